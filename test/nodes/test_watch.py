@@ -2,17 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The watch of a localizer: right, kidnapped, silent and broken ones, with real nodes."""
 
+import time
+
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from processes import wait_for
-from std_msgs.msg import Bool, String
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Bool, Header, String
 from std_srvs.srv import Trigger
 from test_lifecycle import Manager
-from tester import transform_of
-from watched import MOUNT, Robot
+from tester import RELIABLE, transform_of
+from watched import MOUNT, Robot, stamp
 
 from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.ros.outputs.map_to_odom import transform_msg
 from cliploc_ros.ros.qos import LATCHED
 
 PERIOD_S = 1.0
@@ -264,3 +268,39 @@ def test_between_looks_nothing_listens_to_images(watch, tester):
     watched.until_state('localized')
     tester.wait(lambda: tester.listened_to() == 0, 'it to rest')
     watched.looks(1)
+
+
+def test_time_that_jumps_back_begins_the_watch_again(watch, tester):
+    """Transforms and poses from before do not count; nobody is lost by that."""
+    clock = tester.create_publisher(Clock, '/clock', RELIABLE)
+    watched, back_s = watch(use_sim_time=True), [0.0]
+    watched.robot.clock = lambda: time.time() - back_s[0]
+    watched.robot.on_tick = lambda now_s, *_: clock.publish(Clock(clock=stamp(now_s)))
+    watched.until_state('localized')
+    said = len(watched.states)
+    back_s[0] = 100.0
+    watched.until_state('uncertain')
+    watched.until_state('localized')
+    assert 'lost' not in watched.states[said:]
+    assert 'time jumped back by' in watched.process.output()
+    tester.destroy_publisher(clock)
+
+
+@pytest.mark.needs('tf2_ros')
+def test_a_localizer_by_tf_is_right_kidnapped_and_silent(watch, tester):
+    from tf2_msgs.msg import TFMessage
+    publisher = tester.create_publisher(TFMessage, '/tf', 100)
+
+    def send(now_s, map_from_odom, odom_from_base):
+        publisher.publish(TFMessage(transforms=[
+            transform_msg(Header(frame_id=parent, stamp=stamp(now_s)), child, pose)
+            for parent, child, pose in (('map', 'odom', map_from_odom),
+                                        ('odom', 'base_link', odom_from_base))]))
+    watched = watch(watch='tf')
+    watched.robot.on_tick, watched.robot.has_localizer = send, False
+    watched.until_state('localized')
+    watched.robot.carry(3.0)
+    assert watched.until_state('lost') <= 5
+    watched.robot.on_tick = lambda *_: None
+    watched.until_reason("no transform from 'base_link' to 'map'")
+    tester.destroy_publisher(publisher)

@@ -52,7 +52,7 @@ class Robot:
         #: Of what it shows: a number, or NaN.
         self.error_m = 0.0
         self.frame_id, self.has_odom, self.has_localizer, self.sees = 'map', True, True, True
-        self.clock = time.time
+        self.clock, self.on_tick = time.time, lambda now_s, map_from_odom, odom_from_base: None
 
     def close(self):
         self._tester.destroy_publisher(self._odom)
@@ -74,6 +74,7 @@ class Robot:
         now_s = self.clock()
         header = Header(frame_id='odom', stamp=stamp(now_s))
         odom_from_base = aside(self._x) @ invert_transform(BASE_FROM_CAMERA)
+        self.on_tick(now_s, self.believed, odom_from_base)
         if self.has_odom:
             odometry = Odometry(header=header, child_frame_id='base_link')
             odometry.pose.pose = pose_to_msg(odom_from_base)
