@@ -27,7 +27,7 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
-from cliploc_ros.ros.inputs.localizer_pose import LocalizerPose
+from cliploc_ros.ros.inputs.localizer_pose import LaterError, LocalizerPose
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.node.diagnostics import Health
@@ -162,8 +162,8 @@ class Watcher:
                 self._react(stopped)
             except StoppedError:
                 return
-            except (NoFrameError, NoTransformError, TimeJumpError, TimeUpError) as error:
-                # the next look may do
+            except (NoFrameError, NoTransformError, LaterError, TimeJumpError, TimeUpError
+                    ) as error:  # the next look may do
                 self._miss(stopped, str(error), time.monotonic() - _STALE_S)
             except CliplocError as error:
                 self._miss(stopped, str(error))

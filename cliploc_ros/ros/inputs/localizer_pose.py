@@ -34,6 +34,10 @@ class NoLocalizerPoseError(CliplocError):
     """The localizer has no valid pose for an image; the message says what to do."""
 
 
+class LaterError(NoLocalizerPoseError):
+    """The next pose of the localizer may do."""
+
+
 class _Anchor(NamedTuple):
     """Odometry's coordinate frame in the map (4, 4), by the pose that was shown at a stamp."""
 
@@ -69,7 +73,7 @@ class LocalizerPose:
 
         `state` is the robot's at that stamp, `frame_ids` are those of the maps.
 
-        NoLocalizerPoseError: there is none, or it is invalid.
+        NoLocalizerPoseError: there is none, or it is invalid. LaterError: it is too old.
         """
         frame_id, pose = self._by_tf(image, state, parameters, frame_ids) \
             if parameters.watch == 'tf' else self._by_topic(image, state, parameters)
@@ -135,8 +139,8 @@ class LocalizerPose:
             then = self._robot.at(Header(stamp=shown.header.stamp, frame_id=image.frame_id),
                                   parameters)
             if then.place is None or then.place.run != place.run:
-                raise NoLocalizerPoseError(f'odom does not tell the way since {topic} was '
-                                           'published: wait for the next pose')
+                raise LaterError(f'odom does not tell the way since {topic} was published: wait '
+                                 'for the next pose')
             map_from_camera = pose @ invert_transform(then.camera_from_base)
             anchor = self._anchor = _Anchor(
                 shown_ns, place.run, then.place.way_m,
