@@ -114,7 +114,9 @@ class Watch:
         alignment = align(look_at(self._map, observation, self._options),
                           given if turn is None else given @ turn.stated_from_true)
         evidence, expected = measure(alignment)
-        is_full = evidence.is_full(self._belief.has_jumped)
+        # where the map is out of date, objects that nothing explains are no wrong pose
+        is_full = evidence.is_full(self._belief.has_jumped) and (
+            self._belief.has_jumped or not self._missing.is_outdated)
         odds = log_odds(evidence, is_full) + by_vertical(
             given, observation.up_in_camera, self._options.vertical_deviation_deg)
         if recognizer is not None:
