@@ -25,7 +25,7 @@ _MOST_LOOKS, _LEAST_LOOKS, _LEAST_MATCHED = 40, 8, 3
 # Standard deviations of a localizer: of x, y and height [m], and of the yaw [deg].
 _DRIFT_M, _YAW_DEG = (0.15, 0.15, 0.03), 2.0
 # A turn is significant from this angle [deg] and this many deviations on.
-_LEAST_DEG, _LEAST_SIGMAS = 1.5, 4.0
+_LEAST_DEG, _LEAST_SIGMAS = 1.5, 3.0
 _ROUNDS = 10
 
 
