@@ -148,7 +148,7 @@ def test_minutes_without_objects_end_in_uncertain(watch, room):
 def test_a_place_that_the_map_does_not_show_is_uncertain(watch, room):
     """The robot drives through a door to other objects of the same classes."""
     follow(watch, room, drive(10))
-    annex = replace(room, centers=room.centers + [30.0, 0.0, 0.0])
+    annex = replace(room, centers=room.centers + np.array([30.0, 0.0, 0.0]))
     way = [pose_at(30.0 + one[0, 3], one[1, 3], 20.0 * row) for row, one in enumerate(drive(40))]
     near = [moved(way[0], x, 0.0) for x in np.linspace(-27.0, 0.0, 30)]
     follow(watch, room, near, first=10, rows=[])
