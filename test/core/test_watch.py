@@ -208,7 +208,9 @@ def test_the_turn_of_a_camera_is_known_after_twenty_looks(watch, room, rotvec):
     assert found.sigma_deg < 1.5
     if np.count_nonzero(rotvec) == 1:
         angle, axis = np.abs(rotvec).max(), 'xyz'[int(np.argmax(np.abs(rotvec)))]
-        assert found.in_words().endswith(f'degrees about {axis}')
+        assert f'degrees about {axis}' in found.in_words()
+        # the camera is level: its y axis is the vertical
+        assert found.is_yaw == (axis == 'y') == ('yaw of the localizer' in found.in_words())
         assert abs(float(found.in_words().split()[2]) - angle) < 0.5
 
 

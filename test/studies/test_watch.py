@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The study of the watch: simulated localizers, and what the watch says of them."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -31,7 +33,7 @@ def test_drives_are_reproducible_and_change_a_share_of_the_objects():
     assert not make_drive('office', 3, 2).changed.any()
     poses = [one.map_from_camera for one in drive.world.queries]
     steps = np.array([pose_error(after, before)
-                      for before, after in zip(poses, poses[1:], strict=False)])
+                      for before, after in pairwise(poses)])
     assert steps[:, 0].max() < 0.6
     assert steps[:, 1].max() < 35.0
 
