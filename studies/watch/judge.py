@@ -24,8 +24,9 @@ from studies.watch.localizers import LOOK_S, Drive, drifting, kidnapped
 DISPLACED = ((1.0, 0.0), (2.0, 0.0), (5.0, 0.0), (0.0, 30.0), (0.0, 90.0), (0.0, 180.0))
 KIDNAPPED, TWIN = 'kidnapped', 'at a twin'
 # Looks at three objects or more within which a wrong pose should be noticed, and the most looks.
+# Poses become wrong at some looks of a drive.
 LOOKS, _OBJECTS, _MOST_LOOKS = 5, 3, 30
-_EVERY_LOOKS, _FIRST_LOOK, _KIDNAPS = 50, 30, 3
+_FIRST_LOOK, _PARTS, _LEAST_PART, _KIDNAPS = 10, 6, 12, 3
 _FAR = Tolerance(2.0, 30.0)
 # Gap between the rooms of studies.worlds.places.two_rooms [m].
 _GAP_M = 1.5
@@ -63,9 +64,10 @@ def watch_of(drive: Drive) -> Watch:
 def judge(drive: Drive, seed: int, wrong_poses: bool) -> tuple[Right, list[Alarm]]:
     """Return what the watch says of a right localizer, and of wrong ones from some looks on."""
     rng, watch = np.random.default_rng([seed, 9]), watch_of(drive)
+    begins = range(_FIRST_LOOK, len(drive.poses), max(_LEAST_PART, len(drive.poses) // _PARTS))
     poses, alarms, reports = drifting(drive.poses, rng), list[Alarm](), list[WatchReport]()
     for row, (observation, pose) in enumerate(zip(drive.observations, poses, strict=True)):
-        if wrong_poses and row >= _FIRST_LOOK and (row - _FIRST_LOOK) % _EVERY_LOOKS == 0:
+        if wrong_poses and row in begins:
             for case, seen, wrong in _wrong_ways(drive, poses, row, rng):
                 its = copy.deepcopy(watch, {id(drive.landmark_map): drive.landmark_map})
                 found = _alarm(its, drive, case, seen, wrong)

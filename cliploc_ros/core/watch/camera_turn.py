@@ -25,8 +25,10 @@ _MOST_LOOKS, _LEAST_LOOKS, _LEAST_MATCHED = 40, 8, 3
 # Standard deviations of a localizer: of x, y and height [m], and of the yaw [deg].
 _DRIFT_M, _YAW_DEG = (0.15, 0.15, 0.03), 2.0
 # A turn is significant from this angle [deg] and this many deviations on.
-_LEAST_DEG, _LEAST_SIGMAS = 1.5, 4.0
+_LEAST_DEG, _LEAST_SIGMAS = 1.5, 3.0
 _ROUNDS = 10
+# A turn whose axis has this cosine with the vertical is about it.
+_YAW_SHARE = 0.8
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,8 @@ class CameraTurn:
     #: optical axes: x right, y down, z forward
     rotvec_deg: NDArray[np.float64]
     sigma_deg: float  #: Standard deviation on each axis
+    #: Whether it is about the vertical: a constant yaw error of the localizer looks the same
+    is_yaw: bool = False
 
     @property
     def stated_from_true(self) -> NDArray[np.float64]:
@@ -50,14 +54,16 @@ class CameraTurn:
         angle = float(np.linalg.norm(self.rotvec_deg))
         shares = np.abs(self.rotvec_deg) / max(angle, 1e-9)
         names = [name for name, share in zip('xyz', shares, strict=True) if share > 0.4]
-        return f'turned by {angle:.1f} degrees about {" and ".join(names)}'
+        found = f'turned by {angle:.1f} degrees about {" and ".join(names)}'
+        return f'{found}, or the yaw of the localizer is off' if self.is_yaw else found
 
 
 class _Turn(NamedTuple):
-    """A turn that one look shows [rad], and its information, both in the stated camera."""
+    """A turn that one look shows [rad], its information, and the vertical, in the camera."""
 
     rotvec: NDArray[np.float64]
     information: NDArray[np.float64]
+    up: NDArray[np.float64]
 
 
 class TurnEstimate:
@@ -65,6 +71,8 @@ class TurnEstimate:
 
     def __init__(self) -> None:
         self._turns: deque[_Turn] = deque(maxlen=_MOST_LOOKS)
+        #: None before it is known, or where it may be chance
+        self.turn: CameraTurn | None = None
 
     def add(self, alignment: Alignment, given: NDArray[np.float64], is_new: bool) -> None:
         """Take in a look at a right pose (4, 4)."""
@@ -75,20 +83,19 @@ class TurnEstimate:
         if self._turns and not is_new:
             self._turns.pop()
         self._turns.append(_turn_of(fit.pose, information, given))
+        if len(self._turns) >= _LEAST_LOOKS:
+            self.turn = self._significant()
 
-    @property
-    def turn(self) -> CameraTurn | None:
-        """Return the turn; None before it is known, or where it may be chance."""
-        if len(self._turns) < _LEAST_LOOKS:
-            return None
+    def _significant(self) -> CameraTurn | None:
         mean, covariance = _robust_mean(self._turns)
-        sigma_deg = math.degrees(math.sqrt(float(np.linalg.eigvalsh(covariance)[-1])))
-        angle_deg = math.degrees(float(np.linalg.norm(mean)))
-        deviation = math.sqrt(float(mean @ covariance @ mean)) / max(
-            float(np.linalg.norm(mean)), 1e-12)
-        if angle_deg < max(_LEAST_DEG, _LEAST_SIGMAS * math.degrees(deviation)):
+        angle = float(np.linalg.norm(mean))
+        axis = mean / max(angle, 1e-12)
+        deviation = math.sqrt(float(axis @ covariance @ axis))
+        if math.degrees(angle) < max(_LEAST_DEG, _LEAST_SIGMAS * math.degrees(deviation)):
             return None
-        return CameraTurn(np.degrees(mean), sigma_deg)
+        return CameraTurn(
+            np.degrees(mean), math.degrees(math.sqrt(np.linalg.eigvalsh(covariance)[-1])),
+            bool(abs(axis @ self._turns[-1].up) > _YAW_SHARE))
 
 
 def _turn_of(pose: NDArray[np.float64], information: NDArray[np.float64],
@@ -108,10 +115,10 @@ def _turn_of(pose: NDArray[np.float64], information: NDArray[np.float64],
     step = np.linalg.solve(joint, np.concatenate([prior @ back, np.zeros(3)]))
     turned = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
     axes = given[:3, :3]
-    yaw = axes.T @ (0.0, 0.0, 1.0)
+    up = axes[2]
     covariance = (axes.T @ np.linalg.inv(marginal + 1e-6 * np.eye(3)) @ axes
-                  + math.radians(_YAW_DEG) ** 2 * np.outer(yaw, yaw))
-    return _Turn(Rotation.from_matrix(axes.T @ turned).as_rotvec(), np.linalg.inv(covariance))
+                  + math.radians(_YAW_DEG) ** 2 * np.outer(up, up))
+    return _Turn(Rotation.from_matrix(axes.T @ turned).as_rotvec(), np.linalg.inv(covariance), up)
 
 
 def _robust_mean(turns: deque[_Turn]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -23,6 +23,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 # A detector finds landmarks up to here [m], with sides from here on [px], of which the image shows
 # this share and nearer landmarks hide at most that share. Guesses, on the safe side.
 _REACH_M, _LEAST_SIDE_PX, _SHOWN_SHARE, _HIDDEN_SHARE = 6.0, 20.0, 0.75, 0.4
+#: Sides of a landmark, equal angles about the vertical.
+SIDES = 8
 # A landmark beside a shown one is within this angle of its direction, and not much further away.
 _BESIDE_COSINE, _BESIDE_SHARE = np.cos(np.radians(20.0)), 0.8
 
@@ -34,6 +36,7 @@ class Expected(NamedTuple):
     was_seen: NDArray[np.bool_]  #: (k,): whether a detection shows it
     #: (k,): whether a shown landmark beside it or behind it tells that no wall hides it
     in_sight: NDArray[np.bool_]
+    sides: NDArray[np.int64]  #: (k,): from which of SIDES sides the camera looks at it
 
     @property
     def missed(self) -> NDArray[np.int64]:
@@ -68,7 +71,9 @@ def expect(landmark_map: LandmarkMap, camera: Camera, map_from_camera: NDArray[n
     in_sight = _beside(offsets, was_seen)
     rows = np.nonzero(visible)[0]
     rows = rows[np.unique(landmark_map.objects[near[rows]], return_index=True)[1]]
-    return Expected(near[rows], was_seen[rows], in_sight[rows])
+    x, y, _ = (landmark_map.centers[near[rows]] - map_from_camera[:3, 3]).T
+    sides = np.floor(SIDES * (np.arctan2(y, x) / (2.0 * np.pi) + 0.5)).astype(np.int64) % SIDES
+    return Expected(near[rows], was_seen[rows], in_sight[rows], sides)
 
 
 def _hidden(boxes: NDArray[np.float64], depths: NDArray[np.float64], radii: NDArray[np.float64]

@@ -60,7 +60,7 @@ def _signs(image: NDArray[np.uint8]) -> dict[str, bool]:
     """Return which signs an image shows by itself."""
     height = max(1, round(image.shape[0] * _WIDTH_PX / image.shape[1]))
     small = cv2.resize(image, (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
-    grey = small.mean(axis=2, dtype=np.float32) if small.ndim == 3 else small.astype(np.float32)
+    grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
     mean, deviation = grey.mean(), grey.std()
     is_dark = bool(mean < _DARK_MEAN and np.quantile(grey, 0.95) < _DARK_HIGH)
     is_bare = bool(deviation < _BARE) and not is_dark

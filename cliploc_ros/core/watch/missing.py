@@ -15,7 +15,7 @@ from typing import NamedTuple
 from scipy.special import betaln
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.watch.expectation import Expected
+from cliploc_ros.core.watch.expectation import SIDES, Expected
 
 # The share of looks that find a landmark which is there: its mean before any look, the looks that
 # this mean stands for, and the looks that the share of all landmarks, or the seen_ratio of a map,
@@ -39,6 +39,7 @@ class _Record(NamedTuple):
     found: float = 0.0
     missed: float = 0.0  #: Before it was seen last
     misses: float = 0.0  #: Since then
+    seen_from: int = 0  #: The sides from which it was seen, a bit each
 
     def gone(self, share: float) -> float:
         """Return the probability that it is gone, where looks find a landmark at a share."""
@@ -47,6 +48,15 @@ class _Record(NamedTuple):
         there = betaln(found, missed + self.misses) - betaln(found, missed)
         odds = log(_GONE / (1.0 - _GONE)) + self.misses * log(1.0 - _BY_CHANCE) - there
         return float(1.0 / (1.0 + exp(-odds)))
+
+
+def _may_show(seen_from: int, side: int) -> bool:
+    """Return whether a landmark shows from a side: a television does not from behind.
+
+    One that was never seen may show from everywhere.
+    """
+    near = [(side + step) % SIDES for step in (-1, 0, 1)]
+    return not seen_from or any(seen_from >> one & 1 for one in near)
 
 
 class Missing:
@@ -59,13 +69,15 @@ class Missing:
 
     def add(self, expected: Expected, weight: float) -> None:
         """Count a look at a right pose, 1 for one that shares no errors with earlier ones."""
-        for landmark, was_seen, in_sight in zip(*(one.tolist() for one in expected), strict=True):
+        for landmark, was_seen, in_sight, side in zip(*(one.tolist() for one in expected),
+                                                      strict=True):
             one = self._records.get(landmark, _Record())
             if was_seen:
                 keep = min(1.0, _MOST_SEEN / (one.found + weight))
                 self._records[landmark] = _Record(
-                    keep * (one.found + weight), keep * (one.missed + one.misses))
-            elif in_sight:
+                    keep * (one.found + weight), keep * (one.missed + one.misses),
+                    seen_from=one.seen_from | 1 << side)
+            elif in_sight and _may_show(one.seen_from, side):
                 self._records[landmark] = one._replace(misses=one.misses + weight)
         if len(expected.landmarks):
             self._expected.append(expected.landmarks.tolist())

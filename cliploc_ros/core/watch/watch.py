@@ -32,6 +32,8 @@ from cliploc_ros.errors import OptionsError
 _LEAST_AGAINST = {True: 2, False: 3}
 # A look of more weight than this is at another view, see Belief.add.
 _NEW_VIEW = 0.3
+# Keyframes that say so much against a pose [log odds] recognize another place.
+_ELSEWHERE = -3.0
 _RIGID = 1e-3
 
 
@@ -114,11 +116,15 @@ class Watch:
         alignment = align(look_at(self._map, observation, self._options),
                           given if turn is None else given @ turn.stated_from_true)
         evidence, expected = measure(alignment)
-        is_full = evidence.is_full(self._belief.has_jumped)
+        # where the map is out of date, objects that nothing explains are no wrong pose
+        is_full = evidence.is_full(self._belief.has_jumped) and (
+            self._belief.has_jumped or not self._missing.is_outdated)
         odds = log_odds(evidence, is_full) + by_vertical(
             given, observation.up_in_camera, self._options.vertical_deviation_deg)
         if recognizer is not None:
-            odds += by_keyframes(recognizer, alignment, given)
+            by_points = by_keyframes(recognizer, alignment, given)
+            is_full |= by_points < _ELSEWHERE
+            odds += by_points
         if odds == 0.0:
             return evidence
         self._count += 1
