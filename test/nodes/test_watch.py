@@ -213,6 +213,13 @@ def test_without_odometry_a_fresh_pose_will_do(watch):
     watched.until_reason('and odom does not tell the way since: publish odom')
 
 
+def test_a_camera_at_1_hz_will_do(watch):
+    watched = watch()
+    watched.robot.image_every = 20
+    watched.until_state('localized')
+    assert set(watched.looks(3)) == {'localized'}
+
+
 def test_a_localizer_that_jumps_is_another_statement(watch):
     """Of the pose before, nothing counts."""
     watched = watch()

@@ -23,7 +23,7 @@ NOISE = np.random.default_rng(0).integers(0, 256, 3 * CAMERA.width * CAMERA.heig
 # The camera looks along the base's x axis.
 MOUNT = [0.0, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5]
 BASE_FROM_CAMERA = transform_from_pose(np.array(MOUNT[:3]), np.array(MOUNT[3:]))
-TICK_S, IMAGE_EVERY, POSE_EVERY = 0.05, 2, 5
+TICK_S, POSE_EVERY = 0.05, 5
 # It turns round after this way.
 REACH_M = 0.5
 
@@ -41,7 +41,7 @@ class Robot:
     """Publishes what a robot does: step after step, in real time."""
 
     def __init__(self, tester):
-        self._tester, self._tick = tester, 0
+        self._tester, self._tick, self.image_every = tester, 0, 2
         self._odom = tester.create_publisher(Odometry, 'odom', RELIABLE)
         self._pose = tester.localizer._publisher
         self.speed_m_s, self._x, self._sign = 0.3, 0.0, 1.0
@@ -79,7 +79,7 @@ class Robot:
             odometry = Odometry(header=header, child_frame_id='base_link')
             odometry.pose.pose = pose_to_msg(odom_from_base)
             self._odom.publish(odometry)
-        if self._tick % IMAGE_EVERY == 0 and self.sees:
+        if self._tick % self.image_every == 0 and self.sees:
             seen = see_room(ROOM, self.map_from_base @ BASE_FROM_CAMERA)
             image, *others = make_frame(seen, now_s)
             image.data = np.roll(NOISE, self._tick).tobytes()  # a frozen image is a fault
