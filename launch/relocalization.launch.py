@@ -56,6 +56,8 @@ RELOCALIZER_PARAMETERS = {
     'gravity': 'source of the vertical: none, base_frame or imu',
     'matching': 'hybrid, clip or class; class needs no CLIP',
     'mode': 'on_request or continuous',
+    'watch': "where the localizer's pose is watched: none, tf or amcl_pose",
+    'on_lost': 'report, or relocalize once the robot stands',
     'clip_model': 'open_clip architecture',
     'clip_pretrained': 'tag or file',
     'image_transport': 'raw or compressed',

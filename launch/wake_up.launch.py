@@ -18,6 +18,7 @@ ARGUMENTS = {
     'spin': ('spin', "the action that Nav2's behavior_server serves"),
     'wake_up_timeout': ('60.0', 'no turn begins later [s]'),
     'wake_up_turn_deg': ('45.0', 'turn by this much between looks [deg]; 0: never'),
+    'wake_up_watch': ('false', 'true: wake up again whenever the relocalizer finds it lost'),
     'log_level': ('info', 'debug, info, warn or error'),
 }
 MEANINGS = {0: 'accepted', 1: 'refused', 2: 'not ready'}
@@ -32,7 +33,8 @@ def generate_launch_description() -> LaunchDescription:
         namespace=LaunchConfiguration('namespace'),
         arguments=['--relocalizer', LaunchConfiguration('relocalizer'),
                    '--timeout', LaunchConfiguration('wake_up_timeout'),
-                   '--turn-deg', LaunchConfiguration('wake_up_turn_deg')],
+                   '--turn-deg', LaunchConfiguration('wake_up_turn_deg'),
+                   '--watch', LaunchConfiguration('wake_up_watch')],
         remappings=[('spin', LaunchConfiguration('spin'))],
         ros_arguments=['--log-level', LaunchConfiguration('log_level')])
     return LaunchDescription([*declared, RegisterEventHandler(

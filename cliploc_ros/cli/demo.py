@@ -51,6 +51,9 @@ def make_parser() -> argparse.ArgumentParser:
         '--cameras', type=int, choices=(1, 4), default=1,
         help='4: a robot that looks in four directions at once and does not turn (default: 1)')
     parser.add_argument(
+        '--kidnapped', action='store_true',
+        help='carry a driving robot away: its watch notices, and it gets its pose back')
+    parser.add_argument(
         '--rviz', action='store_true', help='show the topics in RViz, where it is installed')
     return parser
 
@@ -63,8 +66,12 @@ def demonstrate(options: argparse.Namespace) -> int:
 
     chosen = DemoOptions(assets=options.assets, out=options.out, wake_ups=options.wake_ups,
                          rate=options.rate, method=options.method, rviz=options.rviz,
-                         has_rig=options.cameras > 1)
-    if options.map:
+                         has_rig=options.cameras > 1, is_watched=options.kidnapped)
+    if options.kidnapped:
+        from cliploc_ros.demo.kidnapped import run_kidnapped
+
+        run_kidnapped(chosen)
+    elif options.map:
         from cliploc_ros.demo.map_demo import run_map_demo
 
         run_map_demo(chosen)

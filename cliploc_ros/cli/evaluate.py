@@ -29,10 +29,15 @@ if TYPE_CHECKING:
 
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
+    from cliploc_ros.datasets.bag_poses import ReadPoses
     from cliploc_ros.datasets.frames import Frames
     from cliploc_ros.datasets.queries import Queries
     from cliploc_ros.evaluation.methods import Method
     from cliploc_ros.evaluation.trials import Query
+
+# Poses of a watched localizer are interpolated over gaps up to this [ns]: AMCL speaks as the robot
+# moves, its transforms at its own rate.
+_WATCHED_GAP_NS = 1_000_000_000
 
 EPILOG = f"""\
 methods: {', '.join(PAPER_METHODS)};
@@ -47,6 +52,8 @@ examples:
   evaluate --queries office.npz --map office.yaml --methods auto --fuse --odometry-noise 0.01 0.5
   evaluate --bag case_20260101T120000.000_refused --map office.yaml
       answers a request again that ~/record stored; exit code 1: another verdict
+  evaluate --bag office --map office.yaml --watch /amcl_pose --odometry /odom
+      watches the poses of a localizer: when they are lost, and whether that is true
 """
 
 
@@ -145,6 +152,14 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
                        help='PoseStamped, PoseWithCovarianceStamped or Odometry (%(default)s)')
     group.add_argument('--body-from-camera', type=float, nargs=7, metavar='V',
                        help='x y z qx qy qz qw of the camera on the body of the ground truth')
+    group.add_argument('--watch', metavar='TOPIC',
+                       help='watch these poses of a localizer by objects, in place of methods; '
+                       'they and those of --odometry are of the same body; writes watch.json and '
+                       'figures')
+    group.add_argument('--watch-period', type=not_negative, default=2.0, metavar='SECONDS',
+                       help='least time between two looks (%(default)s)')
+    group.add_argument('--odometry', metavar='TOPIC',
+                       help='of --watch: which looks are independent')
 
 
 def evaluate(options: argparse.Namespace) -> int:
@@ -164,6 +179,8 @@ def evaluate(options: argparse.Namespace) -> int:
         raise OptionsError('--cameras is for --bag, without --fuse and --save-queries')
     landmark_map = join_maps([LandmarkMap.from_file(file) for file in options.map],
                              [str(file) for file in options.map])
+    if options.watch is not None:
+        return _watch(options, landmark_map)
     if options.bag is not None and _is_case(options):
         return _replay_case(options, landmark_map)
     paper = RelocalizerOptions(
@@ -205,6 +222,39 @@ def evaluate(options: argparse.Namespace) -> int:
                     workers=options.workers or _cores(), scheduler=options.scheduler,
                     layer=layer, noisy=draws if is_noisy else (), sweep=options.sweep,
                     resume=options.resume, figures=options.figures, frames=recorded.frames)
+    return 0
+
+
+def _watch(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
+    """Watch the poses of a localizer in a recording; return the exit code."""
+    from cliploc_ros.core.relocalizer import Relocalizer
+    from cliploc_ros.core.watch.watch import Watch
+    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames, bag_odometry
+    from cliploc_ros.datasets.bag_poses import pose_sources, poses_of_topic
+    from cliploc_ros.evaluation.watching import watch_recording, write_watch
+    from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
+
+    if options.bag is None or options.cameras != [''] or len(options.map) > 1:
+        raise OptionsError('--watch is for --bag, with one map and one camera')
+
+    def read(topic: str) -> 'ReadPoses':
+        return poses_of_topic(topic, _WATCHED_GAP_NS, mount_of(options.body_from_camera))
+    reading = repr([options.watch, options.odometry, options.image, options.camera_info,
+                    options.body_from_camera, options.rectified])
+    odometry, truth = (bag_odometry(options.bag, options.image, read(topic))
+                       if (topic and topic in pose_sources(options.bag)) or required else None
+                       for topic, required in ((options.odometry, bool(options.odometry)),
+                                               (options.ground_truth, False)))
+    recorded = record_once(
+        bag_frames(options.bag, BagTopics(options.image, options.camera_info, options.rectified),
+                   read(options.watch)),
+        RecordingOptions(detector_options(options), None, EVERY_FRAME, reading,
+                         options.workers or 1, options.scheduler), odometry=odometry)
+    relocalizer = Relocalizer(landmark_map, RelocalizerOptions(
+        matching='class', tilt_deviation_deg=options.tilt_deviation,
+        height_range_m=tuple(options.height_range)))
+    looks = watch_recording(recorded, Watch(relocalizer), truth, options.watch_period)
+    print(write_watch(options.out, looks, options.figures), flush=True)
     return 0
 
 

@@ -52,6 +52,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--turn-deg', type=within(-180.0, 180.0), default=45.0, metavar='DEG',
                         help='turn counterclockwise by this much between looks; 0: never '
                         '(%(default)g)')
+    parser.add_argument('--watch', nargs='?', choices=('true', 'false'), const='true',
+                        default='false', help='go on: wake up again whenever the relocalizer, '
+                        'which has to watch, finds the robot lost and at rest')
     return parser
 
 
@@ -71,8 +74,8 @@ def wake_up(options: argparse.Namespace, ros_args: list[str], interrupted: Inter
     except InvalidServiceNameException as error:
         raise OptionsError(f'--relocalizer: {error}') from error
     with running_ros(ros_args):
-        node = WakeUp(WakeUpOptions(options.relocalizer, options.timeout, options.turn_deg),
-                      interrupted)
+        node = WakeUp(WakeUpOptions(options.relocalizer, options.timeout, options.turn_deg,
+                                    options.watch == 'true'), interrupted)
         try:
             return node.run()
         finally:

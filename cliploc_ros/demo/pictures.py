@@ -4,8 +4,10 @@
 
 import textwrap
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,9 +17,11 @@ from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import outline_points, project_ellipsoids
-from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections
 from cliploc_ros.demo.review import ACCEPTED, REFUSED, Judged, Review
 from cliploc_ros.evaluation.figures import EDGED, draw_map
 
@@ -33,6 +37,8 @@ _TOP_VIEW_DPI = 140
 _TRUTH = '#222222'
 _MARGIN_M = 0.45
 _HEADING_M = 0.28
+# Of what the watch says.
+_STATES = {'localized': '#CDE8D8', 'uncertain': '#F5ECC8', 'lost': '#F3CFC3'}
 
 
 def draw_wake_up(review: Review, landmark_map: LandmarkMap, path: Path) -> None:
@@ -218,3 +224,85 @@ def _draw_camera(axes: Axes, map_from_camera: NDArray[np.float64], color: str, m
     axes.plot([x, x + dx], [y, y + dy], color=color, linewidth=1.4, zorder=5)
     axes.plot(x, y, marker=marker, markersize=9 if hollow else 5.5, color=color, zorder=7,
               linestyle='none', markerfacecolor='none' if hollow else color)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Where the robot was at a time [s], where its localizer had it, and what the watch said."""
+
+    time_s: float
+    truth: NDArray[np.float64]
+    believed: NDArray[np.float64]
+    state: str
+
+
+@dataclass(frozen=True)
+class Step:
+    """What happened, when [s], and after how many looks."""
+
+    time_s: float
+    looks: int
+    text: str
+
+
+def draw_kidnapped(file: Path, camera: Camera, detections: Detections, landmark_map: LandmarkMap,
+                   moments: Sequence[Moment], steps: Sequence[Step], path: Path) -> None:
+    """Draw a kidnapped robot: its last view before it was found lost, its ways, and its error.
+
+    The boxes are of the view; the outlines are what the localizer's pose of that time expects.
+    """
+    figure = Figure(figsize=(14.0, 9.0), dpi=_DPI, layout='constrained')
+    (view, top), (timeline, _) = figure.subplots(2, 2, height_ratios=(3, 2))
+    grid = timeline.get_subplotspec().get_gridspec()
+    for axes in figure.axes[2:]:
+        axes.remove()
+    timeline = figure.add_subplot(grid[1, :])
+    lost = next(row for row, one in enumerate(moments) if one.state == 'lost')
+    _draw_expected(view, file, camera, detections, landmark_map, moments[lost].believed)
+    _draw_ways(top, landmark_map, moments)
+    times = np.array([one.time_s for one in moments])
+    errors = [pose_error(one.believed, one.truth)[0] for one in moments]
+    for one, end in zip(moments, times[1:], strict=False):
+        timeline.axvspan(one.time_s, end, color=_STATES.get(one.state, '#FFFFFF'), linewidth=0)
+    timeline.plot(times, errors, color=_TRUTH, linewidth=2.0)
+    for number, step in enumerate(steps):
+        timeline.axvline(step.time_s, color='#666666', linewidth=0.8, linestyle=':')
+        timeline.text(step.time_s + 0.1, 4.8 - 0.25 * number, step.text, fontsize=8)
+    timeline.set(xlabel='time [s]', ylabel="localizer's error [m]", ylim=(0.0, 5.1),
+                 xlim=(0.0, times[-1] + 2.0))
+    timeline.legend(handles=[Patch(color=color, label=state) for state, color in _STATES.items()],
+                    loc='lower left', fontsize=9)
+    figure.savefig(path)
+
+
+def _draw_expected(axes: Axes, file: Path, camera: Camera, detections: Detections,
+                   landmark_map: LandmarkMap, pose: NDArray[np.float64]) -> None:
+    axes.imshow(cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB))
+    axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), xticks=[], yticks=[])
+    axes.set_title("seen (boxes), and what the localizer's pose expects (dotted)", fontsize=10)
+    for left, top, right, bottom in detections.bboxes_xyxy:
+        axes.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False,
+                                 edgecolor=_BOX, linewidth=1.5, path_effects=_EDGED))
+    for outline in project_ellipsoids(invert_transform(pose), landmark_map.centers,
+                                      landmark_map.shapes):
+        if np.isfinite(outline).all():
+            axes.add_patch(Polygon(
+                camera.project_normalized(outline_points(outline)), closed=True, fill=False,
+                edgecolor=_EXPECTED, linewidth=1.5, linestyle=':', path_effects=_EDGED))
+
+
+def _draw_ways(axes: Axes, landmark_map: LandmarkMap, moments: Sequence[Moment]) -> None:
+    """Draw where the robot was, and where its localizer had it."""
+    draw_map(axes, landmark_map)
+    for name, color, style in (('truth', _TRUTH, '-'), ('believed', REFUSED, '--')):
+        way = np.array([getattr(one, name)[:2, 3] for one in moments])
+        jumps = np.nonzero(np.linalg.norm(np.diff(way, axis=0), axis=1) > 1.0)[0] + 1
+        for number, part in enumerate(np.split(way, jumps)):
+            axes.plot(*part.T, color=color, linestyle=style, linewidth=2.0,
+                      label=None if number else
+                      {'truth': 'the robot', 'believed': 'its localizer'}[name])
+        for row in jumps:
+            axes.annotate('', way[row], way[row - 1], arrowprops={
+                'arrowstyle': '->', 'color': color, 'linestyle': ':'})
+    axes.set(aspect='equal', xlabel='x [m]', ylabel='y [m]')
+    axes.legend(fontsize=9, loc='upper right')

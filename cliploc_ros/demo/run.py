@@ -64,6 +64,7 @@ class DemoOptions:
     rviz: bool = False  #: Whether to open RViz if it is installed
     wake_up_map: WakeUpMap | None = None  #: The map to wake up in; None: the assets' map.yaml
     has_rig: bool = False  #: Whether the robot has the cameras of rig/ instead of one
+    is_watched: bool = False  #: Whether its localizer is watched, and a lost robot relocalized
 
     @property
     def map_file(self) -> Path:
@@ -97,6 +98,9 @@ class DemoOptions:
                                          'require_localizer': False,  # the demo has no AMCL
                                          # a search that the clock ends cannot be repeated
                                          'time_budget_ms': 10_000.0}
+        if self.is_watched:
+            parameters |= {'watch': 'amcl_pose', 'watch_period_s': 1.0, 'on_lost': 'relocalize',
+                           'require_localizer': True}
         if matching != 'class':
             parameters |= {'clip_model': self.assets / 'clip.json',
                            'clip_pretrained': self.assets / 'clip.safetensors'}
@@ -183,7 +187,7 @@ def _walk(options: DemoOptions, folder: Path, sequence: TumSequence, domain: int
     chosen = np.linspace(0, len(sequence) - 1, min(options.wake_ups, len(sequence)))
     wake_up_at = {sequence.stamps_ns[round(index)] for index in chosen}
     judged: list[Judged] = []
-    with _nodes(options, domain) as check, ExitStack() as stack:
+    with nodes(options, domain) as check, ExitStack() as stack:
         readers = {name: stack.enter_context(BagReader(folder / f'walk_{name}'))
                    for name in options.mounts}
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
@@ -201,7 +205,7 @@ def _walk(options: DemoOptions, folder: Path, sequence: TumSequence, domain: int
 
 
 @contextmanager
-def _nodes(options: DemoOptions, domain: int) -> Iterator[Callable[[], None]]:
+def nodes(options: DemoOptions, domain: int) -> Iterator[Callable[[], None]]:
     """Run detector and relocalizer; yield a function that raises if one has ended."""
     start = time.monotonic()
     print(f'starting detector and relocalizer ({options.method}); to see their topics: export '

@@ -28,6 +28,7 @@ from cliploc_ros.ros.node.worker import LatestOnly
 from cliploc_ros.ros.outputs.handoff import HandOff
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 from cliploc_ros.ros.request import Pipeline, Requests
+from cliploc_ros.ros.watch import Watcher
 
 _LOG_PERIOD_S = 5.0
 
@@ -53,6 +54,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._cases = CaseRecorder(bool(parameters.record_folder))
         self._requests = Requests(self, self._frames, self._robot, self._pipeline, self._cases,
                                   self._handoff)
+        self._watcher = Watcher(self, self._frames.main, self._robot, self._jumps, self._pipeline,
+                                self._requests, self._handoff, self._answer)
         self._counters = RequestCounters()
         self._last_verdict = 'none yet'
         self._verdicts: dict[str, int] = dict.fromkeys(Verdict, 0)
@@ -80,6 +83,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._robot.open()
         self._pipeline.open()
         self._frames.open()
+        self._watcher.open()
         topic = self._frames.image_topic
         if re.search('[/_]rect', topic) and not parameters.rectified:
             self.get_logger().warning(
@@ -88,6 +92,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
 
     def close(self) -> None:
         """Release the request that waits for frames, and unsubscribe."""
+        self._watcher.close()
         self._handoff.close()
         self._frames.close('the node was deactivated')
         self._pipeline.close()
@@ -95,12 +100,14 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
 
     def release(self) -> None:
         """Release the request that waits for frames: the process ends."""
+        self._watcher.release()
         self._handoff.stop()
         self._frames.close('the node is shutting down')
 
     def _forget(self) -> None:
         """Forget all input: time jumped."""
-        for part in (self._frames, self._robot, self._pipeline, self._handoff, self._cases):
+        for part in (self._frames, self._robot, self._pipeline, self._handoff, self._cases,
+                     self._watcher):
             part.forget()
 
     def examine(self, health: Health) -> None:
@@ -115,6 +122,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                           'base frame': parameters.base_frame,
                           'time limit [s]': parameters.timeout_s,
                           'missing': '; '.join(self._missing())}
+        self._watcher.examine(health)
         localizer = self._pipeline.localizer  # once: a cleanup may drop it meanwhile
         if localizer is not None:
             keyframes = localizer.keyframes
@@ -168,6 +176,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
             answer = replace(answer, map_hash=self._map_hash)
         self._counters.add(answer, time.monotonic() - began_at)
         self._cases.end(answer)
+        if answer.verdict is Verdict.ACCEPTED:
+            self._watcher.start_over()
         self._record(answer)
         return answer
 

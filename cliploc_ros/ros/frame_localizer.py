@@ -34,6 +34,7 @@ from cliploc_ros.core.localizer import (
     BATCH,
     Crops,
     Localizer,
+    by_classes,
     can_do_without_crops,
     informative_first,
 )
@@ -44,6 +45,7 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization, in_its_map
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.watch.watch import Watch, WatchReport
 from cliploc_ros.datasets.depth import depths_from_msg
 from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.files.storage import resolve_cache_dir
@@ -165,6 +167,7 @@ class FrameLocalizer:
         self._observer = observer
         self._options = options
         self._localizer = Localizer(relocalizer)
+        self._watch = Watch(relocalizer)
         self._notes: set[str] = set()
         relocalizer.warm_up()
 
@@ -252,6 +255,32 @@ class FrameLocalizer:
         layer = None if self._keyframes is None else self._keyframes.layer
         return Localized(found, landmark_map, SeenImage(image, seen, layer), compared, is_cut,
                          for_filter, 1 + len(others), frame.left_out)
+
+    def look(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
+             frame_id: str, map_from_camera: NDArray[np.float64]) -> WatchReport:
+        """Compare a frame with the localizer's pose of its camera (4, 4) in the map `frame_id`.
+
+        Crops are compared only where that costs nothing. Other arguments as for localize.
+
+        CliplocError: names what to fix in the frame or in the parameters.
+        """
+        options = parameters.options()
+        self._localizer_for(options)
+        image, observation = self._observed(frame, parameters, state, True)
+        if self._observer is not None and can_do_without_crops(options):
+            observation = self._known_crops(image, observation, options)
+        elif self._observer is not None:
+            observation = by_classes(observation, len(self._map))
+        recognizer = None if self._keyframes is None else self._keyframes.recognizer(
+            image, observation.camera, math.inf, StageTimes('keyframes', time.monotonic()))
+        pose = map_from_camera.copy()
+        pose[:3, 3] += next(part.shift for part in parts_of(self._map)
+                            if part.landmark_map.frame_id == frame_id)
+        return self._watch.look(observation, pose, image, recognizer)
+
+    def forget_looks(self) -> None:
+        """Have the watch begin again."""
+        self._watch.forget()
 
     def _observed(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
                   by_odometry: bool) -> tuple[NDArray[np.uint8], Observation]:
@@ -348,9 +377,11 @@ class FrameLocalizer:
                              compared=rows[:count])
 
     def _localizer_for(self, options: RelocalizerOptions) -> Localizer:
-        """Return the localizer; other options begin a new one."""
+        """Return the localizer; other options begin a new one, and a new watch."""
         if options != self._options:
-            self._localizer, self._options = Localizer(Relocalizer(self._map, options)), options
+            relocalizer = Relocalizer(self._map, options)
+            self._localizer, self._watch = Localizer(relocalizer), Watch(relocalizer)
+            self._options = options
         return self._localizer
 
 

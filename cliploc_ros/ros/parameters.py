@@ -26,6 +26,8 @@ from cliploc_ros.ros.node.parameters import Parameters, parameter
 TRANSPORTS = ('raw', 'compressed')
 MODES = ('on_request', 'continuous')
 VERTICAL_SOURCES = ('none', 'base_frame', 'imu')
+WATCHES = ('none', 'tf', 'amcl_pose')
+REACTIONS = ('report', 'relocalize')
 
 # Of timeout_s, for algorithms other than auto.
 _SEARCH_SHARE = 0.5
@@ -212,6 +214,15 @@ class RelocalizerParameters(CommonParameters):
         'Broadcast map -> odom_frame (REP 105) after an accepted pose; only where no other '
         'localizer does.', read_only=True)
     odom_frame: str = parameter('odom', 'Coordinate frame of odometry, for publish_tf.')
+    watch: str = parameter('none',
+        "Watch whether the localizer's pose is right: map -> base_frame of tf2, or the topic "
+        'localizer_pose.', choices=WATCHES, read_only=True)
+    watch_period_s: float = parameter(2.0,
+        'Look this often; also after each metre or quarter turn of odom, at most once a second.',
+        unit='s', low=1.0, high=5.0)
+    on_lost: str = parameter('report',
+        'When the watch finds the robot lost: only report it, or relocalize once odom shows that '
+        'it stands.', choices=REACTIONS)
     tf_timeout_s: float = parameter(0.5,
         "Wait this long for a transform at the image's stamp. A request waits for the camera's "
         'mount on base_frame until timeout_s.', unit='s', low=0.0, high=60.0)
@@ -241,6 +252,8 @@ class RelocalizerParameters(CommonParameters):
             raise OptionsError('mount_deviation: needs two numbers of 0 or more')
         if self.publish_tf and not self.base_frame:
             raise OptionsError('publish_tf: needs the parameter base_frame')
+        if self.watch == 'amcl_pose' and not self.localizer_pose:
+            raise OptionsError("watch: 'amcl_pose' needs the parameter localizer_pose")
         parse_class_map(self.class_map)
         self.options()
 

@@ -207,6 +207,11 @@ class Requests:
         self._turn = threading.Lock()
         self._previous = Answer(Verdict.FAILED, 'no request yet')
 
+    @property
+    def is_busy(self) -> bool:
+        """Return whether a request is under way."""
+        return self._turn.locked()
+
     def answer(self) -> Answer:
         """Return the answer to a request that arrives now, within timeout_s."""
         arrived_at = time.monotonic()

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Wake a robot up: request its pose, turn between the looks, until accepted or time is up.
 
+With --watch, do so again whenever the relocalizer finds the robot lost.
+
 It turns with Nav2's action `spin`, the only part that needs nav2_msgs.
 """
 
@@ -40,6 +42,8 @@ SILENT_S = 5.0
 _SPIN_S = 0.05
 # What is there is not seen at once.
 _DISCOVERY_S = 2.0
+# What the relocalizer knows is reported within this time.
+_ON_DIAGNOSTICS_S = 1.5
 # Between looks of a robot that does not turn.
 _PAUSE_S = 1.0
 # What an answer may take on its way beyond the relocalizer's own limit.
@@ -182,6 +186,15 @@ class RelocalizerStatus:
         """Return within which time it answers a request [s]; infinite if that is not known."""
         return float(self._report.values.get('time limit [s]', math.inf))
 
+    @property
+    def values(self) -> dict[str, str]:
+        """Return the values of its last report."""
+        return self._report.values
+
+    def has_reported_since(self, moment: float) -> bool:
+        """Return whether it was active and reported since a moment (monotonic clock) [s]."""
+        return self._report.received_at > moment and self._report.values.get('state') == 'active'
+
     def problem(self) -> str:
         """Return why the relocalizer cannot take a request, and what to do; empty if it can."""
         state, silent_s = self._report.values.get('state'), self.silent_s
@@ -220,6 +233,8 @@ class WakeUpOptions:
     relocalizer: str = 'relocalizer'
     timeout_s: float = 60.0  #: No turn begins later; a look does only after a turn
     turn_deg: float = 45.0  #: Turn by this much between looks; 0: do not turn
+    #: Whether to wait, after an accepted pose, until the robot is lost and stands, and go on
+    watch: bool = False
 
 
 class WakeUp(Node):
@@ -248,10 +263,16 @@ class WakeUp(Node):
     def run(self) -> Outcome:
         """Look until a pose is accepted or time is up; end a turn under way in any case.
 
+        To watch is to do so again and again, until one of them fails.
+
         KeyboardInterrupt: the event is set; no turn is under way.
         """
         try:
-            return self._look_about()
+            while (outcome := self._look_about()) is Outcome.ACCEPTED and self._options.watch:
+                if problem := self._until_lost():
+                    return _end(Outcome.NOT_READY, f'not ready: {problem}')
+                self._began_at = time.monotonic()
+            return outcome
         finally:
             self._interrupted = Interruption()  # this one is handled
             self._turning.stop()
@@ -284,6 +305,22 @@ class WakeUp(Node):
             if not problem or self._is_time_up:
                 return problem
             self._spin()
+
+    def _until_lost(self) -> str:
+        """Wait until the robot is lost and stands; return why that cannot be known."""
+        accepted_at = time.monotonic() + _ON_DIAGNOSTICS_S  # what comes earlier may be older
+        while True:
+            self._spin()
+            self._say('waiting', self._status.problem())
+            if not self._status.has_reported_since(accepted_at):
+                continue
+            values = self._status.values
+            if 'watch' not in values:
+                return 'the relocalizer does not watch: set its parameter watch to tf or amcl_pose'
+            self._say('watch', values['watch'] if values['watch'] != 'lost' else
+                      f'{values["watch reason"]}; {values["on lost"]}')
+            if values['lost and at rest'] == 'True':
+                return ''
 
     def _problem(self) -> str:
         """Return why there can be no request now; empty if there can."""

@@ -58,7 +58,8 @@ class LiveState(NamedTuple):
 
     ``is_heard``: it reported within the last seconds. ``pose``: the last accepted one.
     ``verdict``: its last answer in one line. ``is_busy``: a request of this studio waits for its
-    answer. The others are of its diagnostics; '' where they say nothing.
+    answer. ``watch``: what its watch says; ``missing``: landmarks that this one does not see any
+    more. The others are of its diagnostics; '' where they say nothing.
     """
 
     is_heard: bool = False
@@ -68,6 +69,8 @@ class LiveState(NamedTuple):
     map_text: str = ''
     map_file: str = ''
     base_frame: str = ''
+    watch: str = ''
+    missing: tuple[str, ...] = ()
     is_busy: bool = False
 
     @property
@@ -193,7 +196,9 @@ class LiveRelocalizer:
             self._change(is_heard=True, verdict='' if verdict == 'none yet' else verdict,
                          lifecycle=values.get('state', ''), map_text=values.get('map', ''),
                          map_file=values.get('map file', ''),
-                         base_frame=values.get('base frame', ''))
+                         base_frame=values.get('base frame', ''),
+                         watch=values.get('watch reason', ''),
+                         missing=tuple(filter(None, values.get('watch missing', '').split(', '))))
 
     def _change(self, **values: Any) -> None:
         with self._lock:

@@ -37,9 +37,9 @@ class Ellipsoids:
     """
 
     def __init__(self, scene: viser.SceneApi, name: str, on_click: Callable[[Any, str], None],
-                 opacity: float | None = None):
+                 opacity: float | None = None, scale: float = 1.0):
         self._scene, self._name, self._on_click = scene, name, on_click
-        self._opacity = opacity
+        self._opacity, self._scale = opacity, scale
         self._shown: tuple[tuple[str, Landmark], ...] = ()
         self._handle: Any = None
 
@@ -60,7 +60,8 @@ class Ellipsoids:
             'batched_wxyzs': np.array([np.roll(one.quat_xyzw, 1) for _, one in landmarks],
                                       dtype=np.float32),
             'batched_positions': np.array([one.center for _, one in landmarks], dtype=np.float32),
-            'batched_scales': np.array([one.semi_axes for _, one in landmarks], dtype=np.float32),
+            'batched_scales': np.array([self._scale * one.semi_axes for _, one in landmarks],
+                                       dtype=np.float32),
             'batched_colors': np.array([rgb or color_of(one.class_id) for _, one in landmarks],
                                        dtype=np.uint8)}
         if count_changed or self._handle is None:

@@ -21,7 +21,7 @@ from cliploc_ros.mapping.check.places import RADIUS_M
 from cliploc_ros.mapping.check.report import GridCheck
 from cliploc_ros.studio.panels import Actions, paragraph, show_props
 from cliploc_ros.studio.places import Places, PlacesSearch
-from cliploc_ros.studio.scene import some_cameras, wxyz_of
+from cliploc_ros.studio.scene import Ellipsoids, some_cameras, wxyz_of
 
 if TYPE_CHECKING:
     from cliploc_ros.studio.live import LivePose, LiveRelocalizer, LiveState
@@ -50,6 +50,8 @@ _KEYFRAME_FRUSTUM_M, _POINT_M = 0.12, 0.015
 # More points slow the browser down.
 _MAX_POINTS = 30_000
 
+# Larger than the landmark itself, which shines through.
+_MISSING_RGB, _MISSING_SCALE = (220, 0, 0), 1.3
 _CURRENT_RGB, _OLD_RGB = (30, 170, 60), (150, 150, 150)
 # The relocalizer's camera is not known here; a usual one.
 _FOV_RAD, _ASPECT = 0.85, 4.0 / 3.0
@@ -218,6 +220,9 @@ class LivePanel:
         self._live = live
         self._shown: LiveState | None = None
         self._handles: list[Any] = []
+        self._missing = Ellipsoids(
+            self._scene, '/live/missing', lambda _, key: self._document.select([key]), 0.5,
+            _MISSING_SCALE)
         gui = actions.server.gui
         self._status = gui.add_html('')
         self._relocalize = gui.add_button('Relocalize the robot')
@@ -251,6 +256,9 @@ class LivePanel:
         for handle in self._handles:
             handle.remove()
         self._handles = []
+        landmarks = self._document.landmarks
+        self._missing.show([(key, landmarks[key]) for key in state.missing if key in landmarks],
+                           _MISSING_RGB)
         if state.pose is not None and state.pose.frame_id == self._document.frame_id:
             self._handles = self._draw(state.pose, state)
 
@@ -263,6 +271,10 @@ class LivePanel:
             file = Path(state.map_file)
             if file.is_absolute() and file.resolve() != document.path.resolve():
                 lines.append(f'it reads {file}, which is not the map of this studio')
+        if state.watch:
+            lines.append(f'watch: {state.watch}')
+        if state.missing:
+            lines.append(f'missing, red in the map: {", ".join(state.missing)}')
         if state.is_busy:
             lines.append('waiting for its answer')
         lines.append(f'last answer: {state.verdict}' if state.verdict else 'no answer yet')

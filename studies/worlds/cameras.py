@@ -21,6 +21,8 @@ _HEIGHT_M = (0.3, 1.8)
 _PITCH_DEG, _ROLL_DEG = (-20.0, 35.0), 3.0
 # In a second: 5 to 21 degrees and .12 to .36 m (fr3, hand).
 _TURN_DEG, _STEP_M = (5.0, 20.0), 0.15
+# Between two looks of a robot that drives about, 2 s apart; it is steadier than a hand.
+_DRIVE_M, _MOST_TURN_DEG, _DRIVE_ROLL_DEG = 0.5, 30.0, 0.5
 _ELBOW_ROOM_M = 0.2
 _TRIES = 100
 # Looks to choose from: the more things there are ahead, the more likely.
@@ -76,6 +78,35 @@ def walk_through(place: Place, objects: Objects, images: int, rng: np.random.Gen
         if 2 * number >= images:
             step = _STEP_M * np.array([np.cos(yaw), np.sin(yaw)])
             position = np.clip(position + step, 0.1, (place.width - 0.1, place.depth - 0.1))
+    return found
+
+
+def drive_about(place: Place, objects: Objects, images: int, rng: np.random.Generator
+                ) -> NDArray[np.float64]:
+    """Return the poses map_from_camera (images, 4, 4) of a robot that drives from spot to spot.
+
+    There are a look's time and at most half a metre or 30 degrees between two images. At each spot
+    it looks about or waits.
+    """
+    height, pitch = rng.uniform(*_HEIGHT_M), np.radians(rng.uniform(*_PITCH_DEG))
+    position, yaw = _look(place, objects, rng)
+    steps: list[tuple[float, float]] = []  # turn [rad] and way [m], the last one first
+    found = np.empty((images, 4, 4))
+    for number in range(images):
+        roll, nod = np.radians(_DRIVE_ROLL_DEG) * rng.normal(size=2)
+        found[number] = _pose(np.array([*position, height]), yaw, pitch + nod, roll)
+        if not steps:
+            offset = _free_spot(place, objects, rng) - position
+            way, turn = float(np.hypot(*offset)), np.arctan2(offset[1], offset[0]) - yaw
+            turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
+            about = rng.choice((-1.0, 0.0, 1.0)) * np.radians(_MOST_TURN_DEG)
+            steps = [(about, 0.0)] * int(rng.integers(2, 6))
+            drives = int(way / _DRIVE_M) + 1
+            turns = int(abs(turn) / np.radians(_MOST_TURN_DEG)) + 1
+            steps += [(0.0, way / drives)] * drives + [(turn / turns, 0.0)] * turns
+        turn, way = steps.pop()
+        yaw += turn
+        position = position + way * np.array([np.cos(yaw), np.sin(yaw)])
     return found
 
 

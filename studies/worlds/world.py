@@ -19,6 +19,7 @@ from cliploc_ros.units import NS_PER_S
 from studies.worlds.appearance import Encoder
 from studies.worlds.cameras import (
     GROUP_SIZE,
+    drive_about,
     make_camera,
     make_groups,
     walk_through,
@@ -30,6 +31,8 @@ from studies.worlds.things import Objects, make_objects
 
 _FRAME_S = 1.0
 _SCORE = 0.8
+# Where objects are that were taken away [m], and from where on a landmark is wrong.
+_GONE, _WRONG_M = 1e3, 0.3
 # Cameras of one robot lie on a circle of this radius; their mounts are off on each axis.
 _RADIUS_M, _MOUNT_M, _MOUNT_DEG = 0.15, 0.01, 0.5
 # Deviation of the scale of depth from world to world: a guess.
@@ -107,6 +110,45 @@ def make_walk(kind: str, seed: int, images: int) -> World:
     place, scene = _make_scene(kind, None, rng)
     camera = make_camera(rng)
     return _seen(kind, scene, camera, walk_through(place, scene.objects, images, rng), rng)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A world, and the images of a long drive through it."""
+
+    world: World
+    size: tuple[float, float]  #: Of the place, from (0, 0) [m]
+    #: (L,): landmarks whose object was taken away or moved since the place was mapped
+    changed: NDArray[np.bool_]
+    #: (L,): landmarks that are not where an object of their class is, or have another class
+    wrong: NDArray[np.bool_]
+
+
+def make_drive(kind: str, seed: int, images: int, changed: float = 0.0) -> Drive:
+    """Return a world and a drive through it, after a share of its objects changed.
+
+    Half of these were taken away, the others are elsewhere in the place.
+
+    Parameters
+    ----------
+    kind, seed
+        See make_walk.
+    """
+    rng = np.random.default_rng([seed, list(KINDS).index(kind)])
+    place, scene = _make_scene(kind, None, rng)
+    camera, (of_changes, of_looks) = make_camera(rng), rng.spawn(2)
+    poses = drive_about(place, scene.objects, images, rng)
+    count = len(scene.objects.class_ids)
+    rows = of_changes.permutation(count)[:round(changed * count)]
+    centers = scene.objects.centers.copy()
+    centers[rows, :2] = of_changes.uniform((0.0, 0.0), (place.width, place.depth), (len(rows), 2))
+    centers[rows[::2]] = _GONE
+    now = scene._replace(objects=scene.objects._replace(centers=centers))
+    found = scene.found
+    distances = np.linalg.norm(centers[found.objects] - found.landmark_map.centers, axis=1)
+    return Drive(_seen(kind, now, camera, poses, of_looks), (place.width, place.depth),
+                 np.isin(found.objects, rows),
+                 (distances > _WRONG_M) | (found.objects != found.described))
 
 
 def _make_scene(kind: str, sigma_m: float | None, rng: np.random.Generator

@@ -68,6 +68,21 @@ def test_four_cameras_need_not_turn(executables, tmp_path):
     assert height > 0.7 * width, 'two rows of two images'
 
 
+def test_a_kidnapped_robot_is_noticed_stops_and_gets_its_pose_back(executables, tmp_path):
+    code, output, errors = run(executables, '--out', tmp_path, '--kidnapped', '--method',
+                               'class_auto')
+    print(output)
+    assert code == 0, errors
+    steps = re.findall(r'^ *([0-9.]+) s +(\d+) looks: (\w+)', output, re.MULTILINE)
+    assert [step for *_, step in steps] == [
+        'carried', 'noticed', 'it', 'relocalized', 'delivered', 'the']
+    seconds = [float(second) for second, *_ in steps]
+    assert seconds == sorted(seconds), 'nothing is done before it stops'
+    assert int(steps[1][1]) <= 5
+    assert float(re.search('delivered: ([0-9.]+) m', output)[1]) < 0.5
+    assert cv2.imread(str(tmp_path / 'kidnapped.png')).std() > 20
+
+
 def test_pictures_show_something(finished):
     out, _ = finished
     pictures = sorted(out.glob('*.png'))
@@ -160,6 +175,7 @@ def test_no_process_outlives_it(executables, tmp_path, number, expected):
 @pytest.mark.parametrize(('arguments', 'named'), [
     (['--assets', '/nowhere'], '/nowhere/sequence is missing'),
     (['--cameras', '4', '--assets', '/nowhere'], '/nowhere/rig/mounts.json cannot be read'),
+    (['--kidnapped', '--assets', '/nowhere'], '/nowhere/sequence is missing'),
     (['--method', 'class_prosac'], "algorithm 'prosac'"),
     (['--method', 'telepathy'], "'telepathy' is none of"),
     (['--out', '/proc/demo'], '--out /proc/demo'),

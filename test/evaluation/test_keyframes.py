@@ -19,6 +19,7 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import prior_of
+from cliploc_ros.core.watch.watch import Watch
 from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
@@ -93,6 +94,24 @@ def test_another_room_is_refused(layer, office, answer):
     localizer = KeyframeLocalizer(layer)
     for frame in office.select(range(0, 17, 4)).read():
         assert not answer(localizer, frame.image_rgb, frame.camera).accepted
+
+
+def test_the_watch_hears_keyframes(layer, queries, room):
+    """Images without objects: only keyframes tell."""
+    localizer = KeyframeLocalizer(layer)
+    for shift, state in ((0.0, 'localized'), (3.0, 'lost')):
+        watch = Watch(Relocalizer(room, OPTIONS))
+        for number, frame in enumerate(queries):
+            pose = frame.map_from_camera.copy()
+            pose[0, 3] += shift
+            recognizer = ImageRecognizer(localizer, localization.query_features(frame.image_rgb),
+                                         frame.camera)
+            report = watch.look(Observation(
+                frame.camera, NO_OBJECTS, stamp_ns=number * 10**10,
+                odom_from_camera=frame.map_from_camera), pose, frame.image_rgb, recognizer)
+        assert report.state == state
+        assert report.looks == len(queries)
+        assert not report.fault
 
 
 @pytest.fixture

@@ -96,6 +96,15 @@ def test_four_cameras_see_enough_at_once(four_cameras, tester):
     assert 'Traceback' not in process.output()
 
 
+def test_a_watch_looks_with_the_first_camera_alone(start, tester, surroundings_map):
+    process = start('nodes.relocalizer', parameters={
+        'map_file': surroundings_map, 'matching': 'class', 'base_frame': 'base_link',
+        'cameras': list(NAMES), 'base_from_camera': BASE_FROM_CAMERA, 'watch': 'amcl_pose'})
+    process.wait_for_output('ready after')
+    tester.wait(lambda: tester.count_subscribers(f'/{NAMES[0]}/image'), 'a look')
+    assert not any(tester.count_subscribers(f'/{name}/image') for name in NAMES[1:])
+
+
 def test_a_mount_that_contradicts_the_others_is_named(four_cameras):
     process, ask = four_cameras
     turned = make_transform(Rotation.from_euler('y', 60.0, degrees=True).as_matrix(), np.zeros(3))

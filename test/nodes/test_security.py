@@ -44,7 +44,8 @@ def check(tester, node, *absent):
 
 
 def test_the_relocalizer_does_what_its_policy_allows(own_relocalizer, tester):
-    process = own_relocalizer(mode='continuous', gravity='imu', depth_transport='raw')
+    process = own_relocalizer(mode='continuous', gravity='imu', depth_transport='raw',
+                              watch='amcl_pose')
     tester.feed_until(lambda: tester.poses, make_frame(), 'a pose')
     tester.ask()  # odometry is listened to during a request
     check(tester, 'relocalizer', '/image/compressed', '/depth/compressedDepth', '/clock')
@@ -53,7 +54,8 @@ def test_the_relocalizer_does_what_its_policy_allows(own_relocalizer, tester):
     own_relocalizer(image_transport='compressed', use_sim_time='true',
                     depth_transport='compressed')
     tester.ask()
-    check(tester, 'relocalizer', '/image', '/depth', '/imu')
+    check(tester, 'relocalizer', '/image', '/depth', '/imu', '/relocalizer/localized',
+          '/relocalizer/localization_state')
 
 
 @pytest.mark.parametrize(('parameters', 'absent'), [

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from browser import Person, running_chromium
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from processes import PROJECT, wait_for
 from tester import RELIABLE, make_frame
@@ -101,6 +102,23 @@ def test_the_robot_relocalizes_and_the_map_shows_where(person, live, tmp_path, s
     person.picture('live')
     person.click('Let it reload its map')
     person.page.get_by_text('loaded: 60 landmarks').wait_for()
+
+
+@in_a_browser
+def test_the_watch_and_what_is_missing_are_shown(person, live, tester):
+    publisher = tester.create_publisher(DiagnosticArray, '/diagnostics', RELIABLE)
+    values = {'state': 'active', 'watch': 'uncertain', 'watch missing': 'mug_2, bowl_4, unknown',
+              'watch reason': 'uncertain: the map may be out of date here'}
+    msg = DiagnosticArray(status=[DiagnosticStatus(
+        name='relocalizer: status',
+        values=[KeyValue(key=key, value=value) for key, value in values.items()])])
+    tester.wait(publisher.get_subscription_count, 'discovery')
+    publisher.publish(msg)
+    person.page.get_by_text('watch: uncertain: the map may be out of date here').wait_for()
+    person.page.get_by_text('missing, red in the map: mug_2, bowl_4, unknown').wait_for()
+    assert live.state.missing == ('mug_2', 'bowl_4', 'unknown')
+    person.picture('live_missing')
+    tester.destroy_publisher(publisher)
 
 
 @in_a_browser

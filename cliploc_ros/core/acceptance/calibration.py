@@ -95,6 +95,31 @@ class Spread(NamedTuple):
     most_confidence: float
 
 
+class Looking(NamedTuple):
+    """Log odds of a look of the watch, and how its looks add up."""
+
+    none: float
+    utility: float
+    any: float
+    unexplained: float
+    missed: float
+    away: float
+    turned: float
+    crowd: float
+    least: float
+    least_unsure: float
+    most: float
+    lost_per_s: float
+    lost_per_m: float
+    correlated: float
+    correlated_m: float
+    correlated_deg: float
+    correlated_s: float
+    most_jump: float
+    lost: float
+    localized: float
+
+
 class Calibration(NamedTuple):
     """All sections; calibration.yaml says what each number means."""
 
@@ -106,6 +131,7 @@ class Calibration(NamedTuple):
     search: Search
     looks: SuccessiveLooks
     covariance: Spread
+    watch: Looking
 
 
 def load_calibration(path: Path = FILE) -> Calibration:

@@ -123,6 +123,8 @@ RIGHT_M = SAME_ANSWER.distance_m
 SAME_PLACE = Tolerance(0.5, 20.0)
 #: Two looks, linked by odometry, lead to the same pose.
 SAME_LOOK = Tolerance(0.5, 20.0)
+#: A localizer drifts by less, and the mount of a camera is off by less.
+SAME_NEIGHBOURHOOD = Tolerance(0.7, 20.0)
 #: Two refined poses are the same minimum of the cost.
 SAME_MINIMUM = Tolerance(0.05, 2.0)
 #: A camera that moved less sees the same again.

@@ -122,6 +122,8 @@ class FrameSource:
         self._heard_at: dict[str, float] = {}
         self._subscriptions: list[AdaptiveSubscription] = []
         self._subscribed_at = 0.0
+        # Until when it is wanted (monotonic clock) [s]: by those who wait, and after them.
+        self._deadlines: list[float] = []
         self._wanted_until = 0.0
         self._rates = Rates()
         self._newest: Frame | None = None
@@ -151,6 +153,7 @@ class FrameSource:
         """Unsubscribe, and let waiting calls of next_frame raise StoppedError with a reason."""
         with self.changed:
             self._closed = reason
+            self._deadlines.clear()
             self._unsubscribe()
             self.changed.notify_all()
 
@@ -161,10 +164,15 @@ class FrameSource:
             self._depths.clear()
             self._newest = None
 
-    def next_frame(self, after: float, deadline: float) -> Frame:
+    @property
+    def main(self) -> 'FrameSource':
+        """Return the source of the first of several cameras; of one camera, this one."""
+        return self
+
+    def next_frame(self, after: float, deadline: float, linger_s: float | None = None) -> Frame:
         """Return the first complete frame whose image arrived after a moment.
 
-        Both times are of the monotonic clock [s].
+        Both times are of the monotonic clock [s]. `linger_s` takes the place of the source's own.
 
         Raises
         ------
@@ -173,23 +181,28 @@ class FrameSource:
         StoppedError
             The source was closed; the message gives the reason.
         """
-        return next_of_any([self], after, deadline)
+        return next_of_any([self], after, deadline, linger_s)
 
     def want(self, deadline: float) -> None:
-        """Subscribe until a deadline (monotonic clock) [s] and a moment longer.
+        """Subscribe until a deadline (monotonic clock) [s]; want_no_more ends it.
 
         The caller holds the condition. StoppedError: the source was closed.
         """
         if self._closed:
             raise StoppedError(self._closed)
-        self._wanted_until = max(self._wanted_until, deadline + self._linger_s)
+        self._deadlines.append(deadline)
         self._subscribe()
 
-    def want_no_more(self) -> None:
-        """Unsubscribe in a moment. StoppedError: the source was closed."""
+    def want_no_more(self, deadline: float, linger_s: float | None = None) -> None:
+        """Unsubscribe in a moment, unless others wait. StoppedError: the source was closed."""
         if self._closed:
             raise StoppedError(self._closed)
-        self._wanted_until = time.monotonic() + self._linger_s
+        if deadline in self._deadlines:  # not from before it was closed
+            self._deadlines.remove(deadline)
+        linger_s = self._linger_s if linger_s is None else linger_s
+        self._wanted_until = max(self._wanted_until, time.monotonic() + linger_s)
+        if not linger_s:
+            self._rest()
 
     @property
     def is_closed(self) -> bool:
@@ -256,7 +269,8 @@ class FrameSource:
     def _rest(self) -> None:
         """Unsubscribe once no frame has been wanted for a while."""
         with self.changed:
-            if self._subscriptions and time.monotonic() > self._wanted_until:
+            if self._subscriptions and time.monotonic() >= max(
+                    [self._wanted_until, *self._deadlines]):
                 self._unsubscribe()
 
     def _receiver(self, name: str) -> Callable[[Any], None]:
@@ -347,7 +361,8 @@ class FrameSource:
         return str(self._node.resolve_topic_name(self._topics[name]))
 
 
-def next_of_any(sources: Sequence[FrameSource], after: float, deadline: float) -> Frame:
+def next_of_any(sources: Sequence[FrameSource], after: float, deadline: float,
+                linger_s: float | None = None) -> Frame:
     """Return the first complete frame of some sources whose image arrived after a moment.
 
     See FrameSource.next_frame. The sources share their condition.
@@ -360,12 +375,12 @@ def next_of_any(sources: Sequence[FrameSource], after: float, deadline: float) -
             one.want(deadline)
         changed.wait_for(lambda: sources[0].is_closed or newest() is not None,
                          max(0.0, deadline - time.monotonic()))
-        for one in sources:
-            one.want_no_more()
         frame = newest()
+        why = '' if frame else '; '.join(one.why_none(after) for one in sources)
+        for one in sources:
+            one.want_no_more(deadline, linger_s)  # which may forget both
         if frame is None:
-            raise NoFrameError(f'no fresh frame within {deadline - after:.3g} s: '
-                               f'{"; ".join(one.why_none(after) for one in sources)}')
+            raise NoFrameError(f'no fresh frame within {deadline - after:.3g} s: {why}')
         return frame
 
 

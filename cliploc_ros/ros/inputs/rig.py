@@ -47,7 +47,12 @@ class Rig:
     @property
     def image_topic(self) -> str:
         """Return the resolved name of the image topic of the first camera."""
-        return next(iter(self._sources.values())).image_topic
+        return self.main.image_topic
+
+    @property
+    def main(self) -> FrameSource:
+        """Return the source of the first camera."""
+        return next(iter(self._sources.values()))
 
     def open(self) -> None:
         """Allow calls of next_frame; OptionsError: see FrameSource."""

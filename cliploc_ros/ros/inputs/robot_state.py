@@ -63,8 +63,8 @@ class RobotStateSource:
     def open(self) -> None:
         """Subscribe to what the parameters ask for."""
         parameters = self._node.settings.values
-        if parameters.publish_tf or (parameters.base_frame
-                                     and not any(parameters.base_from_camera)):
+        if parameters.publish_tf or parameters.watch == 'tf' or (
+                parameters.base_frame and not any(parameters.base_from_camera)):
             # in the worker, for importing tf2 takes a while
             self._node.worker.run(self.transforms.open)
         self._vertical.open(parameters.gravity)

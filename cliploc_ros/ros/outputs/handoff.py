@@ -10,6 +10,7 @@ shows tells whether it has taken one.
 import math
 import threading
 import time
+from collections.abc import Callable
 from copy import deepcopy
 
 import numpy as np
@@ -73,12 +74,17 @@ class HandOff:
         # What the localizer shows since the pose was last published.
         self._shown: PoseWithCovarianceStamped | None = None
         self._pose_topic = ''
+        self._listeners: list[Callable[[PoseWithCovarianceStamped], None]] = []
         self._subscription: AdaptiveSubscription | None = None
         self._publisher = node.create_publisher(
             PoseWithCovarianceStamped, 'initialpose', qos.POSE,
             event_callbacks=PublisherEventCallbacks(matched=lambda _: self._wake()))
         self._updater = node.create_client(Empty, 'request_nomotion_update',
                                            callback_group=ReentrantCallbackGroup())
+
+    def on_shown(self, listener: Callable[[PoseWithCovarianceStamped], None]) -> None:
+        """Have each pose that the localizer shows reported; the callback must not block."""
+        self._listeners.append(listener)
 
     def open(self, pose_topic: str) -> None:
         """Allow hand-overs. The localizer shows its pose on `pose_topic`; empty: nowhere."""
@@ -149,7 +155,7 @@ class HandOff:
         while not times or (must_show and not self._shows(given, deadline)):
             if must_show and _left_s(deadline) < _LEAST_S:
                 raise NoLocalizerError(self._not_taken(given, times, begun_at))
-            self._check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s, deadline)
+            self.check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s, deadline)
             self._check_place(pose.header.stamp, deadline)
             if self._jumped_at >= received_at:
                 raise TimeJumpError('time jumped back before the hand-over: the pose is from '
@@ -171,6 +177,8 @@ class HandOff:
         with self._changed:
             self._shown = shown
             self._changed.notify_all()
+        for listener in self._listeners:
+            listener(shown)
 
     def _wait_for_localizer(self, deadline: float) -> None:
         """Raise unless there is a localizer, or soon is."""
@@ -207,7 +215,7 @@ class HandOff:
         return (f'{why}{self._pose_topic} shows a pose {distance_m:.2f} m and {angle_deg:.0f} '
                 f'degrees from it (limits {near.distance_m:.2f} and {near.angle_deg:.0f})')
 
-    def _check_rest(self, max_speed_m_s: float, max_turn_rad_s: float, deadline: float) -> None:
+    def check_rest(self, max_speed_m_s: float, max_turn_rad_s: float, deadline: float) -> None:
         """Raise unless odometry shows a robot at rest; without odometry it is taken to rest."""
         odometry = self._odometry.recent(_MAX_ODOM_AGE_S,
                                          min(_ODOM_PATIENCE_S, _left_s(deadline)))

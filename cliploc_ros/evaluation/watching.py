@@ -1,0 +1,170 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The watch over a recording: what it says of the poses of a localizer, and when."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.transforms import SAME_ANSWER, pose_error
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.watch.watch import Watch, WatchState
+from cliploc_ros.datasets.observations import Recorded
+from cliploc_ros.datasets.poses import Poses
+from cliploc_ros.evaluation.watch_figures import draw_roc, draw_timeline
+from cliploc_ros.files.storage import make_folder, write_text
+from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.units import NS_PER_S
+
+
+@dataclass(frozen=True)
+class WatchedLook:
+    """What the watch said after one look, and what is true."""
+
+    stamp_s: float
+    state: str
+    probability: float
+    reason: str
+    matched: int
+    expected: int
+    missing: tuple[str, ...]
+    fault: str
+    way_m: float  #: That the localizer's pose moved since the first look
+    #: Of the localizer's pose; None where the truth is unknown
+    error_m: float | None
+    error_deg: float | None
+
+    @property
+    def is_right(self) -> bool | None:
+        """Return whether the localizer's pose is right; None where the truth is unknown."""
+        if self.error_m is None or self.error_deg is None:
+            return None
+        return self.error_m < SAME_ANSWER.distance_m and self.error_deg < SAME_ANSWER.angle_deg
+
+
+def observation_of(recorded: PosedDetections, row: int, stamp_ns: int) -> Observation:
+    """Return a frame of a recording as an observation by class."""
+    boxes = slice(recorded.frame_offsets[row], recorded.frame_offsets[row + 1])
+    odom = None if recorded.odom_from_camera is None else recorded.odom_from_camera[row]
+    return Observation(
+        recorded.camera, Detections(
+            recorded.bboxes_xyxy[boxes],
+            tuple(recorded.class_names[one] for one in recorded.classes[boxes]),
+            recorded.scores[boxes]), stamp_ns=stamp_ns,
+        depths=None if recorded.depths is None else recorded.depths[boxes].astype(np.float64),
+        odom_from_camera=None if odom is None or np.isnan(odom).any() else odom)
+
+
+def watch_recording(recorded: Recorded, watch: Watch, truth: Poses | None, period_s: float
+                    ) -> list[WatchedLook]:
+    """Return what a watch says of a recording, whose poses are those of a localizer.
+
+    Parameters
+    ----------
+    truth : Poses, optional
+        True poses of the camera.
+    period_s : float
+        Least time between two looks [s].
+    """
+    found, way_m = list[WatchedLook](), 0.0
+    last_ns, last_pose = -NS_PER_S * 10**9, recorded.detections.map_from_camera[:1]
+    for row, stamp_ns in enumerate(recorded.stamps_ns.tolist()):
+        pose = recorded.detections.map_from_camera[row]
+        way_m += float(np.linalg.norm(pose[:3, 3] - last_pose[..., :3, 3]))
+        last_pose = pose
+        if stamp_ns - last_ns < period_s * NS_PER_S:
+            continue
+        last_ns = stamp_ns
+        said = watch.look(observation_of(recorded.detections, row, stamp_ns), pose)
+        true = None if truth is None else truth.pose_at(stamp_ns)
+        error_m, error_deg = (None, None) if true is None else pose_error(pose, true)
+        found.append(WatchedLook(
+            stamp_ns / NS_PER_S, str(said.state), said.probability, said.reason, said.matched,
+            said.expected, said.missing, said.fault, way_m, error_m, error_deg))
+    return found
+
+
+def alarms_of(looks: Sequence[WatchedLook]) -> list[WatchedLook]:
+    """Return the looks at which an alarm begins."""
+    states = [WatchState.UNCERTAIN, *(one.state for one in looks)]
+    return [one for one, (before, now) in zip(looks, pairwise(states), strict=True)
+            if now == WatchState.LOST != before]
+
+
+def times_to_alarm(looks: Sequence[WatchedLook]) -> list[dict[str, Any]]:
+    """Return of each stretch of wrong poses when it began, and when the watch called it lost.
+
+    seconds, metres and looks are None where it did not.
+    """
+    found: list[dict[str, Any]] = []
+    begins = [row for row, one in enumerate(looks) if one.is_right is False
+              and (row == 0 or looks[row - 1].is_right is not False)]
+    for first in begins:
+        last = next((row for row in range(first, len(looks))
+                     if looks[row].is_right is not False), len(looks))
+        noticed = next((row for row in range(first, last)
+                        if looks[row].state == WatchState.LOST), None)
+        began = looks[first]
+        found.append({
+            'stamp_s': began.stamp_s,
+            'seconds': None if noticed is None else looks[noticed].stamp_s - began.stamp_s,
+            'metres': None if noticed is None else looks[noticed].way_m - began.way_m,
+            'looks': None if noticed is None else noticed - first + 1})
+    return found
+
+
+def roc(looks: Sequence[WatchedLook]) -> NDArray[np.float64]:
+    """Return shares (k, 2) of right and of wrong poses below each probability, from 0, 0 on."""
+    known = [one for one in looks if one.is_right is not None]
+    chances = np.array([one.probability for one in known])
+    right = np.array([one.is_right for one in known], dtype=np.bool_)
+    if right.all() or not right.any():
+        return np.empty((0, 2))
+    limits = np.unique(chances)
+    shares = [[(chances[of] <= limit).mean() for of in (right, ~right)] for limit in limits]
+    return np.array([[0.0, 0.0], *shares])
+
+
+def summarize_watch(looks: Sequence[WatchedLook]) -> dict[str, Any]:
+    """Return the figures of a watched recording; None where the truth does not tell."""
+    hours = (looks[-1].stamp_s - looks[0].stamp_s) / 3600.0 if len(looks) > 1 else 0.0
+    alarms, curve = alarms_of(looks), roc(looks)
+    false = sum(one.is_right is True for one in alarms)
+    knows = any(one.is_right is not None for one in looks)
+    area = float(np.trapezoid(curve[:, 1], curve[:, 0])) if len(curve) else None
+    return {
+        'looks': len(looks), 'hours': hours, 'way_m': looks[-1].way_m if looks else 0.0,
+        'states': {str(one): sum(look.state == one for look in looks) for one in WatchState},
+        'alarms': len(alarms), 'false_alarms': false if knows else None,
+        'false_alarms_per_hour': false / hours if knows and hours else None,
+        'area_under_roc': area, 'wrong_stretches': times_to_alarm(looks)}
+
+
+def write_watch(folder: Path, looks: Sequence[WatchedLook], figures: bool) -> str:
+    """Write watch.json and the figures; return a summary in a few lines."""
+    summary = summarize_watch(looks)
+    make_folder(folder)
+    write_text(folder / 'watch.json', json.dumps(
+        {**summary, 'every_look': [asdict(one) for one in looks]}, indent=1))
+    if figures and looks:
+        draw_timeline(folder / 'watch_timeline.png', looks, alarms_of(looks))
+        if len(curve := roc(looks)):
+            draw_roc(folder / 'watch_roc.png', curve, summary['area_under_roc'])
+    states = ', '.join(f'{name} {count}' for name, count in summary['states'].items())
+    lines = [f'{len(looks)} looks in {60.0 * summary["hours"]:.1f} min and '
+             f'{summary["way_m"]:.0f} m: {states}; {summary["alarms"]} alarms']
+    if summary['false_alarms'] is not None:
+        rate = summary['false_alarms_per_hour']
+        lines.append(f'false alarms: {summary["false_alarms"]}'
+                     + ('' if rate is None else f', {rate:.2f} an hour'))
+    for one in summary['wrong_stretches']:
+        lines.append('wrong poses: never called lost' if one['looks'] is None else
+                     f'wrong poses: called lost after {one["looks"]} looks, '
+                     f'{one["seconds"]:.1f} s, {one["metres"]:.1f} m')
+    return '\n'.join(lines)

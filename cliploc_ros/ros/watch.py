@@ -1,0 +1,294 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The watch of a running localizer: a look now and then, a verdict, and what follows from it.
+
+A thread of its own waits for frames and transforms; only the look itself runs in the node's
+worker, and none begins while a request is under way. So a watch never delays a request.
+"""
+
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from numpy.typing import NDArray
+from std_msgs.msg import Bool, String
+
+from cliploc_ros.core.fit.verification import MAX_FRAMES
+from cliploc_ros.core.map.joined_map import parts_of
+from cliploc_ros.core.watch.watch import WatchReport, WatchState
+from cliploc_ros.errors import CliplocError, StoppedError, TimeUpError
+from cliploc_ros.ros import qos
+from cliploc_ros.ros.answer import Answer
+from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
+from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
+from cliploc_ros.ros.inputs.localizer_pose import LaterError, LocalizerPose
+from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
+from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
+from cliploc_ros.ros.node.diagnostics import Health
+from cliploc_ros.ros.node.lifecycle import ManagedNode
+from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError
+from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.ros.request import Pipeline, Requests
+
+# Looks follow each other at least this far apart [s], and take this share of a core at most.
+_LEAST_S, _DUTY = 1.0, 0.1
+# A robot that drove or turned so far since its last look sees something else.
+_WAY_M, _TURN_DEG = 1.0, 90.0
+_POLL_S = 0.1
+# A camera at 1 Hz and a detector of a second complete a frame within this time.
+_FRAME_PATIENCE_S = 5.0
+# A verdict without a look since says no more than that nothing is known.
+_STALE_S = 10.0
+# Whether a robot rests shows within this time.
+_REST_PATIENCE_S = 3.0
+# Between requests of a robot that stays lost; the pause doubles each time.
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 5.0, 160.0
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What the watch says now."""
+
+    state: WatchState = WatchState.UNCERTAIN
+    reason: str = 'no look yet'
+    report: WatchReport | None = None  #: Of the last look; None where it says nothing any more
+    looked_at: float = 0.0  #: When that was (monotonic clock) [s]
+    problem: str = ''  #: What prevents looks, and what to do
+
+
+class Watcher:
+    """Looks whether the localizer's pose is right, while the node is active and `watch` is on.
+
+    Parameters
+    ----------
+    source : FrameSource
+        Of the camera to look with.
+    relocalize : callable
+        Requests a relocalization as a client does, and returns the answer.
+    """
+
+    def __init__(self, node: ManagedNode[RelocalizerParameters], source: FrameSource,
+                 robot: RobotStateSource, jumps: TimeJumps, pipeline: Pipeline,
+                 requests: Requests, handoff: HandOff, relocalize: Callable[[], Answer]) -> None:
+        self._node, self._source, self._robot, self._jumps = node, source, robot, jumps
+        self._pipeline, self._requests, self._handoff = pipeline, requests, handoff
+        self._relocalize = relocalize
+        self.is_on = node.settings.values.watch != 'none'
+        self._pose = LocalizerPose(node, robot)
+        self._lock = threading.Lock()
+        self._known = _Known()
+        self._stopped = threading.Event()
+        self._stopped.set()
+        # Looks at a pose from before this number changed do not count.
+        self._age = 0
+        self._cost_s = 0.0
+        # What became of a robot that is lost, and whether it stands.
+        self._reaction, self._is_at_rest = '', False
+        self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
+        if self.is_on:
+            handoff.on_shown(self._pose.hear)
+            robot.odometry.on_restart(lambda _: self._drop('odom restarted'))
+            self._localized = node.create_publisher(Bool, '~/localized', qos.LATCHED)
+            self._state = node.create_publisher(String, '~/localization_state', qos.LATCHED)
+
+    def open(self) -> None:
+        """Begin to watch."""
+        if self.is_on:
+            self._stopped = threading.Event()
+            self._say(_Known())
+            threading.Thread(target=self._run, args=(self._stopped,), name='watch',
+                             daemon=True).start()
+
+    def close(self) -> None:
+        """Watch no longer; a look under way has no effect."""
+        if self.is_on and not self._stopped.is_set():
+            self.release()
+            self._drop('the node was deactivated')
+            self._pose.forget()
+
+    def release(self) -> None:
+        """End the thread: the process ends."""
+        self._stopped.set()
+
+    def forget(self) -> None:
+        """Forget all looks and poses: time jumped."""
+        if self.is_on:
+            self._pose.forget()
+            self._drop('time jumped')
+
+    def start_over(self) -> None:
+        """Forget all looks: the localizer was given another pose."""
+        if self.is_on:
+            self._drop('the localizer was given another pose')
+
+    def examine(self, health: Health) -> None:
+        """Report the verdict and what prevents looks."""
+        if not self.is_on:
+            return
+        known = self._known
+        report = known.report
+        health.values |= {
+            'watch': str(known.state), 'watch reason': known.reason, 'on lost': self._reaction,
+            'lost and at rest': known.state is WatchState.LOST and self._is_at_rest,
+            'watch look [ms]': f'{1e3 * self._cost_s:.1f}'}
+        if report is not None:
+            turned = '' if report.camera_turn is None else \
+                f'the camera is {report.camera_turn.in_words()}'
+            health.values |= {
+                'watch probability': f'{report.probability:.3f}', 'watch looks': report.looks,
+                'watch matched': f'{report.matched} of {report.expected} expected',
+                'watch missing': ', '.join(report.missing), 'watch fault': report.fault,
+                'watch camera': turned,
+                'watch last look [s]': f'{time.monotonic() - known.looked_at:.1f}'}
+            for problem in filter(None, (report.fault, turned)):
+                health.warn(problem)
+        if known.problem or known.state is WatchState.LOST:
+            health.warn(f'watch: {known.problem or known.reason}')
+
+    # ---- the thread -----------------------------------------------------------------------------
+
+    def _run(self, stopped: threading.Event) -> None:
+        """Look again and again until the event is set."""
+        while not stopped.is_set():
+            begun_at, stamp = time.monotonic(), None
+            try:
+                stamp = self._look(stopped)
+                self._react(stopped)
+            except StoppedError:
+                return
+            except (NoFrameError, NoTransformError, LaterError, TimeJumpError, TimeUpError
+                    ) as error:  # the next look may do
+                self._miss(stopped, str(error), time.monotonic() - _STALE_S)
+            except CliplocError as error:
+                self._miss(stopped, str(error))
+            except Exception as error:
+                self._node.report(traceback.format_exc())
+                self._miss(stopped, f'internal error: {error} (the traceback is in the log)')
+            self._rest(stopped, begun_at, stamp)
+
+    def _rest(self, stopped: threading.Event, begun_at: float, stamp: Time | None) -> None:
+        """Wait until the next look is due."""
+        earliest = begun_at + max(_LEAST_S, self._cost_s / _DUTY)
+        latest = max(earliest, begun_at + self._node.settings.values.watch_period_s)
+        while (now := time.monotonic()) < latest and not stopped.wait(min(_POLL_S, latest - now)):
+            moved = None if stamp is None or now < earliest else \
+                self._robot.odometry.moved_since(stamp, 0.0)
+            if moved is not None and (moved[0] >= _WAY_M or moved[1] >= _TURN_DEG):
+                return
+
+    def _look(self, stopped: threading.Event) -> Time | None:
+        """Compare one frame with the localizer's pose; return its stamp, None without a look."""
+        begun_at, age = time.monotonic(), self._age
+        frame = self._source.next_frame(begun_at, begun_at + _FRAME_PATIENCE_S, 0.0)
+        localizer = self._pipeline.localizer
+        if localizer is None:
+            raise StoppedError('the node was deactivated')
+        if self._requests.is_busy:
+            return None
+        image = frame.image.header
+        self._jumps.check(image.stamp, frame.received_at)
+        # Odometry tells looks apart, whether or not requests fuse frames by it.
+        parameters = replace(self._node.settings.snapshot().of_camera(frame.camera),
+                             fuse_frames=MAX_FRAMES)
+        state = self._robot.at(image, parameters, depth_frame=frame.depth_frame)
+        pose = self._pose.at(image, state, parameters, [
+            part.landmark_map.frame_id for part in parts_of(localizer.landmark_map)])
+        report = self._node.worker.run(
+            partial(self._score, frame, parameters, state, pose, age), begun_at + _STALE_S)
+        if report is not None:
+            self._say(_Known(report.state, report.reason, report, time.monotonic()), stopped, age)
+        return image.stamp
+
+    def _score(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
+               pose: tuple[str, NDArray[np.float64]], age: int) -> WatchReport | None:
+        """Look, in the worker's thread; None if the pose does not count any more."""
+        localizer = self._pipeline.localizer  # that of now: the map may be another one
+        if localizer is None or age != self._age:
+            return None
+        begun_s = time.thread_time()
+        try:
+            return localizer.look(frame, parameters, state, *pose)
+        finally:
+            self._cost_s = time.thread_time() - begun_s
+
+    # ---- the verdict ----------------------------------------------------------------------------
+
+    def _say(self, known: _Known, stopped: threading.Event | None = None, age: int | None = None
+             ) -> None:
+        """Publish a verdict, unless the watch ended or the pose changed meanwhile."""
+        with self._lock:
+            if (stopped is not None and stopped.is_set()) or age not in (None, self._age):
+                return
+            before, self._known = self._known, known
+            self._localized.publish(Bool(data=known.state is WatchState.LOCALIZED))
+            self._state.publish(String(data=str(known.state)))
+        if known.state is WatchState.LOCALIZED:
+            self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
+        if known.state is not WatchState.LOST:
+            self._is_at_rest = False
+        if (known.state, known.problem) != (before.state, before.problem):
+            text = f'watch: {known.problem or known.reason}'
+            if known.state is WatchState.LOST:
+                self._node.get_logger().warning(text)
+            else:
+                self._node.get_logger().info(text)
+            self._node.diagnostics.publish()
+
+    def _miss(self, stopped: threading.Event, problem: str, since: float = float('inf')) -> None:
+        """Say that nothing can be seen; a verdict of a look since a moment stands meanwhile."""
+        known = self._known
+        if known.report is None or known.looked_at < since:
+            self._say(_Known(reason=problem, problem=problem), stopped)
+
+    def _drop(self, why: str) -> None:
+        """Forget all looks."""
+        with self._lock:
+            self._age += 1
+        self._say(_Known(reason=f'{why}: no look since'))
+
+        def forget() -> None:
+            if (localizer := self._pipeline.localizer) is not None:
+                localizer.forget_looks()
+        with suppress(StoppedError):
+            self._node.worker.submit(forget)
+
+    # ---- what follows ---------------------------------------------------------------------------
+
+    def _react(self, stopped: threading.Event) -> None:
+        """Relocalize a lost robot that stands, where that is wanted, and not again and again."""
+        parameters = self._node.settings.values
+        if self._known.state is not WatchState.LOST:
+            return
+        self._reaction = self._why_not_at_rest(parameters)
+        self._is_at_rest = not self._reaction
+        if not self._is_at_rest:
+            return
+        left_s = self._next_request_at - time.monotonic()
+        if parameters.on_lost == 'report' or stopped.is_set():
+            self._reaction = 'the robot stands'
+        elif left_s > 0.0:
+            self._reaction = f'the robot stands; next request in {left_s:.0f} s'
+        else:
+            self._node.get_logger().warning('watch: lost and at rest: relocalizing')
+            answer = self._relocalize()
+            self._next_request_at = time.monotonic() + self._pause_s
+            self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
+            self._reaction = answer.message
+
+    def _why_not_at_rest(self, parameters: RelocalizerParameters) -> str:
+        """Return why the robot may be moving; empty if odometry shows that it stands."""
+        odometry = self._robot.odometry
+        if not odometry.is_published:
+            return f'nobody publishes {odometry.topic}: nothing tells whether the robot stands'
+        try:
+            self._handoff.check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s,
+                                     time.monotonic() + _REST_PATIENCE_S)
+        except HandOffError as error:
+            return str(error)
+        return ''

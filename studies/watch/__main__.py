@@ -1,0 +1,122 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""How well the watch tells whether a localizer is right: ``python -m studies.watch``.
+
+A simulated localizer drifts along with the robot, gets displaced, or the robot is carried away.
+``judge`` does so in simulated worlds, ``recorded`` with recorded boxes, ``mount`` with a camera
+that is turned on its robot. ``cost`` measures time and memory. ``fit`` fits the evidence of looks.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from tqdm import tqdm
+
+from cliploc_ros.command import positive_int, run_command
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.datasets.observations import load_observations
+from cliploc_ros.mapping.building import build_map
+from studies.acceptance.fit import FITTED_KINDS
+from studies.watch import fit
+from studies.watch.judge import Alarm, Right, alarm_table, judge, right_table
+from studies.watch.localizers import Drive, recorded_drive, simulated_drive
+from studies.watch.sensors import measure_cost, mount_table
+from studies.worlds.places import KINDS
+
+# Frames of a recording at 30 Hz between two looks.
+_STEP = 60
+
+
+def _fit(options: argparse.Namespace) -> None:
+    looks = [look for seed in tqdm(range(options.first_seed, options.first_seed + options.worlds),
+                                   disable=None)
+             for kind in KINDS for look in fit.looks_of(kind, seed)]
+    fitted = fit.fit([one for one in looks if one.kind in FITTED_KINDS])
+    print(fit.report(looks, fitted))
+    print('\nfor calibration.yaml, watch:\n' + ', '.join(
+        f'{name}: {getattr(fitted.watch, name):.3g}' for name in fit.TERMS))
+
+
+def _judge(options: argparse.Namespace) -> None:
+    for changed in options.changed:
+        drives = (simulated_drive(kind, seed, options.images, changed, options.labels)
+                  for kind in options.kinds
+                  for seed in range(options.first_seed, options.first_seed + options.worlds))
+        _print(drives, options.worlds * len(options.kinds), changed == 0.0,
+               f'{changed:.0%} of the objects moved or gone')
+
+
+def _recorded(options: argparse.Namespace) -> None:
+    recorded = load_observations(options.observations)
+    its_map = LandmarkMap.from_file(options.map)
+    # the map was made of the even frames
+    _print((recorded_drive('fr3', recorded, its_map, range(first, len(recorded), _STEP))
+            for first in range(1, _STEP, options.every)), len(range(1, _STEP, options.every)),
+           True, str(options.map))
+    if options.splits is not None:
+        drives = []
+        for name, rows in json.loads(options.splits.read_text()).items():
+            built = build_map(recorded.select_frames(rows['map'])).landmark_map
+            drives.append(recorded_drive(name, recorded, built, sorted(
+                frame for _, is_main, frame in rows['queries'] if is_main)))
+        _print(drives, len(drives), True, 'maps of the splits')
+
+
+def _print(drives: Iterable[Drive], count: int, wrong_poses: bool, title: str) -> None:
+    right, alarms = list[Right](), list[Alarm]()
+    for number, drive in enumerate(tqdm(drives, title, count, disable=None)):
+        one, its = judge(drive, number, wrong_poses)
+        right.append(one)
+        alarms += its
+    print(f'{title}\n\n{right_table(right)}\n')
+    if alarms:
+        print(f'{alarm_table(alarms)}\n')
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run a study; return the exit code."""
+    parser = argparse.ArgumentParser(prog='python -m studies.watch', description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+
+    def add(name: str, command: object, summary: str) -> argparse.ArgumentParser:
+        own = commands.add_parser(name, help=summary, description=summary)
+        own.set_defaults(command=command)
+        return own
+
+    def add_worlds(own: argparse.ArgumentParser, worlds: int, first_seed: int) -> None:
+        own.add_argument('--worlds', type=positive_int, default=worlds, metavar='N',
+                         help='of each kind (%(default)s)')
+        own.add_argument('--first-seed', type=int, default=first_seed, help='(%(default)s)')
+        own.add_argument('--kinds', nargs='+', choices=KINDS, default=list(KINDS), metavar='KIND')
+
+    add_worlds(add('fit', _fit, 'the fit of the evidence to simulated worlds'), 16, 0)
+    judged = add('judge', _judge, 'alarms in simulated worlds')
+    add_worlds(judged, 9, 1000)
+    judged.add_argument('--images', type=positive_int, default=300, help='(%(default)s)')
+    judged.add_argument('--changed', type=float, nargs='+', default=[0.0, 0.2, 0.4],
+                        help='shares of the objects that moved or are gone (0 0.2 0.4)')
+    judged.add_argument('--labels', action='store_true', help='of weak and strong encoders')
+    recorded = add('recorded', _recorded, 'alarms with recorded boxes')
+    recorded.add_argument('--observations', type=Path, required=True, metavar='NPZ')
+    recorded.add_argument('--map', type=Path, required=True, metavar='YAML')
+    recorded.add_argument('--splits', type=Path, metavar='JSON', help='rows to map and to query')
+    recorded.add_argument('--every', type=positive_int, default=4, metavar='N',
+                          help='begin a drive at every N-th frame (%(default)s)')
+    mount = add('mount', lambda options: print(mount_table(
+        options.kinds, range(options.first_seed, options.first_seed + options.worlds))),
+        'the angle of a camera that is turned on its robot')
+    add_worlds(mount, 10, 1000)
+    cost = add('cost', lambda options: print(measure_cost(options.looks)),
+               'processor time of a look, and memory over many')
+    cost.add_argument('--looks', type=positive_int, default=10_000, help='(%(default)s)')
+    options = parser.parse_args(arguments)
+    options.command(options)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(run_command(run))

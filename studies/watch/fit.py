@@ -1,0 +1,105 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The fit of the evidence of one look: looks at right and at wrong poses in simulated worlds."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
+from cliploc_ros.core.geometry.transforms import Tolerance
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.watch.alignment import align, look_at
+from cliploc_ros.core.watch.evidence import LookEvidence, log_odds, measure
+from studies.reports import table
+from studies.watch.localizers import (
+    displaced,
+    drifting,
+    kidnapped,
+    simulated_drive,
+    turned_camera,
+)
+
+#: Terms of calibration.yaml that are fitted, in the order of LookEvidence.terms.
+TERMS = ('none', 'utility', 'any', 'unexplained', 'missed', 'away', 'turned', 'crowd')
+_IMAGES = 60
+# Shares of objects that changed since the place was mapped, of one world after the other.
+_CHANGED = (0.0, 0.0, 0.2, 0.4)
+# A quarter of the cameras is turned, by up to this angle [deg].
+_TURNED_SHARE, _TURNED_DEG = 0.25, (2.0, 10.0)
+_WRONG_M, _WRONG_DEG = ((1.3, 3.0), (3.0, 6.0)), ((25.0, 60.0), (60.0, 180.0))
+_NOT_NEAR = Tolerance(1.2, 25.0)
+_RIDGE = 1e-5
+
+
+class Look(NamedTuple):
+    """The evidence of a look at a right or a wrong pose."""
+
+    kind: str
+    evidence: LookEvidence
+    is_right: bool
+
+
+def looks_of(kind: str, seed: int) -> list[Look]:
+    """Return looks of a drive through a world, each at its right pose and at a wrong one."""
+    drive = simulated_drive(kind, seed, _IMAGES, _CHANGED[seed % len(_CHANGED)])
+    rng, options = np.random.default_rng([seed, 5]), RelocalizerOptions(matching='class')
+    turn = turned_camera(rng.uniform(*_TURNED_DEG) if rng.random() < _TURNED_SHARE else 0.0, rng)
+    poses, found = drifting(drive.poses, rng), []
+    drive.landmark_map.prepare()
+    for observation, right in zip(drive.observations, poses, strict=True):
+        joined = look_at(drive.landmark_map, observation, options)
+        wrong = _wrong(right, poses, drive.bounds, rng)
+        found += [Look(kind, measure(align(joined, pose @ turn))[0], is_right)
+                  for pose, is_right in ((right, True), (wrong, False))]
+    return found
+
+
+def _wrong(right: NDArray[np.float64], poses: NDArray[np.float64], bounds: NDArray[np.float64],
+           rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return a wrong pose (4, 4) of a right one: moved, turned, or anywhere on the drive."""
+    kind = rng.integers(5)
+    if kind < 2:
+        return kidnapped(right, rng.uniform(*_WRONG_M[kind]), 0.0, bounds, rng) @ right
+    if kind < 4:
+        return kidnapped(right, 0.0, rng.uniform(*_WRONG_DEG[kind - 2]), bounds, rng) @ right
+    while True:
+        x, y = rng.normal(size=2)
+        other = displaced(poses[rng.integers(len(poses))], x, y, rng.uniform(-np.pi, np.pi))
+        if not _NOT_NEAR.agree(other, right):
+            return other
+
+
+def fit(looks: Sequence[Look]) -> Calibration:
+    """Return the coefficients of maximum likelihood."""
+    seen = [one for one in looks if one.evidence.known]
+    terms = np.array([one.evidence.terms for one in seen])
+    signs = np.where([one.is_right for one in seen], 1.0, -1.0)
+    scale = np.append(1.0, terms[:, 1:].std(axis=0) + 1e-9)
+
+    def loss(coefficients: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        margins = signs * (terms / scale @ coefficients)
+        pull = -signs / (1.0 + np.exp(margins)) / len(signs)
+        return (float(np.logaddexp(0.0, -margins).mean() + _RIDGE * coefficients @ coefficients),
+                (terms / scale).T @ pull + 2.0 * _RIDGE * coefficients)
+
+    solved = minimize(loss, np.zeros(len(TERMS)), jac=True, method='L-BFGS-B')
+    return CALIBRATION._replace(watch=CALIBRATION.watch._replace(
+        **dict(zip(TERMS, map(float, solved.x / scale), strict=True))))
+
+
+def report(looks: Sequence[Look], calibration: Calibration) -> str:
+    """Return a table of how well single looks at three objects or more tell right from wrong."""
+    rows = []
+    for kind in (*dict.fromkeys(one.kind for one in looks), 'all'):
+        its = [one for one in looks if kind in (one.kind, 'all') and one.evidence.known >= 3]
+        odds = np.array([log_odds(one.evidence, True, calibration) for one in its])
+        right = np.array([one.is_right for one in its])
+        rows.append([kind, len(its), f'{odds[right].mean():.1f}', f'{odds[~right].mean():.1f}',
+                     f'{(odds[right] < 0.0).mean():.2f}', f'{(odds[~right] > 0.0).mean():.2f}',
+                     f'{np.logaddexp(0.0, np.where(right, -odds, odds)).mean():.2f}'])
+    return table(['place', 'looks', 'mean log odds, right', 'wrong', 'right ones against',
+                  'wrong ones for', 'log loss'], rows)

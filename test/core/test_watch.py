@@ -1,0 +1,263 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The watch in a room of forty objects, seen by a nearly perfect detector."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import (
+    ellipse_bboxes,
+    ellipses_in_pixels,
+    project_ellipsoids,
+)
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.watch.belief import Belief
+from cliploc_ros.core.watch.evidence import by_vertical
+from cliploc_ros.core.watch.expectation import expect
+from cliploc_ros.core.watch.watch import Watch, WatchState
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.units import NS_PER_S
+
+CAMERA = Camera(640, 480, 400.0, 400.0, 320.0, 240.0)
+SIDE_M, COUNT = 6.0, 40
+
+
+@pytest.fixture(scope='module')
+def room():
+    """Forty objects of eight classes along the walls of a room of 6 m x 6 m."""
+    rng = np.random.default_rng(4)
+    along, wall = rng.uniform(0.3, SIDE_M - 0.3, COUNT), np.arange(COUNT) % 4
+    x = np.choose(wall, [along, along, 0.0 * along, 0.0 * along + SIDE_M])
+    y = np.choose(wall, [0.0 * along, 0.0 * along + SIDE_M, along, along])
+    return LandmarkMap(
+        'map', tuple(f'thing_{row}' for row in range(COUNT)), ('thing',) * COUNT,
+        tuple('abcdefgh'[row] for row in rng.integers(8, size=COUNT)),
+        np.c_[x, y, rng.uniform(0.3, 1.8, COUNT)], rng.uniform(0.1, 0.25, (COUNT, 3)),
+        np.tile([0.0, 0.0, 0.0, 1.0], (COUNT, 1)))
+
+
+def pose_at(x, y, yaw_deg):
+    """map_from_camera of a level camera, 1 m above the floor."""
+    yaw = np.radians(yaw_deg)
+    forward, right = np.array([np.cos(yaw), np.sin(yaw), 0.0]), [np.sin(yaw), -np.cos(yaw), 0.0]
+    return make_transform(np.column_stack([right, [0.0, 0.0, -1.0], forward]), np.array([x, y, 1]))
+
+
+def drive(count):
+    """A robot on a circle about the middle that looks outwards, 20 degrees on each time."""
+    angles = np.radians(20.0 * np.arange(count))
+    return [pose_at(3.0 + np.cos(one), 3.0 + np.sin(one), np.degrees(one) + 15.0)
+            for one in angles]
+
+
+def see(landmark_map, pose, number=0, odom=True, rng=None, rows=None):
+    """What a detector finds at a true pose, of some of the landmarks."""
+    boxes = ellipse_bboxes(ellipses_in_pixels(project_ellipsoids(
+        invert_transform(pose), landmark_map.centers, landmark_map.shapes), CAMERA))
+    shown = np.clip(boxes, 0.0, [CAMERA.width, CAMERA.height] * 2)
+    with np.errstate(invalid='ignore'):
+        in_view = ((shown[:, 2:] - shown[:, :2]).prod(axis=1)
+                   > 0.6 * (boxes[:, 2:] - boxes[:, :2]).prod(axis=1))
+    found = np.nonzero(in_view)[0]
+    found = found if rows is None else np.intersect1d(found, np.array(rows, dtype=int))
+    noise = 0.0 if rng is None else rng.normal(size=(len(found), 4))
+    return Observation(CAMERA, Detections(
+        shown[found] + noise, tuple(landmark_map.class_ids[row] for row in found),
+        np.full(len(found), 0.9)), stamp_ns=2 * number * NS_PER_S,
+        odom_from_camera=pose if odom else None)
+
+
+def moved(pose, x, y, yaw_deg=0.0):
+    turn = Rotation.from_euler('z', yaw_deg, degrees=True).as_matrix()
+    return make_transform(turn @ pose[:3, :3], pose[:3, 3] + [x, y, 0.0])
+
+
+@pytest.fixture
+def watch(room):
+    return Watch(Relocalizer(room, RelocalizerOptions(matching='class')))
+
+
+def follow(watch, room, poses, wrong=None, first=0, **seen):
+    """Look from true poses, with wrong_from_right of the localizer; return the reports."""
+    wrong = np.eye(4) if wrong is None else wrong
+    return [watch.look(see(room, pose, first + number, **seen), wrong @ pose)
+            for number, pose in enumerate(poses)]
+
+
+def test_a_localizer_that_drifts_is_right(watch, room):
+    rng = np.random.default_rng(0)
+    for number, pose in enumerate(drive(30)):
+        x, y = rng.uniform(-0.2, 0.2, 2)
+        report = watch.look(see(room, pose, number, rng=rng), moved(pose, x, y, rng.normal()))
+        assert report.state != WatchState.LOST
+        assert report.matched >= report.expected
+    assert report.state == WatchState.LOCALIZED
+    assert report.probability > 0.99
+    assert report.matched
+    assert not report.missing
+    assert report.camera_turn is None
+    assert len(report.reason) < 120
+
+
+@pytest.mark.parametrize('wrong', [moved(np.eye(4), 2.0, 0.0), moved(np.eye(4), 0.0, 0.0, 60.0),
+                                   moved(np.eye(4), 5.0, 6.0, 180.0)])
+def test_a_pose_that_jumps_away_is_lost_within_five_looks(watch, room, wrong):
+    poses = drive(15)
+    assert follow(watch, room, poses[:10])[-1].state == WatchState.LOCALIZED
+    after = follow(watch, room, poses[10:], wrong, first=10)
+    assert after[0].state != WatchState.LOST  # a single look does not decide
+    assert after[-1].state == WatchState.LOST
+    assert 'relocalize' in after[-1].reason
+    assert len(after[-1].reason) < 120
+
+
+def test_a_robot_that_is_carried_away_is_noticed(watch, room):
+    """Neither odometry nor the localizer notice."""
+    poses = drive(20)
+    follow(watch, room, poses[:10])
+    for number, (there, here) in enumerate(zip(drive(30)[20:], poses[10:], strict=True), 10):
+        seen = replace(see(room, moved(there, -0.7, 1.2, 80.0), number), odom_from_camera=here)
+        report = watch.look(seen, here)
+    assert report.state == WatchState.LOST
+    assert report.probability < 0.05
+
+
+def test_a_localizer_that_finds_itself_is_right_again(watch, room):
+    poses = drive(25)
+    follow(watch, room, poses[:10])
+    assert follow(watch, room, poses[10:15], moved(np.eye(4), 2.0, 0.0), 10)[-1].state == 'lost'
+    assert follow(watch, room, poses[15:], first=15)[-1].state == WatchState.LOCALIZED
+
+
+def test_minutes_without_objects_end_in_uncertain(watch, room):
+    follow(watch, room, drive(10))
+    reports = follow(watch, room, drive(18) * 20, first=10, rows=[])
+    assert {one.state for one in reports} == {WatchState.LOCALIZED, WatchState.UNCERTAIN}
+    assert reports[-1].state == WatchState.UNCERTAIN
+    assert 0.5 <= reports[-1].probability < 0.9
+
+
+def test_a_place_that_the_map_does_not_show_is_uncertain(watch, room):
+    """The robot drives through a door to other objects of the same classes."""
+    follow(watch, room, drive(10))
+    annex = replace(room, centers=room.centers + np.array([30.0, 0.0, 0.0]))
+    way = [pose_at(30.0 + one[0, 3], one[1, 3], 20.0 * row) for row, one in enumerate(drive(40))]
+    near = [moved(way[0], x, 0.0) for x in np.linspace(-27.0, 0.0, 30)]
+    follow(watch, room, near, first=10, rows=[])
+    states = {watch.look(see(annex, pose, 40 + number), pose).state
+              for number, pose in enumerate(way)}
+    assert WatchState.LOST not in states
+    assert WatchState.UNCERTAIN in states
+
+
+def test_a_standing_robot_learns_little_from_more_of_the_same():
+    belief = Belief()
+    for number in range(50):
+        seen = Observation(CAMERA, Detections(np.empty((0, 4)), (), np.empty(0)),
+                           stamp_ns=2 * number * NS_PER_S, odom_from_camera=np.eye(4))
+        belief.wait(seen, np.eye(4))
+        belief.add(seen, -1.0, is_full=True)
+    assert 0.05 < belief.probability < 0.5
+
+
+def test_without_odometry_the_watch_learns_more_slowly(room):
+    chances = []
+    for odom in (True, False):
+        watch = Watch(Relocalizer(room, RelocalizerOptions(matching='class')))
+        wrong = moved(np.eye(4), 2.0, 0.5)
+        chances.append([one.probability for one in follow(watch, room, drive(12), wrong,
+                                                          odom=odom)])
+    assert chances[0][3] < chances[1][3]
+    assert chances[1][-1] < 0.05
+
+
+def test_missing_landmarks_are_named(watch, room):
+    gone = [2, 9, 17, 25]
+    there = np.setdiff1d(np.arange(COUNT), gone)
+    reports = follow(watch, room, drive(90), rows=there, rng=np.random.default_rng(1))
+    assert WatchState.LOST not in {one.state for one in reports}
+    assert not reports[3].missing  # one look does not name any
+    expected = {row for pose in drive(18)
+                for row in expect(room, CAMERA, pose, np.arange(COUNT)).landmarks}
+    named = {room.landmark_ids.index(one) for one in reports[-1].missing}
+    assert named
+    assert named <= set(gone)
+    assert named >= set(gone) & expected - {25} or len(named) >= 2
+
+
+@pytest.mark.parametrize('rotvec', [(3.0, 0.0, 0.0), (0.0, -6.0, 0.0), (0.0, 0.0, 8.0),
+                                    (-2.0, 0.0, 0.0)])
+def test_the_turn_of_a_camera_is_known_after_twenty_looks(watch, room, rotvec):
+    turn = make_transform(Rotation.from_rotvec(rotvec, degrees=True).as_matrix(), np.zeros(3))
+    rng = np.random.default_rng(2)
+    for number, pose in enumerate(drive(20)):
+        given = pose @ invert_transform(turn)
+        report = watch.look(see(room, pose, number, rng=rng),
+                            moved(given, *rng.uniform(-0.05, 0.05, 2)))
+    assert report.state == WatchState.LOCALIZED
+    found = report.camera_turn
+    assert np.linalg.norm(found.rotvec_deg - rotvec) < 0.5
+    assert found.sigma_deg < 1.5
+    if np.count_nonzero(rotvec) == 1:
+        angle, axis = np.abs(rotvec).max(), 'xyz'[int(np.argmax(np.abs(rotvec)))]
+        assert f'degrees about {axis}' in found.in_words()
+        # the camera is level: its y axis is the vertical
+        assert found.is_yaw == (axis == 'y') == ('yaw of the localizer' in found.in_words())
+        assert abs(float(found.in_words().split()[2]) - angle) < 0.5
+
+
+def test_invalid_poses_are_named(watch, room):
+    pose = drive(1)[0]
+    for wrong in (np.full((4, 4), np.nan), np.eye(3), 2.0 * np.eye(4)):
+        with pytest.raises(OptionsError, match='map_from_camera is no rigid transform'):
+            watch.look(see(room, pose), wrong)
+    with pytest.raises(OptionsError, match='odom_from_camera is no rigid transform'):
+        watch.look(replace(see(room, pose), odom_from_camera=np.full((4, 4), np.nan)), pose)
+    assert watch.look(see(room, pose), pose).looks == 1
+
+
+def test_forgetting_and_time_that_goes_back_begin_again(watch, room):
+    assert follow(watch, room, drive(5))[-1].looks == 5
+    assert follow(watch, room, drive(1))[-1].looks == 1
+    watch.forget()
+    assert follow(watch, room, drive(2), first=9)[-1].looks == 2
+
+
+def test_a_pose_against_the_vertical_is_less_likely():
+    level = pose_at(0.0, 0.0, 0.0)
+    tilted = level @ make_transform(Rotation.from_euler('x', 15, degrees=True).as_matrix(),
+                                    np.zeros(3))
+    up = np.array([0.0, -1.0, 0.0])
+    assert by_vertical(level, None, 1.0) == by_vertical(level, up, 1.0) == 0.0
+    assert by_vertical(tilted, up, 1.0) < -3.0
+
+
+def things(*centers):
+    count = len(centers)
+    return LandmarkMap('map', tuple(map(str, range(count))), ('thing',) * count, ('a',) * count,
+                       np.array(centers, dtype=np.float64), np.full((count, 3), 0.2),
+                       np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)))
+
+
+def test_what_an_image_should_show():
+    """Camera at the origin, 1 m high, that looks along x."""
+    some = things((3, 0, 1),  # in view
+                  (5, 0, 1),  # behind it
+                  (-3, 0, 1),  # behind the camera
+                  (3, 2.35, 1),  # cut by the border
+                  (30, 1, 1),  # too far
+                  (3, -1, 1))  # in view
+    found = expect(some, CAMERA, pose_at(0, 0, 0), np.array([5]))
+    assert found.landmarks.tolist() == [0, 5]
+    assert found.was_seen.tolist() == [False, True]
+    assert found.in_sight.tolist() == [True, True]
+    # no shown landmark is beside it: a wall may hide it
+    assert not expect(some, CAMERA, pose_at(0, 0, 0), np.empty(0, dtype=int)).in_sight.any()

@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The watch over a recording: ``evaluate --bag BAG --watch TOPIC``."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cliploc_ros.cli.evaluate import main as evaluate
+from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.datasets.bag_messages import map_from_camera_of, pose_message, stamp_ns
+from cliploc_ros.datasets.bags import BagReader, BagWriter
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum
+from cliploc_ros.evaluation.watching import (
+    WatchedLook,
+    alarms_of,
+    roc,
+    summarize_watch,
+    write_watch,
+)
+
+ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+IMAGES = 24
+
+
+def looked(states, errors_m, chances):
+    return [WatchedLook(2.0 * row, state, chance, '', 0, 0, (), '', 0.5 * row, error, 0.0)
+            for row, (state, error, chance) in enumerate(zip(states, errors_m, chances,
+                                                             strict=True))]
+
+
+def test_figures_of_a_short_drive():
+    """Looks 2 s and .5 m apart; one false alarm, then wrong poses that the third look notices."""
+    looks = looked(['localized', 'lost', 'lost', 'localized', 'localized', 'uncertain', 'lost'],
+                   [0.1, 0.1, 0.2, 0.1, 3.0, 3.0, 3.0], [0.9, 0.04, 0.3, 0.99, 0.95, 0.4, 0.01])
+    assert [one.stamp_s for one in alarms_of(looks)] == [2.0, 12.0]
+    found = summarize_watch(looks)
+    assert found['alarms'] == 2
+    assert found['false_alarms'] == 1
+    assert found['false_alarms_per_hour'] == pytest.approx(300.0)  # one in 12 s
+    assert found['wrong_stretches'] == [
+        {'stamp_s': 8.0, 'seconds': 4.0, 'metres': 1.0, 'looks': 3}]
+    assert found['states'] == {'localized': 3, 'uncertain': 1, 'lost': 3}
+    curve = roc(looks)
+    assert curve[0].tolist() == [0.0, 0.0]
+    assert curve[-1].tolist() == [1.0, 1.0]
+    assert found['area_under_roc'] == pytest.approx(
+        np.mean([[wrong < right for right in (0.9, 0.04, 0.3, 0.99)]
+                 for wrong in (0.95, 0.4, 0.01)]))
+
+
+def test_without_truth_nothing_is_false(tmp_path):
+    looks = looked(['localized', 'lost'], [None, None], [0.9, 0.01])
+    found = summarize_watch(looks)
+    assert found['false_alarms'] is None
+    assert found['wrong_stretches'] == []
+    assert 'false' not in write_watch(tmp_path, looks, figures=True)
+    assert (tmp_path / 'watch_timeline.png').exists()
+    assert not (tmp_path / 'watch_roc.png').exists()
+    assert summarize_watch([])['looks'] == 0
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """The first images of the demo's walk; half way the localizer jumps by 2 m."""
+    folder = tmp_path_factory.mktemp('watched')
+    shutil.copytree(ASSETS / 'sequence', folder / 'tum')
+    images = folder / 'tum/rgb.txt'
+    rows = [line for line in images.read_text().splitlines() if not line.startswith('#')]
+    images.write_text('\n'.join(rows[:IMAGES]) + '\n')
+    sequence = read_tum(folder / 'tum')
+    convert_tum(sequence, find_camera(None, sequence.folder)[0], folder / 'plain',
+                ConversionOptions(world_frame='map', image_format='compressed'))
+    with BagReader(folder / 'plain') as reader, BagWriter(folder / 'bag') as writer:
+        for topic in reader.topics.values():
+            writer.add_topic(topic.name, topic.msgtype)
+        for name in ('/localizer', '/wheels'):
+            writer.add_topic(name, 'geometry_msgs/msg/PoseStamped')
+        for message in reader.messages():
+            writer.write(message.topic, message.stamp_ns, message.data)
+            if message.topic == '/ground_truth':
+                truth = reader.deserialize(message)
+                pose, stamp = map_from_camera_of(truth), stamp_ns(truth)
+                jump = 2.0 * (stamp > sequence.stamps_ns[IMAGES // 2])
+                writer.write('/wheels', message.stamp_ns, pose_message(stamp, 'odom', pose))
+                writer.write('/localizer', message.stamp_ns, pose_message(
+                    stamp, 'map', make_transform(np.eye(3), np.array([jump, 0.1, 0.0])) @ pose))
+    return folder / 'bag'
+
+
+def watch(bag, out, *arguments):
+    return evaluate(list(map(str, (
+        '--bag', bag, '--map', ASSETS / 'map.yaml', '--model', ASSETS / 'yolo.pt', '--image',
+        '/image/compressed', '--watch-period', 0.5, '--out', out, *arguments))))
+
+
+def test_a_localizer_that_jumps_is_noticed(bag, tmp_path, capsys):
+    assert watch(bag, tmp_path, '--watch', '/localizer', '--odometry', '/wheels') == 0
+    found = json.loads((tmp_path / 'watch.json').read_text())
+    assert found['looks'] == len(found['every_look']) == IMAGES
+    assert found['alarms'] == 1
+    assert found['false_alarms'] == 0
+    stretch, = found['wrong_stretches']
+    assert stretch['looks'] <= 5
+    assert found['area_under_roc'] > 0.95
+    assert 'wrong poses: called lost after' in capsys.readouterr().out
+    for name in ('watch_timeline', 'watch_roc'):
+        assert (tmp_path / f'{name}.png').stat().st_size > 10_000
+    assert found['every_look'][3]['state'] == 'localized'
+    assert found['every_look'][-1]['error_m'] == pytest.approx(2.0, abs=0.1)
+
+
+def test_longer_periods_and_no_truth(bag, tmp_path, capsys):
+    assert watch(bag, tmp_path, '--watch', '/localizer', '--watch-period', 2, '--no-figures',
+                 '--ground-truth', '/nowhere') == 0
+    assert json.loads((tmp_path / 'watch.json').read_text())['looks'] == IMAGES / 4
+    assert 'false alarms' not in capsys.readouterr().out
+    assert [path.name for path in tmp_path.iterdir()] == ['watch.json']
+
+
+@pytest.mark.parametrize(('arguments', 'named'), [
+    (('--watch', '/nowhere'), '/nowhere'),
+    (('--watch', '/camera_info'), 'not geometry_msgs'),
+    (('--watch', '/localizer', '--odometry', '/nowhere'), '/nowhere'),
+    (('--watch', '/localizer', '--cameras', 'front'), '--watch is for --bag, with one map')])
+def test_what_does_not_fit_is_named(bag, tmp_path, capsys, arguments, named):
+    assert watch(bag, tmp_path, *arguments) == 1
+    error = capsys.readouterr().err
+    assert named in error
+    assert 'Traceback' not in error

@@ -1,0 +1,322 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The watch of a localizer: right, kidnapped, silent and broken ones, with real nodes."""
+
+import time
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from processes import wait_for
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Bool, Header, String
+from std_srvs.srv import Trigger
+from test_lifecycle import Manager
+from tester import RELIABLE, transform_of
+from watched import MOUNT, Robot, stamp
+
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.ros.outputs.map_to_odom import transform_msg
+from cliploc_ros.ros.qos import LATCHED
+
+PERIOD_S = 1.0
+
+
+class Watched:
+    """What is published of a watch, while its robot goes on."""
+
+    def __init__(self, tester, robot, process):
+        self.tester, self.robot, self.process = tester, robot, process
+        #: One of each look.
+        self.states, self.flags, self.values, self.message = [], [], {}, ''
+        self._heard = [
+            tester.create_subscription(String, 'relocalizer/localization_state',
+                                       lambda msg: self.states.append(msg.data), LATCHED),
+            tester.create_subscription(Bool, 'relocalizer/localized',
+                                       lambda msg: self.flags.append(msg.data), LATCHED),
+            tester.create_subscription(DiagnosticArray, '/diagnostics', self._take, 10)]
+
+    def _take(self, msg):
+        self.message = msg.status[0].message
+        self.values = {value.key: value.value for value in msg.status[0].values}
+
+    def close(self):
+        for subscription in self._heard:
+            self.tester.destroy_subscription(subscription)
+
+    def until(self, condition, what):
+        try:
+            wait_for(condition, what, 30.0, self.robot.step)
+        finally:
+            print(what, self.states[-8:], self.values.get('watch reason'))
+
+    def until_state(self, state):
+        """Go on until a state is published; return after how many looks."""
+        before = len(self.states)
+        self.until(lambda: state in self.states[before:], state)
+        return 1 + self.states[before:].index(state)
+
+    def kidnap(self):
+        """Carry the robot by 3 m, and go on until it is lost.
+
+        In eight tries, with looks .3 m apart after eight that agreed, it took 4 to 11 looks. What
+        was said before is no look at the other place.
+        """
+        self.robot.carry(3.0)
+        assert self.until_state('uncertain') <= 3
+        assert self.until_state('lost') <= 12
+
+    def looks(self, count):
+        """Go on for some looks; return their states."""
+        before = len(self.states)
+        self.until(lambda: len(self.states) >= before + count, f'{count} looks')
+        return self.states[before:]
+
+    def until_reason(self, text):
+        """Go on until the diagnostics name a reason; the robot is never lost meanwhile."""
+        before = len(self.states)
+        self.until(lambda: text in self.values.get('watch reason', ''), f'the reason {text!r}')
+        assert 'lost' not in self.states[before:]
+
+
+@pytest.fixture
+def watch(own_relocalizer, tester):
+    """Start a relocalizer that watches, and a robot in its room."""
+    made = []
+
+    def run(**parameters):
+        tester.localizer.is_on = False
+        process = own_relocalizer(base_frame='base_link', base_from_camera=MOUNT,
+                                  **{'watch': 'amcl_pose', 'watch_period_s': PERIOD_S,
+                                     **parameters})
+        made.append(Watched(tester, Robot(tester), process))
+        return made[-1]
+    yield run
+    for one in made:
+        one.close()
+        one.robot.close()
+        print(one.process.output())
+        assert one.process.alive and 'Traceback' not in one.process.output()
+    tester.localizer.is_on = True
+
+
+def test_a_right_localizer_stays_localized(watch):
+    watched = watch()
+    watched.until_state('localized')
+    assert set(watched.looks(10)) == {'localized'}
+    assert watched.flags[-1] is True
+    assert float(watched.values['watch probability']) > 0.9
+    assert int(watched.values['watch looks']) > 5
+    assert 'expected' in watched.values['watch matched']
+    assert not watched.tester.initial_poses
+
+
+def test_a_kidnapped_robot_is_lost_and_only_reported(watch):
+    watched = watch()
+    watched.until_state('localized')
+    watched.looks(5)
+    watched.kidnap()
+    assert watched.flags[-1] is False
+    watched.robot.speed_m_s = 0.0
+    watched.until(lambda: watched.values.get('on lost') == 'the robot stands', 'rest')
+    watched.looks(3)
+    assert not watched.tester.initial_poses
+    assert 'watch: lost' in watched.message
+
+
+def test_a_lost_robot_is_relocalized_once_it_stands(watch):
+    watched = watch(on_lost='relocalize')
+    watched.until_state('localized')
+    watched.robot.carry(3.0)
+    watched.until_state('lost')
+    watched.looks(3)
+    assert watched.values['on lost'].startswith('the robot moves at 0.'), 'nothing is done'
+    assert not watched.tester.poses and not watched.tester.initial_poses
+    watched.robot.speed_m_s = 0.0
+    watched.until(lambda: watched.tester.poses, 'a request')
+    error_m, error_deg = pose_error(transform_of(watched.tester.poses[-1].pose.pose),
+                                    watched.robot.map_from_base)
+    assert error_m < 0.05 and error_deg < 1.0
+    watched.until_state('localized')
+    watched.robot.speed_m_s = 0.2
+    assert set(watched.looks(5)) == {'localized'}
+    assert 'relocalizing' in watched.process.output()
+    assert watched.process.output().count('relocalizing') == 1
+
+
+def test_without_a_watch_nothing_is_published_or_listened_to(own_relocalizer, tester):
+    own_relocalizer()
+    assert not tester.count_publishers('/relocalizer/localized')
+    assert not tester.count_publishers('/relocalizer/localization_state')
+    assert tester.listened_to() == 0
+    tester.wait(lambda: 'relocalizer' in tester.get_node_names(), 'its name')
+    tester.wait(lambda: {'/odom', '/amcl_pose'} == {
+        name for name, _ in tester.get_subscriber_names_and_types_by_node('relocalizer', '/')},
+        'its subscriptions')
+
+
+def test_a_lost_robot_without_a_pose_is_not_requested_again_and_again(watch):
+    watched = watch(on_lost='relocalize', min_inliers=999)
+    watched.until_state('localized')
+    watched.robot.carry(3.0)
+    watched.until_state('lost')
+    watched.robot.speed_m_s = 0.0
+    watched.until(lambda: 'next request in' in watched.values.get('on lost', ''), 'a pause')
+    asked = watched.process.output().count('relocalizing')
+    watched.looks(3)
+    assert watched.process.output().count('relocalizing') == asked <= 2
+    assert not watched.tester.initial_poses
+
+
+@pytest.mark.parametrize(('fault', 'text'), [
+    ({'has_localizer': False}, 'no pose heard on /amcl_pose yet: AMCL shows one once'),
+    ({'frame_id': 'floor_2'}, "the localizer's pose is in frame 'floor_2', the map in 'map'"),
+    ({'sees': False}, 'no fresh frame within 5 s: '),
+    ({'has_odom': False, 'has_localizer': False}, 'no pose heard on /amcl_pose yet')])
+def test_what_is_missing_is_named_and_not_taken_for_lost(watch, fault, text):
+    watched = watch()
+    for name, value in fault.items():
+        setattr(watched.robot, name, value)
+    watched.until_reason(text)
+    assert watched.states[-1] == 'uncertain' and watched.flags[-1] is False
+    assert text in watched.message
+
+
+def test_a_localizer_that_shows_nan_is_named(watch):
+    watched = watch()
+    watched.until_state('localized')
+    watched.robot.error_m = float('nan')
+    watched.until_reason('/amcl_pose shows a pose with NaN')
+    assert watched.states[-1] == 'uncertain'
+
+
+def test_two_localizers_are_named(watch, tester):
+    watched = watch()
+    watched.until_state('localized')
+    second = tester.create_publisher(PoseWithCovarianceStamped, 'amcl_pose', LATCHED)
+    watched.until_reason('2 publishers of /amcl_pose (tester, tester): stop all but one')
+    tester.destroy_publisher(second)
+    watched.until_state('localized')
+
+
+def test_a_localizer_that_falls_silent_while_the_robot_drives_is_named(watch):
+    watched = watch()
+    watched.until_state('localized')
+    watched.robot.has_localizer, watched.robot.speed_m_s = False, 0.5
+    watched.until_reason('/amcl_pose is silent for 2.')
+    assert watched.states[-1] == 'uncertain'
+
+
+def test_images_that_stop_end_in_uncertain(watch):
+    watched = watch()
+    watched.until_state('localized')
+    watched.robot.sees = False
+    watched.until_reason('no fresh frame within 5 s: ')
+    assert watched.states[-1] == 'uncertain'
+
+
+def test_without_odometry_a_fresh_pose_will_do(watch):
+    watched = watch()
+    watched.robot.has_odom = False
+    watched.until_state('localized')
+    watched.robot.has_localizer = False
+    watched.until_reason('and odom does not tell the way since: publish odom')
+
+
+def test_a_camera_at_1_hz_will_do(watch):
+    watched = watch()
+    watched.robot.image_every = 20
+    watched.until_state('localized')
+    assert set(watched.looks(3)) == {'localized'}
+
+
+def test_a_localizer_that_jumps_is_another_statement(watch):
+    """Of the pose before, nothing counts."""
+    watched = watch()
+    watched.until_state('localized')
+    watched.looks(3)
+    wrong = watched.robot.believed.copy()
+    wrong[0, 3] += 3.0
+    watched.robot.believed, right = wrong, watched.robot.believed
+    watched.until_state('lost')
+    watched.robot.believed = right
+    watched.until_state('localized')
+
+
+def test_a_node_that_is_deactivated_says_nothing_more(watch, tester):
+    watched = watch()
+    watched.until_state('localized')
+    manager = Manager(tester, 'relocalizer')
+    for _ in range(3):
+        manager.do('deactivate')
+        watched.until(lambda: watched.states[-1] == 'uncertain', 'uncertain')
+        said = len(watched.states)
+        tester.wait(lambda: tester.listened_to() == 0, 'it to rest')
+        assert len(watched.states) == said and watched.flags[-1] is False
+        manager.do('activate')
+        watched.until_state('localized')
+
+
+def test_a_map_that_is_read_again_is_watched_anew(watch, tester):
+    watched = watch()
+    watched.until_state('localized')
+    watched.looks(3)
+    answer = tester.call(Trigger, 'relocalizer/reload_map', Trigger.Request())
+    assert answer.success, answer.message
+    watched.until(lambda: watched.values.get('watch looks') == '1', 'a new watch')
+    watched.until_state('localized')
+
+
+def test_requests_are_answered_as_ever_and_begin_the_watch_again(watch, tester):
+    watched = watch()
+    watched.until_state('localized')
+    watched.robot.speed_m_s = 0.0
+    future = tester.ask()
+    watched.until(future.done, 'an answer')
+    assert future.result().success, future.result().message
+    assert 'uncertain' in watched.states[-3:]
+    watched.until_state('localized')
+
+
+def test_between_looks_nothing_listens_to_images(watch, tester):
+    """A detector rests there."""
+    watched = watch(watch_period_s=5.0)
+    watched.robot.speed_m_s = 0.05
+    watched.until_state('localized')
+    tester.wait(lambda: tester.listened_to() == 0, 'it to rest')
+    watched.looks(1)
+
+
+def test_time_that_jumps_back_begins_the_watch_again(watch, tester):
+    """Transforms and poses from before do not count; nobody is lost by that."""
+    clock = tester.create_publisher(Clock, '/clock', RELIABLE)
+    watched, back_s = watch(use_sim_time=True), [0.0]
+    watched.robot.clock = lambda: time.time() - back_s[0]
+    watched.robot.on_tick = lambda now_s, *_: clock.publish(Clock(clock=stamp(now_s)))
+    watched.until_state('localized')
+    said = len(watched.states)
+    back_s[0] = 100.0
+    watched.until_state('uncertain')
+    watched.until_state('localized')
+    assert 'lost' not in watched.states[said:]
+    assert 'time jumped back by' in watched.process.output()
+    tester.destroy_publisher(clock)
+
+
+@pytest.mark.needs('tf2_ros')
+def test_a_localizer_by_tf_is_right_kidnapped_and_silent(watch, tester):
+    from tf2_msgs.msg import TFMessage
+    publisher = tester.create_publisher(TFMessage, '/tf', 100)
+
+    def send(now_s, map_from_odom, odom_from_base):
+        publisher.publish(TFMessage(transforms=[
+            transform_msg(Header(frame_id=parent, stamp=stamp(now_s)), child, pose)
+            for parent, child, pose in (('map', 'odom', map_from_odom),
+                                        ('odom', 'base_link', odom_from_base))]))
+    watched = watch(watch='tf')
+    watched.robot.on_tick, watched.robot.has_localizer = send, False
+    watched.until_state('localized')
+    watched.kidnap()
+    watched.robot.on_tick = lambda *_: None
+    watched.until_reason("no transform from 'base_link' to 'map'")
+    tester.destroy_publisher(publisher)

@@ -1,0 +1,104 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A robot that drives to and fro in the simulated room, with a localizer like AMCL."""
+
+import time
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from nav_msgs.msg import Odometry
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from std_msgs.msg import Header
+from tester import RELIABLE, make_frame, transform_of
+
+from cliploc_ros.core.geometry.transforms import (
+    invert_transform,
+    make_transform,
+    transform_from_pose,
+)
+from cliploc_ros.ros.conversions import pose_to_msg, pose_with_covariance_msg
+
+ROOM = make_room()
+NOISE = np.random.default_rng(0).integers(0, 256, 3 * CAMERA.width * CAMERA.height, np.uint8)
+# The camera looks along the base's x axis.
+MOUNT = [0.0, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5]
+BASE_FROM_CAMERA = transform_from_pose(np.array(MOUNT[:3]), np.array(MOUNT[3:]))
+TICK_S, POSE_EVERY = 0.05, 5
+# It turns round after this way.
+REACH_M = 0.5
+
+
+def aside(metres):
+    """Return a move (4, 4) along the image's rows."""
+    return make_transform(np.eye(3), np.array([metres, 0.0, 0.0]))
+
+
+def stamp(seconds):
+    return Time(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
+
+
+class Robot:
+    """Publishes what a robot does: step after step, in real time."""
+
+    def __init__(self, tester):
+        self._tester, self._tick, self.image_every = tester, 0, 2
+        self._odom = tester.create_publisher(Odometry, 'odom', RELIABLE)
+        self._pose = tester.localizer._publisher
+        self.speed_m_s, self._x, self._sign = 0.3, 0.0, 1.0
+        #: (4, 4): where its run of odometry began; another one after it was carried away.
+        self.start = MAP_FROM_CAMERA @ aside(-1.5)
+        #: What the localizer takes for that.
+        self.believed = self.start
+        #: Of what it shows: a number, or NaN.
+        self.error_m = 0.0
+        self.frame_id, self.has_odom, self.has_localizer, self.sees = 'map', True, True, True
+        self.clock, self.on_tick = time.time, lambda now_s, map_from_odom, odom_from_base: None
+
+    def close(self):
+        self._tester.destroy_publisher(self._odom)
+
+    @property
+    def map_from_base(self):
+        """The truth."""
+        return self.start @ aside(self._x) @ invert_transform(BASE_FROM_CAMERA)
+
+    def carry(self, metres):
+        """Kidnap it: neither odometry nor the localizer notices."""
+        self.start = self.start @ aside(metres)
+
+    def step(self):
+        """Go on by one tick."""
+        if abs(self._x) > REACH_M:
+            self._sign = -np.sign(self._x)
+        self._x += self._sign * self.speed_m_s * TICK_S
+        now_s = self.clock()
+        header = Header(frame_id='odom', stamp=stamp(now_s))
+        odom_from_base = aside(self._x) @ invert_transform(BASE_FROM_CAMERA)
+        self.on_tick(now_s, self.believed, odom_from_base)
+        if self.has_odom:
+            odometry = Odometry(header=header, child_frame_id='base_link')
+            odometry.pose.pose = pose_to_msg(odom_from_base)
+            self._odom.publish(odometry)
+        if self._tick % self.image_every == 0 and self.sees:
+            seen = see_room(ROOM, self.map_from_base @ BASE_FROM_CAMERA)
+            image, *others = make_frame(seen, now_s)
+            image.data = np.roll(NOISE, self._tick).tobytes()  # a frozen image is a fault
+            self._tester.publish((image, *others))
+        if self._tester.initial_poses:  # as AMCL takes it at rest
+            given = transform_of(self._tester.initial_poses.pop().pose.pose)
+            self.believed = given @ invert_transform(odom_from_base)
+            self.show(odom_from_base, now_s)
+        elif self._tick % POSE_EVERY == 0 and self.has_localizer:
+            self.show(odom_from_base, now_s)
+        self._tick += 1
+        until = time.monotonic() + TICK_S
+        while time.monotonic() < until:
+            self._tester.spin()
+
+    def show(self, odom_from_base, now_s):
+        """Publish the localizer's pose."""
+        shown = pose_with_covariance_msg(
+            Header(frame_id=self.frame_id, stamp=stamp(now_s)), self.believed @ odom_from_base,
+            0.01 * np.eye(6))
+        shown.pose.pose.position.x += self.error_m
+        self._pose.publish(shown)
