@@ -249,7 +249,8 @@ def _watch(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
         bag_frames(options.bag, BagTopics(options.image, options.camera_info, options.rectified),
                    read(options.watch)),
         RecordingOptions(detector_options(options), None, EVERY_FRAME, reading,
-                         options.workers or 1, options.scheduler), odometry=odometry)
+                         options.workers or 1, options.scheduler),
+        odometry=None if odometry is None else {'': odometry})
     relocalizer = Relocalizer(landmark_map, RelocalizerOptions(
         matching='class', tilt_deviation_deg=options.tilt_deviation,
         height_range_m=tuple(options.height_range)))

@@ -53,10 +53,10 @@ def observation_of(recorded: PosedDetections, row: int, stamp_ns: int) -> Observ
     boxes = slice(recorded.frame_offsets[row], recorded.frame_offsets[row + 1])
     odom = None if recorded.odom_from_camera is None else recorded.odom_from_camera[row]
     return Observation(
-        recorded.camera, Detections(
+        recorded.camera_of(row), Detections(
             recorded.bboxes_xyxy[boxes],
             tuple(recorded.class_names[one] for one in recorded.classes[boxes]),
-            recorded.scores[boxes]), stamp_ns=stamp_ns,
+            recorded.scores[boxes]), stamp_ns=stamp_ns, camera_name=recorded.name_of(row),
         depths=None if recorded.depths is None else recorded.depths[boxes].astype(np.float64),
         odom_from_camera=None if odom is None or np.isnan(odom).any() else odom)
 

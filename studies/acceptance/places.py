@@ -12,14 +12,15 @@ import numpy as np
 
 from cliploc_ros.command import positive_int
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.datasets.queries import Queries, load_queries
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.trials import Query, make_queries
+from cliploc_ros.evaluation.watching import observation_of
 from cliploc_ros.mapping.building import build_map
 from cliploc_ros.simulation.sensors import simulate_depths, with_neighbours, with_vertical
+from cliploc_ros.units import NS_PER_S
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_world
@@ -96,10 +97,9 @@ class Recording(NamedTuple):
         """Return the place."""
         landmark_map = LandmarkMap.from_file(self.landmark_map)
         found = load_queries(self.queries, landmark_map.landmark_ids)
-        queries = make_queries(found, landmark_map, every_frame=True)
+        queries: Sequence[Query] = make_queries(found, landmark_map, every_frame=True)
         if not self.has_depth:
-            queries = tuple(replace(one, observation=replace(one.observation, depths=None))
-                            for one in queries)
+            queries = _without_depth(queries)
         elif all(one.depths is None for one in found.frames):
             queries = _with_simulated_depth(queries, found, landmark_map)
         return Place(landmark_map, queries,
@@ -149,15 +149,16 @@ class Halved(NamedTuple):
             halves.reverse()
         landmark_map = build_map(recorded.select_frames(halves[0])).landmark_map
         asked = recorded.select_frames(halves[1])
-        queries = []
-        for number in range(len(asked)):
-            rows = slice(*map(int, asked.frame_offsets[number:number + 2]))
-            queries.append(Query(number, Observation(
-                asked.camera_of(number), Detections(asked.bboxes_xyxy[rows], tuple(
-                    asked.class_names[one] for one in asked.classes[rows]), asked.scores[rows]),
-                depths=None if asked.depths is None or not self.has_depth
-                else asked.depths[rows].astype(np.float64)), asked.map_from_camera[number]))
+        queries = [Query(number, observation_of(asked, number, round(stamp_s * NS_PER_S)), pose)
+                   for number, (stamp_s, pose) in enumerate(zip(
+                       asked.stamps_s, asked.map_from_camera, strict=True))]
+        if not self.has_depth:
+            queries = _without_depth(queries)
         return Place(landmark_map, queries, range(len(queries)), [True] * len(queries))
+
+
+def _without_depth(queries: Sequence[Query]) -> list[Query]:
+    return [replace(one, observation=replace(one.observation, depths=None)) for one in queries]
 
 
 def _with_simulated_depth(queries: Sequence[Query], recorded: Queries, landmark_map: LandmarkMap
