@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from std_msgs.msg import Bool, String
 
 from cliploc_ros.core.fit.verification import MAX_FRAMES
+from cliploc_ros.core.geometry.transforms import SAME_SPOT
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.watch.watch import WatchReport, WatchState
 from cliploc_ros.errors import CliplocError, StoppedError, TimeUpError
@@ -90,6 +91,7 @@ class Watcher:
         self._cost_s = 0.0
         # What became of a robot that is lost, and whether it stands.
         self._reaction, self._is_at_rest = '', False
+        self._rest_stamp: Time | None = None
         self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
         if self.is_on:
             handoff.on_shown(self._pose.hear)
@@ -159,7 +161,7 @@ class Watcher:
             begun_at, stamp = time.monotonic(), None
             try:
                 stamp = self._look(stopped)
-                self._react(stopped)
+                self._react(stopped, stamp)
             except StoppedError:
                 return
             except (NoFrameError, NoTransformError, LaterError, TimeJumpError, TimeUpError
@@ -260,12 +262,13 @@ class Watcher:
 
     # ---- what follows ---------------------------------------------------------------------------
 
-    def _react(self, stopped: threading.Event) -> None:
+    def _react(self, stopped: threading.Event, stamp: Time | None) -> None:
         """Relocalize a lost robot that stands, where that is wanted, and not again and again."""
         parameters = self._node.settings.values
-        if self._known.state is not WatchState.LOST:
+        if self._known.state is not WatchState.LOST or stamp is None:
+            self._rest_stamp = None
             return
-        self._reaction = self._why_not_at_rest(parameters)
+        self._reaction = self._why_not_at_rest(parameters, stamp)
         self._is_at_rest = not self._reaction
         if not self._is_at_rest:
             return
@@ -281,8 +284,13 @@ class Watcher:
             self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
             self._reaction = answer.message
 
-    def _why_not_at_rest(self, parameters: RelocalizerParameters) -> str:
-        """Return why the robot may be moving; empty if odometry shows that it stands."""
+    def _why_not_at_rest(self, parameters: RelocalizerParameters, stamp: Time) -> str:
+        """Return why the robot may be moving; empty if odometry shows that it stands.
+
+        It stands at two looks, and has not moved between: one that turns round seems to stand for
+        a moment.
+        """
+        since, self._rest_stamp = self._rest_stamp, None
         odometry = self._robot.odometry
         if not odometry.is_published:
             return f'nobody publishes {odometry.topic}: nothing tells whether the robot stands'
@@ -291,4 +299,8 @@ class Watcher:
                                      time.monotonic() + _REST_PATIENCE_S)
         except HandOffError as error:
             return str(error)
-        return ''
+        moved = None if since is None else odometry.moved_since(since, 0.0)
+        has_stayed = moved is not None and (moved[0] <= SAME_SPOT.distance_m
+                                            and moved[1] <= SAME_SPOT.angle_deg)
+        self._rest_stamp = stamp
+        return '' if has_stayed else 'the robot has just stopped'

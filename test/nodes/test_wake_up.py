@@ -15,7 +15,6 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.task import Future
 from scene import make_room, see_room
 from tester import RELIABLE, TakingLocalizer, class_matching, make_frame
-from watched import MOUNT, Robot
 
 from cliploc_ros.cli.wake_up import main
 
@@ -178,35 +177,6 @@ def test_an_interrupt_stops_the_robot(relocalizer, start, end, tester, serve_spi
     assert spinner.cancelled.done()
     tester.wait(lambda: tester.listened_to() == 0, 'the poor frames to be gone')
     assert tester.relocalize(make_frame()).success
-
-
-def test_a_robot_that_gets_lost_is_woken_up_again(own_relocalizer, start, tester):
-    """It drives on for a while, and nothing is done until it stands."""
-    own_relocalizer(base_frame='base_link', base_from_camera=MOUNT, watch='amcl_pose',
-                    watch_period_s=1.0)
-    tester.localizer.is_on = False
-    robot = Robot(tester)
-    try:
-        robot.speed_m_s = 0.0
-        process = start('cli.wake_up', '--watch', '--turn-deg', 0)
-        said = lambda text: wait_for(  # noqa: E731
-            lambda: text in process.output(), text, work=robot.step)
-        said('look 1 ')
-        robot.speed_m_s = 0.3
-        said('watch: localized')
-        robot.carry(3.0)
-        said('watch: lost')
-        said('; the robot moves at 0.')
-        assert len(looks(process)) == 1
-        robot.speed_m_s = 0.0
-        wait_for(lambda: len(looks(process)) == 2, 'another wake-up', work=robot.step)
-        assert [answer[:8] for *_, answer in looks(process)] == ['accepted'] * 2
-        said('watch: localized')
-        assert process.stop(signal.SIGTERM)[0] == INTERRUPTED
-    finally:
-        robot.close()
-        tester.localizer.is_on = True
-        print(process.output())
 
 
 def test_a_relocalizer_that_does_not_watch_is_named(relocalizer, start, end):

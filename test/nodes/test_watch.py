@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The watch of a localizer: right, kidnapped, silent and broken ones, with real nodes."""
 
+import signal
 import time
 
 import pytest
@@ -130,7 +131,9 @@ def test_a_lost_robot_is_relocalized_once_it_stands(watch):
     watched.robot.carry(3.0)
     watched.until_state('lost')
     watched.looks(3)
-    assert watched.values['on lost'].startswith('the robot moves at 0.'), 'nothing is done'
+    assert watched.values['on lost'].startswith(
+        ('the robot moves at 0.', 'the robot has just stopped')), 'nothing is done'
+    assert 'relocalizing' not in watched.process.output()
     assert not watched.tester.poses and not watched.tester.initial_poses
     watched.robot.speed_m_s = 0.0
     watched.until(lambda: watched.tester.poses, 'a request')
@@ -301,6 +304,24 @@ def test_time_that_jumps_back_begins_the_watch_again(watch, tester):
     assert 'lost' not in watched.states[said:]
     assert 'time jumped back by' in watched.process.output()
     tester.destroy_publisher(clock)
+
+
+def test_wake_up_goes_on_and_wakes_a_lost_robot_up_again(watch, start):
+    """The robot drives on for a while, and nothing is done until it stands."""
+    watched = watch()
+    watched.robot.speed_m_s = 0.0
+    process = start('cli.wake_up', '--watch', '--turn-deg', 0)
+    watched.until(lambda: 'look 1 ' in process.output(), 'a look')
+    watched.robot.speed_m_s = 0.3
+    watched.until(lambda: 'watch: localized' in process.output(), 'localized')
+    watched.robot.carry(3.0)
+    watched.until(lambda: '; the robot moves at 0.' in process.output(), 'lost')
+    assert process.output().count('accepted: ') == 1
+    watched.robot.speed_m_s = 0.0
+    watched.until(lambda: process.output().count('accepted: ') == 2, 'another wake-up')
+    said = process.output().count('watch: localized')
+    watched.until(lambda: process.output().count('watch: localized') > said, 'localized')
+    assert process.stop(signal.SIGTERM)[0] == 130
 
 
 @pytest.mark.needs('tf2_ros')
