@@ -23,8 +23,7 @@ from cliploc_ros.core.watch.alignment import Alignment
 from cliploc_ros.core.watch.expectation import Expected, expect
 
 # A wrong pose shows where this many objects are in the image, and so many landmarks should be.
-# Where more than this share of the objects fits, the place has changed.
-_OBJECTS, _MAPPED, _FITTING = 3, 2, 0.25
+_OBJECTS, _MAPPED = 3, 2
 
 
 class LookEvidence(NamedTuple):
@@ -41,12 +40,8 @@ class LookEvidence(NamedTuple):
     crowd: float  #: Logarithm of the pairs of a detection and a landmark in view of its class
 
     def is_full(self, has_jumped: bool) -> bool:
-        """Return whether a wrong pose would show, and nothing else.
-
-        One that jumped need not be at a mapped spot.
-        """
-        return self.known >= _OBJECTS and (has_jumped or (
-            self.expected >= _MAPPED and self.matched <= _FITTING * self.known))
+        """Return whether a wrong pose would show; one that jumped need not be at a mapped spot."""
+        return self.known >= _OBJECTS and (has_jumped or self.expected >= _MAPPED)
 
     @property
     def terms(self) -> tuple[float, ...]:
