@@ -79,7 +79,7 @@ def test_an_edge_at_the_border_of_the_image_is_open(recorded):
     """The lens moves the border inwards: such an edge measures no object."""
     views = make_views(recorded, MappingOptions())
     assert views.is_open.any(axis=0).all() and 0.02 < views.is_open.mean() < 0.1
-    left, top, right, bottom = views.bounds * LENS.fx + (319.5, 239.5, 319.5, 239.5)
+    left, top, right, bottom = views.bounds[0] * LENS.fx + (319.5, 239.5, 319.5, 239.5)
     assert 5 < left < 30 and 3 < top < 30 and 610 < right < 635 and 450 < bottom < 477
     again = make_views(recorded.select_frames(range(5)), MappingOptions())
     assert (again.is_open == views.is_open[:len(again.is_open)]).all()

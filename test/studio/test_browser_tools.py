@@ -3,6 +3,7 @@
 """The layers of the page: coverage, places that look alike, and keyframes."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from studio_map import ASSETS, person_at, write_two_rooms
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.images import views_of_folder
+from cliploc_ros.studio.recording import Recording
 from cliploc_ros.studio.studio import Studio
 
 pytestmark = [pytest.mark.clock, pytest.mark.needs('viser', 'playwright', 'chromium')]
@@ -82,3 +84,24 @@ def test_keyframes_are_shown_and_hidden(chromium, path):
         box.check(force=True)
         wait_for(lambda: all(node.visible for node in nodes.values()), 'they are shown again')
         assert value_of(server, 'Show keyframes') is True
+
+
+def test_the_camera_of_a_view_is_named(chromium, path):
+    """The second of two cameras has half the pixels, and a wider view."""
+    shutil.copy(ASSETS / 'map.yaml', path)
+    views = views_of_folder(ASSETS / 'sequence')
+    camera, = views.cameras
+    small = replace(camera, width=320, height=240, fx=200.0, fy=200.0, cx=159.5, cy=119.5)
+    views = replace(views, cameras=(camera, small), camera_names=('front', 'back'),
+                    camera_rows=np.arange(len(views)) % 2)
+    studio = Studio(Document(path), Recording(views))
+    with person_at(chromium, studio) as (person, server):
+        for view, name, one in ((0, 'front', camera), (1, 'back', small), (2, 'front', camera)):
+            with studio.document.lock:
+                studio.show_view(view)
+            person.click('Forget the boxes')  # whatever redraws the page
+            person.page.get_by_text(f'camera {name}').wait_for()
+            image = server.scene._handle_from_node_name['/view/image']
+            wait_for(lambda one=one, image=image: np.isclose(
+                image.render_width, 0.3 * one.width / one.fx), 'the image is as wide as its view')
+        person.picture('cameras')
