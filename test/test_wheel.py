@@ -21,7 +21,7 @@ PROJECT = Path(__file__).resolve().parents[1]
 ROOM = PROJECT / 'test/mapping/changed_room'
 SOURCES = ('cliploc_ros', 'config', 'launch', 'resource', 'LICENSE', 'package.xml', 'setup.cfg',
            'setup.py')
-MAX_MB = 17.0
+MAX_MB = 17.5  # 16.3 of them are images and networks of the demo
 #: What a computer without ROS and without the extra "models" lacks. ROS's .pth file starts the
 #: interpreter again with its libraries.
 LEFT_OUT = re.compile(r'(?!rosbags)(rclpy|rpyutils|ament|ros|\w+_(msgs|srvs|interfaces)|launch|'
