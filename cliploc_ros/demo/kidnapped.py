@@ -151,15 +151,15 @@ class KidnappedRobot(Node):
                             child_frame_id=_FRAME)
         odometry.pose.pose = pose_to_msg(self._odom_from_camera)
         self._odom.publish(odometry)
-        believed = self._map_from_odom @ self._odom_from_camera
+        localized = self._map_from_odom @ self._odom_from_camera
         if self.now_s >= self._show_at:
             self._show_at = self.now_s + _POSE_PERIOD_S
             self._shown.publish(pose_with_covariance_msg(
-                Header(frame_id=self._frame_id, stamp=stamp.to_msg()), believed,
+                Header(frame_id=self._frame_id, stamp=stamp.to_msg()), localized,
                 0.01 * np.eye(6)))
         if view is not None:
             self._take_image(view, Header(frame_id=_FRAME, stamp=stamp.to_msg()))
-        self.moments.append(Moment(self.now_s, self._truth, believed, self.state))
+        self.moments.append(Moment(self.now_s, self._truth, localized, self.state))
         while (left_s := end - time.monotonic()) > 0.0:
             self._executor.spin_once(timeout_sec=left_s)
 
@@ -226,7 +226,7 @@ def run_kidnapped(options: DemoOptions) -> list[Step]:
 
 
 def _kidnap(robot: KidnappedRobot, before: Sequence[View], after: Sequence[View]) -> list[Step]:
-    """Let the robot drive, carry it away, and wait until it is where it believes to be."""
+    """Let the robot drive, carry it away, and wait until its localizer is right again."""
     steps: list[Step] = []
     carried_s, first = 0.0, 0
 

@@ -228,11 +228,11 @@ def _draw_camera(axes: Axes, map_from_camera: NDArray[np.float64], color: str, m
 
 @dataclass(frozen=True)
 class Moment:
-    """Where the robot was at a time [s], where its localizer had it, and what the watch said."""
+    """The robot's pose at a time, the pose of its localizer, and the state of the watch."""
 
-    time_s: float
-    truth: NDArray[np.float64]
-    believed: NDArray[np.float64]
+    time_s: float  #: [s]
+    truth: NDArray[np.float64]  #: (4, 4): map_from_camera
+    localized: NDArray[np.float64]  #: (4, 4): the same, of the localizer
     state: str
 
 
@@ -258,10 +258,10 @@ def draw_kidnapped(file: Path, camera: Camera, detections: Detections, landmark_
         axes.remove()
     timeline = figure.add_subplot(grid[1, :])
     lost = next(row for row, one in enumerate(moments) if one.state == 'lost')
-    _draw_expected(view, file, camera, detections, landmark_map, moments[lost].believed)
+    _draw_expected(view, file, camera, detections, landmark_map, moments[lost].localized)
     _draw_ways(top, landmark_map, moments)
     times = np.array([one.time_s for one in moments])
-    errors = [pose_error(one.believed, one.truth)[0] for one in moments]
+    errors = [pose_error(one.localized, one.truth)[0] for one in moments]
     for one, end in zip(moments, times[1:], strict=False):
         timeline.axvspan(one.time_s, end, color=_STATES.get(one.state, '#FFFFFF'), linewidth=0)
     timeline.plot(times, errors, color=_TRUTH, linewidth=2.0)
@@ -292,15 +292,15 @@ def _draw_expected(axes: Axes, file: Path, camera: Camera, detections: Detection
 
 
 def _draw_ways(axes: Axes, landmark_map: LandmarkMap, moments: Sequence[Moment]) -> None:
-    """Draw where the robot was, and where its localizer had it."""
+    """Draw the way of the robot, and that of its localizer's poses."""
     draw_map(axes, landmark_map)
-    for name, color, style in (('truth', _TRUTH, '-'), ('believed', REFUSED, '--')):
+    for name, color, style in (('truth', _TRUTH, '-'), ('localized', REFUSED, '--')):
         way = np.array([getattr(one, name)[:2, 3] for one in moments])
         jumps = np.nonzero(np.linalg.norm(np.diff(way, axis=0), axis=1) > 1.0)[0] + 1
         for number, part in enumerate(np.split(way, jumps)):
             axes.plot(*part.T, color=color, linestyle=style, linewidth=2.0,
                       label=None if number else
-                      {'truth': 'the robot', 'believed': 'its localizer'}[name])
+                      {'truth': 'the robot', 'localized': 'its localizer'}[name])
         for row in jumps:
             axes.annotate('', way[row], way[row - 1], arrowprops={
                 'arrowstyle': '->', 'color': color, 'linestyle': ':'})

@@ -238,11 +238,11 @@ def test_a_localizer_that_jumps_is_another_statement(watch):
     watched = watch()
     watched.until_state('localized')
     watched.looks(3)
-    wrong = watched.robot.believed.copy()
+    wrong = watched.robot.map_from_odom.copy()
     wrong[0, 3] += 3.0
-    watched.robot.believed, right = wrong, watched.robot.believed
+    watched.robot.map_from_odom, right = wrong, watched.robot.map_from_odom
     watched.until_state('lost')
-    watched.robot.believed = right
+    watched.robot.map_from_odom = right
     watched.until_state('localized')
 
 

@@ -48,7 +48,7 @@ class Robot:
         #: (4, 4): where its run of odometry began; another one after it was carried away.
         self.start = MAP_FROM_CAMERA @ aside(-1.5)
         #: What the localizer takes for that.
-        self.believed = self.start
+        self.map_from_odom = self.start
         #: Of what it shows: a number, or NaN.
         self.error_m = 0.0
         self.frame_id, self.has_odom, self.has_localizer, self.sees = 'map', True, True, True
@@ -74,7 +74,7 @@ class Robot:
         now_s = self.clock()
         header = Header(frame_id='odom', stamp=stamp(now_s))
         odom_from_base = aside(self._x) @ invert_transform(BASE_FROM_CAMERA)
-        self.on_tick(now_s, self.believed, odom_from_base)
+        self.on_tick(now_s, self.map_from_odom, odom_from_base)
         if self.has_odom:
             odometry = Odometry(header=header, child_frame_id='base_link')
             odometry.pose.pose = pose_to_msg(odom_from_base)
@@ -86,7 +86,7 @@ class Robot:
             self._tester.publish((image, *others))
         if self._tester.initial_poses:  # as AMCL takes it at rest
             given = transform_of(self._tester.initial_poses.pop().pose.pose)
-            self.believed = given @ invert_transform(odom_from_base)
+            self.map_from_odom = given @ invert_transform(odom_from_base)
             self.show(odom_from_base, now_s)
         elif self._tick % POSE_EVERY == 0 and self.has_localizer:
             self.show(odom_from_base, now_s)
@@ -98,7 +98,7 @@ class Robot:
     def show(self, odom_from_base, now_s):
         """Publish the localizer's pose."""
         shown = pose_with_covariance_msg(
-            Header(frame_id=self.frame_id, stamp=stamp(now_s)), self.believed @ odom_from_base,
-            0.01 * np.eye(6))
+            Header(frame_id=self.frame_id, stamp=stamp(now_s)),
+            self.map_from_odom @ odom_from_base, 0.01 * np.eye(6))
         shown.pose.pose.position.x += self.error_m
         self._pose.publish(shown)

@@ -30,18 +30,13 @@ _BESIDE_COSINE, _BESIDE_SHARE = np.cos(np.radians(20.0)), 0.8
 
 
 class Expected(NamedTuple):
-    """The landmarks that an image should show: k rows of the map, and what tells of each."""
+    """The k landmarks that an image should show, and whether it shows each."""
 
     landmarks: NDArray[np.int64]  #: (k,): one of each object
     was_seen: NDArray[np.bool_]  #: (k,): whether a detection shows it
     #: (k,): whether a shown landmark beside it or behind it tells that no wall hides it
     in_sight: NDArray[np.bool_]
     sides: NDArray[np.int64]  #: (k,): from which of SIDES sides the camera looks at it
-
-    @property
-    def missed(self) -> NDArray[np.int64]:
-        """Return the landmarks that should be seen and are not."""
-        return self.landmarks[~self.was_seen & self.in_sight]
 
 
 def expect(landmark_map: LandmarkMap, camera: Camera, map_from_camera: NDArray[np.float64],
