@@ -214,13 +214,17 @@ def test_the_turn_of_a_camera_is_known_after_twenty_looks(watch, room, rotvec):
         assert abs(float(found.in_words().split()[2]) - angle) < 0.5
 
 
-def test_invalid_poses_are_named(watch, room):
+def test_invalid_inputs_are_named(watch, room):
     pose = drive(1)[0]
     for wrong in (np.full((4, 4), np.nan), np.eye(3), 2.0 * np.eye(4)):
         with pytest.raises(OptionsError, match='map_from_camera is no rigid transform'):
             watch.look(see(room, pose), wrong)
     with pytest.raises(OptionsError, match='odom_from_camera is no rigid transform'):
         watch.look(replace(see(room, pose), odom_from_camera=np.full((4, 4), np.nan)), pose)
+    with pytest.raises(OptionsError, match='is no unit vector'):
+        watch.look(replace(see(room, pose), up_in_camera=np.full(3, np.nan)), pose)
+    with pytest.raises(OptionsError, match='has no pixels'):
+        watch.look(see(room, pose), pose, np.zeros((0, 0, 3), np.uint8))
     assert watch.look(see(room, pose), pose).looks == 1
 
 

@@ -84,7 +84,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
     the vertical is no unit vector.
     """
     scene, left_out = match_frame(landmark_map, observation, options)
-    vertical = _vertical(observation, options)
+    vertical = vertical_of(observation, options)
     leaders = Leaders.none_yet(REFINED if options.refine else MAX_DISTINCT)
     tilted, samples, progress = Leaders.none_yet(), None, Progress(0, 1.0)
     if _has_samples(scene, vertical):
@@ -115,7 +115,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
 
 def prior_of(observation: Observation, options: RelocalizerOptions) -> Prior:
     """Return what is known of the camera of a frame before anything is searched."""
-    vertical, (low, high) = _vertical(observation, options), options.height_range_m
+    vertical, (low, high) = vertical_of(observation, options), options.height_range_m
     known = _is_known(vertical)
     return Prior(tuple(vertical[:3]) if known else _UPRIGHT, _UP_IN_MAP, low, high,
                  np.radians(options.max_tilt_deg), vertical[6] if known else inf)
@@ -126,8 +126,11 @@ def coverage_of(frames: Sequence[SearchedFrame]) -> float:
     return min(one.progress.coverage for one in frames)
 
 
-def _vertical(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64]:
-    """Return the vertical (7,) of a frame; the paper's algorithms do not use it."""
+def vertical_of(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64]:
+    """Return the vertical (7,) of a frame; the paper's algorithms do not use it.
+
+    OptionsError: it is no unit vector.
+    """
     up = observation.up_in_camera
     if up is None or options.algorithm != 'auto':
         return VERTICAL_UNKNOWN

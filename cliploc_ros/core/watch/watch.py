@@ -13,6 +13,7 @@ from cliploc_ros.core.geometry.transforms import is_rigid
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search.frame_search import vertical_of
 from cliploc_ros.core.watch.alignment import align, look_at
 from cliploc_ros.core.watch.belief import Belief
 from cliploc_ros.core.watch.camera_turn import CameraTurn, TurnEstimate
@@ -95,9 +96,12 @@ class Watch:
         Raises
         ------
         OptionsError
-            A pose is no rigid transform, or the observation is invalid.
+            A pose is no rigid transform, the image has no pixels, or the observation is invalid.
         """
         _check(observation, map_from_camera)
+        vertical_of(observation, self._options)  # refuses an invalid one
+        if image is not None and not image.size:
+            raise OptionsError(f'image of shape {image.shape} has no pixels')
         if observation.stamp_ns < self._stamp_ns:
             self.forget()
         self._stamp_ns = observation.stamp_ns
