@@ -17,6 +17,7 @@ topics (with --prefix camera: /camera/image and so on):
   /camera_info                  sensor_msgs/CameraInfo
   /ground_truth                 geometry_msgs/PoseStamped, the camera in the world frame
   /detections                   vision_msgs/Detection2DArray, with --detections
+  /imu                          sensor_msgs/Imu, where the folder has accelerometer.txt
 
 examples:
   tum_to_bag rgbd_dataset_freiburg3_long_office_household office
@@ -83,7 +84,8 @@ def convert(options: argparse.Namespace) -> int:
         detections,
         progress=lambda images: tqdm(images, unit='image', disable=None))  # on a terminal only
     print(f'wrote {options.output}: {result.images} images, {result.poses} ground-truth poses, '
-          f'{result.detections} detection messages in {time.monotonic() - begin:.1f} s')
+          f'{result.detections} detection messages, {result.accelerations} accelerations in '
+          f'{time.monotonic() - begin:.1f} s')
     if len(sequence.trajectory) == 0:
         print('the folder has no ground truth')
     elif missing := result.images - result.poses:

@@ -21,6 +21,7 @@ COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 DETECTIONS = 'vision_msgs/msg/Detection2DArray'
 POSE = 'geometry_msgs/msg/PoseStamped'
+IMU = 'sensor_msgs/msg/Imu'
 
 
 def stamp_ns(message: Any) -> int:
@@ -79,6 +80,19 @@ def detections_message(stamp: int, frame_id: str, detections: Detections) -> Any
 def pose_message(stamp: int, frame_id: str, map_from_camera: NDArray[np.float64]) -> Any:
     """Make a geometry_msgs/PoseStamped of the camera (4, 4) in the map's coordinate frame."""
     return _make(POSE, header=_header(stamp, frame_id), pose=_pose(map_from_camera))
+
+
+def imu_message(stamp: int, frame_id: str, acceleration: NDArray[np.float64]) -> Any:
+    """Make a sensor_msgs/Imu of an acceleration (3,) [m/s^2] alone."""
+    missing = np.zeros(9)
+    missing[0] = -1.0  # says that a field is not measured
+    vector = 'geometry_msgs/msg/Vector3'
+    x, y, z = acceleration.tolist()
+    return _make(IMU, header=_header(stamp, frame_id), orientation=_make(
+        'geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=missing, angular_velocity=_make(vector, x=0.0, y=0.0, z=0.0),
+        angular_velocity_covariance=missing, linear_acceleration=_make(vector, x=x, y=y, z=z),
+        linear_acceleration_covariance=np.zeros(9))
 
 
 def map_from_camera_of(message: Any) -> NDArray[np.float64]:

@@ -73,26 +73,43 @@ def read_tum_trajectory(path: str | Path) -> TimedPoses:
     message names file and line.
     """
     samples: dict[int, list[float]] = {}
-    for where, line in _data_lines(Path(path)):
-        fields = line.replace(',', ' ').split()
-        if len(fields) != 8:
-            raise DatasetError(
-                f'{where}: expected timestamp tx ty tz qx qy qz qw, got {len(fields)} fields')
-        shown = f'pose {" ".join(fields[1:])!r}'
-        try:
-            values = [float(field) for field in fields[1:]]
-        except ValueError:
-            raise DatasetError(f'{where}: {shown} is not seven numbers') from None
-        if not np.all(np.isfinite(values)):
-            raise DatasetError(f'{where}: {shown} is not finite')
+    for where, stamp_ns, values in _stamped_numbers(Path(path), 'tx ty tz qx qy qz qw'):
         norm = float(np.linalg.norm(values[3:]))
         if abs(norm - 1) > _MAX_NORM_ERROR:
             raise DatasetError(f'{where}: quaternion qx qy qz qw has norm {norm:.3f}, not 1')
-        samples.setdefault(parse_stamp_ns(fields[0], where), values)
+        samples.setdefault(stamp_ns, values)
     stamps = sorted(samples)
     rows = np.array([samples[stamp] for stamp in stamps]).reshape(-1, 7)
     quats_xyzw = rows[:, 3:] / np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
     return TimedPoses(np.array(stamps, dtype=np.int64), rows[:, :3], quats_xyzw)
+
+
+def read_tum_accelerometer(path: str | Path) -> tuple[list[int], NDArray[np.float64]]:
+    """Return the stamps [ns] and accelerations (n, 3) [m/s^2] of an accelerometer.txt.
+
+    DatasetError: a line does not hold four numbers; the message names file and line.
+    """
+    samples = [(stamp_ns, values) for _, stamp_ns, values in _stamped_numbers(
+        Path(path), 'ax ay az')]
+    return ([stamp_ns for stamp_ns, _ in samples],
+            np.array([values for _, values in samples]).reshape(-1, 3))
+
+
+def _stamped_numbers(path: Path, names: str) -> Iterator[tuple[str, int, list[float]]]:
+    """Yield 'file:line', the stamp [ns] and the named numbers of each line."""
+    count = 1 + len(names.split())
+    for where, line in _data_lines(path):
+        fields = line.replace(',', ' ').split()
+        if len(fields) != count:
+            raise DatasetError(f'{where}: expected timestamp {names}, got {len(fields)} fields')
+        shown = f'{" ".join(fields[1:])!r}'
+        try:
+            values = [float(field) for field in fields[1:]]
+        except ValueError:
+            raise DatasetError(f'{where}: {shown} is not {names}') from None
+        if not np.all(np.isfinite(values)):
+            raise DatasetError(f'{where}: {shown} is not finite')
+        yield where, parse_stamp_ns(fields[0], where), values
 
 
 def parse_stamp_ns(text: str, where: str) -> int:

@@ -15,7 +15,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.datasets import bag_messages
 from cliploc_ros.datasets.bags import BagWriter
-from cliploc_ros.datasets.tum import TumSequence
+from cliploc_ros.datasets.tum import TumSequence, read_tum_accelerometer
 from cliploc_ros.errors import DatasetError
 
 #: Passes on an iterable of stamp [ns] and file of each image, and shows progress.
@@ -37,6 +37,7 @@ class ConversionOptions:
     #: Coordinate frame of images, camera_info and detections (optical axes)
     camera_frame: str = 'camera_optical_frame'
     world_frame: str = 'world'  #: Coordinate frame of the ground-truth poses: the map's
+    imu_frame: str = 'imu'  #: Coordinate frame of the accelerometer, whose mount TUM does not give
 
     def topic(self, name: str) -> str:
         """Return the absolute name of a topic.
@@ -55,6 +56,7 @@ class ConversionResult:
     images: int  #: Images, each with a camera_info
     poses: int  #: Images with ground truth
     detections: int  #: Images with an entry of recorded detections, which may be empty
+    accelerations: int = 0  #: Samples of the accelerometer
 
 
 def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
@@ -62,10 +64,11 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
                 progress: Progress = iter) -> ConversionResult:
     """Write a sequence as a rosbag2 recording.
 
-    Topics: ``image`` or ``image/compressed``, ``camera_info``, ``ground_truth`` and, if given,
-    ``detections``. All headers of a frame have exactly the image's stamp, which is also the time
-    of recording. DatasetError: an image is invalid, no image has detections, or the output cannot
-    be written. No partial recording remains.
+    Topics: ``image`` or ``image/compressed``, ``camera_info``, ``ground_truth``, ``detections`` if
+    given, and ``imu`` where the folder has an accelerometer.txt. All headers of a frame have
+    exactly the image's stamp, which is also the time of recording. DatasetError: an image is
+    invalid, no image has detections, or the output cannot be written. No partial recording
+    remains.
 
     Parameters
     ----------
@@ -88,6 +91,9 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
     info_topic, pose_topic = options.topic('camera_info'), options.topic('ground_truth')
     boxes_topic = options.topic('detections')
     frame, poses, boxes = options.camera_frame, 0, 0
+    accelerometer = sequence.folder / 'accelerometer.txt'
+    stamps_ns, accelerations = (read_tum_accelerometer(accelerometer) if accelerometer.exists()
+                                else ([], np.empty((0, 3))))
     with BagWriter(output, options.storage) as bag:
         bag.add_topic(image_topic, bag_messages.COMPRESSED_IMAGE if is_compressed
                       else bag_messages.IMAGE)
@@ -109,7 +115,13 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
                 bag.write(pose_topic, stamp_ns, bag_messages.pose_message(
                     stamp_ns, options.world_frame, map_from_camera))
                 poses += 1
-    return ConversionResult(len(sequence), poses, boxes)
+        if stamps_ns:
+            imu_topic = options.topic('imu')
+            bag.add_topic(imu_topic, bag_messages.IMU)
+            for stamp_ns, acceleration in zip(stamps_ns, accelerations, strict=True):
+                bag.write(imu_topic, stamp_ns, bag_messages.imu_message(
+                    stamp_ns, options.imu_frame, acceleration))
+    return ConversionResult(len(sequence), poses, boxes, len(stamps_ns))
 
 
 def _image_message(stamp_ns: int, frame_id: str, path: Path, camera: Camera, is_compressed: bool

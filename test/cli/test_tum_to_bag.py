@@ -116,6 +116,24 @@ def test_jpeg_bytes_are_copied(make_sequence, tmp_path):
     assert image.data.tobytes() == file.read_bytes()
 
 
+def test_accelerations_become_an_imu(make_sequence, tmp_path):
+    sequence = make_sequence()
+    (sequence.folder / 'accelerometer.txt').write_text('# t a\n1.25 0.5 7 -5\n1.5 0.25 8 -6\n')
+    done = run('tum_to_bag', sequence.folder, tmp_path / 'bag')
+    assert done.returncode == 0, done.stderr
+    assert '2 accelerations' in done.stdout
+    first, second = read_all(tmp_path / 'bag')['/imu']
+    assert bag_messages.stamp_ns(first) == 1_250_000_000
+    assert first.header.frame_id == 'imu'
+    assert first.orientation_covariance[0] == first.angular_velocity_covariance[0] == -1
+    one = second.linear_acceleration
+    assert (one.x, one.y, one.z) == (0.25, 8.0, -6.0)
+    (sequence.folder / 'accelerometer.txt').write_text('1.25 0.5 nan -5\n')
+    done = run('tum_to_bag', sequence.folder, tmp_path / 'other')
+    assert 'accelerometer.txt:1' in done.stderr
+    assert not (tmp_path / 'other').exists()
+
+
 def test_options_reach_the_recording(make_sequence, tmp_path):
     sequence = make_sequence(count=7)
     (sequence.folder / 'groundtruth.txt').unlink()

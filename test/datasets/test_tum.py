@@ -115,7 +115,7 @@ def test_no_stamps(text):
         ('rgb.txt', '1.1 rgb/1.1.png\n1.0 rgb/1.1.png\n', r'rgb.txt:2: .*not exceed the one'),
         ('rgb.txt', '# nothing\n', r'rgb.txt: lists no images'),
         ('groundtruth.txt', '1 2 3\n', r'groundtruth.txt:1: expected .*, got 3 fields'),
-        ('groundtruth.txt', '1 0 0 0 0 0 0 one\n', r'groundtruth.txt:1: .*not seven numbers'),
+        ('groundtruth.txt', '1 0 0 0 0 0 0 one\n', r'groundtruth.txt:1: .*not tx ty tz'),
         ('groundtruth.txt', '1 0 0 nan 0 0 0 1\n', r'groundtruth.txt:1: .*not finite'),
         ('groundtruth.txt', '1 0 0 0 0 0 0 0\n', r'groundtruth.txt:1: .*norm 0.000, not 1'),
         ('groundtruth.txt', '-1 0 0 0 0 0 0 1\n', r'groundtruth.txt:1: timestamp -1'),

@@ -1,0 +1,179 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A part of a room is mapped; the rest of it and other rooms are asked, in several ways."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from math import inf
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from cliploc_ros.core.fit.covariance import normalized_square
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes.localization import ImageRecognizer, KeyframeLocalizer
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.evaluation.trials import Query
+from cliploc_ros.mapping.building import build_map
+from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
+from studies.blame import blame
+from studies.rooms.baseline import SiftMap
+from studies.rooms.rooms import ROBOT, Room, RoomOptions, known_of, read_room
+
+#: What answers.
+WAYS = OBJECTS, KEYFRAMES, BOTH, SIFT = 'objects', 'keyframes', 'both', 'SIFT with PnP'
+#: What is known besides the image. Keyframes do not use depth.
+KNOWN = NOTHING, VERTICAL, DEPTH, ALL = '-', 'vertical', 'depth', 'vertical, depth'
+_NO_BOXES = Detections(np.empty((0, 4)), (), np.empty(0))
+# A failure by objects is one beyond this error, and is blamed on something [m].
+_FAILED_M = 0.5
+
+
+class Task(NamedTuple):
+    """A part of a room, by its name, and how many images to ask of its map at most."""
+
+    room: str
+    kind: str
+    part: str
+    images: int  # of the rest of the room
+    elsewhere: int  # of each other room
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The best pose of one query in one way."""
+
+    room: str
+    kind: str
+    part: str
+    asked: str  #: The room of the image
+    number: int  #: Of the image in its room
+    way: str
+    known: str
+    error_m: float  #: Infinite without a pose, and in another room
+    error_deg: float
+    accepted: bool
+    confidence: float
+    nees: float
+    source: str
+    reason: str
+    boxes: int
+    inliers: int
+    cause: str = ''  #: What the failure of objects is blamed on
+    classes: tuple[str, ...] = ()  #: Of the objects that support an accepted pose
+
+    @property
+    def is_here(self) -> bool:
+        """Return whether the image is of the mapped room."""
+        return self.asked == self.room
+
+
+@dataclass(frozen=True)
+class Answers:
+    """All outcomes of a part, and what it was mapped to."""
+
+    task: Task
+    landmark_map: LandmarkMap
+    keyframes: int
+    outcomes: tuple[Outcome, ...]
+
+
+def make_ask(folders: Sequence[str], options: RoomOptions, with_sift: bool
+             ) -> Callable[[Task], Answers]:
+    """Return the function that maps a part and asks its map, for a worker."""
+    cv2.setNumThreads(1)
+
+    @lru_cache
+    def rooms() -> dict[str, Room]:
+        return {room.name: room for room in (read_room(one, options) for one in folders)}
+
+    def ask(task: Task) -> Answers:
+        room = rooms()[task.room]
+        mapped, asked = next((mapped, asked) for _, part, mapped, asked in room.parts()
+                             if part == task.part)
+        landmark_map = build_map(room.detections.select_frames(mapped)).landmark_map
+        layer = build_layer(room.frames.select(mapped.tolist()), landmark_map, LayerOptions())
+        keyframes, sift = KeyframeLocalizer(layer), None
+        if with_sift and room.has_depth:
+            sift = SiftMap([room.raws[row].decode() for row in mapped])
+        asking = room.by_robot if task.kind == ROBOT else room
+        if len(asked) > task.images:  # evenly spread over the time
+            asked = asked[np.linspace(0, len(asked) - 1, task.images).astype(np.int64)]
+        found = [one for row in asked for one in _ask_here(
+            task, asking, landmark_map, keyframes, sift, asking.queries[row])]
+        rng = np.random.default_rng(len(task.part))
+        for other in rooms().values():
+            if other.name != room.name:
+                some = rng.permutation(len(other))[:task.elsewhere]
+                found += [one for row in some for one in _ask_elsewhere(
+                    task, other, landmark_map, keyframes, other.queries[row])]
+        return Answers(task, landmark_map, len(layer), tuple(found))
+    return ask
+
+
+def _ask_here(task: Task, room: Room, landmark_map: LandmarkMap, keyframes: KeyframeLocalizer,
+              sift: SiftMap | None, query: Query) -> Iterator[Outcome]:
+    """Yield the answers to an image of the mapped room."""
+    depth = (DEPTH, ALL) if room.has_depth else ()
+    for way, known in [*((way, one) for way in (OBJECTS, BOTH)
+                         for one in (NOTHING, VERTICAL, *depth)),
+                       (KEYFRAMES, NOTHING), (KEYFRAMES, VERTICAL)]:
+        yield _outcome(task, room.name, query, way, known, landmark_map, keyframes)
+    if sift is not None:
+        image_rgb, camera = room.raws[query.number].color()
+        pose = sift.locate(image_rgb, camera)
+        error_m, error_deg = (inf, inf) if pose is None else pose_error(
+            pose, query.map_from_camera)
+        yield Outcome(task.room, task.kind, task.part, room.name, query.number, SIFT, NOTHING,
+                      error_m, error_deg, False, 0.0, inf, SIFT, '', 0, 0)
+
+
+def _ask_elsewhere(task: Task, other: Room, landmark_map: LandmarkMap,
+                   keyframes: KeyframeLocalizer, query: Query) -> Iterator[Outcome]:
+    """Yield the answers to an image of another room, all of which should be refusals."""
+    for way in (OBJECTS, KEYFRAMES, BOTH):
+        for known in (NOTHING, VERTICAL) if other.has_poses else (NOTHING,):
+            yield _outcome(task, other.name, query, way, known, landmark_map, keyframes)
+
+
+def _outcome(task: Task, asked: str, query: Query, way: str, known: str,
+             landmark_map: LandmarkMap, keyframes: KeyframeLocalizer) -> Outcome:
+    observation = known_of(query.observation, known)
+    if way == KEYFRAMES:
+        observation = replace(observation, detections=_NO_BOXES, depths=None)
+    relocalizer = Relocalizer(landmark_map, RelocalizerOptions(matching='class'))
+    recognizer = None
+    if way != OBJECTS and query.image is not None:
+        recognizer = ImageRecognizer(keyframes, query.image.features, query.image.camera)
+    found = relocalizer.relocalize([observation], recognizer)
+    pose, is_here = found.map_from_camera, asked == task.room
+    error_m, error_deg, nees = inf, inf, inf
+    if pose is not None and is_here:
+        error_m, error_deg = pose_error(pose, query.map_from_camera)
+        if found.covariance is not None:
+            nees = normalized_square(pose, found.covariance, query.map_from_camera)
+    cause = ''
+    if way == OBJECTS and known == NOTHING and is_here and error_m > _FAILED_M:
+        cause = blame(landmark_map, relocalizer, replace(query, observation=observation),
+                      _FAILED_M).cause
+    return Outcome(
+        task.room, task.kind, task.part, asked, query.number, way, known, float(error_m),
+        float(error_deg), found.accepted, float(found.confidence), float(nees), found.source,
+        found.reason, len(observation.detections), len(found.matches), cause,
+        _classes(landmark_map, found) if found.accepted else ())
+
+
+def _classes(landmark_map: LandmarkMap, found: Relocalization) -> tuple[str, ...]:
+    return tuple(landmark_map.class_ids[one.landmark] for one in found.matches)
+
+
+def tasks_of(room: Room, kinds: Sequence[str], images: int, elsewhere: int) -> list[Task]:
+    """Return a task for each part of a room in some kinds of splits."""
+    return [Task(room.name, kind, part, images, elsewhere) for kind, part, _, _ in room.parts()
+            if kind in kinds]

@@ -1,0 +1,246 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of real rooms: what detector and features say of each image, and their parts."""
+
+import pickle
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.keyframes.features import Features
+from cliploc_ros.core.keyframes.localization import query_features
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
+from cliploc_ros.datasets.frames import DepthFormat, Frames, ImageFile, RawFrame, folder_frames
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.evaluation.trials import ImageFeatures, Query
+from cliploc_ros.evaluation.watching import observation_of
+from cliploc_ros.files.storage import make_folder, write_file
+from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
+from cliploc_ros.simulation.sensors import with_vertical
+from cliploc_ros.units import NS_PER_S
+from studies.keyframes.records import _upright
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.int64]
+#: A map by one camera, asked by another at another height.
+ROBOT = 'phone to robot'
+# An accelerometer is averaged so near each image, as the node does [s].
+_WINDOW_S = 0.1
+# Without an accelerometer, the deviation of a simulated vertical.
+_VERTICAL_DEG = 1.0
+# A camera without calibration is taken to see so much from left to right.
+_USUAL_VIEW_DEG = 65.0
+# What the robot's camera shows of an image, and the width of its own.
+_ROBOT_SHARE, _ROBOT_PX = 0.8, 424
+# Parts with fewer images are no map, or no question.
+_LEAST_IMAGES = 15
+
+
+@dataclass(frozen=True)
+class RoomOptions:
+    """How rooms are read."""
+
+    model: str  #: Weights of YOLO
+    out: Path  #: Folder of what is kept from run to run
+    conf: float = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """A recording; row i of all columns is its i-th image. Without poses it can only be asked."""
+
+    name: str
+    options: RoomOptions
+    frames: Frames
+    raws: tuple[RawFrame, ...]
+    detections: PosedDetections
+    features: tuple[tuple[Features, Camera], ...]
+    has_poses: bool
+    ups: Floats | None  #: (n, 3): measured verticals in the camera; None: they are simulated
+
+    def __len__(self) -> int:
+        """Return the number of images."""
+        return len(self.raws)
+
+    @property
+    def has_depth(self) -> bool:
+        """Return whether the recording has depth."""
+        return self.detections.depths is not None
+
+    @cached_property
+    def by_robot(self) -> 'Room':
+        """Return the room as another camera sees it: a part of each image, and coarser."""
+        raws = tuple(replace(raw, color=partial(_robot_view, raw.color), depth=None)
+                     for raw in self.raws)
+        frames = _frames_of_raws(self.frames.source, raws)
+        return replace(self, frames=frames, raws=raws, **_seen(
+            frames, raws, self.options, f'{self.name}.robot'))
+
+    @cached_property
+    def queries(self) -> tuple[Query, ...]:
+        """Return all images as queries, with all that is known of them."""
+        plain = [Query(row, observation_of(self.detections, row, raw.stamp_ns),
+                       self.detections.map_from_camera[row],
+                       image=ImageFeatures(*self.features[row], 0.0))
+                 for row, raw in enumerate(self.raws)]
+        if self.ups is None:
+            return with_vertical(plain, _VERTICAL_DEG)
+        return tuple(replace(one, observation=replace(one.observation, up_in_camera=up))
+                     for one, up in zip(plain, self.ups, strict=True))
+
+    def parts(self) -> Iterator[tuple[str, str, Rows, Rows]]:
+        """Yield a kind of split, the name of a part, and the rows to map and to ask.
+
+        Split by time (images in turn, and halves), by where the camera looks, and by its height;
+        'phone to robot' maps one height, and asks the other with another camera, see by_robot.
+        """
+        if not self.has_poses:
+            return
+        rows, poses = np.arange(len(self)), self.detections.map_from_camera
+        forward = poses[:, :2, 2]
+        axis = np.linalg.svd(forward - forward.mean(axis=0), full_matrices=False)[2][0]
+        along = forward @ axis
+        splits = {'in turn': rows % 2 == 0, 'halves': rows < len(rows) // 2,
+                  'directions': along < np.median(along),
+                  **dict.fromkeys(('heights', ROBOT), poses[:, 2, 3] < np.median(poses[:, 2, 3]))}
+        for kind, is_first in splits.items():
+            for number, is_mapped in enumerate((is_first, ~is_first)):
+                mapped, asked = rows[is_mapped], rows[~is_mapped]
+                if min(len(mapped), len(asked)) >= _LEAST_IMAGES:
+                    yield kind, f'{kind} {number}', mapped, asked
+
+
+def read_room(where: str, options: RoomOptions) -> Room:
+    """Return a room: a folder that the readers take, or one of images alone.
+
+    ``DIR@METRES`` gives the unit of depth.
+    """
+    path, _, unit = where.partition('@')
+    folder = Path(path)
+    frames, has_poses = _frames_of(folder, float(unit) if unit else None)
+    raws = tuple(frames.read_raw(lambda place, stamp_ns, pose: pose is not None))
+    if not (folder / 'rgb.txt').exists() and has_poses:
+        raws = _upright(raws)
+    raws = tuple(replace(raw, place=row) for row, raw in enumerate(raws))
+    frames = _frames_of_raws(frames.source, raws)
+    make_folder(options.out)
+    return Room(folder.name, options, frames, raws, has_poses=has_poses,
+                ups=_measured_verticals(folder, raws), **_seen(frames, raws, options, folder.name))
+
+
+def _frames_of_raws(source: Path, raws: tuple[RawFrame, ...]) -> Frames:
+    return Frames(source, len(raws), lambda is_wanted: (
+        raw for raw in raws if is_wanted(raw.place, raw.stamp_ns, raw.map_from_camera)))
+
+
+def _seen(frames: Frames, raws: tuple[RawFrame, ...], options: RoomOptions, name: str
+          ) -> dict[str, Any]:
+    """Return detections and features of all images; those of an earlier run."""
+    recorded = record_once(
+        frames, RecordingOptions(DetectorOptions(options.model, conf=options.conf), None,
+                                 EVERY_FRAME, reading=name), options.out / f'{name}.npz')
+    return {'detections': recorded.detections,
+            'features': _features_of(raws, options.out / f'{name}.features.pickle')}
+
+
+def _robot_view(color: Callable[[], tuple[NDArray[np.uint8], Camera]]
+                ) -> tuple[NDArray[np.uint8], Camera]:
+    """Return a part of an image, and its camera."""
+    image_rgb, camera = color()
+    columns, rows = round(_ROBOT_SHARE * camera.width), round(_ROBOT_SHARE * camera.height)
+    left, top = round(0.7 * (camera.width - columns)), round(0.4 * (camera.height - rows))
+    scale = _ROBOT_PX / columns
+    small = cv2.resize(image_rgb[top:top + rows, left:left + columns], None, fx=scale, fy=scale,
+                       interpolation=cv2.INTER_AREA)
+    return np.asarray(small, dtype=np.uint8), replace(
+        camera, width=small.shape[1], height=small.shape[0], fx=camera.fx * scale,
+        fy=camera.fy * scale, cx=(camera.cx - left + 0.5) * scale - 0.5,
+        cy=(camera.cy - top + 0.5) * scale - 0.5)
+
+
+def _frames_of(folder: Path, depth_unit: float | None) -> tuple[Frames, bool]:
+    """Return the frames of a folder, z up, and whether their poses are true."""
+    if not (folder / 'rgb.txt').exists() and (folder / 'images').is_dir():
+        return _without_poses(folder / 'images'), False
+    if (folder / 'rgb.txt').exists() and not (folder / 'depth.txt').exists():
+        return tum_frames(read_tum(folder), find_camera(None, folder)[0]), True
+    return rgbd_frames(folder, FolderOptions(depth=DepthFormat(depth_unit))), True
+
+
+@dataclass(frozen=True)
+class _Nowhere:
+    """The poses of images whose poses nobody knows."""
+
+    span_ns: tuple[int, int]
+
+    def pose_at(self, stamp_ns: int) -> Floats | None:
+        return np.eye(4)
+
+
+def _without_poses(folder: Path) -> Frames:
+    """Return images without poses, by a usual camera."""
+    paths = sorted(one for one in folder.iterdir() if one.suffix.lower() in ('.jpg', '.png'))
+    if not paths:
+        raise DatasetError(f'{folder}: has no images')
+    files = [ImageFile(row * NS_PER_S, path) for row, path in enumerate(paths)]
+    first = cv2.imread(str(paths[0]))
+    if first is None:
+        raise DatasetError(f'{paths[0]} cannot be read as an image')
+    height, width = first.shape[:2]
+    focal = 0.5 * width / np.tan(np.radians(0.5 * _USUAL_VIEW_DEG))
+    return folder_frames(folder, files, _Nowhere((0, len(files) * NS_PER_S)), Camera(
+        width, height, focal, focal, 0.5 * width, 0.5 * height))
+
+
+def _features_of(raws: tuple[RawFrame, ...], file: Path) -> tuple[tuple[Features, Camera], ...]:
+    """Return the features of each image and the camera they are of; those of an earlier run."""
+    if not file.exists():
+        found = []
+        for raw in raws:
+            image_rgb, camera = raw.color()
+            found.append((tuple(vars(query_features(image_rgb)).values()), camera))
+        write_file(file, lambda partial: partial.write_bytes(pickle.dumps(found)))
+    return tuple((Features(*columns), camera) for columns, camera in pickle.loads(
+        file.read_bytes()))
+
+
+def _measured_verticals(folder: Path, raws: tuple[RawFrame, ...]) -> Floats | None:
+    """Return the vertical in the camera (n, 3) by a TUM folder's accelerometer, None without one.
+
+    How the sensor is mounted is not published: one rotation is fitted to all true poses.
+    """
+    file = folder / 'accelerometer.txt'
+    if not file.exists():
+        return None
+    samples = np.loadtxt(file)
+    stamps = np.array([raw.stamp_ns / NS_PER_S for raw in raws])
+    near = np.abs(samples[:, 0] - stamps[:, None]) <= _WINDOW_S
+    means = near @ samples[:, 1:] / np.maximum(near.sum(axis=1), 1)[:, None]
+    lengths = np.linalg.norm(means, axis=1)
+    if (lengths == 0.0).any():
+        raise DatasetError(f'{file}: has gaps: no sample is within {_WINDOW_S} s of some images')
+    ups = means / lengths[:, None]
+    true = np.array([raw.map_from_camera[2, :3] for raw in raws
+                     if raw.map_from_camera is not None])
+    mount, _ = Rotation.align_vectors(true, ups)
+    return np.asarray(mount.apply(ups))
+
+
+def known_of(observation: Observation, names: str) -> Observation:
+    """Return an observation with only what is named of 'vertical' and 'depth'."""
+    return replace(observation,
+                   up_in_camera=observation.up_in_camera if 'vertical' in names else None,
+                   depths=observation.depths if 'depth' in names else None)

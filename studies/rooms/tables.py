@@ -1,0 +1,128 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The tables of all rooms: Markdown."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from cliploc_ros.core.geometry.transforms import RIGHT_M
+from cliploc_ros.evaluation.figures import within_ellipsoid
+from studies.reports import interval, table
+from studies.rooms.asking import BOTH, KEYFRAMES, KNOWN, NOTHING, OBJECTS, WAYS, Answers, Outcome
+from studies.rooms.rooms import Room
+
+LIMITS_M = 0.1, 0.25, 0.5, 1.0
+# Numbers of boxes in an image, from and to.
+_BOXES = (0, 2), (3, 3), (4, 4), (5, 6), (7, 50)
+_MOST_CLASSES = 15
+
+
+def tables(answers: Sequence[Answers], rooms: Sequence[Room]) -> str:
+    """Return all tables, each under a heading."""
+    outcomes = [one for answer in answers for one in answer.outcomes]
+    here = [one for one in outcomes if one.is_here]
+    columns = ['room', 'split', 'by', 'known', 'images', *(f'{limit:g} m' for limit in LIMITS_M),
+               'accepted', 'false', 'recall', 'in 95 %']
+    rows = [(*key, *success(its)) for key, its in grouped(here, 'room', 'kind', 'way', 'known')]
+    return '\n\n'.join([
+        '## Rooms', _room_table(answers, rooms),
+        '## Success and acceptance', table(columns, rows),
+        '## All splits of a room', table(
+            [one for one in columns if one != 'split'],
+            [(*key, *success(its)) for key, its in grouped(here, 'room', 'way', 'known')]),
+        '## Images of other rooms', table(
+            ['map of', 'by', 'images', 'accepted (all false)', '95 % of images'],
+            [(*('all rooms', *key)[-2:], *_false(its))
+             for by in (('room', 'way'), ('way',)) for key, its in grouped(
+                 [one for one in outcomes if not one.is_here], *by)]),
+        '## Why objects fail by more than .5 m', _blame_table(here),
+        '## Boxes that an image needs', _boxes_table(here),
+        '## Classes that carry accepted poses of objects', _class_table(here, rooms)])
+
+
+def grouped(outcomes: Iterable[Outcome], *by: str
+            ) -> list[tuple[tuple[str, ...], list[Outcome]]]:
+    """Return outcomes in groups of equal fields: ways and what is known in their own order."""
+    order = [*WAYS, *KNOWN]
+    groups: dict[tuple[str, ...], list[Outcome]] = {}
+    for one in outcomes:
+        groups.setdefault(tuple(getattr(one, name) for name in by), []).append(one)
+    # other names in the order in which they come first
+    order += [name for key in groups for name in key if name not in order]
+    return sorted(groups.items(), key=lambda pair: [order.index(name) for name in pair[0]])
+
+
+def success(outcomes: Sequence[Outcome]) -> list[str]:
+    """Return the cells about images of the mapped room."""
+    errors = np.array([one.error_m for one in outcomes])
+    accepted = np.array([one.accepted for one in outcomes])
+    right = errors < RIGHT_M
+    nees = np.array([one.nees for one in outcomes])[accepted & right]
+    cells = [str(len(outcomes)), *(f'{np.mean(errors < limit):.2f}' for limit in LIMITS_M)]
+    if outcomes[0].way not in (OBJECTS, KEYFRAMES, BOTH):
+        return [*cells, '', '', '', '']
+    return [*cells, str(accepted.sum()), str((accepted & ~right).sum()),
+            f'{accepted[right].mean():.2f}' if right.any() else '',
+            f'{within_ellipsoid(nees):.2f}' if len(nees) else '']
+
+
+def _false(outcomes: Sequence[Outcome]) -> list[str]:
+    false = sum(one.accepted for one in outcomes)
+    return [str(len(outcomes)), str(false), interval(false, len(outcomes), 4)]
+
+
+def _room_table(answers: Sequence[Answers], rooms: Sequence[Room]) -> str:
+    rows = []
+    for room in rooms:
+        maps = [one for one in answers if one.task.room == room.name]
+        boxes = np.diff(room.detections.frame_offsets)
+        size = np.ptp(room.detections.map_from_camera[:, :3, 3], axis=0)
+        rows.append((room.name, len(room), f'{boxes.mean():.1f}', f'{np.mean(boxes >= 3):.2f}',
+                     *([''] * 3 if not maps else (
+                         ' x '.join(f'{one:.1f}' for one in size),
+                         _range([len(one.landmark_map) for one in maps]),
+                         _range([one.keyframes for one in maps])))))
+    return table(['room', 'images', 'boxes an image', 'with three or more', 'path [m]',
+                  'landmarks of a part', 'keyframes of a part'], rows)
+
+
+def _range(values: Sequence[int]) -> str:
+    return f'{min(values)} to {max(values)}'
+
+
+def _blame_table(here: Sequence[Outcome]) -> str:
+    asked = [one for one in here if one.way == OBJECTS and one.known == NOTHING]
+    causes = ['objects', 'map', 'candidates', 'search', 'choice']
+    rows = []
+    for key, its in grouped(asked, 'room', 'kind'):
+        counts = Counter(one.cause for one in its)
+        rows.append((*key, len(its), counts[''], *(counts[cause] for cause in causes)))
+    return table(['room', 'split', 'images', 'right', *causes], rows)
+
+
+def _boxes_table(here: Sequence[Outcome]) -> str:
+    rows = []
+    for key, its in grouped([one for one in here if one.way == OBJECTS], 'room', 'known'):
+        for low, high in _BOXES:
+            some = [one for one in its if low <= one.boxes <= high]
+            if some:
+                cells = success(some)
+                rows.append((*key, f'{low} to {high}' if high > low else low, cells[0],
+                             *cells[3:7]))
+    return table(['room', 'known', 'boxes', 'images', '0.5 m', '1 m', 'accepted', 'false'], rows)
+
+
+def _class_table(here: Sequence[Outcome], rooms: Sequence[Room]) -> str:
+    rows = []
+    for room in rooms:
+        names = [room.detections.class_names[one] for one in room.detections.classes]
+        boxes, its = Counter(names), [one for one in here if one.room == room.name
+                                      and one.way == OBJECTS and one.accepted]
+        carried = Counter(name for one in its for name in one.classes)
+        if its:
+            rows += [(room.name, name, f'{count / len(room):.2f}',
+                      f'{carried[name] / len(its):.2f}')
+                     for name, count in boxes.most_common(_MOST_CLASSES)]
+    return table(['room', 'class', 'boxes an image', 'objects an accepted pose'], rows)
