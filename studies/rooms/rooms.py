@@ -55,7 +55,7 @@ class RoomOptions:
 
     model: str  #: Weights of YOLO
     out: Path  #: Folder of what is kept from run to run
-    conf: float = 0.25
+    conf: float = DetectorOptions.conf
 
 
 @dataclass(frozen=True, eq=False)
