@@ -124,19 +124,21 @@ def read_named_folder(options: argparse.Namespace, folder: 'FolderOptions') -> '
     distance = None
     if options.known_distance is not None:
         first, second, metres = options.known_distance
-        distance = first, second, _metres(metres)
+        distance = first, second, metres_of(metres, '--known-distance')
     if distance is not None and options.scale is not None:
         raise OptionsError('give --scale or --known-distance, not both')
     folder = replace(folder, layout=key, images=options.images, axes=options.axes,
-                     scale=options.scale, known_distance=distance, level=options.level)
+                     scale=options.scale, known_distance=distance, level=options.level,
+                     any_unit=getattr(options, 'object_size', None) is not None)
     return rgbd_frames(path, folder) if key == 'rgbd' else read_folder(path, folder)
 
 
-def _metres(text: str) -> float:
+def metres_of(text: str, option: str) -> float:
+    """Return the length that an option gives; OptionsError: it is none."""
     try:
         return positive(text)
     except (ValueError, argparse.ArgumentTypeError):
-        raise OptionsError(f'--known-distance: {text} is no distance above 0 m') from None
+        raise OptionsError(f'{option}: {text} is no length above 0 m') from None
 
 
 def _add_pose_options(parser: argparse.ArgumentParser) -> None:

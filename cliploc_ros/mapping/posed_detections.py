@@ -118,6 +118,12 @@ class PosedDetections:
         """Return the same detections with other poses (F, 4, 4)."""
         return replace(self, map_from_camera=map_from_camera)
 
+    def scaled(self, scale: float) -> 'PosedDetections':
+        """Return the same detections with positions times a scale."""
+        poses = self.map_from_camera.copy()
+        poses[:, :3, 3] *= scale
+        return self.with_poses(poses)
+
 
 def group_cameras(cameras: Sequence[Camera]) -> tuple[tuple[Camera, ...], NDArray[np.int64]]:
     """Return the cameras that stand for those of single images, and the row (F,) of each image.

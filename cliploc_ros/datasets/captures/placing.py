@@ -32,9 +32,9 @@ UP: Mapping[str, _Pose] = {
     'z': np.eye(3), 'y': np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
 
 # Pairs of images that tell the axes: with this much of a turn, which an error of axes turns round.
-_PAIRS, _TRIED, _REACH = 6, 12, 20
+_PAIRS, _TRIED, _REACH = 4, 12, 20
 _TURN_DEG = (4.0, 30.0)
-_FEATURES, _LONGEST_PX = 800, 640
+_FEATURES, _LONGEST_PX = 500, 480
 _LEAST_MATCHES = 25
 # Median epipolar errors at an image _LONGEST_PX wide [px]: a true choice has 0.3 to 2 of them.
 _GOOD_PX, _WRONG_PX, _BETTER = 3.0, 4.0, 0.35
