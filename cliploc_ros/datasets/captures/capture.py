@@ -119,15 +119,14 @@ def _sound(pose: NDArray[np.float64] | None, where: str) -> NDArray[np.float64] 
     """Return a rigid pose (4, 4); None where tracking was lost."""
     if pose is None or not np.isfinite(pose).all():
         return None
-    rotation = pose[:3, :3]
     if not is_rigid(pose, _ROTATION_TOLERANCE):
-        is_mirrored = np.abs(rotation).max() < 10.0 and np.linalg.det(rotation) < -0.5
+        is_mirrored = is_rigid(pose @ np.diag([1.0, 1.0, -1.0, 1.0]), _ROTATION_TOLERANCE)
         raise DatasetError(f'{where} is no rotation and translation' + (
-            ': it is a reflection; one axis points the other way: export with right-handed axes'
+            ': it is a reflection; export with right-handed axes'
             if is_mirrored else ': its axes have no unit length or are not at right angles'))
     if np.abs(pose[:3, 3]).max() > _MOST_M:
         raise DatasetError(f'{where} is {np.abs(pose[:3, 3]).max():.3g} m from the origin')
-    left, _, right = np.linalg.svd(rotation)
+    left, _, right = np.linalg.svd(pose[:3, :3])
     sound = pose.copy()
     sound[:3, :3] = left @ right
     return sound
