@@ -24,6 +24,7 @@ from hypothesis import strategies as st
 from cliploc_ros.datasets.folders import FolderOptions, read_folder
 from cliploc_ros.errors import CliplocError, DatasetError
 
+pytestmark = pytest.mark.needs('pycolmap')
 METRES = FolderOptions(scale=1.0)
 
 

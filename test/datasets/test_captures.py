@@ -30,6 +30,7 @@ from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.recording.networks import Look
 from cliploc_ros.recording.recorder import record_every_frame
 
+pytestmark = pytest.mark.needs('pycolmap')
 METRES = FolderOptions(scale=1.0)
 OPTIONS = MappingOptions(min_baseline_deg=5.0, estimate_pose_errors=False)
 
@@ -108,7 +109,8 @@ def test_text_models_and_per_frame_intrinsics_say_the_same(shots, tmp_path):
     ('OPENCV', [500, 505, 318, 244, 0.1, -0.05, 0.001, -0.002]),
     ('FULL_OPENCV', [500, 505, 318, 244, 0.1, -0.05, 0.001, -0.002, 0.01, 0.02, 0.01, 0.003]),
     ('OPENCV_FISHEYE', [300, 305, 318, 244, 0.1, -0.05, 0.01, -0.002]),
-    ('SIMPLE_RADIAL_FISHEYE', [300, 318, 244, 0.1]), ('RADIAL_FISHEYE', [300, 318, 244, 0.1, -0.02]),
+    ('SIMPLE_RADIAL_FISHEYE', [300, 318, 244, 0.1]),
+    ('RADIAL_FISHEYE', [300, 318, 244, 0.1, -0.02]),
     ('SIMPLE_FISHEYE', [300, 318, 244]), ('FISHEYE', [300, 305, 318, 244])])
 def test_camera_models_project_as_colmap_does(model, values, shots, tmp_path):
     import pycolmap

@@ -18,7 +18,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.datasets.folders import FolderOptions, read_folder
 
-ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+ASSETS = Path(__file__).resolve().parents[1] / 'cliploc_ros/demo/assets'
 WALK = ASSETS / 'mapping'
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 # ARKit's and HoloLens's map from one with z up
@@ -41,7 +41,7 @@ def shots_of(folder=WALK):
                  raw.color.args[0].camera) for raw in raws]
 
 
-def write_colmap(folder, shots, text=False, camera_of=None, scale=1.0, world=np.eye(4)):
+def write_colmap(folder, shots, text=False, camera_of=None, scale=1.0, world=None):
     """A project; camera_of(number) returns a camera's model, size and values."""
     import pycolmap
 
@@ -56,7 +56,7 @@ def write_colmap(folder, shots, text=False, camera_of=None, scale=1.0, world=np.
             camera = pycolmap.Camera(model=name, width=width, height=height, params=parameters)
             camera.camera_id = seen[repr(values)] = len(seen) + 1
             model.add_camera_with_trivial_rig(camera)
-        pose = world @ shot.pose
+        pose = shot.pose.copy() if world is None else world @ shot.pose
         pose[:3, 3] /= scale
         image = pycolmap.Image(name=f'walk/{shot.path.name}', camera_id=seen[repr(values)],
                                image_id=number,
@@ -75,7 +75,8 @@ def write_nerf(folder, shots, per_frame=False, **more):
     intrinsics = {'w': one.width, 'h': one.height, 'fl_x': one.fx, 'fl_y': one.fy,
                   'cx': one.cx + 0.5, 'cy': one.cy + 0.5, 'k1': 0.0, 'camera_model': 'OPENCV'}
     frames = [{'file_path': f'./images/{shot.path.name}', 'colmap_im_id': number,
-               'transform_matrix': (shot.pose @ FLIP).tolist(), **(intrinsics if per_frame else {})}
+               'transform_matrix': (shot.pose @ FLIP).tolist(),
+               **(intrinsics if per_frame else {})}
               for number, shot in enumerate(shots)]
     (folder / 'images').mkdir(parents=True)
     for shot in shots:
@@ -148,7 +149,8 @@ def write_arkitscenes(folder, shots):
         cv2.imwrite(str(folder / f'lowres_wide/41_{time}.png'), cv2.imread(str(shot.path)))
         cv2.imwrite(str(folder / f'lowres_depth/41_{time}.png'), DEPTH_MM)
         # their names may be a millisecond off
-        (folder / f'lowres_wide_intrinsics/41_{shot.stamp_ns / 1e9 + 0.001:.3f}.pincam').write_text(
+        near = f'{shot.stamp_ns / 1e9 + 0.001:.3f}'
+        (folder / f'lowres_wide_intrinsics/41_{near}.pincam').write_text(
             ' '.join(map(str, [one.width, one.height, one.fx, one.fy, one.cx, one.cy])))
     (folder / 'lowres_wide.traj').write_text('\n'.join(rows))
     return folder
