@@ -18,10 +18,10 @@ from cliploc_ros.cli.sources import (
     add_network_options,
     add_topic_options,
     camera_names,
+    check_folder_options,
     clip_options,
     detector_options,
     mount_of,
-    placing_of,
     read_named_folder,
 )
 from cliploc_ros.command import not_negative, positive_int, run_main, within
@@ -185,6 +185,7 @@ def evaluate(options: argparse.Namespace) -> int:
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):
         raise OptionsError('--cameras is for --bag, without --fuse and --save-queries')
+    check_folder_options(options)
     landmark_map = join_maps([LandmarkMap.from_file(file) for file in options.map],
                              [str(file) for file in options.map])
     if options.watch is not None:
@@ -340,7 +341,7 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
     print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
     reading = repr([options.every, options.intrinsics, options.image, options.camera_info,
                     options.ground_truth, options.body_from_camera, options.rectified,
-                    *([camera] if camera else []), *placing_of(options)])
+                    *([camera] if camera else [])])
     recording = RecordingOptions(detector_options(options), clip_options(options), EVERY_FRAME,
                                  reading, options.workers or 1, options.scheduler)
     queries = recorded_queries(frames, landmark_map, recording, list(map(str, options.map)),

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'max_gap', 'image',
             'camera_info', 'rectified', 'depth', 'depth_unit', 'depth_intrinsics',
             'depth_baseline', 'intrinsics')
-# So do these, where they are given.
+# Of folders only.
 _PLACING = ('images', 'axes', 'scale', 'known_distance', 'level')
 
 
@@ -219,6 +219,7 @@ def read_source(options: argparse.Namespace) -> 'Recorded':
     if options.bag is None and (options.odometry_topic or options.odometry_frame):
         raise OptionsError('--odometry-topic and --odometry-frame are for --bag')
     camera_names(options)
+    check_folder_options(options)
     if options.observations is not None:
         return load_recorded(options.observations)
     if options.workers < 1:
@@ -229,15 +230,16 @@ def read_source(options: argparse.Namespace) -> 'Recorded':
         detector_options(options, conf=options.conf),
         clip_options(options) if options.clip else None, KeyframeOptions(*options.keyframes),
         repr([str(getattr(options, name)) for name in _READING]
-             + (options.cameras if options.cameras != [''] else []) + placing_of(options)),
-        options.workers,
+             + (options.cameras if options.cameras != [''] else [])), options.workers,
         options.scheduler), options.record_to, _odometry(options))
 
 
-def placing_of(options: argparse.Namespace) -> list[str]:
-    """Return the given options that place the poses of a folder."""
-    return [f'{name}={value}' for name in _PLACING
-            if (value := getattr(options, name)) not in (None, False)]
+def check_folder_options(options: argparse.Namespace) -> None:
+    """Refuse options of folders with another source; OptionsError names them."""
+    given = [f'--{name.replace("_", "-")}' for name in _PLACING
+             if getattr(options, name) not in (None, False)]
+    if given and folder_of(options) is None:
+        raise OptionsError(f'{", ".join(given)}: for folders of images only')
 
 
 def source_of(options: argparse.Namespace) -> Path:

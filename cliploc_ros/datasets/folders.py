@@ -5,6 +5,7 @@
 TUM RGB-D, with or without depth, and 7-Scenes are read here, the others in ``captures``.
 """
 
+import hashlib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -116,6 +117,8 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
                                     or options.body_from_camera is not None):
         raise DatasetError(f'{folder}: {layout.name} has its own cameras and poses: '
                            '--intrinsics, --trajectory and --mount are for TUM RGB-D')
+    if options.images is not None and layout.key not in ('colmap', 'nerf'):
+        raise DatasetError(f'{folder}: --images is for COLMAP and transforms.json')
     try:
         return _placed(folder, layout, layout.read(folder, options), options)
     except OSError as error:
@@ -163,9 +166,13 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
     elif options.level:
         raise DatasetError(f'{folder}: the cameras do not tell the vertical: they turn too '
                            'little, or were held on their side; leave out --level')
-    return folder_frames(folder, files, poses, replace(
+    frames = folder_frames(folder, files, poses, replace(
         capture.depth, unit_m=options.depth.unit_m or capture.depth.unit_m,
-        camera=options.depth.camera or capture.depth.camera), tuple(filter(None, notes)))
+        camera=options.depth.camera or capture.depth.camera))
+    known = [(file.color.name, file.camera, np.round(pose, 6).tolist())
+             for file, pose in poses.all_of(files)]
+    return replace(frames, digest=hashlib.sha256(repr(known).encode()).hexdigest()[:12],
+                   notes=tuple(filter(None, notes)))
 
 
 def tum_frames(sequence: TumSequence, camera: Camera, options: FolderOptions = _NO_OPTIONS

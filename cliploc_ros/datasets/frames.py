@@ -79,6 +79,7 @@ class Frames:
     #: The frames of each of several cameras; empty for one
     of_cameras: tuple['Frames', ...] = ()
     varies: bool = False  #: Whether each image has a camera of its own
+    digest: str = ''  #: Of poses and cameras, which may change while the folder does not
     notes: tuple[str, ...] = ()  #: What the user should know about how they were read
 
     @property
@@ -98,7 +99,8 @@ class Frames:
         def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
             return self.read_raw(lambda place, stamp_ns, pose: place in chosen
                                  and is_wanted(place, stamp_ns, pose))
-        return Frames(self.source, len(chosen), read_raw, varies=self.varies, notes=self.notes)
+        return Frames(self.source, len(chosen), read_raw, varies=self.varies, digest=self.digest,
+                      notes=self.notes)
 
 
 def join_frames(of_cameras: Mapping[str, Frames]) -> Frames:
@@ -137,7 +139,7 @@ class DepthFormat:
 
 
 def folder_frames(folder: Path, files: Sequence[ImageFile], poses: Poses,
-                  depth: DepthFormat | None = None, notes: tuple[str, ...] = ()) -> Frames:
+                  depth: DepthFormat | None = None) -> Frames:
     """Return the frames of image files.
 
     DatasetError: the poses are of another time than the images.
@@ -152,7 +154,7 @@ def folder_frames(folder: Path, files: Sequence[ImageFile], poses: Poses,
                 yield RawFrame(place, file.stamp_ns, pose, partial(read_color, file),
                                None if file.depth is None else partial(_read_depth, file, form))
     return Frames(folder, len(files), read_raw,
-                  varies=any(file.camera != files[0].camera for file in files), notes=notes)
+                  varies=any(file.camera != files[0].camera for file in files))
 
 
 def read_color(file: ImageFile) -> tuple[NDArray[np.uint8], Camera]:

@@ -135,7 +135,8 @@ def describe(frames: Frames, options: RecordingOptions) -> str:
     if clip is not None:
         files += [clip.model, clip.pretrained, clip.checkpoint_path]
     return json.dumps({
-        'source': [frames.source.name, _state(frames.source.resolve()), frames.count],
+        'source': [frames.source.name, _state(frames.source.resolve()), frames.count,
+                   *([frames.digest] if frames.digest else [])],
         'yolo': _settings(options.detector), 'clip': None if clip is None else _settings(clip),
         # the path of '' would be the working folder, which changes with every file written there
         'files': [_state(Path(file)) if file else None for file in files],

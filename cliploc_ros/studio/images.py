@@ -96,10 +96,14 @@ def views_of_folder(path: Path) -> PosedDetections:
     layout = find_layout(path)
     if layout is None:
         raise DatasetError(f'{path}: has no poses to look from; give --observations, too')
-    posed, cameras, files = [], [], layout.read(path, FolderOptions()).files
+    capture = layout.read(path, FolderOptions())
+    if not capture.is_metric:
+        raise DatasetError(f'{path}: {layout.name} does not know its unit; give --observations, '
+                           'too: build_map makes them, with --scale')
+    posed, cameras = [], []
     for raw in read_folder(path).read_raw(lambda place, stamp_ns, pose: pose is not None):
         posed.append((raw.stamp_ns, raw.map_from_camera))
-        cameras.append(files[raw.place].camera.pinhole)
+        cameras.append(capture.files[raw.place].camera.pinhole)
     if not posed:
         raise DatasetError(f'{path}: no image has a pose')
     each, rows = group_cameras(cameras)

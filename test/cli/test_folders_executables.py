@@ -13,6 +13,7 @@ from cliploc_ros.cli.evaluate import main as evaluate
 from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.errors import DatasetError
 from cliploc_ros.studio.images import open_images
 
 pytestmark = pytest.mark.needs('pycolmap')
@@ -74,3 +75,13 @@ def test_options_that_do_not_go_together(options, expected, tmp_path, capsys):
     assert run(build_map, '--colmap', folder, *NETWORKS, '--no-clip', '--out',
                tmp_path / 'map.yaml', *options) == 1
     assert expected in capsys.readouterr().err
+
+
+def test_options_of_folders_with_other_sources(tmp_path, capsys):
+    assert run(build_map, '--observations', tmp_path / 'o.npz', '--out', tmp_path / 'map.yaml',
+               '--level', '--scale', 2) == 1
+    assert '--scale, --level: for folders of images only' in capsys.readouterr().err
+    folder = write_colmap(tmp_path / 'scan', shots_of()[:2])
+    with pytest.raises(DatasetError, match='does not know its unit; give --observations, too'):
+        open_studio(make_parser().parse_args([str(tmp_path / 'map.yaml'), '--images',
+                                              str(folder)]))

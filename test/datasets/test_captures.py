@@ -30,7 +30,11 @@ from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.recording.networks import Look
-from cliploc_ros.recording.recorder import record_every_frame
+from cliploc_ros.recording.recorder import (
+    RecordingOptions,
+    observation_file,
+    record_every_frame,
+)
 
 pytestmark = pytest.mark.needs('pycolmap')
 METRES = FolderOptions(scale=1.0)
@@ -156,6 +160,18 @@ def test_images_with_their_own_cameras(shots, look, original, tmp_path):
     assert again.frame_cameras.tolist() == [0] + [1] * (len(shots) - 1)
     made = build_map(again, OPTIONS).landmark_map
     assert isinstance(made, LandmarkMap) and len(made) > 20
+
+
+def test_another_model_in_the_same_folder_is_recorded_again(shots, tmp_path):
+    folder = write_colmap(tmp_path / 'scan', shots[:5])
+    options = RecordingOptions(DetectorOptions(), None)
+    before = observation_file(read_folder(folder, METRES), options)
+    assert observation_file(read_folder(folder, METRES), options) == before
+    assert observation_file(read_folder(folder, FolderOptions(scale=2.0)), options) != before
+    other = write_colmap(tmp_path / 'other', [shot._replace(pose=shots[0].pose)
+                                              for shot in shots[:5]])
+    (folder / 'sparse/0/images.bin').write_bytes((other / 'sparse/0/images.bin').read_bytes())
+    assert observation_file(read_folder(folder, METRES), options) != before
 
 
 def test_a_video_is_read_image_by_image(shots, tmp_path):

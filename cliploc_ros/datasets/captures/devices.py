@@ -5,6 +5,7 @@
 Their trackers measure in metres and know the vertical: ARKit and HoloLens have y up.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -36,6 +37,8 @@ _IN_MILLIMETRES = DepthFormat(MILLIMETRE)
 _TICK_NS, _TICKS_TO_1970 = 100, 116_444_736_000_000_000
 # ARKitScenes rounds the times of its files to a millisecond.
 _ROUNDING_S = 0.001
+# Its poses come at 10 Hz, its images up to 60 Hz.
+_MAX_GAP_NS = 200_000_000
 
 
 def is_polycam(folder: Path) -> bool:
@@ -169,6 +172,7 @@ def read_arkitscenes(folder: Path) -> Capture:
         [_stamp_ns(row[0]) or 0 for row in rows],
         [[*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()] for pose in poses],
         str(path))
+    known = replace(known, max_gap_ns=_MAX_GAP_NS)
     kind = 'vga_wide' if (folder / 'vga_wide').is_dir() else 'lowres_wide'
     shots = []
     for color in sorted((folder / kind).glob('*.png')):
