@@ -22,6 +22,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.folders import FolderOptions, find_layout, read_folder
+from cliploc_ros.datasets.frames import undistorted
 from cliploc_ros.datasets.observations import load_observations, save_observations
 from cliploc_ros.errors import MappingError
 from cliploc_ros.make_map import scale_of_objects
@@ -101,7 +102,13 @@ def test_text_models_and_per_frame_intrinsics_say_the_same(shots, tmp_path):
     for text in (False, True):
         write_colmap(tmp_path / f'{text}', shots[:5], text)
     write_nerf(tmp_path / 'nerf', shots[:5], per_frame=True)
-    for folder in ('False', 'True', 'nerf', 'True/sparse/0', 'nerf/transforms.json'):
+    # without points, every second line is empty
+    bare = write_colmap(tmp_path / 'bare', shots[:5], text=True) / 'sparse/0/images.txt'
+    lines = bare.read_text().splitlines()
+    first = next(row for row, line in enumerate(lines) if not line.startswith('#'))
+    bare.write_text('\r\n'.join([*lines[:first], *(
+        '' if row % 2 else line for row, line in enumerate(lines[first:]))]))
+    for folder in ('bare', 'False', 'True', 'nerf', 'True/sparse/0', 'nerf/transforms.json'):
         frames = read_folder(tmp_path / folder, METRES)
         poses = [raw.map_from_camera for raw in frames.read_raw(lambda *_: True)]
         np.testing.assert_allclose(poses, [shot.pose for shot in shots[:5]], atol=1e-9)
@@ -204,3 +211,16 @@ def test_the_scale_by_a_distance_and_by_objects(shots, look, original, tmp_path)
     assert scale == pytest.approx(0.4, rel=0.02) and objects == len(rows)
     with pytest.raises(MappingError, match="no object of class 'unicorn' is mapped; there are "):
         scale_of_objects(detections, OPTIONS, 'unicorn', metres)
+
+
+def test_a_large_image_is_undistorted_as_its_pixels_are():
+    camera = Camera(2400, 1800, 1700.0, 1700.0, 1200.0, 900.0, 'plumb_bob',
+                    (0.1, -0.05, 0.001, 0.002))
+    ramp = np.zeros((1800, 2400, 3), dtype=np.uint8)
+    ramp[..., 0], ramp[..., 1] = np.arange(2400) / 10, np.arange(1800)[:, None] / 10
+    rows, columns = np.random.default_rng(0).integers(100, (1700, 2300), (2000, 2)).T
+    places = camera.project_normalized(camera.pinhole.normalize_points(
+        np.stack([columns, rows], axis=1)))
+    found = undistorted(ramp, camera)[rows, columns, :2]
+    inside = ((places > 0) & (places < (2399, 1799))).all(axis=1)
+    assert inside.mean() > 0.9 and np.abs(found - places / 10)[inside].max() < 1.1
