@@ -13,7 +13,7 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.frames import Frames
-from cliploc_ros.errors import ModelError
+from cliploc_ros.errors import MappingError, ModelError
 from cliploc_ros.mapping.building import MappingReport, build_map
 from cliploc_ros.mapping.labelling import classes_of, embed_landmarks, label_landmarks
 from cliploc_ros.mapping.options import MappingOptions, PoseErrors
@@ -29,6 +29,8 @@ from cliploc_ros.vocabulary.vocabulary import Vocabulary, load_vocabulary, shipp
 # Standard deviations of poses that a localizer gives [m] [deg]. Guesses; the map holds on to exact
 # ones all the same.
 _USUAL_NOISE = PoseErrors(0.05, 1.0)
+# Trial maps that find a scale by objects of known size, and when it has settled.
+_TRIALS, _SAME_SIZE = 4, 0.01
 
 
 @dataclass(frozen=True)
@@ -159,6 +161,36 @@ def make_map(detections: PosedDetections, labeller: Labeller,
     return MadeMap(landmark_map, built.report, embeddings,
                    None if frames is None or layer is None
                    else build_layer(frames, landmark_map, layer), built.mount)
+
+
+def scale_of_objects(detections: PosedDetections, options: MappingOptions, class_name: str,
+                     metres: float) -> tuple[float, int]:
+    """Return metres of a unit of the poses, by the longest extent of the objects of a class [m].
+
+    Of the objects of a trial map the median counts. Mapping knows sizes in metres, so that the
+    trial is repeated with the scale found. The number of these objects is returned, too.
+
+    Raises
+    ------
+    MappingError
+        The detections have depth, which says the scale, or no object of the class is mapped.
+    """
+    if detections.depths is not None:
+        raise MappingError('--object-size: the recording has depth, which is in metres; give '
+                           '--scale where the poses are not')
+    scale = 1.0
+    for _ in range(_TRIALS):
+        built = build_map(detections.scaled(scale), options).landmark_map
+        own = [row for row, one in enumerate(built.class_ids) if one == class_name]
+        if not own:
+            raise MappingError(
+                f"--object-size: no object of class '{class_name}' is mapped; there are "
+                f'{", ".join(sorted(set(built.class_ids)))}')
+        step = metres / float(np.median(2.0 * built.semi_axes[own].max(axis=1)))
+        scale *= step
+        if abs(step - 1.0) < _SAME_SIZE:
+            break
+    return scale, len(own)
 
 
 def update_map(path: Path, detections: PosedDetections, labeller: Labeller,

@@ -20,6 +20,7 @@ from cliploc_ros.cli.map_layer import (
 from cliploc_ros.cli.sources import (
     add_source_options,
     clip_options,
+    metres_of,
     mount_of,
     read_source,
     source_of,
@@ -31,7 +32,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from cliploc_ros.mapping.options import PoseErrors
+    from cliploc_ros.mapping.options import MappingOptions, PoseErrors
+    from cliploc_ros.mapping.posed_detections import PosedDetections
 
 EPILOG = """\
 examples:
@@ -42,6 +44,8 @@ examples:
   build_map --observations office.npz --out office.yaml
   build_map --observations office.npz --out office.yaml --pose-noise 0.05 1
   build_map --observations office.npz --out office.yaml --vocabulary our_things.yaml
+  build_map --folder phone_scan --out office.yaml
+  build_map --colmap office --known-distance a.jpg b.jpg 1.5 --level --out office.yaml
   build_map --observations office.npz --out office.yaml --every 5 --report office.json
   build_map --rgbd kitchen --out kitchen.yaml --keyframe-layer
   build_map --bag today --map-frame map --update office.yaml --out office.yaml --report today.json
@@ -73,6 +77,9 @@ def make_parser() -> argparse.ArgumentParser:
     labels = parser.add_argument_group('labels')
     labels.add_argument('--vocabulary', type=Path, metavar='FILE',
                         help='phrases by class (YAML), besides the shipped ones')
+    parser.add_argument('--object-size', nargs=2, metavar=('CLASS', 'METRES'),
+                        help='the longest extent of the objects of a class, which says the scale '
+                        'of the poses')
     add_layer_options(parser)
     poses = parser.add_argument_group('poses with errors')
     poses.add_argument('--joint', action=argparse.BooleanOptionalAction,
@@ -119,6 +126,8 @@ def build(options: argparse.Namespace) -> int:
         source=f'build_map {name}', random_seed=options.seed)
     recorded = read_source(options)
     detections = recorded.detections
+    if options.object_size is not None:
+        detections = _scaled(detections, options, mapping)
     if recorded.without_pose:
         print(f'no pose: {recorded.without_pose} of {recorded.images} images', flush=True)
     if options.every > 1:
@@ -159,11 +168,26 @@ def _check(options: argparse.Namespace) -> None:
     if path.is_dir():
         raise MappingError(f'{path} is a folder; name the map file to write')
     check_layer_options(options)
+    if options.object_size is not None and (options.scale or options.known_distance
+                                            or options.update is not None):
+        raise OptionsError('--object-size is not for --scale, --known-distance or --update')
     if options.refine_mount and options.update is not None:
         raise OptionsError('--refine-mount is for new maps, not for --update')
     if options.refine_mount and len(options.cameras) > 1:
         raise OptionsError('--refine-mount is for one camera: correct each with a map of '
                            '--cameras NAME alone')
+
+
+def _scaled(detections: 'PosedDetections', options: argparse.Namespace, mapping: 'MappingOptions'
+            ) -> 'PosedDetections':
+    """Return detections with poses in metres, by the size of known objects."""
+    from cliploc_ros.make_map import scale_of_objects
+
+    class_name, metres = options.object_size[0], metres_of(options.object_size[1], '--object-size')
+    scale, objects = scale_of_objects(detections, mapping, class_name, metres)
+    print(f'a unit is {scale:.5g} m, by {objects} objects of class {class_name}', flush=True)
+    options.scale = scale  # for the images of the keyframes
+    return detections.scaled(scale)
 
 
 def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':

@@ -13,12 +13,16 @@ from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.cli.sources import (
+    add_folder_options,
+    add_folders,
     add_network_options,
     add_topic_options,
     camera_names,
+    check_folder_options,
     clip_options,
     detector_options,
     mount_of,
+    read_named_folder,
 )
 from cliploc_ros.command import not_negative, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
@@ -47,6 +51,7 @@ methods: {', '.join(PAPER_METHODS)};
 
 examples:
   evaluate --queries office.npz --map office.yaml --methods all --trials 5
+  evaluate --folder second_walk --map office.yaml --methods auto --every 5
   evaluate --bag office --map office.yaml --image /camera/image_raw --save-queries office.npz
   evaluate --queries office.npz --map office.yaml --methods auto --gravity --height-range 0.8 2.2
   evaluate --queries office.npz --map office.yaml --methods auto --fuse --odometry-noise 0.01 0.5
@@ -73,6 +78,7 @@ def make_parser() -> argparse.ArgumentParser:
                          help='recorded boxes and similarities')
     sources.add_argument('--bag', type=Path, help='a rosbag2 recording with ground truth')
     sources.add_argument('--tum', type=Path, metavar='DIR', help='a TUM RGB-D folder')
+    add_folders(sources)
     parser.add_argument('--map', type=Path, nargs='+', required=True, metavar='YAML',
                         help='several maps are searched as one; true poses are in the first')
     parser.add_argument('--methods', nargs='+', default=[ALL], metavar='M',
@@ -93,10 +99,11 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--resume', action='store_true', help='continue an unfinished run')
     parser.add_argument('--no-figures', dest='figures', action='store_false')
     add_use_option(parser, f"'{AUTO}' uses the keyframes of the map, as the relocalizer does; "
-                   'needs the images of --bag or --tum')
+                   'needs the images of --bag or a folder')
     _add_paper_options(parser)
     _add_sensor_options(parser)
     _add_recording_options(parser)
+    add_folder_options(parser)
     return parser
 
 
@@ -134,7 +141,7 @@ def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_recording_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('options of --bag and --tum')
+    group = parser.add_argument_group('options of --bag and folders')
     group.add_argument('--save-queries', type=Path, metavar='NPZ',
                        help='write the recorded boxes and similarities, for --queries')
     add_network_options(group)
@@ -142,8 +149,9 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
                        help="compare crops with the map's labels (text), with the images next to "
                        'it, or with both (%(default)s)')
     group.add_argument('--every', type=positive_int, default=1, metavar='N',
-                       help='use every N-th image of --tum')
-    group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE', help='of --tum')
+                       help='use every N-th image of a folder')
+    group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE',
+                       help='camera of TUM RGB-D and 7-Scenes')
     add_topic_options(group)
     group.add_argument('--sync-tolerance', type=not_negative, default=0.05, metavar='SECONDS',
                        help='images of several --cameras within this time are of one instant, and '
@@ -177,6 +185,7 @@ def evaluate(options: argparse.Namespace) -> int:
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):
         raise OptionsError('--cameras is for --bag, without --fuse and --save-queries')
+    check_folder_options(options)
     landmark_map = join_maps([LandmarkMap.from_file(file) for file in options.map],
                              [str(file) for file in options.map])
     if options.watch is not None:
@@ -273,7 +282,7 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
     elif len(options.map) > 1:
         problem = 'several maps are searched by objects only'
     elif options.queries is not None:
-        problem = '--queries has no images: give --bag or --tum'
+        problem = '--queries has no images: give --bag or a folder'
     if not problem:
         return read_layer(options.map[0], landmark_map, wanted)
     if wanted:
@@ -326,9 +335,10 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
 
     if options.queries is not None:
         if options.save_queries is not None:
-            raise OptionsError('--save-queries needs --bag or --tum')
+            raise OptionsError('--save-queries needs --bag or a folder')
         return load_queries(options.queries, landmark_map.landmark_ids)
     frames = _frames(options, camera)
+    print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
     reading = repr([options.every, options.intrinsics, options.image, options.camera_info,
                     options.ground_truth, options.body_from_camera, options.rectified,
                     *([camera] if camera else [])])
@@ -348,13 +358,11 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
 def _frames(options: argparse.Namespace, camera: str) -> 'Frames':
     from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames, topic_of
     from cliploc_ros.datasets.bag_poses import poses_of_topic
-    from cliploc_ros.datasets.folders import tum_frames
-    from cliploc_ros.datasets.intrinsics import find_camera
-    from cliploc_ros.datasets.tum import read_tum
+    from cliploc_ros.datasets.folders import FolderOptions
 
-    if options.tum is not None:
-        sequence = read_tum(options.tum).every(options.every)
-        return tum_frames(sequence, find_camera(options.intrinsics, options.tum)[0])
+    if options.bag is None:
+        frames = read_named_folder(options, FolderOptions(options.intrinsics))
+        return frames.select(range(0, frames.count, options.every))
     topics = BagTopics(options.image, options.camera_info, options.rectified)
     return bag_frames(
         options.bag, topics.of_camera(camera),

@@ -45,8 +45,8 @@ def check_layer_options(options: argparse.Namespace) -> None:
     for name in ('observations', 'update'):
         if getattr(options, name) is not None:
             raise OptionsError(f'--keyframe-layer is not for --{name}: keyframes need the images '
-                               'of the recording that the map is built from; give --bag, --tum or '
-                               '--rgbd')
+                               'of the recording that the map is built from; give --bag or a '
+                               'folder')
     if options.every > 1:
         raise OptionsError('--keyframe-layer is not for --every: choose frames with '
                            '--keyframes METRES DEGREES')

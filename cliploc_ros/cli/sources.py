@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cliploc_ros.command import positive
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES, with_detector, with_encoder
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from cliploc_ros.datasets.bag_poses import ReadPoses
+    from cliploc_ros.datasets.folders import FolderOptions
     from cliploc_ros.datasets.frames import DepthFormat, Frames
     from cliploc_ros.datasets.observations import Recorded
     from cliploc_ros.datasets.poses import Poses
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
 _READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'max_gap', 'image',
             'camera_info', 'rectified', 'depth', 'depth_unit', 'depth_intrinsics',
             'depth_baseline', 'intrinsics')
+# Of folders only.
+_PLACING = ('images', 'axes', 'scale', 'known_distance', 'level')
 
 
 def add_network_options(group: Any) -> None:
@@ -67,15 +71,78 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
     sources.add_argument('--tum', type=Path, metavar='DIR', help='a TUM RGB-D folder, no depth')
     sources.add_argument('--rgbd', type=Path, metavar='DIR',
                          help='a folder with depth: TUM RGB-D or 7-Scenes')
+    add_folders(sources)
     sources.add_argument('--observations', type=Path, metavar='NPZ',
                          help='boxes and poses that were recorded before')
     _add_pose_options(parser)
+    add_folder_options(parser)
     _add_image_options(parser)
     _add_network_options(parser)
 
 
+def add_folders(group: Any) -> None:
+    """Add the options that name a folder of other layouts to a group of a parser."""
+    group.add_argument('--folder', type=Path, metavar='DIR',
+                       help='a folder of any known layout, with its depth: TUM RGB-D, 7-Scenes, '
+                       'Polycam, Record3D, Stray Scanner, ARKitScenes, HoloLens 2, '
+                       'transforms.json, COLMAP')
+    group.add_argument('--colmap', type=Path, metavar='DIR',
+                       help='a COLMAP model, or a project with sparse/0 and images/')
+    group.add_argument('--nerf', type=Path, metavar='DIR',
+                       help='a transforms.json of nerfstudio or Instant-NGP, or its folder')
+
+
+def add_folder_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say what poses of a folder mean."""
+    group = parser.add_argument_group('poses of --folder, --colmap and --nerf')
+    group.add_argument('--images', type=Path, metavar='DIR',
+                       help='where the images of --colmap or --nerf are, if not beside them')
+    group.add_argument('--scale', type=positive, metavar='METRES', help='of a unit of the poses')
+    group.add_argument('--known-distance', nargs=3, metavar=('IMAGE_A', 'IMAGE_B', 'METRES'),
+                       help='between the cameras of two images: another way to say the scale')
+    group.add_argument('--level', action='store_true',
+                       help='turn z up, by the tilt of the cameras')
+    group.add_argument('--axes', choices=('opencv', 'opengl', 'opencv-inverse', 'opengl-inverse'),
+                       help='what the poses are: of cameras with these axes, or inverse '
+                       "(the layout's own)")
+
+
+def folder_of(options: argparse.Namespace) -> 'tuple[Path, str] | None':
+    """Return the folder that the command line names and the key of its layout; '' to find it."""
+    named = {'tum': 'tum', 'rgbd': 'rgbd', 'folder': '', 'colmap': 'colmap', 'nerf': 'nerf'}
+    return next(((getattr(options, name), key) for name, key in named.items()
+                 if getattr(options, name, None) is not None), None)
+
+
+def read_named_folder(options: argparse.Namespace, folder: 'FolderOptions') -> 'Frames':
+    """Return the images of the folder that the command line names, and print what is to know."""
+    from cliploc_ros.datasets.folders import read_folder, rgbd_frames
+
+    found = folder_of(options)
+    assert found is not None
+    path, key = found
+    distance = None
+    if options.known_distance is not None:
+        first, second, metres = options.known_distance
+        distance = first, second, metres_of(metres, '--known-distance')
+    if distance is not None and options.scale is not None:
+        raise OptionsError('give --scale or --known-distance, not both')
+    folder = replace(folder, layout=key, images=options.images, axes=options.axes,
+                     scale=options.scale, known_distance=distance, level=options.level,
+                     any_unit=getattr(options, 'object_size', None) is not None)
+    return rgbd_frames(path, folder) if key == 'rgbd' else read_folder(path, folder)
+
+
+def metres_of(text: str, option: str) -> float:
+    """Return the length that an option gives; OptionsError: it is none."""
+    try:
+        return positive(text)
+    except (ValueError, argparse.ArgumentTypeError):
+        raise OptionsError(f'{option}: {text} is no length above 0 m') from None
+
+
 def _add_pose_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('poses of --bag and --tum')
+    group = parser.add_argument_group('poses of --bag and TUM RGB-D')
     group.add_argument('--pose-topic', metavar='TOPIC',
                        help='PoseStamped, PoseWithCovarianceStamped or Odometry')
     group.add_argument('--map-frame', metavar='FRAME',
@@ -109,11 +176,11 @@ def add_topic_options(group: Any) -> None:
 
 
 def _add_image_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('images and depth of --bag, --tum and --rgbd')
+    group = parser.add_argument_group('images and depth of --bag and folders')
     add_topic_options(group)
     group.add_argument('--depth', metavar='TOPIC', help='depth registered to the images of --bag')
     group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE',
-                       help='camera of --tum and --rgbd, where the folder does not say it')
+                       help='camera of TUM RGB-D and 7-Scenes, where the folder does not say it')
     group.add_argument('--depth-unit', type=float, metavar='METRES',
                        help='one count of a depth image (0.001; 0.0002 for TUM; 1 for floats)')
     group.add_argument('--depth-intrinsics', type=float, nargs=4,
@@ -152,11 +219,14 @@ def read_source(options: argparse.Namespace) -> 'Recorded':
     if options.bag is None and (options.odometry_topic or options.odometry_frame):
         raise OptionsError('--odometry-topic and --odometry-frame are for --bag')
     camera_names(options)
+    check_folder_options(options)
     if options.observations is not None:
         return load_recorded(options.observations)
     if options.workers < 1:
         raise OptionsError(f'--workers {options.workers}: give 1 or more')
-    return record_once(read_frames(options), RecordingOptions(
+    frames = read_frames(options)
+    print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
+    return record_once(frames, RecordingOptions(
         detector_options(options, conf=options.conf),
         clip_options(options) if options.clip else None, KeyframeOptions(*options.keyframes),
         repr([str(getattr(options, name)) for name in _READING]
@@ -164,9 +234,18 @@ def read_source(options: argparse.Namespace) -> 'Recorded':
         options.scheduler), options.record_to, _odometry(options))
 
 
+def check_folder_options(options: argparse.Namespace) -> None:
+    """Refuse options of folders with another source; OptionsError names them."""
+    given = [f'--{name.replace("_", "-")}' for name in _PLACING
+             if getattr(options, name) not in (None, False)]
+    if given and folder_of(options) is None:
+        raise OptionsError(f'{", ".join(given)}: for folders of images only')
+
+
 def source_of(options: argparse.Namespace) -> Path:
     """Return the folder or file that the command line names."""
-    return Path(options.bag or options.tum or options.rgbd or options.observations)
+    found = folder_of(options)
+    return found[0] if found is not None else Path(options.bag or options.observations)
 
 
 def read_frames(options: argparse.Namespace) -> 'Frames':
@@ -174,10 +253,9 @@ def read_frames(options: argparse.Namespace) -> 'Frames':
 
     CliplocError: the source or the options cannot be used.
     """
-    from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
+    from cliploc_ros.datasets.folders import FolderOptions
     from cliploc_ros.datasets.frames import join_frames
-    from cliploc_ros.datasets.intrinsics import find_camera
-    from cliploc_ros.datasets.tum import read_tum, read_tum_trajectory
+    from cliploc_ros.datasets.tum import read_tum_trajectory
 
     names, mounts = camera_names(options), _mounts(options)
     if options.bag is not None:
@@ -185,15 +263,11 @@ def read_frames(options: argparse.Namespace) -> 'Frames':
         return of_cameras[''] if names == [''] else join_frames(of_cameras)
     if options.pose_topic or options.map_frame or options.depth:
         raise OptionsError('--pose-topic, --map-frame and --depth are for --bag')
-    folder = FolderOptions(
+    return read_named_folder(options, FolderOptions(
         options.intrinsics,
         None if options.trajectory is None else read_tum_trajectory(options.trajectory),
         round(options.max_gap * NS_PER_S),
-        mounts[''], _depth_format(options))
-    if options.rgbd is not None:
-        return rgbd_frames(options.rgbd, folder)
-    return tum_frames(read_tum(options.tum), find_camera(options.intrinsics, options.tum)[0],
-                      folder)
+        mounts[''], _depth_format(options)))
 
 
 def camera_names(options: argparse.Namespace) -> list[str]:

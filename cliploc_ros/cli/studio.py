@@ -54,7 +54,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--observations', type=Path, metavar='NPZ',
                         help='boxes and poses of a recording of the place')
     parser.add_argument('--images', type=Path, metavar='BAG|DIR',
-                        help='a rosbag2 recording or a TUM folder with the images of the views')
+                        help='a rosbag2 recording, or a folder as of build_map --folder, with the '
+                        'images of the views')
     add_topic_options(parser)
     parser.add_argument('--clip-model', metavar='NAME|JSON',
                         help='offer the five phrases that this CLIP finds best, as build_map')

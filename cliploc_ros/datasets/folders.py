@@ -1,10 +1,16 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Folders of images with poses: TUM RGB-D, with or without depth, and 7-Scenes."""
+"""Folders of images with poses: the table of their layouts, and the one reader of all of them.
 
+TUM RGB-D, with or without depth, and 7-Scenes are read here, the others in ``captures``.
+"""
+
+import hashlib
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +20,29 @@ from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     is_rigid,
     make_transform,
+)
+from cliploc_ros.datasets.captures.capture import Capture, StampedPoses
+from cliploc_ros.datasets.captures.colmap import is_colmap, read_colmap
+from cliploc_ros.datasets.captures.devices import (
+    is_arkitscenes,
+    is_hololens,
+    is_polycam,
+    is_record3d,
+    is_stray,
+    read_arkitscenes,
+    read_hololens,
+    read_polycam,
+    read_record3d,
+    read_stray,
+)
+from cliploc_ros.datasets.captures.nerf import is_nerf, read_nerf
+from cliploc_ros.datasets.captures.placing import (
+    UP,
+    PlacedPoses,
+    check_axes,
+    find_scale,
+    find_vertical,
+    rotation_to_z,
 )
 from cliploc_ros.datasets.depth import MILLIMETRE, TUM_UNIT, DepthCamera
 from cliploc_ros.datasets.frames import DepthFormat, Frames, ImageFile, folder_frames
@@ -32,6 +61,8 @@ _SEVEN_SCENES_NAME = re.compile(r'frame-(\d+)\.color\.(?:jpe?g|png)')
 _SEVEN_SCENES_HZ = 30
 _MAX_DEPTH_DELAY_NS = 20_000_000
 _NO_CHANGE = DepthFormat()
+# A vertical by the tilt of hand-held cameras is as good as this.
+_MOST_TILT_DEG = 5.0
 
 
 @dataclass(frozen=True)
@@ -44,18 +75,117 @@ class FolderOptions:
     #: (4, 4): how the camera is mounted on what the poses are of
     body_from_camera: NDArray[np.float64] | None = None
     depth: DepthFormat = _NO_CHANGE  #: What differs from the folder's usual format
+    layout: str = ''  #: Key of one of LAYOUTS; '': the one whose files are there
+    images: Path | None = None  #: Folder of the images of colmap and nerf
+    axes: str | None = None  #: What the stored poses are, one of AXES; None: by the layout
+    scale: float | None = None  #: Metres of a stored unit
+    #: Two images, and the distance between their cameras [m]: another way to say the scale
+    known_distance: tuple[str, str, float] | None = None
+    any_unit: bool = False  #: Take an unknown unit for the metre
+    level: bool = False  #: Turn the map so that z is up, by the tilt of the cameras
 
 
-def tum_frames(sequence: TumSequence, camera: Camera, options: FolderOptions | None = None
+_NO_OPTIONS = FolderOptions()
+
+
+class Layout(NamedTuple):
+    """A layout of folders."""
+
+    key: str
+    name: str  #: For people
+    #: Returns whether a folder has it, and its images
+    is_layout: Callable[[Path], bool]
+    read: Callable[[Path, FolderOptions], Capture]
+
+
+def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
+    """Return the images of a folder of any layout, with poses in metres and OpenCV's camera axes.
+
+    Images and poses are compared, so that a wrong choice of axes is refused.
+
+    Raises
+    ------
+    DatasetError
+        The folder has no known layout, or cannot be used; says what to do.
+    """
+    layout = find_layout(folder, options.layout)
+    if layout is None:
+        raise DatasetError(f'{folder}: has the files of no known layout: '
+                           f'{", ".join(sorted({one.name for one in LAYOUTS}))}; images alone '
+                           'need poses, as COLMAP makes them')
+    if layout.key not in _OPEN and (options.intrinsics or options.trajectory is not None
+                                    or options.body_from_camera is not None):
+        raise DatasetError(f'{folder}: {layout.name} has its own cameras and poses: '
+                           '--intrinsics, --trajectory and --mount are for TUM RGB-D')
+    if options.images is not None and layout.key not in ('colmap', 'nerf'):
+        raise DatasetError(f'{folder}: --images is for COLMAP and transforms.json')
+    try:
+        return _placed(folder, layout, layout.read(folder, options), options)
+    except OSError as error:
+        raise DatasetError(f'{folder}: cannot be read: {error}') from error
+
+
+def find_layout(folder: Path, key: str = '') -> Layout | None:
+    """Return the layout of a key, or the one whose files are there; None for none.
+
+    DatasetError: there is no such folder.
+    """
+    if not folder.exists():
+        raise DatasetError(f'{folder}: no such folder')
+    return next((one for one in LAYOUTS
+                 if one.key == key or (not key and one.is_layout(folder))), None)
+
+
+def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptions) -> Frames:
+    """Return the frames of a capture, in the map's coordinate frame."""
+    _check_poses(folder, capture.poses)
+    axes = options.axes or capture.axes
+    files, poses = list(capture.files), PlacedPoses(capture.poses, axes)
+    posed = poses.all_of(files)
+    count = max(len(files), capture.images)
+    notes = [f'read as {layout.name}: {len(posed)} of {count} images have poses', *capture.notes,
+             check_axes(files, capture.poses, axes, folder)]
+    scale = options.scale
+    if options.known_distance is not None:
+        scale = find_scale(posed, *options.known_distance, str(folder))
+        notes.append(f'a unit is {scale:.5g} m, by the known distance')
+    if scale is None and not capture.is_metric and not options.any_unit:
+        raise DatasetError(f'{folder}: {layout.name} does not know its unit: give --scale METRES '
+                           'of a unit (1 where they are metres), --known-distance or '
+                           '--object-size')
+    poses = replace(poses, scale=scale or 1.0, map_from_stored=UP[capture.up or 'z'])
+    up = find_vertical(np.array([pose for _, pose in poses.all_of(files)])) if posed else None
+    if up is not None and (options.level or not capture.up):
+        rotation, tilt_deg = rotation_to_z(up)
+        if options.level:
+            poses = replace(poses, map_from_stored=rotation @ poses.map_from_stored)
+            notes.append(f'levelled: the vertical of the cameras was {tilt_deg:.1f} degrees off z')
+        elif tilt_deg > _MOST_TILT_DEG:
+            notes.append(f'z is {tilt_deg:.0f} degrees off the vertical of the cameras: --level '
+                         'turns it up')
+    elif options.level:
+        raise DatasetError(f'{folder}: the cameras do not tell the vertical: they turn too '
+                           'little, or were held on their side; leave out --level')
+    frames = folder_frames(folder, files, poses, replace(
+        capture.depth, unit_m=options.depth.unit_m or capture.depth.unit_m,
+        camera=options.depth.camera or capture.depth.camera))
+    known = [(file.color.name, file.camera, np.round(pose, 6).tolist())
+             for file, pose in poses.all_of(files)]
+    return replace(frames, digest=hashlib.sha256(repr(known).encode()).hexdigest()[:12],
+                   notes=tuple(filter(None, notes)))
+
+
+def tum_frames(sequence: TumSequence, camera: Camera, options: FolderOptions = _NO_OPTIONS
                ) -> Frames:
     """Return the frames of a TUM folder, taken by one camera; without depth.
 
     DatasetError: there are no poses, or they are of another time.
     """
-    files = [ImageFile(stamp, path) for stamp, path in
+    files = [ImageFile(stamp, path, camera) for stamp, path in
              zip(sequence.stamps_ns, sequence.image_paths, strict=True)]
-    return folder_frames(sequence.folder, files, _poses(sequence, options or FolderOptions()),
-                         camera)
+    poses = _poses(sequence, options)
+    _check_poses(sequence.folder, poses)
+    return folder_frames(sequence.folder, files, poses)
 
 
 def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
@@ -63,27 +193,33 @@ def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
 
     DatasetError: the folder has neither layout, or poses and intrinsics are missing.
     """
-    if not folder.is_dir():
-        raise DatasetError(f'{folder}: no such folder')
-    if not (folder / 'rgb.txt').exists():
-        return _seven_scenes_frames(folder, options)
-    sequence = read_tum(folder)
-    if not (folder / 'depth.txt').exists():
+    is_tum = (folder / 'rgb.txt').exists()
+    if is_tum and not (folder / 'depth.txt').exists():
         raise DatasetError(f'{folder}: has no depth.txt; map from it with --tum, without depth')
-    stamps, paths = read_image_list(folder / 'depth.txt')
-    times = np.array(stamps, dtype=np.int64)
-    files = []
-    for stamp, path in zip(sequence.stamps_ns, sequence.image_paths, strict=True):
-        nearest = int(np.argmin(np.abs(times - stamp)))
-        near = abs(stamps[nearest] - stamp) <= _MAX_DEPTH_DELAY_NS
-        files.append(ImageFile(stamp, path, paths[nearest] if near else None))
-    camera = find_camera(options.intrinsics, folder)[0]
-    form = replace(options.depth, unit_m=options.depth.unit_m or TUM_UNIT)
-    return folder_frames(folder, files, _poses(sequence, options), camera, form)
+    return read_folder(folder, replace(options, layout='rgbd' if is_tum else '7scenes'))
 
 
-def _seven_scenes_frames(folder: Path, options: FolderOptions) -> Frames:
-    """Return the frames of 7-Scenes, whose poses are the depth camera's."""
+def _tum(folder: Path, options: FolderOptions, with_depth: bool = True) -> Capture:
+    """Return a TUM folder; each image has the nearest depth image."""
+    sequence, camera = read_tum(folder), find_camera(options.intrinsics, folder)[0]
+    depths: dict[int, Path] = {}
+    if with_depth and (folder / 'depth.txt').exists():
+        stamps, paths = read_image_list(folder / 'depth.txt')
+        times = np.array(stamps, dtype=np.int64)
+        for stamp in sequence.stamps_ns:
+            nearest = int(np.argmin(np.abs(times - stamp)))
+            if abs(stamps[nearest] - stamp) <= _MAX_DEPTH_DELAY_NS:
+                depths[stamp] = paths[nearest]
+    return Capture(tuple(
+        ImageFile(stamp, path, camera, depths.get(stamp)) for stamp, path in
+        zip(sequence.stamps_ns, sequence.image_paths, strict=True)),
+        _poses(sequence, options), depth=DepthFormat(TUM_UNIT))
+
+
+def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
+    """Return the images of 7-Scenes, whose poses are the depth camera's."""
+    camera = (_SEVEN_SCENES_COLOR if options.intrinsics is None
+              else read_camera(options.intrinsics))
     images = {int(match[1]): path for path in folder.iterdir()
               if (match := _SEVEN_SCENES_NAME.fullmatch(path.name))}
     if not images:
@@ -98,29 +234,13 @@ def _seven_scenes_frames(folder: Path, options: FolderOptions) -> Frames:
         stem = path.name.partition('.')[0]
         depth, pose = folder / f'{stem}.depth.png', folder / f'{stem}.pose.txt'
         stamp = number * NS_PER_S // _SEVEN_SCENES_HZ
-        files.append(ImageFile(stamp, path, depth if depth.exists() else None))
+        files.append(ImageFile(stamp, path, camera, depth if depth.exists() else None))
         map_from_depth = _read_pose(pose) if pose.exists() else None
         if map_from_depth is not None:
             poses[stamp] = map_from_depth @ depth_from_color
-    camera = (_SEVEN_SCENES_COLOR if options.intrinsics is None
-              else read_camera(options.intrinsics))
     if not poses:
         raise DatasetError(f'{folder}: no image has a valid .pose.txt beside it')
-    return folder_frames(folder, files, _StampedPoses(poses), camera, form)
-
-
-@dataclass(frozen=True)
-class _StampedPoses:
-    """Poses of the images themselves, which need no interpolation."""
-
-    poses: dict[int, NDArray[np.float64]]
-
-    @property
-    def span_ns(self) -> tuple[int, int]:
-        return min(self.poses), max(self.poses)
-
-    def pose_at(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        return self.poses.get(stamp_ns)
+    return Capture(tuple(files), StampedPoses(poses), depth=form)
 
 
 def _read_pose(path: Path) -> NDArray[np.float64] | None:
@@ -140,8 +260,31 @@ def _read_pose(path: Path) -> NDArray[np.float64] | None:
 
 def _poses(sequence: TumSequence, options: FolderOptions) -> Poses:
     trajectory = sequence.trajectory if options.trajectory is None else options.trajectory
-    if len(trajectory) == 0:
-        raise DatasetError(f'{sequence.folder}: there are no poses: no groundtruth.txt here; give '
-                           '--trajectory FILE')
     return replace(trajectory, max_gap_ns=options.max_gap_ns,
                    body_from_camera=options.body_from_camera)
+
+
+def _check_poses(folder: Path, poses: Poses) -> None:
+    if poses.span_ns is None:
+        raise DatasetError(f'{folder}: there are no poses: no groundtruth.txt here; give '
+                           '--trajectory FILE')
+
+
+#: The first one whose files are there is read. TUM RGB-D without depth only where asked for.
+LAYOUTS = (
+    Layout('rgbd', 'TUM RGB-D', lambda folder: (folder / 'rgb.txt').is_file(), _tum),
+    Layout('7scenes', '7-Scenes', lambda folder: any(folder.glob('frame-*.color.*')),
+           _seven_scenes),
+    Layout('polycam', 'Polycam', is_polycam, lambda folder, _: read_polycam(folder)),
+    Layout('stray', 'Stray Scanner', is_stray, lambda folder, _: read_stray(folder)),
+    Layout('record3d', 'Record3D', is_record3d, lambda folder, _: read_record3d(folder)),
+    Layout('arkitscenes', 'ARKitScenes', is_arkitscenes,
+           lambda folder, _: read_arkitscenes(folder)),
+    Layout('hololens', 'HoloLens 2', is_hololens, lambda folder, _: read_hololens(folder)),
+    Layout('nerf', 'transforms.json', is_nerf,
+           lambda folder, options: read_nerf(folder, options.images)),
+    Layout('colmap', 'COLMAP model', is_colmap,
+           lambda folder, options: read_colmap(folder, options.images)),
+    Layout('tum', 'TUM RGB-D', lambda folder: False,
+           lambda folder, options: _tum(folder, options, with_depth=False)))
+_OPEN = ('rgbd', '7scenes', 'tum')  # layouts that may lack cameras and poses

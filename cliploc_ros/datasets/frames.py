@@ -6,9 +6,10 @@ The one reader of evaluation, mapping and map editor. A source is read as a stre
 what is not wanted is never decoded, and a raw frame can be decoded in another process.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
 
@@ -21,6 +22,9 @@ from cliploc_ros.datasets.depth import DepthCamera, DepthImage, depth_from_count
 from cliploc_ros.datasets.poses import Poses, check_clock
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.units import NS_PER_S
+
+# An undistorted image has so many places computed, which take 0.6 kB each.
+_MOST_PLACES = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,9 @@ class Frames:
     camera: str = ''  #: Its name, of several cameras
     #: The frames of each of several cameras; empty for one
     of_cameras: tuple['Frames', ...] = ()
+    varies: bool = False  #: Whether each image has a camera of its own
+    digest: str = ''  #: Of poses and cameras, which may change while the folder does not
+    notes: tuple[str, ...] = ()  #: What the user should know about how they were read
 
     @property
     def each(self) -> tuple['Frames', ...]:
@@ -96,7 +103,8 @@ class Frames:
         def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
             return self.read_raw(lambda place, stamp_ns, pose: place in chosen
                                  and is_wanted(place, stamp_ns, pose))
-        return Frames(self.source, len(chosen), read_raw)
+        return Frames(self.source, len(chosen), read_raw, varies=self.varies, digest=self.digest,
+                      notes=self.notes)
 
 
 def join_frames(of_cameras: Mapping[str, Frames]) -> Frames:
@@ -118,8 +126,11 @@ class ImageFile:
     """An image of a folder, and its depth image if there is one."""
 
     stamp_ns: int
-    color: Path
+    color: Path  #: An image, or a video
+    camera: Camera
     depth: Path | None = None
+    confidence: Path | None = None  #: Of the depth: an image of its size, 0 where it is a guess
+    number: int | None = None  #: Of the image in a video
 
 
 @dataclass(frozen=True)
@@ -131,9 +142,9 @@ class DepthFormat:
     camera: DepthCamera | None = None  #: None: registered to the colour image
 
 
-def folder_frames(folder: Path, files: list[ImageFile], poses: Poses, camera: Camera,
+def folder_frames(folder: Path, files: Sequence[ImageFile], poses: Poses,
                   depth: DepthFormat | None = None) -> Frames:
-    """Return the frames of image files taken by one camera.
+    """Return the frames of image files.
 
     DatasetError: the poses are of another time than the images.
     """
@@ -144,40 +155,86 @@ def folder_frames(folder: Path, files: list[ImageFile], poses: Poses, camera: Ca
         for place, file in enumerate(files):
             pose = poses.pose_at(file.stamp_ns)
             if is_wanted(place, file.stamp_ns, pose):
-                yield RawFrame(
-                    place, file.stamp_ns, pose, partial(read_color, file.color, camera),
-                    None if file.depth is None else partial(_read_depth, file.depth, form))
-    return Frames(folder, len(files), read_raw)
+                yield RawFrame(place, file.stamp_ns, pose, partial(read_color, file),
+                               None if file.depth is None else partial(_read_depth, file, form))
+    return Frames(folder, len(files), read_raw,
+                  varies=any(file.camera != files[0].camera for file in files))
 
 
-def read_color(path: Path, camera: Camera) -> tuple[NDArray[np.uint8], Camera]:
-    """Return an image file (h, w, 3), red first, and its camera.
+def read_color(file: ImageFile) -> tuple[NDArray[np.uint8], Camera]:
+    """Return the image (h, w, 3) of a file, red first, and its camera.
 
     DatasetError: the image cannot be decoded, or is not of the camera's size.
     """
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    path, camera = file.color, file.camera
+    image = (cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+             if file.number is None else _open_video(path).image(file.number))
     if image is None:
-        raise DatasetError(f'{path} cannot be read as an image')
+        of = '' if file.number is None else f': image {file.number} of the video'
+        raise DatasetError(f'{path}{of} cannot be read as an image')
     if image.shape[:2] != (camera.height, camera.width):
-        raise DatasetError(f'{path} has {image.shape[1]}x{image.shape[0]} px, but the '
-                           f'camera has {camera.width}x{camera.height} px')
+        turned = image.shape[:2] == (camera.width, camera.height)
+        raise DatasetError(
+            f'{path} has {image.shape[1]}x{image.shape[0]} px, but the camera has '
+            f'{camera.width}x{camera.height} px' + (
+                '; is it turned by its EXIF orientation? turn the pixels, as with mogrify '
+                '-auto-orient' if turned else ''))
     return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8), camera
 
 
-def _read_depth(path: Path, form: DepthFormat) -> DepthImage:
-    counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+class _Video:
+    """A video that is read forward; a jump back opens it again."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._open()
+
+    def _open(self) -> None:
+        self._next = 0
+        self._capture = cv2.VideoCapture(str(self._path))
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+
+    def image(self, number: int) -> NDArray[np.uint8] | None:
+        """Return an image (h, w, 3), blue first; None where there is none."""
+        if number < self._next:
+            self._open()
+        while self._next < number:
+            self._next += 1
+            if not self._capture.grab():
+                return None
+        self._next += 1
+        found, image = self._capture.read()
+        return image if found else None
+
+
+_open_video = lru_cache(1)(_Video)
+
+
+def _read_depth(file: ImageFile, form: DepthFormat) -> DepthImage:
+    counts = cv2.imread(str(file.depth), cv2.IMREAD_UNCHANGED)
     if counts is None:
-        raise DatasetError(f'{path} cannot be read as a depth image')
-    return DepthImage(depth_from_counts(counts, form.unit_m, str(path)), form.camera)
+        raise DatasetError(f'{file.depth} cannot be read as a depth image')
+    depths_m = depth_from_counts(counts, form.unit_m, str(file.depth))
+    if file.confidence is not None:
+        certain = cv2.imread(str(file.confidence), cv2.IMREAD_UNCHANGED)
+        if certain is None or certain.shape != depths_m.shape:
+            raise DatasetError(f'{file.confidence} is no image of the size of {file.depth}')
+        depths_m[certain == 0] = np.nan
+    return DepthImage(depths_m, form.camera)
 
 
 def undistorted(image_rgb: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
     """Return an image (h, w, 3) as the pinhole of its camera would show it; black outside."""
     if not any(camera.distortion):
         return image_rgb
-    columns, rows = np.meshgrid(np.arange(0.0, camera.width), np.arange(0.0, camera.height))
+    # a large image has a coarser grid of places, and those between: a lens is smooth
+    step = max(1, math.isqrt(camera.width * camera.height // _MOST_PLACES))
+    columns, rows = np.meshgrid(*(step * np.arange(-1, side // step + 2) + 0.5 * (step - 1)
+                                  for side in (camera.width, camera.height)))
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
     places = camera.project_normalized(camera.pinhole.normalize_points(pixels))
     places = np.nan_to_num(places, nan=-1.0).reshape(*columns.shape, 2).astype(np.float32)
+    places = cv2.resize(places, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)[
+        step:step + camera.height, step:step + camera.width]
     return np.asarray(cv2.remap(image_rgb, places[..., 0], places[..., 1], cv2.INTER_LINEAR),
                       dtype=np.uint8)

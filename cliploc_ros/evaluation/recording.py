@@ -61,10 +61,13 @@ def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap, labels: Label
     frames = []
     for frame, stamp_ns in enumerate(recorded.stamps_ns):
         rows = slice(*map(int, detections.frame_offsets[frame:frame + 2]))
+        boxes = detections.bboxes_xyxy[rows]
+        if detections.camera_of(frame) != camera:  # queries have one camera
+            boxes = camera.bboxes_in_pixels(detections.camera_of(frame).normalize_bboxes(boxes))
         crops = detections.embeddings[rows].astype(np.float32)
         similarities = np.asarray(CropSimilarities(crops, labels)).astype(np.float64)
         frames.append(QueryFrame(
-            stamp_ns=int(stamp_ns), bboxes_xyxy=detections.bboxes_xyxy[rows],
+            stamp_ns=int(stamp_ns), bboxes_xyxy=boxes,
             class_ids=tuple(names[number] for number in detections.classes[rows]),
             scores=detections.scores[rows], similarities=similarities,
             true_landmark=np.full(len(crops), -1, dtype=np.int64),

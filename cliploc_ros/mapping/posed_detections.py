@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 
+# A focal length and a principal point that differ by less are of one camera that focuses.
+_SAME_CAMERA = 0.02
 _PER_BOX = ('bboxes_xyxy', 'classes', 'scores', 'depths', 'depth_spreads', 'embeddings',
             'open_edges')
 
@@ -115,3 +117,35 @@ class PosedDetections:
     def with_poses(self, map_from_camera: NDArray[np.float64]) -> 'PosedDetections':
         """Return the same detections with other poses (F, 4, 4)."""
         return replace(self, map_from_camera=map_from_camera)
+
+    def scaled(self, scale: float) -> 'PosedDetections':
+        """Return the same detections with positions times a scale."""
+        poses = self.map_from_camera.copy()
+        poses[:, :3, 3] *= scale
+        return self.with_poses(poses)
+
+
+def group_cameras(cameras: Sequence[Camera]) -> tuple[tuple[Camera, ...], NDArray[np.int64]]:
+    """Return the cameras that stand for those of single images, and the row (F,) of each image.
+
+    Cameras of one size that focus in other ways share one.
+    """
+    found: list[Camera] = []
+    rows = {}
+    for one in dict.fromkeys(cameras):
+        def is_near(other: Camera, one: Camera = one) -> bool:
+            differences = np.array([one.fx - other.fx, one.fy - other.fy, one.cx - other.cx,
+                                    one.cy - other.cy]) / other.fx
+            return ((one.width, one.height) == (other.width, other.height)
+                    and bool(np.abs(differences).max() < _SAME_CAMERA))
+        rows[one] = next((row for row, other in enumerate(found) if is_near(other)), len(found))
+        if rows[one] == len(found):
+            found.append(one)
+    return tuple(found), np.array([rows[one] for one in cameras], dtype=np.int64)
+
+
+def names_of_group(cameras: Sequence[Camera]) -> tuple[str, ...]:
+    """Return a name for each of several cameras of a folder, by its size; '' for a single one."""
+    if len(cameras) == 1:
+        return ('',)
+    return tuple(f'{number}: {one.width}x{one.height}' for number, one in enumerate(cameras, 1))

@@ -19,6 +19,8 @@ _MAX_SPEED_M_PER_S = 10.0
 _MAX_TURN_DEG_PER_S = 720.0
 _LEAST_JUMP_M, _LEAST_JUMP_DEG = 0.5, 30.0
 _MAX_EMPTY_SHARE = 0.5
+# A camera that moves by more than this, seen from the first one, is on no rig with it.
+_MOST_PLAY_M = 0.5
 
 
 class Views(NamedTuple):
@@ -108,7 +110,8 @@ def _levers(detections: PosedDetections) -> NDArray[np.float64]:
     """Return the levers (F, 3) of Views [m].
 
     A camera's place on the rig is the median of where it was, seen from the first camera, whose
-    poses are interpolated. Of a camera that moves on its robot it is an approximation.
+    poses are interpolated. Of a camera that moves on its robot it is an approximation. Cameras
+    that move on their own, as those of a folder of photos, have none.
     """
     cameras, poses = detections.frame_cameras, detections.map_from_camera
     levers, first = np.zeros((len(cameras), 3)), np.nonzero(cameras == 0)[0]
@@ -118,8 +121,10 @@ def _levers(detections: PosedDetections) -> NDArray[np.float64]:
             there = np.stack([np.interp(detections.stamps_s[own], detections.stamps_s[first],
                                         poses[first, axis, 3]) for axis in range(3)], axis=1)
             axes = poses[own, :3, :3]
-            levers[own] = axes @ np.median(np.einsum(
-                'fji,fj->fi', axes, poses[own, :3, 3] - there), axis=0)
+            places = np.einsum('fji,fj->fi', axes, poses[own, :3, 3] - there)
+            place = np.median(places, axis=0)
+            if np.median(np.linalg.norm(places - place, axis=1)) < _MOST_PLAY_M:
+                levers[own] = axes @ place
     return levers
 
 

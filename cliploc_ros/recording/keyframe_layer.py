@@ -152,8 +152,11 @@ def _small_jpeg(frame: Frame) -> bytes:
     camera = frame.camera
     scale = min(1.0, _IMAGE_PX / max(camera.width, camera.height))
     width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
-    image = cv2.resize(undistorted(frame.image_rgb, camera), (width, height),
-                       interpolation=cv2.INTER_AREA)
+    x, y = width / camera.width, height / camera.height
+    small = replace(camera, width=width, height=height, fx=x * camera.fx, fy=y * camera.fy,
+                    cx=x * (camera.cx + 0.5) - 0.5, cy=y * (camera.cy + 0.5) - 0.5)
+    image = undistorted(np.asarray(cv2.resize(
+        frame.image_rgb, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8), small)
     _, content = cv2.imencode('.jpg', np.ascontiguousarray(image[..., ::-1]),
                               [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return bytes(content)

@@ -136,5 +136,4 @@ def _undistorted(detections: Detections, camera: Camera
         return boxes, np.empty((0, 4), dtype=np.bool_)
     is_open = at_border(boxes, np.array([camera.width, camera.height] * 2),
                         MappingOptions.border_px)
-    undistorted = camera.normalize_bboxes(boxes)
-    return undistorted * ([camera.fx, camera.fy] * 2) + [camera.cx, camera.cy] * 2, is_open
+    return camera.bboxes_in_pixels(camera.normalize_bboxes(boxes)), is_open

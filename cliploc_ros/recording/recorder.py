@@ -36,7 +36,11 @@ from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.mapping.options import MappingOptions
-from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.mapping.posed_detections import (
+    PosedDetections,
+    group_cameras,
+    names_of_group,
+)
 from cliploc_ros.mapping.views import at_border
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.protocols import DetectorOptions
@@ -131,7 +135,8 @@ def describe(frames: Frames, options: RecordingOptions) -> str:
     if clip is not None:
         files += [clip.model, clip.pretrained, clip.checkpoint_path]
     return json.dumps({
-        'source': [frames.source.name, _state(frames.source.resolve()), frames.count],
+        'source': [frames.source.name, _state(frames.source.resolve()), frames.count,
+                   *([frames.digest] if frames.digest else [])],
         'yolo': _settings(options.detector), 'clip': None if clip is None else _settings(clip),
         # the path of '' would be the working folder, which changes with every file written there
         'files': [_state(Path(file)) if file else None for file in files],
@@ -200,7 +205,7 @@ def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame]) ->
     """Return what networks at hand say of every frame with a pose; nothing is written."""
     with _read_keyframes(frames, EVERY_FRAME) as (raws, filters):
         seen = [look(raw) for raw in raws]
-    return _assemble(seen, frames.source, filters, '', '')
+    return _assemble(seen, frames, filters, '', '')
 
 
 def _record(frames: Frames, options: RecordingOptions, described: str, log: Log) -> Recorded:
@@ -224,7 +229,7 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log)
                 seen[result.place] = result
                 _judge_depth(seen, frames.source)
     encoder_key = '' if options.clip is None else resolve_clip_weights(options.clip).key
-    return _assemble(list(seen.values()), frames.source, filters, encoder_key, described)
+    return _assemble(list(seen.values()), frames, filters, encoder_key, described)
 
 
 def _parse_entry(line: bytes) -> Any:
@@ -254,17 +259,24 @@ def _judge_depth(seen: Mapping[int, SeenFrame], source: Path) -> None:
         check_depth_unit(np.concatenate(depths), str(source))
 
 
-def _assemble(seen: list[SeenFrame], source: Path, filters: Mapping[str, KeyframeFilter],
+def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, KeyframeFilter],
               encoder_key: str, described: str) -> Recorded:
     """Return the observations of frames in the order of time.
 
     DatasetError: a camera has no frames, or changes.
     """
-    seen = sorted(seen, key=lambda one: (one.stamp_ns, one.place))
+    seen, source = sorted(seen, key=lambda one: (one.stamp_ns, one.place)), frames.source
     cameras = tuple(_camera_of([one for one in seen if one.camera == name], f'{source}: {name}:'
-                               if name else f'{source}:', keyframes.asked)
+                               if name else f'{source}:', keyframes.asked, frames.varies)
                     for name, keyframes in filters.items())
     camera_names = tuple(filters)
+    rows = np.array([camera_names.index(one.camera) for one in seen])
+    if frames.varies:
+        own = [camera_from_numbers(one.image_size, one.intrinsics) for one in seen]
+        cameras, rows = group_cameras(own)
+        camera_names = names_of_group(cameras)
+        seen = [_seen_by(one, camera, cameras[row])
+                for one, camera, row in zip(seen, own, rows, strict=True)]
     names = np.concatenate([one.class_ids for one in seen])
     class_names, classes = np.unique(names, return_inverse=True)
     depths = np.concatenate([one.depths for one in seen])
@@ -289,8 +301,7 @@ def _assemble(seen: list[SeenFrame], source: Path, filters: Mapping[str, Keyfram
         embeddings=(np.concatenate([one.embeddings for one in seen])
                     if any(one.embeddings.shape[1] for one in seen) else None),
         encoder_key=encoder_key, open_edges=open_edges if len(open_edges) else None,
-        camera_rows=(None if camera_names == ('',)
-                     else np.array([camera_names.index(one.camera) for one in seen])),
+        camera_rows=None if camera_names == ('',) else rows,
         camera_names=camera_names)
     return Recorded(
         detections, np.array([one.stamp_ns for one in seen], dtype=np.int64),
@@ -299,8 +310,19 @@ def _assemble(seen: list[SeenFrame], source: Path, filters: Mapping[str, Keyfram
         sum(one.without_pose for one in filters.values()), described)
 
 
-def _camera_of(seen: list[SeenFrame], where: str, images: int) -> Camera:
-    """Return the camera of frames that one camera took.
+def _seen_by(seen: SeenFrame, camera: Camera, other: Camera) -> SeenFrame:
+    """Return the boxes of a frame as another pinhole of its place shows them."""
+    if camera == other:
+        return seen
+    boxes, is_open = seen.bboxes_xyxy, seen.open_edges
+    if not len(is_open):
+        is_open = at_border(boxes, np.tile(seen.image_size, 2), MappingOptions.border_px)
+    return replace(seen, bboxes_xyxy=other.bboxes_in_pixels(camera.normalize_bboxes(boxes)),
+                   open_edges=is_open)
+
+
+def _camera_of(seen: list[SeenFrame], where: str, images: int, varies: bool) -> Camera:
+    """Return the camera of frames that one camera took, or of the first one where it varies.
 
     DatasetError: there are none, they are of several cameras, or their depth has another unit.
     """
@@ -309,8 +331,8 @@ def _camera_of(seen: list[SeenFrame], where: str, images: int) -> Camera:
                            'gaps with --max-gap, or record poses with the images')
     first = seen[0]
     for one in seen:
-        if (one.image_size != first.image_size).any() or (one.intrinsics
-                                                          != first.intrinsics).any():
+        if not varies and ((one.image_size != first.image_size).any()
+                           or (one.intrinsics != first.intrinsics).any()):
             raise DatasetError(f'{where} the camera changes at {one.stamp_ns / NS_PER_S:.6f}, but '
                                'observations of one name have one camera; name several with '
                                '--cameras')

@@ -20,12 +20,10 @@ from cliploc_ros.core.geometry.ellipsoid import (
 )
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.datasets.bag_frames import BagTopics, bag_images
-from cliploc_ros.datasets.folders import tum_frames
+from cliploc_ros.datasets.folders import FolderOptions, find_layout, read_folder
 from cliploc_ros.datasets.frames import read_color, undistorted
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.mapping.posed_detections import PosedDetections, group_cameras, names_of_group
 from cliploc_ros.studio.landmark import Landmark
 from cliploc_ros.units import NS_PER_S
 
@@ -50,14 +48,14 @@ class Images:
     """The images of a folder or a recording, taken at stamps (F,) [ns].
 
     ``read`` returns image and camera of a place, 0 to F - 1; ``cameras`` are the names (F,) of
-    several cameras.
+    several cameras; of a folder, whose stamps differ, the stamp is enough.
     """
 
     def __init__(self, stamps_ns: NDArray[np.int64],
                  read: Callable[[int], tuple[NDArray[np.uint8], Camera]],
                  cameras: Sequence[str] = ()):
         self._stamps_ns = stamps_ns
-        self._cameras = np.array(cameras or [''] * len(stamps_ns), dtype=np.str_)
+        self._cameras = np.array(cameras, dtype=np.str_)
         self._read: Callable[[int], NDArray[np.uint8]] = lru_cache(_IMAGES_KEPT)(
             lambda place: undistorted(*read(place)))
 
@@ -66,7 +64,8 @@ class Images:
 
         None without one.
         """
-        places = np.nonzero(self._cameras == camera)[0]
+        places = (np.nonzero(self._cameras == camera)[0] if len(self._cameras)
+                  else np.arange(len(self._stamps_ns)))
         if not len(places):
             return None
         offsets = np.abs(self._stamps_ns[places] - round(stamp_s * NS_PER_S))
@@ -75,16 +74,16 @@ class Images:
 
 
 def open_images(path: Path, topics: BagTopics, cameras: Sequence[str] = ('',)) -> Images:
-    """Open the images of a TUM folder, or those of each camera of a rosbag2 recording.
+    """Open the images of a folder, or those of each camera of a rosbag2 recording.
 
     DatasetError: it is neither, or lacks a camera.
     """
     if not path.exists():
         raise DatasetError(f'{path}: no such folder or recording')
-    if (path / 'rgb.txt').exists():
-        sequence, camera = read_tum(path), find_camera(None, path)[0]
-        return Images(np.array(sequence.stamps_ns, dtype=np.int64),
-                      lambda place: read_color(sequence.image_paths[place], camera))
+    if (layout := find_layout(path)) is not None:
+        files = layout.read(path, FolderOptions()).files
+        return Images(np.array([one.stamp_ns for one in files], dtype=np.int64),
+                      lambda place: read_color(files[place]))
     of_cameras = [bag_images(path, topics.of_camera(name)) for name in cameras]
     places = [(one, place) for one in of_cameras for place in range(len(one.times_ns))]
     names = np.repeat(np.array(cameras), [len(one.times_ns) for one in of_cameras])
@@ -93,20 +92,28 @@ def open_images(path: Path, topics: BagTopics, cameras: Sequence[str] = ('',)) -
 
 
 def views_of_folder(path: Path) -> PosedDetections:
-    """Return the poses of a TUM folder as views without boxes; DatasetError: it has no poses."""
-    if not (path / 'rgb.txt').exists():
+    """Return the poses of a folder as views without boxes; DatasetError: it has no poses."""
+    layout = find_layout(path)
+    if layout is None:
         raise DatasetError(f'{path}: has no poses to look from; give --observations, too')
-    sequence, camera = read_tum(path), find_camera(None, path)[0]
-    tum_frames(sequence, camera)  # refuses a folder without poses
-    posed = [(stamp, pose) for stamp in sequence.stamps_ns
-             if (pose := sequence.pose_at(stamp)) is not None]
+    capture = layout.read(path, FolderOptions())
+    if not capture.is_metric:
+        raise DatasetError(f'{path}: {layout.name} does not know its unit; give --observations, '
+                           'too: build_map makes them, with --scale')
+    posed, cameras = [], []
+    for raw in read_folder(path).read_raw(lambda place, stamp_ns, pose: pose is not None):
+        posed.append((raw.stamp_ns, raw.map_from_camera))
+        cameras.append(capture.files[raw.place].camera.pinhole)
     if not posed:
         raise DatasetError(f'{path}: no image has a pose')
+    each, rows = group_cameras(cameras)
+    names = names_of_group(each)
     return PosedDetections(
-        cameras=(camera.pinhole,), map_from_camera=np.array([pose for _, pose in posed]),
+        cameras=each, map_from_camera=np.array([pose for _, pose in posed]),
         stamps_s=np.array([stamp for stamp, _ in posed]) / NS_PER_S,
         frame_offsets=np.zeros(len(posed) + 1, dtype=np.int64), bboxes_xyxy=np.empty((0, 4)),
-        class_names=(), classes=np.empty(0, dtype=np.int64), scores=np.empty(0))
+        class_names=(), classes=np.empty(0, dtype=np.int64), scores=np.empty(0),
+        camera_rows=None if names == ('',) else rows, camera_names=names)
 
 
 class Outline(NamedTuple):

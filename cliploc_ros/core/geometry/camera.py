@@ -159,6 +159,10 @@ class Camera:
             [points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]], axis=-1)
         return edges
 
+    def bboxes_in_pixels(self, edges: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return boxes (n, 4) of the plane z = 1 as undistorted boxes (n, 4) [px]."""
+        return edges * ([self.fx, self.fy] * 2) + [self.cx, self.cy] * 2
+
 
 def frusta(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64], depth_m: float
            ) -> NDArray[np.float64]:

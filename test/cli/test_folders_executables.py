@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A map of a COLMAP project, a walk of a phone in it, and the studio with its images."""
+
+import json
+
+import numpy as np
+import pytest
+from capture_folders import ASSETS, shots_of, write_colmap, write_polycam
+
+from cliploc_ros.cli.build_map import main as build_map
+from cliploc_ros.cli.evaluate import main as evaluate
+from cliploc_ros.cli.studio import make_parser, open_studio
+from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.studio.images import open_images
+
+pytestmark = pytest.mark.needs('pycolmap')
+NETWORKS = ('--model', ASSETS / 'yolo.pt', '--device', 'cpu')
+CLIP = ('--clip-model', ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'clip.safetensors')
+
+
+def run(main, *arguments):
+    return main([*map(str, arguments)])
+
+
+def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys):
+    shots = shots_of()
+    first, last = shots[0], shots[-1]
+    folder = write_colmap(tmp_path / 'scan', shots, scale=0.4, camera_of=lambda number: (
+        'SIMPLE_PINHOLE', 640, 480, [500.0 + number % 3, 320.0, 240.0]))
+    built = tmp_path / 'built.yaml'
+    distance_m = np.linalg.norm(first.pose[:3, 3] - last.pose[:3, 3])
+    arguments = ('--colmap', folder, *NETWORKS, *CLIP, '--keyframe-layer', '--out', built)
+    assert run(build_map, *arguments) == 1
+    assert 'COLMAP model does not know its unit: give --scale' in capsys.readouterr().err
+    assert run(build_map, *arguments, '--known-distance', first.path.name, last.path.name,
+               distance_m) == 0
+    shown = capsys.readouterr().out
+    assert 'read as COLMAP model: 30 of 30 images have poses' in shown
+    assert 'a unit is 0.4 m, by the known distance' in shown
+    landmarks = LandmarkMap.from_file(built)
+    # keyframes have the camera of their image, and the poses of the map
+    layer = load_layer_of_map(layer_path(built), landmarks)
+    assert {layer.camera_of(row).fx for row in range(len(layer))} == {500.0, 501.0, 502.0}
+    known = np.array([shot.pose[:3, 3] for shot in shots])
+    for pose in layer.map_from_camera:
+        assert np.linalg.norm(known - pose[:3, 3], axis=1).min() < 1e-3
+
+    walk = write_polycam(tmp_path / 'phone', shots_of(ASSETS / 'sequence')[::4])
+    assert run(evaluate, '--folder', walk, '--map', built, *NETWORKS, *CLIP, '--methods', 'auto',
+               '--trials', 1, '--sweep', '--no-figures', '--out', tmp_path / 'out') == 0
+    assert 'read as Polycam: 12 of 12 images have poses' in capsys.readouterr().out
+    accepted = [one for one in json.loads((tmp_path / 'out/results.json').read_text())
+                if one['accepted']]
+    assert len(accepted) > 4 and max(one['error_m'] for one in accepted) < 0.5
+
+    studio = open_studio(make_parser().parse_args([str(built), '--images', str(walk)]))
+    try:
+        assert studio.views == 12 and studio.recording.detections.cameras[0].fx == 500.0
+        assert open_images(walk, None).near(float(
+            studio.recording.detections.stamps_s[3])).shape == (480, 640, 3)
+    finally:
+        studio.document.close()
+
+
+@pytest.mark.parametrize(('options', 'expected'), [
+    (('--scale', 1, '--known-distance', 'a', 'b', 1), 'give --scale or --known-distance, not'),
+    (('--known-distance', 'a', 'b', 'far'), '--known-distance: far is no length above 0 m'),
+    (('--object-size', 'chair', 1, '--scale', 2), '--object-size is not for --scale'),
+    (('--intrinsics', 'fr1', '--scale', 1), 'COLMAP model has its own cameras and poses')])
+def test_options_that_do_not_go_together(options, expected, tmp_path, capsys):
+    folder = write_colmap(tmp_path / 'scan', shots_of()[:2])
+    assert run(build_map, '--colmap', folder, *NETWORKS, '--no-clip', '--out',
+               tmp_path / 'map.yaml', *options) == 1
+    assert expected in capsys.readouterr().err
+
+
+def test_options_of_folders_with_other_sources(tmp_path, capsys):
+    assert run(build_map, '--observations', tmp_path / 'o.npz', '--out', tmp_path / 'map.yaml',
+               '--level', '--scale', 2) == 1
+    assert '--scale, --level: for folders of images only' in capsys.readouterr().err
+    folder = write_colmap(tmp_path / 'scan', shots_of()[:2])
+    with pytest.raises(DatasetError, match='does not know its unit; give --observations, too'):
+        open_studio(make_parser().parse_args([str(tmp_path / 'map.yaml'), '--images',
+                                              str(folder)]))

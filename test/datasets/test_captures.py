@@ -1,0 +1,226 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Folders of other programs and devices: the same images, poses and map as of the original."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from capture_folders import (
+    ASSETS,
+    DEPTH_MM,
+    WALK,
+    WRITERS,
+    shots_of,
+    write_colmap,
+    write_nerf,
+    write_stray,
+)
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.datasets.folders import FolderOptions, find_layout, read_folder
+from cliploc_ros.datasets.frames import undistorted
+from cliploc_ros.datasets.observations import load_observations, save_observations
+from cliploc_ros.errors import MappingError
+from cliploc_ros.make_map import scale_of_objects
+from cliploc_ros.mapping.building import build_map
+from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.recording.networks import Look
+from cliploc_ros.recording.recorder import (
+    RecordingOptions,
+    observation_file,
+    record_every_frame,
+)
+
+pytestmark = pytest.mark.needs('pycolmap')
+METRES = FolderOptions(scale=1.0)
+OPTIONS = MappingOptions(min_baseline_deg=5.0, estimate_pose_errors=False)
+
+
+@pytest.fixture(scope='session')
+def look():
+    """The demo's detector, which looks once at equal pixels."""
+    detect, seen = load_detector(DetectorOptions(model=str(ASSETS / 'yolo.pt'))).detect, {}
+
+    def once(image):
+        key = image.tobytes()
+        if key not in seen:
+            seen[key] = detect(image)
+        return seen[key]
+    return Look(once)
+
+
+@pytest.fixture(scope='session')
+def original(look):
+    """The map of the walk as a TUM folder."""
+    return build_map(record_every_frame(
+        read_folder(WALK, FolderOptions(layout='tum')), look).detections, OPTIONS).landmark_map
+
+
+@pytest.fixture(scope='session')
+def shots():
+    return shots_of()
+
+
+def assert_same_map(one, other):
+    assert one.class_ids == other.class_ids
+    np.testing.assert_allclose(one.centers, other.centers, atol=1e-3)
+    np.testing.assert_allclose(one.semi_axes, other.semi_axes, atol=1e-3)
+
+
+@pytest.mark.parametrize('layout', WRITERS)
+def test_the_map_is_that_of_the_original(layout, shots, look, original, tmp_path):
+    folder = WRITERS[layout](tmp_path / 'scan', shots)
+    assert find_layout(folder).name == layout
+    frames = read_folder(folder, METRES)
+    assert frames.notes[0] == f'read as {layout}: {len(shots)} of {len(shots)} images have poses'
+    for raw, shot in zip(frames.read_raw(lambda *_: True), shots, strict=True):
+        assert max(pose_error(raw.map_from_camera, shot.pose)) < 1e-4
+        np.testing.assert_allclose(raw.color.args[0].camera.matrix, shot.camera.matrix, atol=1e-6)
+        if layout not in ('COLMAP model', 'transforms.json'):
+            assert abs(raw.stamp_ns - shot.stamp_ns) < 2_000
+    has_depth = layout in ('Polycam', 'Stray Scanner', 'ARKitScenes')
+    assert (raw.depth is not None) == has_depth
+    if has_depth:
+        depths = raw.depth().depths_m
+        assert depths.shape == DEPTH_MM.shape and depths[-1, -1] == 2.0
+        # where Polycam's confidence is low
+        assert np.isnan(depths[0, 0]) == (layout == 'Polycam')
+    # flat depth is not of this room: the map is compared without it
+    made = build_map(record_every_frame(frames, lambda raw: look(replace(raw, depth=None))
+                                        ).detections, OPTIONS).landmark_map
+    assert len(made) > 20
+    assert_same_map(made, original)
+
+
+def test_text_models_and_per_frame_intrinsics_say_the_same(shots, tmp_path):
+    for text in (False, True):
+        write_colmap(tmp_path / f'{text}', shots[:5], text)
+    write_nerf(tmp_path / 'nerf', shots[:5], per_frame=True)
+    # without points, every second line is empty
+    bare = write_colmap(tmp_path / 'bare', shots[:5], text=True) / 'sparse/0/images.txt'
+    lines = bare.read_text().splitlines()
+    first = next(row for row, line in enumerate(lines) if not line.startswith('#'))
+    bare.write_text('\r\n'.join([*lines[:first], *(
+        '' if row % 2 else line for row, line in enumerate(lines[first:]))]))
+    for folder in ('bare', 'False', 'True', 'nerf', 'True/sparse/0', 'nerf/transforms.json'):
+        frames = read_folder(tmp_path / folder, METRES)
+        poses = [raw.map_from_camera for raw in frames.read_raw(lambda *_: True)]
+        np.testing.assert_allclose(poses, [shot.pose for shot in shots[:5]], atol=1e-9)
+
+
+@pytest.mark.parametrize(('model', 'values'), [
+    ('SIMPLE_PINHOLE', [500, 320, 240]), ('PINHOLE', [500, 505, 318, 244]),
+    ('SIMPLE_RADIAL', [500, 320, 240, 0.1]), ('RADIAL', [500, 318, 242, 0.1, -0.05]),
+    ('OPENCV', [500, 505, 318, 244, 0.1, -0.05, 0.001, -0.002]),
+    ('FULL_OPENCV', [500, 505, 318, 244, 0.1, -0.05, 0.001, -0.002, 0.01, 0.02, 0.01, 0.003]),
+    ('OPENCV_FISHEYE', [300, 305, 318, 244, 0.1, -0.05, 0.01, -0.002]),
+    ('SIMPLE_RADIAL_FISHEYE', [300, 318, 244, 0.1]),
+    ('RADIAL_FISHEYE', [300, 318, 244, 0.1, -0.02]),
+    ('SIMPLE_FISHEYE', [300, 318, 244]), ('FISHEYE', [300, 305, 318, 244])])
+def test_camera_models_project_as_colmap_does(model, values, shots, tmp_path):
+    import pycolmap
+
+    write_colmap(tmp_path, shots[:1], camera_of=lambda _: (model, 640, 480, values))
+    raw = next(read_folder(tmp_path, METRES).read_raw(lambda *_: True))
+    theirs = pycolmap.Camera(model=model, width=640, height=480, params=values)
+    points = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.4, 0.0, 0.4]), -1).reshape(-1, 2)
+    expected = [theirs.img_from_cam(np.array([*point, 1.0])) for point in points]
+    np.testing.assert_allclose(raw.color.args[0].camera.project_normalized(points) + 0.5,
+                               expected, atol=1e-6)
+
+
+def test_images_with_their_own_cameras(shots, look, original, tmp_path):
+    """A phone that focuses, and one image of another size: boxes go over exactly."""
+    focus = 1.0 + 0.004 * np.sin(np.arange(len(shots) + 1))
+
+    def camera_of(number):
+        return 'PINHOLE', 640, 480, [500 * focus[number], 500 * focus[number], 320 + number / 9,
+                                     240]
+    folder = write_colmap(tmp_path, shots, camera_of=camera_of)
+    frames = read_folder(folder, METRES)
+    assert frames.varies
+    recorded = record_every_frame(frames, look)
+    assert len(recorded.detections.cameras) == 1 and recorded.detections.open_edges is not None
+    own = Camera(640, 480, 500 * focus[4], 500 * focus[4], 320 + 4 / 9 - 0.5, 239.5)
+    boxes = look.detect(next(read_folder(folder, METRES).select([3]).read()).image_rgb)
+    rows = slice(*recorded.detections.frame_offsets[3:5])
+    np.testing.assert_allclose(
+        recorded.detections.cameras[0].normalize_bboxes(recorded.detections.bboxes_xyxy[rows]),
+        own.normalize_bboxes(boxes.bboxes_xyxy), atol=1e-9)
+    # an image on its side is a camera of its own, in the file as well
+    image = folder / 'images/walk' / shots[0].path.name
+    cv2.imwrite(str(image), np.zeros((640, 480, 3), dtype=np.uint8))
+    other = write_colmap(tmp_path / 'other', shots, camera_of=lambda number: (
+        ('PINHOLE', 480, 640, [500, 500, 240, 320]) if number == 1 else camera_of(number)))
+    cv2.imwrite(str(other / 'images/walk' / shots[0].path.name),
+                np.zeros((640, 480, 3), dtype=np.uint8))
+    recorded = record_every_frame(read_folder(other, METRES), look)
+    save_observations(tmp_path / 'o.npz', recorded.detections)
+    again = load_observations(tmp_path / 'o.npz')
+    assert again.camera_names == ('1: 480x640', '2: 640x480')
+    assert again.frame_cameras.tolist() == [0] + [1] * (len(shots) - 1)
+    made = build_map(again, OPTIONS).landmark_map
+    assert isinstance(made, LandmarkMap) and len(made) > 20
+
+
+def test_another_model_in_the_same_folder_is_recorded_again(shots, tmp_path):
+    folder = write_colmap(tmp_path / 'scan', shots[:5])
+    options = RecordingOptions(DetectorOptions(), None)
+    before = observation_file(read_folder(folder, METRES), options)
+    assert observation_file(read_folder(folder, METRES), options) == before
+    assert observation_file(read_folder(folder, FolderOptions(scale=2.0)), options) != before
+    other = write_colmap(tmp_path / 'other', [shot._replace(pose=shots[0].pose)
+                                              for shot in shots[:5]])
+    (folder / 'sparse/0/images.bin').write_bytes((other / 'sparse/0/images.bin').read_bytes())
+    assert observation_file(read_folder(folder, METRES), options) != before
+
+
+def test_a_video_is_read_image_by_image(shots, tmp_path):
+    write_stray(tmp_path, shots[:6])
+    for path in (tmp_path / 'rgb').iterdir():
+        path.unlink()
+    video = cv2.VideoWriter(str(tmp_path / 'rgb.mp4'), cv2.VideoWriter.fourcc(*'mp4v'), 30.0,
+                            (640, 480))
+    for number in range(6):
+        video.write(np.full((480, 640, 3), 40 * number, dtype=np.uint8))
+    video.release()
+    frames = read_folder(tmp_path)
+    assert [round(float(one.image_rgb.mean()) / 40) for one in frames.read()] == [*range(6)]
+    one, = frames.select([2]).read()  # back
+    assert round(float(one.image_rgb.mean()) / 40) == 2
+
+
+def test_the_scale_by_a_distance_and_by_objects(shots, look, original, tmp_path):
+    folder = write_colmap(tmp_path, shots, scale=0.4)
+    first, last = shots[0], shots[-1]
+    apart = float(np.linalg.norm(first.pose[:3, 3] - last.pose[:3, 3]))
+    frames = read_folder(folder, FolderOptions(
+        known_distance=(first.path.name, f'walk/{last.path.name}', apart)))
+    assert 'a unit is 0.4 m, by the known distance' in frames.notes
+    detections = record_every_frame(read_folder(folder, FolderOptions(any_unit=True)),
+                                    look).detections
+    rows = [row for row, name in enumerate(original.class_ids) if name == 'book']
+    metres = float(np.median(2.0 * original.semi_axes[rows].max(axis=1)))
+    scale, objects = scale_of_objects(detections, OPTIONS, 'book', metres)
+    assert scale == pytest.approx(0.4, rel=0.02) and objects == len(rows)
+    with pytest.raises(MappingError, match="no object of class 'unicorn' is mapped; there are "):
+        scale_of_objects(detections, OPTIONS, 'unicorn', metres)
+
+
+def test_a_large_image_is_undistorted_as_its_pixels_are():
+    camera = Camera(2400, 1800, 1700.0, 1700.0, 1200.0, 900.0, 'plumb_bob',
+                    (0.1, -0.05, 0.001, 0.002))
+    ramp = np.zeros((1800, 2400, 3), dtype=np.uint8)
+    ramp[..., 0], ramp[..., 1] = np.arange(2400) / 10, np.arange(1800)[:, None] / 10
+    rows, columns = np.random.default_rng(0).integers(100, (1700, 2300), (2000, 2)).T
+    places = camera.project_normalized(camera.pinhole.normalize_points(
+        np.stack([columns, rows], axis=1)))
+    found = undistorted(ramp, camera)[rows, columns, :2]
+    inside = ((places > 0) & (places < (2399, 1799))).all(axis=1)
+    assert inside.mean() > 0.9 and np.abs(found - places / 10)[inside].max() < 1.1
