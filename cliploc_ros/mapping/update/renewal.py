@@ -12,11 +12,10 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.mapping.building import LeftOut
+from cliploc_ros.mapping.building import LeftOut, left_out_lines, rounded
 from cliploc_ros.mapping.evidence import Evidence, gather_evidence
 from cliploc_ros.mapping.landmarks import ellipsoid_numbers, unused_ids
 from cliploc_ros.mapping.update.alignment import LEAST_MOVE_SIGMAS, Known, deviations
@@ -158,7 +157,7 @@ class UpdateReport:
             rows += [f'{name}: {one.line()}' for one in found[:_ROWS_SHOWN]]
             if len(found) > _ROWS_SHOWN:
                 rows.append(f'{name}: and {len(found) - _ROWS_SHOWN} more, see --report')
-        return rows
+        return rows + left_out_lines(self.left_out)
 
 
 def describe(old: LandmarkMap, updated: LandmarkMap, objects: Objects, fates: Fates,
@@ -175,7 +174,7 @@ def describe(old: LandmarkMap, updated: LandmarkMap, objects: Objects, fates: Fa
         name, center = old.landmark_ids[row], old.centers[row]
         now = updated.centers[places[name]] if name in places else center
         rivals = fates.rivals.get(int(fates.objects[row]), ()) if row in fates.moved else ()
-        return UpdatedLandmark(name, old.labels[row], old.class_ids[row], _rounded(now),
+        return UpdatedLandmark(name, old.labels[row], old.class_ids[row], rounded(now),
                                round(float(np.linalg.norm(now - center)), 3), evidence,
                                old.details[row].last_seen if old.details else None,
                                tuple(old.landmark_ids[rival] for rival in rivals))
@@ -197,11 +196,6 @@ def describe(old: LandmarkMap, updated: LandmarkMap, objects: Objects, fates: Fa
                               for row in fates.not_observed),
         'new': tuple(UpdatedLandmark(
             updated.landmark_ids[place], updated.labels[place], updated.class_ids[place],
-            _rounded(updated.centers[place]), 0.0, seen_in(objects.sight, number),
+            rounded(updated.centers[place]), 0.0, seen_in(objects.sight, number),
             updated.details[place].last_seen)
             for place, number in enumerate(fates.new, len(updated) - len(fates.new)))}
-
-
-def _rounded(center: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = (round(float(value), 3) for value in center)
-    return x, y, z

@@ -11,6 +11,7 @@ from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.pose_noise import estimated_note
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.update.alignment import (
     MIN_CONFIRMED,
@@ -90,7 +91,8 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
         frames=len(detections), viewpoints=int(given.viewpoints.max()) + 1,
         offset_m=aligned.offset_m, offset_deg=aligned.offset_deg,
         pose_change_m=aligned.change_m, pose_change_deg=aligned.change_deg,
-        **describe(old, updated, objects, fates, judged), left_out=judged.finds.left_out,
+        **describe(old, updated, objects, fates, judged),
+        left_out=tuple(sorted(judged.finds.left_out, key=lambda one: -one.support)),
         notes=tuple(notes))
     kept = np.setdiff1d(np.arange(len(old)), fates.missing)
     rows_of = np.full(len(objects.owners) + 1, -1, dtype=np.int64)
@@ -117,6 +119,8 @@ def _notes(old: LandmarkMap, known: Known, aligned: Alignment, detections: Posed
            ) -> list[str]:
     """Return what the user should know of the input."""
     notes = []
+    if aligned.estimated is not None:
+        notes.append(estimated_note(aligned.estimated))
     if aligned.offset_m > _LEAST_OFFSET_M or aligned.offset_deg > _LEAST_OFFSET_DEG:
         notes.append(f'the poses are {aligned.offset_m * 100:.1f} cm and {aligned.offset_deg:.1f} '
                      'degrees off the map as a whole; this is corrected')
