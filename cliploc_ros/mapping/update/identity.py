@@ -66,7 +66,7 @@ def decide_fates(known: Known, judged: Judged, objects: Objects, looks: 'Looks |
     rows = np.nonzero(elsewhere)[0]
     elsewhere[rows] = has_moved(known.landmarks.select(rows), known.sigmas[rows],
                                 objects.refits.select(numbers[rows]))
-    missing = ~found & (judged.is_gone | judged.is_there)
+    missing = ~found & ((judged.is_gone & ~judged.is_doubtful) | judged.is_there)
     return Fates(
         np.nonzero(found & ~elsewhere)[0], np.nonzero(elsewhere)[0], np.nonzero(missing)[0],
         np.nonzero(~found & ~missing)[0],
