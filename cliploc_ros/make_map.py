@@ -16,7 +16,7 @@ from cliploc_ros.datasets.frames import Frames
 from cliploc_ros.errors import MappingError, ModelError
 from cliploc_ros.mapping.building import MappingReport, build_map
 from cliploc_ros.mapping.labelling import classes_of, embed_landmarks, label_landmarks
-from cliploc_ros.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.systematic import MountCorrection
 from cliploc_ros.mapping.update.renewal import UpdateReport
@@ -26,9 +26,6 @@ from cliploc_ros.models.phrase_embeddings import phrases_of_classes
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.vocabulary.vocabulary import Vocabulary, load_vocabulary, shipped_phrases
 
-# Standard deviations of poses that a localizer gives [m] [deg]. Guesses; the map holds on to exact
-# ones all the same.
-_USUAL_NOISE = PoseErrors(0.05, 1.0)
 # Trial maps that find a scale by objects of known size, and when it has settled.
 _TRIALS, _SAME_SIZE = 4, 0.01
 
@@ -197,8 +194,8 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
                options: MappingOptions) -> MadeMap:
     """Bring a map file up to date with a recording; its file is not written.
 
-    Poses are refined against the map. Without ``pose_errors`` that tell how far they may be off,
-    those of a localizer are assumed, unless the poses are to be taken as they are.
+    Poses are refined against the map, as far as ``pose_errors`` or the boxes tell that they are
+    off.
 
     Raises
     ------
@@ -208,8 +205,6 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
     """
     old = LandmarkMap.from_file(path)
     old_embeddings = load_embeddings_of_map(path, old.landmark_ids)
-    if options.pose_errors is None and options.estimate_pose_errors:
-        options = replace(options, pose_errors=_USUAL_NOISE)
     updated = update_landmarks(old, detections, options, old_embeddings)
     landmark_map, first = updated.landmark_map, updated.first_new
     if first == len(landmark_map):

@@ -38,6 +38,7 @@ from cliploc_ros.mapping.odometry import link_frames
 from cliploc_ros.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.mapping.pose_noise import (
     estimate_pose_errors,
+    estimated_note,
     left_by_poses,
     shared_by_neighbours,
     significant_pose_errors,
@@ -62,10 +63,6 @@ _REASONS_SHOWN = 10
 Progress = Callable[[str, float], None]
 
 
-class NothingFoundError(MappingError):
-    """The boxes show no landmark that is good enough for a map."""
-
-
 @dataclass(frozen=True)
 class LeftOut:
     """A landmark that is not good enough for the map."""
@@ -76,6 +73,31 @@ class LeftOut:
     support: int
     viewpoints: int
     reason: str
+
+
+class NothingFoundError(MappingError):
+    """The boxes show no landmark that is good enough for a map, but perhaps some that are not."""
+
+    def __init__(self, message: str, left_out: tuple[LeftOut, ...]):
+        super().__init__(message)
+        self.left_out = left_out
+
+
+def rounded(center: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Return a centre to the millimetre, for reports."""
+    x, y, z = center.round(3).tolist()
+    return x, y, z
+
+
+def left_out_lines(left_out: Sequence[LeftOut]) -> list[str]:
+    """Return what is left out as text."""
+    rows = [f'left out: {len(left_out)}'] if left_out else []
+    rows += [f'  {one.class_id} at {one.center[0]:.2f} {one.center[1]:.2f} '
+             f'{one.center[2]:.2f} with {one.support} frames: {one.reason}'
+             for one in left_out[:_REASONS_SHOWN]]
+    if len(left_out) > _REASONS_SHOWN:
+        rows.append(f'  and {len(left_out) - _REASONS_SHOWN} more')
+    return rows
 
 
 @dataclass(frozen=True)
@@ -110,14 +132,7 @@ class MappingReport:
             rows.append(f'poses refined by {self.pose_change_m * 100:.1f} cm and '
                         f'{self.pose_change_deg:.2f} degrees (root mean square)')
         rows += [f'note: {note}' for note in self.notes]
-        if self.left_out:
-            rows.append(f'left out: {len(self.left_out)}')
-        rows += [f'  {one.class_id} at {one.center[0]:.2f} {one.center[1]:.2f} '
-                 f'{one.center[2]:.2f} with {one.support} frames: {one.reason}'
-                 for one in self.left_out[:_REASONS_SHOWN]]
-        if len(self.left_out) > _REASONS_SHOWN:
-            rows.append(f'  and {len(self.left_out) - _REASONS_SHOWN} more')
-        return rows
+        return rows + left_out_lines(self.left_out)
 
 
 @dataclass(frozen=True)
@@ -177,7 +192,8 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
             f'no landmark is good enough for a map; {len(draft.reasons)} were left out, the first '
             f'one because: {draft.reasons[0]}' if draft.reasons else
             'no boxes of one class meet in space; check that poses and stamps belong to these '
-            'images, that the poses are of the camera (z forward), and the intrinsics')
+            'images, that the poses are of the camera (z forward), and the intrinsics',
+            _left_out(detections, draft))
     built = _finish(detections, given, views, draft, errors, options, notes + pose_notes)
     return replace(built, mount=mount)
 
@@ -292,9 +308,7 @@ def _with_poses(given: Views, odometry: NDArray[np.float64] | None, draft: _Draf
                 # objects that were split before tell more now
                 errors = estimate_pose_errors(given, draft.landmarks, draft.shown, views) or errors
     if is_estimated:
-        notes.append(f'poses are off by about {100 * errors.sigma_m:.1f} cm and '
-                     f'{errors.sigma_deg:.1f} degrees on each axis for {errors.correlation_s:.1f} '
-                     's, estimated from the boxes; refined')
+        notes.append(estimated_note(errors))
     return views, draft, errors, notes + ([link_note] if link_note else [])
 
 
@@ -309,14 +323,10 @@ def _finish(detections: PosedDetections, given: Views, views: Views, draft: _Dra
     count = len(landmarks.centers)
     evidence = gather_evidence(views, landmarks, shown)
     explained, median_iou = explained_boxes(views, landmarks, shown)
-    centers_m = draft.left_out.centers.round(3).tolist()
-    against = draft.evidence_against
     report = MappingReport(
         len(detections), int(views.viewpoints.max()) + 1, len(detections.classes), count,
-        explained, median_iou, *pose_changes(given, views), tuple(
-            LeftOut(detections.class_names[draft.left_out.classes[row]], tuple(centers_m[row]),
-                    int(against.support[row]), int(against.viewpoints[row]), draft.reasons[row])
-            for row in np.argsort(-against.support, kind='stable')), tuple(notes))
+        explained, median_iou, *pose_changes(given, views), _left_out(detections, draft),
+        tuple(notes))
     evidence = evidence._replace(position_sigma=np.hypot(
         evidence.position_sigma,
         left_by_poses(views, np.square(pose_errors(given, views)), shown, count)))
@@ -333,6 +343,15 @@ def _finish(detections: PosedDetections, given: Views, views: Views, draft: _Dra
         LandmarkMap(options.frame_id, unused_ids(names), names, names, landmarks.centers,
                     *ellipsoid_numbers(landmarks.bases), details),
         report, shown, map_from_cameras(views))
+
+
+def _left_out(detections: PosedDetections, draft: _Draft) -> tuple[LeftOut, ...]:
+    """Return what a draft leaves out, the landmark with the greatest support first."""
+    against = draft.evidence_against
+    return tuple(LeftOut(
+        detections.class_names[draft.left_out.classes[row]], rounded(draft.left_out.centers[row]),
+        int(against.support[row]), int(against.viewpoints[row]), draft.reasons[row])
+        for row in np.argsort(-against.support, kind='stable'))
 
 
 def _class_weights(detections: PosedDetections, rows: NDArray[np.int64]

@@ -67,6 +67,13 @@ def significant_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[n
     return errors
 
 
+def estimated_note(errors: PoseErrors) -> str:
+    """Return what the user should know of estimated errors of the poses."""
+    return (f'poses are off by about {100 * errors.sigma_m:.1f} cm and {errors.sigma_deg:.1f} '
+            f'degrees on each axis for {errors.correlation_s:.1f} s, estimated from the boxes; '
+            'refined')
+
+
 def estimate_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[np.int64],
                          start: Views) -> PoseErrors | None:
     """Return how the errors of the given poses seem to behave; None with too few boxes.

@@ -345,3 +345,73 @@ def test_odd_fields_of_a_map_do_no_harm(details):
 def test_useless_recordings_say_what_to_correct(change, message):
     with pytest.raises(MappingError, match=message):
         update_map(make_things(), change(see(make_things(), POSES)))
+
+
+def test_a_lost_landmark_beside_a_like_one_comes_back():
+    """Its neighbour of the same class overlaps many of its boxes, and must not keep them."""
+    things = make_things(12)
+    pair = moved(replace(things, semi_axes=np.full_like(things.semi_axes, 0.12)),
+                 {3: things.centers[0] + (0.26, 0.0, 0.0)})
+    updated = update_map(without(pair, 3), see(pair, POSES, noise_px=2.0, missed=0.3))
+    assert updated.report.moved == updated.report.missing == ()
+    (one,) = updated.report.new
+    assert one.center == pytest.approx(pair.centers[3], abs=0.03)
+    assert len(updated.report.confirmed) == len(pair) - 1
+
+
+def test_a_displaced_landmark_that_is_hard_to_see_comes_back_and_leaves_no_ghost():
+    """Its low seen_ratio alone does not prove that it has gone from where the map has it."""
+    things = make_things(12)
+    details = tuple(replace(one, seen_ratio=ratio) for one, ratio in zip(
+        things.details, np.linspace(0.1, 0.9, 12), strict=True))
+    things = replace(things, details=details)
+    wrong = moved(things, {0: things.centers[0] + (0.27, 0.25, 0.0)})
+    report = update_map(wrong, see(things, POSES, noise_px=2.0, missed=0.4)).report
+    (one,) = report.moved
+    assert one.landmark_id == 'thing_0'
+    assert one.center == pytest.approx(things.centers[0], abs=0.03)
+    assert report.new == report.missing == ()
+
+
+def test_a_landmark_that_is_never_seen_is_named():
+    things = make_things(12)
+    details = tuple(replace(one, seen_ratio=ratio) for one, ratio in zip(
+        things.details, np.tile([0.1, 0.9], 6), strict=True))
+    updated = update_map(replace(things, details=details),
+                         see(without(things, 0), POSES, missed=0.4))
+    (one,) = updated.report.doubtful
+    assert one.landmark_id == 'thing_0'
+    assert 'seen in 0: it stays' in one.evidence
+    assert any(line.startswith('doubtful: thing_0') for line in updated.report.lines())
+    assert updated.landmark_map.details[0].seen_ratio < 0.1
+
+
+def test_what_is_left_out_has_its_reason():
+    things = make_things(12)
+    later = join_maps(things, replace(things.select([0]), centers=np.array([[1.9, 0.0, 0.8]])))
+    poses = np.array([look_at(np.array([-2.6, y, 1.1])) for y in np.linspace(-0.3, 0.3, 30)])
+    report = update_map(things, see(later, poses, noise_px=1.0)).report
+    assert report.new == ()
+    (one,) = [one for one in report.left_out if np.hypot(one.center[0] - 1.9, one.center[1]) < 0.6]
+    assert one.support >= 20
+    assert one.reason.startswith('seen from one side only')
+    assert any(one.reason in line for line in report.lines())
+
+
+@pytest.mark.parametrize(('sigma_m', 'noise'), [(0.02, (0.0, 0.0)), (0.05, (0.0, 0.0)),
+                                                (0.05, (0.05, 1.0))])
+def test_an_exact_map_hardly_moves_and_errors_of_poses_are_estimated(sigma_m, noise):
+    things, rng = make_things(), np.random.default_rng(0)
+    old = replace(things, details=tuple(replace(one, position_sigma=sigma_m)
+                                        for one in things.details))
+    poses = POSES.copy()
+    poses[:, :3, 3] += rng.normal(scale=noise[0], size=(len(POSES), 3))
+    poses[:, :3, :3] = Rotation.from_rotvec(rng.normal(
+        scale=np.radians(noise[1]), size=(len(POSES), 3))).as_matrix() @ poses[:, :3, :3]
+    updated = update_map(old, see(things, POSES, noise_px=2.0, missed=0.3).with_poses(poses),
+                         MappingOptions(estimate_pose_errors=True))
+    ways = np.linalg.norm(updated.landmark_map.centers - things.centers, axis=1)
+    assert np.median(ways) < 0.01
+    assert (updated.report.pose_change_m > 0.04) == (noise[0] > 0.0)
+    assert any('estimated from the boxes' in one for one in updated.report.notes) == (
+        noise[0] > 0.0)

@@ -17,10 +17,17 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.association import associate
 from cliploc_ros.mapping.fitting import fit_ellipsoid
-from cliploc_ros.mapping.joint import Anchors, pose_changes, refine_jointly
+from cliploc_ros.mapping.joint import Anchors, pose_changes, pose_errors, refine_jointly
 from cliploc_ros.mapping.labelling import classes_of
-from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
-from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.landmarks import (
+    Landmarks,
+    group_boxes,
+    join_landmarks,
+    landmarks_of_map,
+    no_landmarks,
+)
+from cliploc_ros.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.mapping.pose_noise import significant_pose_errors
 from cliploc_ros.mapping.views import Views, camera_from_map, map_from_cameras
 
 # A position is known no better than this [m]: objects are no ellipsoids. A guess.
@@ -55,21 +62,30 @@ class Known(NamedTuple):
     details: tuple[LandmarkDetails, ...]
     named: Landmarks  #: The landmarks once for each of their classes
     owners: NDArray[np.int64]  #: The landmark of each of these
+    landmark_ids: tuple[str, ...]
+    class_ids: tuple[str, ...]
 
     @property
     def names(self) -> set[tuple[int, int]]:
         """Return all pairs of a landmark and one of its classes."""
         return set(zip(self.owners.tolist(), self.named.classes.tolist(), strict=True))
 
-    def shown(self, views: Views, min_iou: float) -> NDArray[np.int64]:
-        """Return the old landmark (n,) that each box shows, -1 for none.
+    def shown(self, views: Views, min_iou: float, is_gone: NDArray[np.bool_] | None = None,
+              others: Landmarks | None = None) -> NDArray[np.int64]:
+        """Return the old landmark (n,) that each box shows, or L + the other one; -1 for none.
 
-        One landmark has at most one box in a frame, whatever its classes.
+        One landmark has at most one box in a frame, whatever its classes. Those that are gone
+        (L,) have none.
         """
-        shown = associate(views, self.named, min_iou)
+        count, others = len(self.sigmas), others or no_landmarks()
+        kept = np.nonzero(np.ones(len(self.owners), dtype=np.bool_) if is_gone is None
+                          else ~is_gone[self.owners])[0]
+        owned = np.append(self.owners[kept], count + np.arange(len(others.centers)))
+        shown = associate(views, join_landmarks(self.named.select(kept), others), min_iou)
         rows = np.nonzero(shown >= 0)[0]
-        owners = self.owners[shown[rows]]
-        _, kept = np.unique(views.frames[rows] * len(self.sigmas) + owners, return_index=True)
+        owners = owned[shown[rows]]
+        _, kept = np.unique(views.frames[rows] * (count + len(others.centers)) + owners,
+                            return_index=True)
         once = np.full(len(shown), -1, dtype=np.int64)
         once[rows[kept]] = owners[kept]
         return once
@@ -88,7 +104,8 @@ def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...]) -> Known:
     sigmas = np.array([_UNKNOWN_SIGMA_M if one.position_sigma is None
                        else one.position_sigma for one in details])
     return Known(landmarks._replace(classes=first), np.maximum(sigmas, _LEAST_SIGMA_M), details,
-                 Landmarks(landmarks.centers[owners], landmarks.bases[owners], classes), owners)
+                 Landmarks(landmarks.centers[owners], landmarks.bases[owners], classes), owners,
+                 old.landmark_ids, old.class_ids)
 
 
 class Refits(NamedTuple):
@@ -140,6 +157,8 @@ class Alignment(NamedTuple):
     #: Root mean square by which the poses were refined after that
     change_m: float
     change_deg: float
+    changes: NDArray[np.float64]  #: (F, 6): by how much each pose was refined [m] [rad]
+    estimated: PoseErrors | None  #: The errors of the poses, where they were estimated
 
 
 def align(given: Views, known: Known, options: MappingOptions) -> Alignment:
@@ -161,8 +180,14 @@ def align(given: Views, known: Known, options: MappingOptions) -> Alignment:
     middle = known.landmarks.centers.mean(axis=0)
     offset_m = float(np.linalg.norm(total[:3, :3].T @ (middle - total[:3, 3]) - middle))
     offset_deg = float(np.degrees(Rotation.from_matrix(total[:3, :3]).magnitude()))
-    refined = _refine(views, known, options)
-    return Alignment(refined, offset_m, offset_deg, *pose_changes(views, refined))
+    errors, estimated = options.pose_errors, None
+    if errors is None and options.estimate_pose_errors:
+        shown = known.shown(views, options.association_iou)
+        found = refit(views, known.landmarks, shown, options.min_viewpoints)
+        errors = estimated = significant_pose_errors(views, found.landmarks, shown)
+    refined = views if errors is None else _refine(views, known, errors, options)
+    return Alignment(refined, offset_m, offset_deg, *pose_changes(views, refined),
+                     pose_errors(views, refined), estimated)
 
 
 def _offset(known: Known, refits: Refits) -> NDArray[np.float64]:
@@ -191,11 +216,9 @@ def _offset(known: Known, refits: Refits) -> NDArray[np.float64]:
     return step
 
 
-def _refine(aligned: Views, known: Known, options: MappingOptions) -> Views:
+def _refine(aligned: Views, known: Known, errors: PoseErrors, options: MappingOptions) -> Views:
     """Return the views with poses refined against the old landmarks that are in their place."""
-    views, errors = aligned, options.pose_errors
-    if errors is None:
-        return aligned
+    views = aligned
     anchors = Anchors(known.landmarks.centers, known.sigmas)
     for _ in range(options.refinements):
         shown = known.shown(views, options.association_iou)

@@ -29,6 +29,8 @@ _IN_PLACE_GAIN, _NEAR_GAIN, _ELSEWHERE_GAIN = 6.0, 4.0, 2.0
 _MAX_LOOK_GAIN = 5.0
 # Of equal objects the nearer one is chosen.
 _GAIN_PER_M = 0.02
+# A landmark that is only doubted has not moved farther than this [m]. A guess.
+_MAX_DOUBTED_MOVE_M = 1.5
 # A second choice that gains hardly less makes the first one ambiguous.
 _AMBIGUOUS_GAIN = 1.0
 # Of the logarithm of an object's size, and the largest difference. Guesses.
@@ -55,7 +57,7 @@ class Fates(NamedTuple):
 def decide_fates(known: Known, judged: Judged, objects: Objects, looks: 'Looks | None'
                  ) -> Fates:
     """Return what became of each old landmark."""
-    numbers, rivals = _identify(known, objects, judged.is_gone, looks)
+    numbers, rivals = _identify(known, objects, judged, looks)
     found = numbers >= 0
     elsewhere = found.copy()
     rows = np.nonzero(found)[0]
@@ -64,7 +66,7 @@ def decide_fates(known: Known, judged: Judged, objects: Objects, looks: 'Looks |
     rows = np.nonzero(elsewhere)[0]
     elsewhere[rows] = has_moved(known.landmarks.select(rows), known.sigmas[rows],
                                 objects.refits.select(numbers[rows]))
-    missing = ~found & (judged.is_gone | judged.is_there)
+    missing = ~found & ((judged.is_gone & ~judged.is_doubtful) | judged.is_there)
     return Fates(
         np.nonzero(found & ~elsewhere)[0], np.nonzero(elsewhere)[0], np.nonzero(missing)[0],
         np.nonzero(~found & ~missing)[0],
@@ -148,15 +150,16 @@ class _LookModel(NamedTuple):
         return np.nan_to_num(np.clip(gains, -_MAX_LOOK_GAIN, _MAX_LOOK_GAIN), nan=0.0)
 
 
-def _identify(known: Known, objects: Objects, is_gone: NDArray[np.bool_], looks: Looks | None
+def _identify(known: Known, objects: Objects, judged: Judged, looks: Looks | None
               ) -> tuple[NDArray[np.int64], dict[int, tuple[int, ...]]]:
     """Return the object (L,) that each old landmark is, -1 for none, and the rivals of objects.
 
-    Landmarks that are gone may be any new object; others only the one in their place or near it.
+    Landmarks that are gone may be any new object, doubtful ones one that is not far; others only
+    the one in their place or near it.
     """
     held = np.nonzero(objects.owners >= 0)[0]
     owners = objects.owners[held]
-    result = np.full(len(is_gone), -1, dtype=np.int64)
+    result = np.full(len(known.sigmas), -1, dtype=np.int64)
     result[owners] = held
     groups = _class_groups(known, objects)
     model = None if looks is None else _learn_looks(objects, looks, groups)
@@ -166,7 +169,7 @@ def _identify(known: Known, objects: Objects, is_gone: NDArray[np.bool_], looks:
         cosines = np.einsum('ld,ld->l', *pairs).astype(np.float64)
         doubtful = (pairs[0].any(axis=1) & pairs[1].any(axis=1)
                     & (cosines < model.own - _DOUBT * model.sigma))
-    searched = is_gone.copy()
+    searched = judged.is_gone | judged.is_doubtful
     searched[[row for rows in objects.near for row in rows]] = True
     searched[owners] = doubtful
     offered = objects.owners < 0
@@ -178,7 +181,7 @@ def _identify(known: Known, objects: Objects, is_gone: NDArray[np.bool_], looks:
         rows = np.nonzero(searched & (of_landmarks == group))[0]
         columns = np.nonzero(offered & (of_objects == group))[0]
         if len(rows) and len(columns):
-            gains = _gains(known, objects, is_gone, rows, columns)
+            gains = _gains(known, objects, judged, rows, columns)
             if looks is not None and model is not None:
                 gains += model.gains(looks.similarities(rows, columns))
             result[rows], close = _assign(gains, rows, columns)
@@ -217,7 +220,7 @@ def _learn_looks(objects: Objects, looks: Looks, groups: NDArray[np.int64]) -> _
     return _LookModel(middle, elsewhere, max(*spreads, 1e-3))
 
 
-def _gains(known: Known, objects: Objects, is_gone: NDArray[np.bool_], rows: NDArray[np.int64],
+def _gains(known: Known, objects: Objects, judged: Judged, rows: NDArray[np.int64],
            columns: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the gains (k, j) by place, class and size; -inf where a pair is impossible."""
     sizes = [np.log(np.sort(np.linalg.norm(one.bases, axis=1), axis=1)[:, 1:]).mean(axis=1)
@@ -234,7 +237,9 @@ def _gains(known: Known, objects: Objects, is_gone: NDArray[np.bool_], rows: NDA
             elif int(row) in objects.near[number]:
                 gains[place, column] += _NEAR_GAIN - _ELSEWHERE_GAIN
             elif (change[place, column] > _MAX_SIZE_CHANGE
-                  or not (is_gone[row] or row in objects.owners)
+                  or not (judged.is_gone[row] or row in objects.owners
+                          or (judged.is_doubtful[row]
+                              and ways_m[place, column] < _MAX_DOUBTED_MOVE_M))
                   or (int(row), int(objects.landmarks.classes[number])) not in names):
                 gains[place, column] = -np.inf
     return gains

@@ -5,6 +5,7 @@
 Boxes that no old landmark explains show new objects, which hide old places in turn.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from scipy.special import betaln, expit
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.mapping.association import close_pairs, find_overlaps, seen_apart
-from cliploc_ros.mapping.building import LeftOut, NothingFoundError, build_map
+from cliploc_ros.mapping.building import LeftOut, NothingFoundError, build_map, rounded
 from cliploc_ros.mapping.evidence import gather_evidence
 from cliploc_ros.mapping.landmarks import (
     Landmarks,
@@ -24,8 +25,16 @@ from cliploc_ros.mapping.landmarks import (
     no_landmarks,
 )
 from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.pose_noise import left_by_poses
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.update.alignment import LEAST_MOVE_SHAPES, Known, Refits, has_moved, refit
+from cliploc_ros.mapping.update.alignment import (
+    LEAST_MOVE_SHAPES,
+    Alignment,
+    Known,
+    Refits,
+    has_moved,
+    refit,
+)
 from cliploc_ros.mapping.update.sight import Sight, look_for
 from cliploc_ros.mapping.views import Views, map_from_cameras
 
@@ -47,27 +56,34 @@ _PRIOR_VIEWS = 4.0
 _GONE_BELOW, _GONE_BELOW_IF_TAKEN, _THERE_ABOVE = 0.05, 0.5, 0.95
 #: Its place must be in view from this number of viewpoints before an object can be missing.
 LEAST_VIEWS = 5
-# A new landmark must be detected this often, in units of how often the old ones are.
-_MIN_NEW_SHARE = 0.4
-# Overlaps with which a box is near a landmark, and on it whatever its class. Guesses.
-_NEAR_IOU, _SAME_IOU = 0.02, 0.5
+# A new landmark must be detected this often, and one in its place, in units of how often the old
+# ones are. The second one was chosen on blocks of TUM fr3, between landmarks that were displaced
+# in the map (at most 0.17) and those that were not (at least 0.2, but for 3 of 47).
+_MIN_NEW_SHARE, _MIN_SHARE_IN_PLACE = 0.4, 0.15
 
 
 class Finds(NamedTuple):
     """New landmarks: m of them."""
 
     landmarks: Landmarks
+    class_ids: tuple[str, ...]
     details: tuple[LandmarkDetails, ...]
-    #: (n,): the new landmark that each box of the recording shows, -1 for none
-    shown: NDArray[np.int64]
-    left_out: tuple[LeftOut, ...]  #: Objects that are not good enough for a map
+    left_out: tuple[LeftOut, ...]  #: Objects that are not good enough for a map, or are old ones
 
-    def select(self, rows: NDArray[np.int64]) -> 'Finds':
-        """Return some of the new landmarks."""
-        numbers = np.full(len(self.details) + 1, -1, dtype=np.int64)
-        numbers[rows] = np.arange(len(rows))
-        return Finds(self.landmarks.select(rows), tuple(self.details[row] for row in rows),
-                     numbers[self.shown], self.left_out)
+    def without(self, reasons: Sequence[str | None], sight: Sight) -> 'Finds':
+        """Return the finds without those that have a reason (m,), which are left out.
+
+        The last ones in sight are the finds.
+        """
+        kept = [row for row, reason in enumerate(reasons) if reason is None]
+        own = sight.select(slice(len(sight.seen) - len(reasons), None))
+        return Finds(
+            self.landmarks.select(np.array(kept, dtype=np.int64)),
+            tuple(self.class_ids[row] for row in kept), tuple(self.details[row] for row in kept),
+            self.left_out + tuple(
+                LeftOut(self.class_ids[row], rounded(self.landmarks.centers[row]),
+                        int(own.seen_frames[row]), int(own.seen[row]), reason)
+                for row, reason in enumerate(reasons) if reason is not None))
 
 
 class Judged(NamedTuple):
@@ -79,6 +95,8 @@ class Judged(NamedTuple):
     sight: Sight  #: Of the old places, then of the finds
     is_gone: NDArray[np.bool_]  #: (L,)
     is_there: NDArray[np.bool_]  #: (L,): Neither: the recording does not tell
+    #: (L,): not proven to be gone, although boxes put it elsewhere, or hardly any shows it
+    is_doubtful: NDArray[np.bool_]
 
 
 def judge(detections: PosedDetections, views: Views, known: Known, options: MappingOptions
@@ -88,39 +106,54 @@ def judge(detections: PosedDetections, views: Views, known: Known, options: Mapp
     The views have poses in the coordinate frame of the map.
     """
     count = len(known.landmarks.centers)
-    shown = known.shown(views, options.association_iou)
-    refits = refit(views, known.landmarks, shown, options.min_viewpoints)
+    finds = _find_new(detections, views, _free(views, known, options), options)
+    # old landmarks and finds compete for the boxes: an old one may have those of a neighbour
+    shown, _ = _look(views, known, finds, np.zeros(count, dtype=np.bool_), options)
+    refits = refit(views, known.landmarks, np.where(shown < count, shown, -1),
+                   options.min_viewpoints)
     displaced = has_moved(known.landmarks, known.sigmas, refits)
-    sight = look_for(views, known.landmarks, shown, np.ones(count, dtype=np.bool_))
-    is_gone = displaced | _is_absent(known, sight, _GONE_BELOW)
-    finds = _find_new(detections, views, _free(views, known, refits, shown, is_gone), options)
-    finds = _with_displaced(finds, refits, shown, displaced, options.merge_distance)
+    finds = _with_displaced(finds, refits, displaced, known.class_ids, options.merge_distance)
+    shown, sight = _look(views, known, finds, displaced, options)
+    is_gone = displaced | _is_absent(known, sight.select(slice(count)), _GONE_BELOW)
     # a new object may be in the place of an old one of which a wrong box remains
-    finds = _without_copies(views, finds, refits.landmarks, _held(shown, is_gone), 1.0, options)
-    _, sight = _look(views, known, finds, shown, is_gone)
+    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 1.0, options)
+    _, sight = _look(views, known, finds, is_gone, options)
     # finds are seen about as often as the old landmarks, which come first
-    usual = sight.seen_ratio[:count][sight.seen[:count] > 0]
-    least = _MIN_NEW_SHARE * (float(np.median(usual)) if len(usual) else 1.0)
-    finds = finds.select(np.nonzero(sight.seen_ratio[count:] >= least)[0])
+    ratios = sight.seen_ratio[:count][sight.seen[:count] > 0]
+    usual = float(np.median(ratios)) if len(ratios) else 1.0
+    least = _MIN_NEW_SHARE * usual
+    finds = finds.without([
+        None if ratio >= least else f'seen in {100 * ratio:.1f} % of the frames that show its '
+        f'place, not {100 * least:.1f} %, {_MIN_NEW_SHARE:g} of what is usual'
+        for ratio in sight.seen_ratio[count:]], sight)
     # new objects hide old places
-    _, sight = _look(views, known, finds, shown, is_gone)
+    shown, sight = _look(views, known, finds, is_gone, options)
     # an old landmark is hardly there if a find with more boxes is in its place
-    of_old, of_new = group_boxes(shown, count), group_boxes(finds.shown, len(finds.details))
+    of_old, of_new = _boxes(shown, count, finds)
     limits = np.full(count, _GONE_BELOW)
     for new, row, _ in _pairs_between(finds.landmarks, known.landmarks, options.merge_distance):
         if len(of_new[new]) > len(of_old[row]):
             limits[row] = _GONE_BELOW_IF_TAKEN
     is_gone = displaced | _is_absent(known, sight.select(slice(count)), limits)
-    finds = _without_copies(views, finds, refits.landmarks, _held(shown, is_gone), 0.0, options)
+    shown, sight = _look(views, known, finds, is_gone, options)
+    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 0.0, options)
     # objects that are gone hide nothing
-    both, sight = _look(views, known, finds, shown, is_gone)
+    shown, sight = _look(views, known, finds, is_gone, options)
     own = sight.select(slice(count))
     is_gone |= _is_absent(known, own, limits)
-    fits = gather_evidence(views, refits.landmarks, _held(shown, is_gone)).median_iou
-    is_there = (~is_gone & (fits >= options.min_median_iou)
-                & (refits.is_known
-                   | (_probability_there(known, own) > _THERE_ABOVE)))
-    return Judged(both, finds, sight, is_gone, is_there)
+    shown[np.isin(shown, np.nonzero(is_gone)[0])] = -1
+    of_landmarks = np.where(shown < count, shown, -1)
+    refits = refit(views, known.landmarks, of_landmarks, options.min_viewpoints)
+    fits = gather_evidence(views, refits.landmarks, of_landmarks).median_iou
+    is_rare = ((own.seen_ratio < _MIN_SHARE_IN_PLACE * usual)
+               & (own.expected >= LEAST_VIEWS))
+    is_there = (~is_gone & ~is_rare & (fits >= options.min_median_iou)
+                & (refits.is_known | (_probability_there(known, own) > _THERE_ABOVE)))
+    # boxes put it elsewhere, but may not make a landmark there: then nothing says that it is gone
+    is_doubtful = (is_gone & ~_is_absent(known, own, limits)) | (
+        ~is_there & ~is_gone & (is_rare | _is_absent(known, own, _STAYS))
+        & (known.landmarks.classes >= 0))
+    return Judged(shown, finds, sight, is_gone, is_there, is_doubtful)
 
 
 def _is_absent(known: Known, sight: Sight, limits: NDArray[np.float64] | float
@@ -171,36 +204,37 @@ def _log_evidence(sight: Sight, ratios: NDArray[np.float64], views: float) -> ND
     return np.asarray(betaln(a + sight.seen, b + sight.expected - sight.seen) - betaln(a, b))
 
 
-def _look(views: Views, known: Known, finds: Finds, shown: NDArray[np.int64],
-          is_gone: NDArray[np.bool_]) -> tuple[NDArray[np.int64], Sight]:
+def _look(views: Views, known: Known, finds: Finds, is_gone: NDArray[np.bool_],
+          options: MappingOptions) -> tuple[NDArray[np.int64], Sight]:
     """Return the landmark or find that each box shows, and the sight of all their places."""
-    own = _held(shown, is_gone)
-    both = np.where((own < 0) & (finds.shown >= 0), len(is_gone) + finds.shown, own)
+    shown = known.shown(views, options.association_iou, is_gone, finds.landmarks)
     is_solid = np.concatenate([~is_gone, np.ones(len(finds.details), dtype=np.bool_)])
-    return both, look_for(views, join_landmarks(known.landmarks, finds.landmarks), both, is_solid)
+    return shown, look_for(views, join_landmarks(known.landmarks, finds.landmarks), shown,
+                           is_solid)
 
 
-def _held(shown: NDArray[np.int64], is_gone: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the landmark (n,) that each box shows, without those that are gone."""
-    return np.where((shown >= 0) & ~is_gone[shown], shown, -1)
+def _boxes(shown: NDArray[np.int64], count: int, finds: Finds
+           ) -> tuple[list[NDArray[np.int64]], list[NDArray[np.int64]]]:
+    """Return the boxes of each of the old landmarks, and of each of the finds."""
+    boxes = group_boxes(shown, count + len(finds.details))
+    return boxes[:count], boxes[count:]
 
 
-def _free(views: Views, known: Known, refits: Refits, shown: NDArray[np.int64],
-          is_gone: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Tell which boxes (n,) may show new objects.
+def _free(views: Views, known: Known, options: MappingOptions) -> NDArray[np.bool_]:
+    """Tell which boxes (n,) may show new objects: those that no old landmark fits well.
 
-    A box near a landmark that has no better one is no proof of a new object; nor is a box on a
-    landmark that has at least as many of its own: it may be another name for it.
+    Nor is a box free on a landmark that has at least as many of its own: it may be another name
+    for it.
     """
-    own = _held(shown, is_gone)
-    near = _held(known.shown(views, _NEAR_IOU), is_gone)
+    own = known.shown(views, options.min_median_iou)
     nameless = find_overlaps(
         views._replace(classes=np.zeros_like(views.classes)),
-        refits.landmarks._replace(classes=np.zeros_like(refits.landmarks.classes)), _SAME_IOU)
+        known.landmarks._replace(classes=np.zeros_like(known.landmarks.classes)),
+        options.min_median_iou)
     others = own[nameless.boxes] < 0
-    on, count = nameless.landmarks[others], len(is_gone)
+    on, count = nameless.landmarks[others], len(known.sigmas)
     is_named = np.bincount(own[own >= 0], minlength=count) >= np.bincount(on, minlength=count)
-    free = (own < 0) & (near < 0)
+    free = own < 0
     free[nameless.boxes[others][is_named[on]]] = False
     return free
 
@@ -208,52 +242,50 @@ def _free(views: Views, known: Known, refits: Refits, shown: NDArray[np.int64],
 def _find_new(detections: PosedDetections, views: Views, is_free: NDArray[np.bool_],
               options: MappingOptions) -> Finds:
     """Return the landmarks that the free boxes show, for the poses of the views."""
-    shown = np.full(len(is_free), -1, dtype=np.int64)
-    nothing = Finds(no_landmarks(), (), shown, ())
+    nothing = Finds(no_landmarks(), (), (), ())
     if not is_free.any():
         return nothing
     posed = detections.with_poses(map_from_cameras(views)).select_boxes(is_free)
     try:
         built = build_map(posed, replace(options, pose_errors=None, estimate_pose_errors=False,
                                          refine_mount=False))
-    except NothingFoundError:
-        return nothing
-    shown[is_free] = built.shown
+    except NothingFoundError as error:
+        return nothing._replace(left_out=error.left_out)
     return Finds(landmarks_of_map(built.landmark_map, detections.class_names),
-                 built.landmark_map.details, shown, built.report.left_out)
+                 built.landmark_map.class_ids, built.landmark_map.details, built.report.left_out)
 
 
-def _with_displaced(finds: Finds, refits: Refits, shown: NDArray[np.int64],
-                    displaced: NDArray[np.bool_], merge_distance: float) -> Finds:
+def _with_displaced(finds: Finds, refits: Refits, displaced: NDArray[np.bool_],
+                    class_ids: Sequence[str], merge_distance: float) -> Finds:
     """Return the finds with the landmarks that stand a little off their place, if not found."""
     rows = np.nonzero(displaced)[0]
     again = {moved for moved, _, _ in _pairs_between(refits.landmarks.select(rows),
                                                      finds.landmarks, merge_distance)}
     rows = rows[[moved not in again for moved in range(len(rows))]]
-    numbers = np.full(len(displaced) + 1, -1, dtype=np.int64)
-    numbers[rows] = len(finds.details) + np.arange(len(rows))
-    return Finds(join_landmarks(finds.landmarks, refits.landmarks.select(rows)),
-                 finds.details + (LandmarkDetails(),) * len(rows),
-                 np.where(finds.shown >= 0, finds.shown, numbers[shown]), finds.left_out)
+    return finds._replace(
+        landmarks=join_landmarks(finds.landmarks, refits.landmarks.select(rows)),
+        class_ids=finds.class_ids + tuple(class_ids[row] for row in rows.tolist()),
+        details=finds.details + (LandmarkDetails(),) * len(rows))
 
 
-def _without_copies(views: Views, finds: Finds, old: Landmarks, old_shown: NDArray[np.int64],
-                    majority: float, options: MappingOptions) -> Finds:
+def _without_copies(views: Views, finds: Finds, old: Landmarks, known: Known,
+                    shown: NDArray[np.int64], sight: Sight, majority: float,
+                    options: MappingOptions) -> Finds:
     """Return the new landmarks without those that are an old one in its place.
 
     An old landmark is in its place if it has a box, and a majority for each of the new one's. Of
     two landmarks that lie in one another, the boxes are those of one object: parts of it, or
     another name for it. If they only touch, frames that show both tell them apart.
     """
-    of_old = group_boxes(old_shown, len(old.centers))
-    of_new = group_boxes(finds.shown, len(finds.details))
-    is_copy = np.zeros(len(of_new), dtype=np.bool_)
+    of_old, of_new = _boxes(shown, len(old.centers), finds)
+    reasons: list[str | None] = [None] * len(of_new)
     for new, row, distance in _pairs_between(finds.landmarks, old, options.merge_distance):
         is_one_class = old.classes[row] == finds.landmarks.classes[new]
-        is_copy[new] |= len(of_old[row]) >= max(1.0, majority * len(of_new[new])) and (
-            (is_one_class and distance < LEAST_MOVE_SHAPES)
-            or seen_apart(views, of_old[row], of_new[new]) <= options.max_seen_apart)
-    return finds.select(np.nonzero(~is_copy)[0])
+        if len(of_old[row]) >= max(1.0, majority * len(of_new[new])) and (
+                (is_one_class and distance < LEAST_MOVE_SHAPES)
+                or seen_apart(views, of_old[row], of_new[new]) <= options.max_seen_apart):
+            reasons[new] = f'it is {known.landmark_ids[row]} in its place'
+    return finds.without(reasons, sight)
 
 
 def _pairs_between(new: Landmarks, old: Landmarks, max_distance: float
@@ -281,9 +313,10 @@ class Objects(NamedTuple):
         return self.refits.landmarks
 
 
-def gather_objects(views: Views, known: Known, judged: Judged, options: MappingOptions) -> Objects:
+def gather_objects(aligned: Alignment, known: Known, judged: Judged, options: MappingOptions
+                   ) -> Objects:
     """Return the objects that the recording shows."""
-    count, finds = len(known.sigmas), judged.finds
+    views, count, finds = aligned.views, len(known.sigmas), judged.finds
     in_place = np.nonzero(judged.is_there)[0]
     places = np.concatenate([in_place, count + np.arange(len(finds.details))])
     numbers = np.full(count + len(finds.details) + 1, -1, dtype=np.int64)
@@ -291,6 +324,9 @@ def gather_objects(views: Views, known: Known, judged: Judged, options: MappingO
     shown = numbers[judged.shown]
     refits = refit(views, join_landmarks(known.landmarks.select(in_place), finds.landmarks), shown,
                    options.min_viewpoints)
+    left_m = left_by_poses(views, np.square(aligned.changes), shown, len(places))
+    refits = refits._replace(
+        covariances=refits.covariances + np.square(left_m)[:, None, None] * np.eye(3))
     near: list[set[int]] = [set() for _ in places]
     names = known.names
     for new, row, _ in _pairs_between(finds.landmarks, known.landmarks,

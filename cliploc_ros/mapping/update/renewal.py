@@ -12,11 +12,10 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.mapping.building import LeftOut
+from cliploc_ros.mapping.building import LeftOut, left_out_lines, rounded
 from cliploc_ros.mapping.evidence import Evidence, gather_evidence
 from cliploc_ros.mapping.landmarks import ellipsoid_numbers, unused_ids
 from cliploc_ros.mapping.update.alignment import LEAST_MOVE_SIGMAS, Known, deviations
@@ -29,7 +28,7 @@ _ROWS_SHOWN = 40
 
 
 def renew(old: LandmarkMap, known: Known, views: Views, objects: Objects, fates: Fates,
-          class_names: tuple[str, ...]) -> LandmarkMap:
+          judged: Judged, class_names: tuple[str, ...]) -> LandmarkMap:
     """Return the new map: the old landmarks that are left, in their order, then new ones.
 
     The class names are those of the recording; the views have its poses in the map.
@@ -42,6 +41,8 @@ def renew(old: LandmarkMap, known: Known, views: Views, objects: Objects, fates:
         details[row] = _in_place(details[row], objects.sight, evidence, fates.objects[row])
     for row in fates.moved:
         details[row] = _in_new_place(details[row], objects.sight, evidence, fates.objects[row])
+    for row in fates.not_observed[judged.is_doubtful[fates.not_observed]].tolist():
+        details[row] = _looked_for(details[row], judged.sight, row)
     placed = dict.fromkeys(fates.moved.tolist(), 1.0) | _refitted(known, objects, fates)
     for row, weight in placed.items():
         number = fates.objects[row]
@@ -80,15 +81,21 @@ def _refitted(known: Known, objects: Objects, fates: Fates) -> dict[int, float]:
     return dict(zip(rows[better].tolist(), weights[better].tolist(), strict=True))
 
 
-def _in_place(details: LandmarkDetails, sight: Sight, evidence: Evidence, number: int
-              ) -> LandmarkDetails:
-    """Return what is known of a landmark in its place with what the recording adds."""
+def _looked_for(details: LandmarkDetails, sight: Sight, number: int) -> LandmarkDetails:
+    """Return what is known of a landmark with the frames that should have shown it, too."""
     support, expected = details.support or 0, int(sight.expected_frames[number])
     if support and details.seen_ratio:
         expected += round(support / details.seen_ratio)
     support += int(sight.seen_frames[number])
+    return replace(details, support=support, seen_ratio=min(1.0, support / max(1, expected)))
+
+
+def _in_place(details: LandmarkDetails, sight: Sight, evidence: Evidence, number: int
+              ) -> LandmarkDetails:
+    """Return what is known of a landmark in its place with what the recording adds."""
+    details = _looked_for(details, sight, number)
     return replace(
-        details, support=support, seen_ratio=min(1.0, support / max(1, expected)),
+        details,
         baseline_deg=max(details.baseline_deg or 0.0, float(evidence.baseline_deg[number])),
         last_seen=max(details.last_seen or 0.0, float(evidence.last_seen[number])))
 
@@ -140,6 +147,8 @@ class UpdateReport:
     missing: tuple[UpdatedLandmark, ...]
     new: tuple[UpdatedLandmark, ...]
     not_observed: tuple[UpdatedLandmark, ...]
+    #: Those of not_observed that may have gone: hardly seen where their places were in view
+    doubtful: tuple[UpdatedLandmark, ...]
     left_out: tuple[LeftOut, ...]  #: New objects that are not good enough for the map
     notes: tuple[str, ...]
 
@@ -151,14 +160,16 @@ class UpdateReport:
         """Return the report as text."""
         rows = [f'{len(self.confirmed)} confirmed, {len(self.moved)} moved, '
                 f'{len(self.missing)} missing, {len(self.new)} new, '
-                f'{len(self.not_observed)} not observed; {self.frames} frames of '
+                f'{len(self.not_observed)} not observed ({len(self.doubtful)} doubtful); '
+                f'{self.frames} frames of '
                 f'{self.viewpoints} viewpoints']
         rows += [f'note: {note}' for note in self.notes]
-        for name, found in (('moved', self.moved), ('missing', self.missing), ('new', self.new)):
+        for name, found in (('moved', self.moved), ('missing', self.missing),
+                            ('doubtful', self.doubtful), ('new', self.new)):
             rows += [f'{name}: {one.line()}' for one in found[:_ROWS_SHOWN]]
             if len(found) > _ROWS_SHOWN:
                 rows.append(f'{name}: and {len(found) - _ROWS_SHOWN} more, see --report')
-        return rows
+        return rows + left_out_lines(self.left_out)
 
 
 def describe(old: LandmarkMap, updated: LandmarkMap, objects: Objects, fates: Fates,
@@ -175,7 +186,7 @@ def describe(old: LandmarkMap, updated: LandmarkMap, objects: Objects, fates: Fa
         name, center = old.landmark_ids[row], old.centers[row]
         now = updated.centers[places[name]] if name in places else center
         rivals = fates.rivals.get(int(fates.objects[row]), ()) if row in fates.moved else ()
-        return UpdatedLandmark(name, old.labels[row], old.class_ids[row], _rounded(now),
+        return UpdatedLandmark(name, old.labels[row], old.class_ids[row], rounded(now),
                                round(float(np.linalg.norm(now - center)), 3), evidence,
                                old.details[row].last_seen if old.details else None,
                                tuple(old.landmark_ids[rival] for rival in rivals))
@@ -195,13 +206,11 @@ def describe(old: LandmarkMap, updated: LandmarkMap, objects: Objects, fates: Fa
         'missing': tuple(item(row, seen_in(judged.sight, row)) for row in fates.missing),
         'not_observed': tuple(item(row, seen_in(judged.sight, row))
                               for row in fates.not_observed),
+        'doubtful': tuple(item(row, f'{seen_in(judged.sight, row)}: it stays; delete it if it is '
+                               'not there')
+                          for row in fates.not_observed if judged.is_doubtful[row]),
         'new': tuple(UpdatedLandmark(
             updated.landmark_ids[place], updated.labels[place], updated.class_ids[place],
-            _rounded(updated.centers[place]), 0.0, seen_in(objects.sight, number),
+            rounded(updated.centers[place]), 0.0, seen_in(objects.sight, number),
             updated.details[place].last_seen)
             for place, number in enumerate(fates.new, len(updated) - len(fates.new)))}
-
-
-def _rounded(center: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = (round(float(value), 3) for value in center)
-    return x, y, z
