@@ -70,6 +70,15 @@ class Places(NamedTuple):
     unlabelled: float
 
 
+class Prior(NamedTuple):
+    """What a region says that is known before."""
+
+    most: float
+    most_probability: float
+    least_m: float
+    least_deg: float
+
+
 class Search(NamedTuple):
     """When a search is enough."""
 
@@ -128,6 +137,7 @@ class Calibration(NamedTuple):
     genuine: Genuine
     attitude: Attitude
     places: Places
+    prior: Prior
     search: Search
     looks: SuccessiveLooks
     covariance: Spread

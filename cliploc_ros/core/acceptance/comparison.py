@@ -127,7 +127,7 @@ def search_contenders(joined: JoinedFrames, finalists: Sequence[Finalist],
     contenders = contenders_of(joined, finalists, is_upright.tolist())
     if not joined.options.refine:
         return contenders
-    order = sorted(range(len(contenders)), key=lambda row: -contenders[row].odds)
+    order = sorted(range(len(contenders)), key=lambda row: -contenders[row].rank)
     return [contenders[row] for known in (True, False) for row in first_of_each_place(
         [row for row in order if contenders[row].is_upright == known], finalists, MAX_DISTINCT)]
 
@@ -146,10 +146,11 @@ def compare(joined: JoinedFrames, contenders: list[Contender],
         contenders = [one._replace(odds=one.odds + _missed(one.pose, seen, recognizer))
                       for one in contenders]
         contenders += _proposed(joined, seen, contenders)
-        contenders.sort(key=lambda one: (not one.is_upright, -one.odds))
+        contenders.sort(key=lambda one: (not one.is_upright, -one.rank))
     poses = np.array([one.pose for one in contenders]).reshape(-1, 4, 4)
     return Comparison(contenders, poses, confidences(
-        np.array([one.odds for one in contenders]), poses, none_right(joined.setting)), seen)
+        np.array([one.odds for one in contenders]), poses, none_right(joined.setting),
+        prior=np.array([one.prior for one in contenders])), seen)
 
 
 def _proposed(joined: JoinedFrames, seen: Recognition, met: Sequence[Contender]
@@ -319,7 +320,9 @@ def _by_points(joined: JoinedFrames, compared: Comparison) -> float:
             if one.recognized is not None or not near]
     odds = [one.by_points if near else one.odds for one, near in zip(
         compared.contenders, compared.leading, strict=True)]
-    found = confidences(np.array(odds)[rows], compared.poses[rows], none_right(joined.setting))
+    priors = np.array([one.prior for one in compared.contenders])
+    found = confidences(np.array(odds)[rows], compared.poses[rows], none_right(joined.setting),
+                        prior=priors[rows])
     return float(max(found[number] for number, row in enumerate(rows) if compared.leading[row]))
 
 
@@ -344,8 +347,9 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
         return 1.0, None
     supports = supports_of(joined, poses[others],
                            [matches_of(joined.rig, twins[row - 1]) for row in others])
-    chance, likeliest = chance_distinct(best.support, supports, _leads_of_points(
-        compared, poses[others], are_rooms[inside][others - 1], recognizer))
+    leads = best.prior - joined.prior_odds(poses[others]) + _leads_of_points(
+        compared, poses[others], are_rooms[inside][others - 1], recognizer)
+    chance, likeliest = chance_distinct(best.support, supports, leads)
     return chance, place_of(joined.landmark_map, poses[others][likeliest])
 
 
