@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.map.occupancy_grid import OccupancyGrid
 from cliploc_ros.core.map.similarities import Similarities
 
 #: (4, 4): a body at the camera, with axes x ahead, y left, z up (REP 103)
@@ -99,6 +100,7 @@ class Observation:
     #: (n,): standard deviation of each depth [m]; None for those of a usual RGB-D camera
     depth_deviations: NDArray[np.float64] | None = None
     region: Region | None = None  #: Where the robot probably is; None where nothing is known
+    grid: OccupancyGrid | None = None  #: Walls; None where they are not known
 
     @property
     def similarity_rows(self) -> NDArray[np.int64]:

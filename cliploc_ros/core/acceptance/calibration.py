@@ -71,12 +71,16 @@ class Places(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """What a region says that is known before."""
+    """What a region and an occupancy grid say."""
 
     most: float
     most_probability: float
     least_m: float
     least_deg: float
+    in_wall: float
+    outside: float
+    blocked: float
+    most_blocked: float
 
 
 class Search(NamedTuple):
