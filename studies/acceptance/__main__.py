@@ -127,7 +127,8 @@ def _stress(options: argparse.Namespace) -> None:
 
 def _priors(options: argparse.Namespace) -> None:
     tasks = [task._replace(seed=task.seed + place.seed) for place in chosen_places(options)
-             for task in tasks_of([place], RelocalizerOptions(matching=options.matching), [*PRIORS])]
+             for task in tasks_of([place], RelocalizerOptions(matching=options.matching),
+                                  [*PRIORS])]
     found: list[Outcome] = run_all(make_search, tasks, 'searches', options.workers)
     for by in (('place', 'trouble', 'level'), ('trouble', 'level')):
         print(acceptance_table(found, by), end='\n\n')
@@ -216,7 +217,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     add_arguments(stress, ('room', 'office', 'shop'), first_seed=1000)
     stress.add_argument('--only', nargs='+', default=[''], metavar='TEXT',
                         help='troubles whose name contains one of these')
-    priors = add('priors', _priors, 'what a region known before adds, right and wrong')
+    priors = add('priors', _priors, 'what regions and walls known before add, right and wrong')
     add_arguments(priors, worlds=20, first_seed=1100)
     robustness = add('robustness', _robustness, 'success and false accepts over growing troubles',
                      'draw them')

@@ -74,7 +74,6 @@ class Prior(NamedTuple):
     """What a region and an occupancy grid say."""
 
     most: float
-    most_probability: float
     least_m: float
     least_deg: float
     in_wall: float

@@ -56,8 +56,8 @@ def confidences(odds: NDArray[np.float64], poses: NDArray[np.float64], none: flo
     """Return the probability (m,) that each pose (m, 4, 4) is within 1 m of the truth.
 
     The rest to 1 is the probability that another pose is right, or none. Odds (m,) are the
-    utilities of the poses, none is that of the case that none of them is right. The prior (m,),
-    log odds, decides between poses: it never raises the odds of a pose against none.
+    utilities of the poses, none is that of the case that none of them is right. The prior (m,)
+    is log odds of 0 or less, so it raises no pose against none.
     """
     if len(odds) == 0:
         return np.empty(0)
@@ -77,7 +77,7 @@ def confidences(odds: NDArray[np.float64], poses: NDArray[np.float64], none: flo
     # what the prior says of each pose is no evidence of objects, and not steepened
     kept = np.where(agreeing[lead], sharpened[lead] / likely[lead], lost)
     weighted = shares * kept * np.exp(prior)
-    none_of_them = max(0.0, 1.0 - float(shares @ kept)) * np.exp(np.maximum(0.0, prior))
+    none_of_them = max(0.0, 1.0 - float(shares @ kept))
     return np.minimum(agreeing @ weighted / (weighted.sum() + none_of_them), most)
 
 

@@ -4,10 +4,10 @@
 
 A region is right with its probability p; otherwise the robot may be anywhere in the map. So a pose
 has the density p N(pose) + (1 - p) u, where u is uniform over the map. Its logarithm over u is
-bounded by log(1 - p) below and by a constant above, and decides between poses. It never raises a
-pose against the case that no pose is right, see confidences: the confidence of a pose stays below
-that without its rivals, so a region lifts no pose that its objects support weakly. Against that
-case it only lowers poses outside of it.
+bounded: 0 in the region, a constant elsewhere. So a region never raises a pose against the case
+that no pose is right, and lifts none that its objects support weakly: the confidence of a pose
+stays below that without its rivals. Nor does it decide alone between two places that look the
+same: the robot may have been told the wrong one of them.
 
 An occupancy grid speaks against the leading pose alone. So it never decides between poses, and a
 grid of another floor or frame makes no wrong pose more likely.
@@ -34,7 +34,7 @@ _REACH_M = 0.3
 
 def region_odds(landmark_map: LandmarkMap, region: Region, poses: NDArray[np.float64]
                 ) -> NDArray[np.float64]:
-    """Return the log odds (m,) that a region gives to camera poses (m, 4, 4) of a map.
+    """Return the log odds (m,), 0 or less, that a region gives to camera poses (m, 4, 4) of a map.
 
     A region of a map that is not there says nothing.
     """
@@ -58,9 +58,9 @@ def region_odds(landmark_map: LandmarkMap, region: Region, poses: NDArray[np.flo
     # a region wider than the map is as good as the map
     peak = (max(0.0, math.log(area / (2.0 * math.pi)) - 0.5 * np.linalg.slogdet(spot)[1])
             + max(0.0, 0.5 * math.log(2.0 * math.pi / yaw)))
-    p = min(region.probability, terms.most_probability)
-    return np.asarray(np.minimum(
-        terms.most, np.logaddexp(math.log(1.0 - p), math.log(max(p, 1e-9)) + peak - 0.5 * squares)))
+    p = min(max(region.probability, 1e-9), 1.0 - 1e-9)
+    odds = np.logaddexp(math.log(1.0 - p), math.log(p) + peak - 0.5 * squares)
+    return np.asarray(np.clip(odds, -terms.most, 0.0))
 
 
 class Walls(NamedTuple):

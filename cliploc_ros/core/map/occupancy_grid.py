@@ -28,8 +28,8 @@ class OccupancyGrid:
     """Cells of a horizontal plane, most often that of a lidar."""
 
     frame_id: str  #: The coordinate frame of the origin
-    #: (rows, columns) of int8: FREE, OCCUPIED or UNKNOWN; the first cell lies at the origin, columns
-    #: along x of the grid, rows along y
+    #: (rows, columns): FREE, OCCUPIED or UNKNOWN; the first cell lies at the origin, columns along
+    #: x of the grid, rows along y
     cells: NDArray[np.int8]
     resolution_m: float  #: Side of a cell
     origin: tuple[float, float, float]  #: x, y [m] and yaw [rad] of the grid in the frame
