@@ -28,6 +28,8 @@ from cliploc_ros.core.observation import Region
 
 # A robot drives about beyond the outermost landmarks, too [m].
 _MARGIN_M = 1.0
+# A body that points up or down has no yaw: of its x axis, this much must be level.
+_LEAST_AHEAD = 0.5
 # A camera is so near to free space: errors of pose and grid, and what a camera reaches over [m].
 _REACH_M = 0.3
 
@@ -48,6 +50,7 @@ def region_odds(landmark_map: LandmarkMap, region: Region, poses: NDArray[np.flo
     steps = np.c_[bodies[:, :2, 3] - shift[:2], np.arctan2(bodies[:, 1, 0], bodies[:, 0, 0])]
     steps -= region.mean
     steps[:, 2] = (steps[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
+    steps[np.hypot(*bodies[:, :2, 0].T) < _LEAST_AHEAD, 2] = 0.0
     covariance = region.covariance + np.diag(
         [terms.least_m, terms.least_m, math.radians(terms.least_deg)]) ** 2
     spot, yaw = covariance[:2, :2], covariance[2, 2]
