@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.map.occupancy_grid import OccupancyGrid
 from cliploc_ros.core.map.similarities import Similarities
+from cliploc_ros.errors import OptionsError
 
 #: (4, 4): a body at the camera, with axes x ahead, y left, z up (REP 103)
 OPTICAL_FROM_BODY = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0],
@@ -61,6 +62,13 @@ class Detections:
         return self.select(np.sort(best))
 
 
+def check_planar(covariance: NDArray[np.float64]) -> None:
+    """Raise OptionsError for what is no covariance (3, 3) of x, y and yaw."""
+    if not np.isfinite(covariance).all() or not np.linalg.eigvalsh(covariance).min() > 0.0:
+        raise OptionsError('the covariance of x, y and yaw must be finite and positive definite; '
+                           'give 10 rad^2 where yaw is unknown')
+
+
 @dataclass(frozen=True)
 class Region:
     """Where the robot probably is, whatever its camera shows: a Gaussian in one map."""
@@ -71,6 +79,13 @@ class Region:
     probability: float  #: That this is right, 0 to 1; else the robot may be anywhere
     #: (4, 4): the body, whose x axis points ahead; by default one that looks as the camera does
     camera_from_body: NDArray[np.float64] = field(default_factory=OPTICAL_FROM_BODY.copy)
+
+    def __post_init__(self) -> None:
+        """Raise OptionsError for what is no region."""
+        if not np.isfinite(self.mean).all() or not 0.0 <= self.probability <= 1.0:
+            raise OptionsError(f'region: {self.mean} must be finite, and its probability '
+                               f'{self.probability} 0 to 1')
+        check_planar(self.covariance)
 
 
 @dataclass(frozen=True)

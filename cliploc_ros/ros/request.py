@@ -325,7 +325,7 @@ def _summary(localized: Localized, stages_ms: Mapping[str, float]) -> str:
             else ', depth contradicts the boxes'
     prior = ''
     if found.evidence is not None and found.evidence.prior:
-        prior = f', prior {found.evidence.prior:+.1f}'
+        prior = f', prior {found.evidence.prior:.1f}'
     return (f'[confidence {found.confidence:.3f}, score {found.score:.2f}, '
             f'{sum(map(len, found.frame_matches[-localized.cameras:]))} inliers, '
             f'{found.tried} hypotheses, '

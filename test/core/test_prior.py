@@ -21,6 +21,7 @@ from cliploc_ros.core.map.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Observation, Region
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.errors import OptionsError
 
 TERMS = CALIBRATION.prior
 OPTIONS = RelocalizerOptions(matching='class')
@@ -74,10 +75,22 @@ def test_a_region_that_says_nothing_changes_nothing(vague):
     assert region_odds(TWINS, vague, looking(0.0, 3.0)) == pytest.approx([0.0], abs=1e-3)
 
 
+@pytest.mark.parametrize('fields', [{'x': np.nan}, {'sigma_m': 0.0}, {'sigma_m': np.inf},
+                                    {'probability': 1.5}, {'yaw_deviation': np.nan}])
+def test_what_is_no_region_is_refused(fields):
+    with pytest.raises(OptionsError, match=r'region: |covariance of x, y and yaw'):
+        region(**fields)
+
+
 def test_the_yaw_counts_across_the_seam():
     ahead = region(yaw=math.pi - 0.05, yaw_deviation=0.1)
     odds = [region_odds(TWINS, ahead, looking(yaw))[0] for yaw in (0.05 - math.pi, 0.0)]
     assert odds == pytest.approx([0.0, -TERMS.most])
+
+
+def test_a_camera_that_looks_up_has_no_yaw():
+    ahead = region(yaw=2.0, yaw_deviation=0.01)
+    assert region_odds(TWINS, ahead, np.eye(4)[None]) == [0.0]
 
 
 def test_a_region_decides_between_rooms_that_nearly_look_the_same():

@@ -30,7 +30,7 @@ from cliploc_ros.core.map.occupancy_grid import (
     OccupancyGrid,
     check_size,
 )
-from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Region
+from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Region, check_planar
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.files.storage import write_text
 from cliploc_ros.ros import qos
@@ -106,7 +106,7 @@ class PriorSource:
         try:
             planar_of(msg)
             self._told = msg
-        except NoPriorError as error:
+        except CliplocError as error:
             self._node.get_logger().warning(f'localizing without a prior: ~/prior: {error}')
 
     def hear_grid(self, msg: OccupancyGridMsg) -> None:
@@ -154,7 +154,7 @@ class PriorSource:
             return
         try:
             at, _ = planar_of(pose)
-        except NoPriorError:
+        except CliplocError:
             return  # of a foreign localizer
         if self._written is None or not SAME_SPOT.agree(at, self._written):
             self._written, self._written_at = at, time.monotonic()
@@ -221,9 +221,7 @@ def planar_of(msg: PoseWithCovarianceStamped
               ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return a pose (4, 4) and the covariance (3, 3) of x, y and yaw.
 
-    The covariances of yaw with x and y count as 0.
-
-    NoPriorError: pose or covariance is invalid.
+    The covariances of yaw with x and y count as 0. CliplocError: one of both is invalid.
     """
     pose = pose_from_msg(msg.pose.pose)
     covariance = np.reshape(msg.pose.covariance, (6, 6))[np.ix_(_PLANAR, _PLANAR)]
@@ -231,9 +229,7 @@ def planar_of(msg: PoseWithCovarianceStamped
         raise NoPriorError('a pose with NaN or a quaternion that is not of length 1')
     covariance = 0.5 * (covariance + covariance.T)
     covariance[2, :2] = covariance[:2, 2] = 0.0
-    if not np.isfinite(covariance).all() or not np.linalg.eigvalsh(covariance).min() > 0.0:
-        raise NoPriorError('the covariance of x, y and yaw must be finite and positive definite; '
-                           'give 10 rad^2 where yaw is unknown')
+    check_planar(covariance)
     return pose, covariance
 
 
