@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A room of twelve objects and a perfect view of it: simulated, for tests without recordings."""
 
+from dataclasses import replace
+
 import numpy as np
 import yaml
 
@@ -30,6 +32,17 @@ def make_room() -> LandmarkMap:
         tuple('abc'[i % 3] for i in range(count)),
         np.c_[rng.uniform(-2, 2, (count, 2)), rng.uniform(3, 6, count)],
         rng.uniform(0.05, 0.3, (count, 3)), quats / np.linalg.norm(quats, axis=1, keepdims=True))
+
+
+def doubled_room(offset) -> LandmarkMap:
+    """The room twice; the second one is an offset (3,) away [m]."""
+    room = make_room()
+    return replace(room, landmark_ids=(*room.landmark_ids, *(f'{one}_2' for one in
+                                                            room.landmark_ids)),
+                   labels=room.labels * 2, class_ids=room.class_ids * 2,
+                   centers=np.concatenate([room.centers, room.centers + offset]),
+                   semi_axes=np.tile(room.semi_axes, (2, 1)),
+                   quats_xyzw=np.tile(room.quats_xyzw, (2, 1)))
 
 
 def see_room(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA) -> Detections:

@@ -2,13 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """One frame of the camera: its detections, and how similar they are to each label."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.map.occupancy_grid import OccupancyGrid
 from cliploc_ros.core.map.similarities import Similarities
+from cliploc_ros.errors import OptionsError
+
+#: (4, 4): a body at the camera, with axes x ahead, y left, z up (REP 103)
+OPTICAL_FROM_BODY = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0],
+                              [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,32 @@ class Detections:
         return self.select(np.sort(best))
 
 
+def check_planar(covariance: NDArray[np.float64]) -> None:
+    """Raise OptionsError for what is no covariance (3, 3) of x, y and yaw."""
+    if not np.isfinite(covariance).all() or not np.linalg.eigvalsh(covariance).min() > 0.0:
+        raise OptionsError('the covariance of x, y and yaw must be finite and positive definite; '
+                           'give 10 rad^2 where yaw is unknown')
+
+
+@dataclass(frozen=True)
+class Region:
+    """Where the robot probably is, whatever its camera shows: a Gaussian in one map."""
+
+    frame_id: str  #: Of the map
+    mean: NDArray[np.float64]  #: (3,): x [m], y [m] and yaw [rad] of the body
+    covariance: NDArray[np.float64]  #: (3, 3): of these, positive definite
+    probability: float  #: That this is right, 0 to 1; else the robot may be anywhere
+    #: (4, 4): the body, whose x axis points ahead; by default one that looks as the camera does
+    camera_from_body: NDArray[np.float64] = field(default_factory=OPTICAL_FROM_BODY.copy)
+
+    def __post_init__(self) -> None:
+        """Raise OptionsError for what is no region."""
+        if not np.isfinite(self.mean).all() or not 0.0 <= self.probability <= 1.0:
+            raise OptionsError(f'region: {self.mean} must be finite, and its probability '
+                               f'{self.probability} 0 to 1')
+        check_planar(self.covariance)
+
+
 @dataclass(frozen=True)
 class Observation:
     """A frame's detections with its camera and time."""
@@ -82,6 +114,8 @@ class Observation:
     depths: NDArray[np.float64] | None = None
     #: (n,): standard deviation of each depth [m]; None for those of a usual RGB-D camera
     depth_deviations: NDArray[np.float64] | None = None
+    region: Region | None = None  #: Where the robot probably is; None where nothing is known
+    grid: OccupancyGrid | None = None  #: Walls; None where they are not known
 
     @property
     def similarity_rows(self) -> NDArray[np.int64]:

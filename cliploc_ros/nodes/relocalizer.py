@@ -51,6 +51,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                 self, parameters.image_transport, linger_s, on_frame, parameters.detections_type,
                 parameters.depth_transport, parameters.depth_tolerance_s)
         self._handoff = HandOff(self, self._robot.odometry)
+        self._handoff.on_shown(self._robot.prior.follow)
         self._cases = CaseRecorder(bool(parameters.record_folder))
         self._requests = Requests(self, self._frames, self._robot, self._pipeline, self._cases,
                                   self._handoff)

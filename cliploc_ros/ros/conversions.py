@@ -19,11 +19,12 @@ from vision_msgs.msg import (
     ObjectHypothesisWithPose,
 )
 
-from cliploc_ros.core.geometry.transforms import quaternion_from_transform
+from cliploc_ros.core.geometry.transforms import quaternion_from_transform, transform_from_pose
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 
+_UNIT_TOLERANCE = 0.01
 DETECTION_TYPES = ('vision_msgs', 'yolo_msgs')
 
 
@@ -45,6 +46,16 @@ def detections_to_msg(detections: Detections, header: Header) -> Detection2DArra
             header=header, bbox=bbox,
             results=[ObjectHypothesisWithPose(hypothesis=hypothesis)]))
     return msg
+
+
+def pose_from_msg(msg: Pose) -> NDArray[np.float64] | None:
+    """Return a pose (4, 4); None for one with NaN, or a quaternion that is not of length 1."""
+    p, q = msg.position, msg.orientation
+    position, quat_xyzw = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
+    if not np.isfinite(position).all() or not abs(
+            np.linalg.norm(quat_xyzw) - 1.0) < _UNIT_TOLERANCE:
+        return None
+    return transform_from_pose(position, quat_xyzw)
 
 
 def pose_to_msg(parent_from_child: NDArray[np.float64]) -> Pose:

@@ -27,6 +27,8 @@ TRANSPORTS = ('raw', 'compressed')
 MODES = ('on_request', 'continuous')
 VERTICAL_SOURCES = ('none', 'base_frame', 'imu')
 WATCHES = ('none', 'tf', 'amcl_pose')
+#: Value of occupancy_grid for the topic `map`.
+BY_TOPIC = 'topic'
 REACTIONS = ('report', 'relocalize')
 
 # Of timeout_s, for algorithms other than auto.
@@ -105,6 +107,16 @@ class RelocalizerParameters(CommonParameters):
     keyframes_file: str = parameter('auto',
         "Layer of keyframes of the map, read with it: a file, or 'auto': NAME.keyframes.npz "
         'next to map_file NAME.yaml, where there is one; empty: none.')
+    occupancy_grid: str = parameter('',
+        "Walls, evidence against a pose: a YAML file of map_server in the first map's frame, or "
+        "'topic': the topic map; empty: none.")
+    prior_probability: float = parameter(0.9,
+        'Probability that what ~/prior tells is right.', low=0.0, high=0.99)
+    last_pose_file: str = parameter('',
+        'Keep the last pose in this file; after a restart the robot is probably still there. '
+        'Empty: keep none.', read_only=True)
+    last_pose_probability: float = parameter(0.8,
+        'Probability of that.', low=0.0, high=0.99)
     mode: str = parameter('on_request',
         'Localize on request, or with every frame.', choices=MODES, read_only=True)
     timeout_s: float = parameter(10.0,

@@ -124,7 +124,9 @@ class Pipeline:
         state = self._robot.at(image, parameters.of_camera(frame.camera), deadline,
                                frame.depth_frame)
         beside = self._beside(frame, parameters, deadline)
-        localized = localizer.localize(frame, parameters, state, times, deadline, beside)
+        known = self._robot.prior.known(image.stamp, parameters, state.camera_from_base,
+                                        localizer.frame_ids, localizer.map_hash)
+        localized = localizer.localize(frame, parameters, state, times, deadline, beside, known)
         stages_ms = times.ms
         self._node.stages.add(stages_ms)
         self._node.check_active()
@@ -184,6 +186,7 @@ class Pipeline:
             answer = replace(answer, verdict=Verdict.WITHHELD, pose=None,
                              detail=f'publish_tf: {error} (accepted: {answer.detail})')
         self._pose.publish(for_filter)
+        self._robot.prior.keep(pose, self._node.settings.snapshot(), answer.map_hash)
         return answer
 
 
@@ -320,10 +323,14 @@ def _summary(localized: Localized, stages_ms: Mapping[str, float]) -> str:
     if found.depth is not None:
         depth = f', depth of {found.depth.objects} objects' if found.depth.is_passed \
             else ', depth contradicts the boxes'
+    prior = ''
+    if found.evidence is not None and found.evidence.prior:
+        prior = f', prior {found.evidence.prior:.1f}'
     return (f'[confidence {found.confidence:.3f}, score {found.score:.2f}, '
             f'{sum(map(len, found.frame_matches[-localized.cameras:]))} inliers, '
             f'{found.tried} hypotheses, '
-            f'{100 * found.coverage:.3g} % of the search{crops}{keyframes}{depth}{cameras}; '
+            f'{100 * found.coverage:.3g} % of the search{crops}{keyframes}{depth}{cameras}'
+            f'{prior}; '
             f'{in_words(stages_ms)}]')
 
 

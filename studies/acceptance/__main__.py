@@ -36,6 +36,7 @@ from studies.acceptance.looks import (
     retry,
 )
 from studies.acceptance.places import MODES, ONE, Simulated, add_arguments, chosen_places
+from studies.acceptance.priors import PRIORS
 from studies.acceptance.searches import (
     Outcome,
     Task,
@@ -124,6 +125,15 @@ def _stress(options: argparse.Namespace) -> None:
                            ('trouble', 'level', 'mode')))
 
 
+def _priors(options: argparse.Namespace) -> None:
+    tasks = [task._replace(seed=task.seed + place.seed) for place in chosen_places(options)
+             for task in tasks_of([place], RelocalizerOptions(matching=options.matching),
+                                  [*PRIORS])]
+    found: list[Outcome] = run_all(make_search, tasks, 'searches', options.workers)
+    for by in (('place', 'trouble', 'level'), ('trouble', 'level')):
+        print(acceptance_table(found, by), end='\n\n')
+
+
 def _robustness(options: argparse.Namespace) -> None:
     tasks = tasks_of(chosen_places(options), RelocalizerOptions(matching=options.matching),
                      [*CURVES], options.seed)
@@ -207,6 +217,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
     add_arguments(stress, ('room', 'office', 'shop'), first_seed=1000)
     stress.add_argument('--only', nargs='+', default=[''], metavar='TEXT',
                         help='troubles whose name contains one of these')
+    priors = add('priors', _priors, 'what regions and walls known before add, right and wrong')
+    add_arguments(priors, worlds=20, first_seed=1100)
     robustness = add('robustness', _robustness, 'success and false accepts over growing troubles',
                      'draw them')
     add_arguments(robustness, ('room', 'office', 'shop'), first_seed=1000)
@@ -222,7 +234,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     fits.add_argument('--worlds', type=positive_int, default=24, metavar='N', help='of each kind')
     fits.add_argument('--depth', action='store_true', help='fit the coefficient of depth alone')
     fits.add_argument('--workers', type=positive_int, default=1, metavar='N')
-    for own in (judge, stress, robustness, retries, growth):
+    for own in (judge, stress, priors, robustness, retries, growth):
         own.add_argument('--matching', choices=fit.MATCHINGS, default='hybrid')
     for own in (robustness, retries):
         own.add_argument('--seed', type=int, default=0, help='of the changes (%(default)s)')

@@ -20,6 +20,7 @@ from cliploc_ros.evaluation.methods import AUTO, Method
 from cliploc_ros.evaluation.trials import run_trial
 from studies.acceptance.fit import best_recall
 from studies.acceptance.places import SEED, AnyPlace, Place
+from studies.acceptance.priors import PRIORS
 from studies.acceptance.troubles import CURVES, TROUBLES
 from studies.reports import interval, table
 
@@ -27,6 +28,7 @@ from studies.reports import interval, table
 SUCCESS_M = 0.1, 0.25, 0.5, 1.0
 _PANEL_SIZE = 2.8, 2.8  # of one trouble in the figure [inch]
 _PANELS_A_ROW, _LABEL_WIDTH = 3, 22
+_CHANGES = TROUBLES | CURVES | PRIORS
 
 
 class Task(NamedTuple):
@@ -64,7 +66,7 @@ def search(task: Task) -> list[Outcome]:
     place = _loaded(task.place)
     if task.mode not in place.modes:
         return []
-    trouble = (TROUBLES | CURVES)[task.trouble]
+    trouble = _CHANGES[task.trouble]
     landmark_map, queries = trouble.change(
         place.landmark_map, place.ask(task.mode, task.seed), task.level,
         np.random.default_rng(task.seed))
@@ -85,8 +87,8 @@ def tasks_of(places: Sequence[AnyPlace], options: RelocalizerOptions,
              names: Sequence[str], seed: int = SEED) -> list[Task]:
     """Return a task for each level of some troubles in each of their modes, at each place."""
     return [Task(place, mode, options, name, level, seed) for name in names
-            for level in (TROUBLES | CURVES)[name].levels for place in places
-            for mode in (TROUBLES | CURVES)[name].modes]
+            for level in _CHANGES[name].levels for place in places
+            for mode in _CHANGES[name].modes]
 
 
 def confidences_of(outcomes: Sequence[Outcome]

@@ -3,11 +3,10 @@
 """Places that look alike, found in the map, and what tells them apart."""
 
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from scene import CAMERA, MAP_FROM_CAMERA, doubled_room, make_room, see_room
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
@@ -165,16 +164,6 @@ def test_a_refusal_names_both_places():
     assert reason == ('confidence 0.59 < 0.99; (1.0, -2.0, 0.5) and (9.0, 3.0, 1.2) m look alike; '
                       'turn the camera to objects that differ')
     assert len(f'refused: {reason}') < 130
-
-
-def doubled_room(offset):
-    room = make_room()
-    return replace(room, landmark_ids=(*room.landmark_ids, *(f'{one}_2' for one in
-                                                            room.landmark_ids)),
-                   labels=room.labels * 2, class_ids=room.class_ids * 2,
-                   centers=np.concatenate([room.centers, room.centers + offset]),
-                   semi_axes=np.tile(room.semi_axes, (2, 1)),
-                   quats_xyzw=np.tile(room.quats_xyzw, (2, 1)))
 
 
 def seen(differing=0):

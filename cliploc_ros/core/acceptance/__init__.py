@@ -8,6 +8,8 @@ contenders
     The poses that may be right, of objects and of keyframes, and the odds of each.
 support
     The evidence of the objects for a pose.
+prior
+    What a region and walls that are known before say of a pose.
 depth_check
     Whether the depths of a request can be right.
 confidence

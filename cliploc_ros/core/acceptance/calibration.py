@@ -70,6 +70,18 @@ class Places(NamedTuple):
     unlabelled: float
 
 
+class Prior(NamedTuple):
+    """What a region and an occupancy grid say."""
+
+    most: float
+    least_m: float
+    least_deg: float
+    in_wall: float
+    outside: float
+    blocked: float
+    most_blocked: float
+
+
 class Search(NamedTuple):
     """When a search is enough."""
 
@@ -128,6 +140,7 @@ class Calibration(NamedTuple):
     genuine: Genuine
     attitude: Attitude
     places: Places
+    prior: Prior
     search: Search
     looks: SuccessiveLooks
     covariance: Spread

@@ -35,6 +35,7 @@ from cliploc_ros.core.acceptance.genuine import Motion, Signs, compare_motion, s
 from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.mirror import chance_not_mirrored
+from cliploc_ros.core.acceptance.prior import walls_against
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, is_exhaustive
 from cliploc_ros.core.fit.covariance import fuse, share_within
 from cliploc_ros.core.fit.finalists import (
@@ -127,7 +128,7 @@ def search_contenders(joined: JoinedFrames, finalists: Sequence[Finalist],
     contenders = contenders_of(joined, finalists, is_upright.tolist())
     if not joined.options.refine:
         return contenders
-    order = sorted(range(len(contenders)), key=lambda row: -contenders[row].odds)
+    order = sorted(range(len(contenders)), key=lambda row: -contenders[row].rank)
     return [contenders[row] for known in (True, False) for row in first_of_each_place(
         [row for row in order if contenders[row].is_upright == known], finalists, MAX_DISTINCT)]
 
@@ -146,10 +147,11 @@ def compare(joined: JoinedFrames, contenders: list[Contender],
         contenders = [one._replace(odds=one.odds + _missed(one.pose, seen, recognizer))
                       for one in contenders]
         contenders += _proposed(joined, seen, contenders)
-        contenders.sort(key=lambda one: (not one.is_upright, -one.odds))
+        contenders.sort(key=lambda one: (not one.is_upright, -one.rank))
     poses = np.array([one.pose for one in contenders]).reshape(-1, 4, 4)
     return Comparison(contenders, poses, confidences(
-        np.array([one.odds for one in contenders]), poses, none_right(joined.setting)), seen)
+        np.array([one.odds for one in contenders]), poses, none_right(joined.setting),
+        prior=np.array([one.prior for one in contenders])), seen)
 
 
 def _proposed(joined: JoinedFrames, seen: Recognition, met: Sequence[Contender]
@@ -240,8 +242,10 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
         motion=_motion(joined, compared, looks, recognizer),
         not_mirrored=_not_mirrored(joined, compared, by_points),
         uncontradicted=_uncontradicted(joined, compared),
-        recognized=place and place.recognized,
-        earlier=looks.confidences_in(last, compared.poses[0]),
+        recognized=place and place.recognized, walls=None if last.grid is None else walls_against(
+            joined.landmark_map, last.grid, compared.poses[0],
+            [one.landmark for one in best.matches[-1]]),
+        prior=compared.contenders[0].prior, earlier=looks.confidences_in(last, compared.poses[0]),
         crops_left=0 if last.compared is None else len(last.detections) - len(last.compared))
 
 
@@ -319,7 +323,9 @@ def _by_points(joined: JoinedFrames, compared: Comparison) -> float:
             if one.recognized is not None or not near]
     odds = [one.by_points if near else one.odds for one, near in zip(
         compared.contenders, compared.leading, strict=True)]
-    found = confidences(np.array(odds)[rows], compared.poses[rows], none_right(joined.setting))
+    priors = np.array([one.prior for one in compared.contenders])
+    found = confidences(np.array(odds)[rows], compared.poses[rows], none_right(joined.setting),
+                        prior=priors[rows])
     return float(max(found[number] for number, row in enumerate(rows) if compared.leading[row]))
 
 
@@ -344,8 +350,9 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
         return 1.0, None
     supports = supports_of(joined, poses[others],
                            [matches_of(joined.rig, twins[row - 1]) for row in others])
-    chance, likeliest = chance_distinct(best.support, supports, _leads_of_points(
-        compared, poses[others], are_rooms[inside][others - 1], recognizer))
+    leads = best.prior - joined.prior_odds(poses[others]) + _leads_of_points(
+        compared, poses[others], are_rooms[inside][others - 1], recognizer)
+    chance, likeliest = chance_distinct(best.support, supports, leads)
     return chance, place_of(joined.landmark_map, poses[others][likeliest])
 
 

@@ -51,11 +51,13 @@ class Setting(NamedTuple):
 
 
 def confidences(odds: NDArray[np.float64], poses: NDArray[np.float64], none: float,
-                calibration: Calibration = CALIBRATION) -> NDArray[np.float64]:
+                calibration: Calibration = CALIBRATION,
+                prior: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """Return the probability (m,) that each pose (m, 4, 4) is within 1 m of the truth.
 
     The rest to 1 is the probability that another pose is right, or none. Odds (m,) are the
-    utilities of the poses, none is that of the case that none of them is right.
+    utilities of the poses, none is that of the case that none of them is right. The prior (m,)
+    is log odds of 0 or less, so it raises no pose against none.
     """
     if len(odds) == 0:
         return np.empty(0)
@@ -70,7 +72,13 @@ def confidences(odds: NDArray[np.float64], poses: NDArray[np.float64], none: flo
     lead = int(np.argmax(likely))
     # the other places lose what the leading place gains
     lost = (1.0 - sharpened[lead]) / (1.0 - likely[lead])
-    return np.minimum(np.where(agreeing[lead], sharpened, likely * lost), most)
+    if prior is None or not prior.any():
+        return np.minimum(np.where(agreeing[lead], sharpened, likely * lost), most)
+    # what the prior says of each pose is no evidence of objects, and not steepened
+    kept = np.where(agreeing[lead], sharpened[lead] / likely[lead], lost)
+    weighted = shares * kept * np.exp(prior)
+    none_of_them = max(0.0, 1.0 - float(shares @ kept))
+    return np.minimum(agreeing @ weighted / (weighted.sum() + none_of_them), most)
 
 
 def utilities(supports: Sequence[Support], calibration: Calibration = CALIBRATION

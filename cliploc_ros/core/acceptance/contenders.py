@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.confidence import Setting, tilt_handicaps, utilities
+from cliploc_ros.core.acceptance.prior import region_odds
 from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
 from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
@@ -45,6 +46,12 @@ class JoinedFrames(NamedTuple):
         return Setting(len(self.landmark_map),
                        self.options.vertical_deviation_deg if self.knows_vertical else math.inf)
 
+    def prior_odds(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the log odds (m,) that the last frame's region gives to poses (m, 4, 4)."""
+        region = self.frames[-1].observation.region
+        return np.zeros(len(poses)) if region is None else region_odds(
+            self.landmark_map, region, poses)
+
 
 def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
                 frames: Sequence[SearchedFrame]) -> JoinedFrames:
@@ -76,11 +83,18 @@ class Contender(NamedTuple):
     support: Support  #: By objects
     is_upright: bool  #: Whether it uses the known vertical, or agrees with it
     handicap: float  #: Log odds that its attitude takes from it
-    odds: float  #: Logarithm of its odds, up to a constant that all contenders share
+    #: Logarithm of its odds, up to a constant that all contenders share; without the prior
+    odds: float
+    prior: float = 0.0  #: Log odds that a region known before gives it
     #: What keyframes show there, where they propose the pose
     recognized: RecognizedPlace | None = None
     #: The odds of a pose that keyframes propose, without what objects say for it
     by_points: float = -math.inf
+
+    @property
+    def rank(self) -> float:
+        """Return the log odds by which it competes with other contenders."""
+        return self.odds + self.prior
 
 
 def contenders_of(joined: JoinedFrames, finalists: Sequence[Finalist], upright: Sequence[bool]
@@ -92,7 +106,8 @@ def contenders_of(joined: JoinedFrames, finalists: Sequence[Finalist], upright: 
     handicaps = np.where(upright, 0.0, CALIBRATION.attitude.wrong_mount) \
         if joined.knows_vertical else tilt_handicaps(poses, joined.options.tilt_deviation_deg)
     return list(map(Contender, finalists, poses, matches, supports, upright, handicaps.tolist(),
-                    (utilities(supports) - handicaps).tolist()))
+                    (utilities(supports) - handicaps).tolist(),
+                    joined.prior_odds(poses).tolist()))
 
 
 def supports_of(joined: JoinedFrames, poses: NDArray[np.float64],

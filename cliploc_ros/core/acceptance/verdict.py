@@ -11,6 +11,7 @@ import numpy as np
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, chance_genuine
+from cliploc_ros.core.acceptance.prior import Walls
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.options import RelocalizerOptions
 
@@ -43,6 +44,8 @@ class RefusalKind(StrEnum):
     CONTRADICTION = auto()
     #: Keyframes show signs of a picture of the place, of wrong intrinsics, or of a changed place.
     CHANGED = auto()
+    #: The occupancy grid has a wall at the pose, or before most of the matched objects.
+    OBSTRUCTED = auto()
     #: The time of the request ended before a frame was localized.
     TIME_UP = auto()
 
@@ -98,6 +101,8 @@ class Evidence:
     #: Probability that keyframes are wrong which recognize another place only
     uncontradicted: float = 1.0
     recognized: RecognizedPlace | None = None  #: What keyframes show at the pose
+    walls: Walls | None = None  #: What an occupancy grid says; None without one
+    prior: float = 0.0  #: Log odds that a region known before gives the pose
     #: Confidence of each earlier look in this pose, see cliploc_ros.core.acceptance.looks
     earlier: tuple[float, ...] = ()
     crops_left: int = 0  #: Number of crops that were not compared with labels yet
@@ -118,15 +123,29 @@ class Evidence:
         return 1.0 if self.signs is None else chance_genuine(self.signs, self.motion)
 
     @property
+    def unobstructed(self) -> float:
+        """Return the factor by which walls lower the probability, 0 to 1.
+
+        They take from the log odds, so a pose that is nearly certain stays.
+        """
+        if self.walls is None:
+            return 1.0
+        return 1.0 / (1.0 + (1.0 - self._by_poses) * math.expm1(-self.walls.odds))
+
+    @property
+    def _by_poses(self) -> float:
+        return max(self.likely * self.found, self.by_points)
+
+    @property
     def certainty(self) -> float:
         """Return the probability that nothing besides the poses found makes it wrong."""
         return (self.distinct * self.near * self.genuine * self.not_mirrored
-                * self.uncontradicted)
+                * self.uncontradicted * self.unobstructed)
 
     @property
     def confidence(self) -> float:
         """Return the probability that the leading pose is within 1 m of the truth."""
-        return max(self.likely * self.found, self.by_points) * self.certainty
+        return self._by_poses * self.certainty
 
     @property
     def mean_confidence(self) -> float:
@@ -195,11 +214,14 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
                        f'confidence {_rounded_down(confidence, digits)} < {needed:.{digits}f}, as '
                        f'it takes without {evidence.crops_left} crops; raise timeout_s')
     compared = f'confidence {_rounded_down(confidence)} < {options.min_confidence:g}'
+    if evidence.prior < 0.0:
+        compared += '; the prior has the robot elsewhere'
     likely = max(evidence.likely, evidence.by_points)
     found = max(evidence.likely * evidence.found, evidence.by_points) / max(likely, 1e-9)
     weakest = min({'likely': likely, 'distinct': evidence.distinct, 'near': evidence.near,
                    'genuine': evidence.genuine, 'mirror': evidence.not_mirrored,
-                   'keyframes': evidence.uncontradicted, 'found': found}.items(),
+                   'keyframes': evidence.uncontradicted, 'found': found,
+                   'walls': evidence.unobstructed}.items(),
                   key=lambda item: item[1])[0]
     # the twin may be among the rivals, too
     if evidence.twin is not None and evidence.distinct < options.min_confidence and (
@@ -219,6 +241,9 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
     if weakest == 'mirror':
         return Refusal(RefusalKind.AMBIGUOUS, f'{compared}; mirrored, the image fits another '
                                               'pose; turn the camera to more objects')
+    if weakest == 'walls' and evidence.walls is not None:
+        return Refusal(RefusalKind.OBSTRUCTED, f'{compared}; {evidence.walls.in_words()}; '
+                                               'check its origin, or turn to more objects')
     if weakest == 'found':
         return Refusal(RefusalKind.SEARCH_CUT_SHORT,
                        f'{compared}; pose met only {evidence.meetings:g} times in '

@@ -11,13 +11,9 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 from std_msgs.msg import Header
 
-from cliploc_ros.core.geometry.transforms import (
-    invert_transform,
-    is_rigid,
-    transform_from_pose,
-)
+from cliploc_ros.core.geometry.transforms import invert_transform, is_rigid
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.ros.conversions import stamp_ns
+from cliploc_ros.ros.conversions import pose_from_msg, stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.robot_state import CameraPlace, RobotState, RobotStateSource
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -27,7 +23,6 @@ from cliploc_ros.units import NS_PER_S
 _UNLINKED_NS = NS_PER_S // 2
 # A localizer that hears scans shows its pose more often than this (AMCL: each .25 m).
 _SILENT_WAY_M = 2.0
-_UNIT_TOLERANCE = 0.01
 
 
 class NoLocalizerPoseError(CliplocError):
@@ -150,9 +145,8 @@ class LocalizerPose:
 
 def _pose_of(shown: PoseWithCovarianceStamped, topic: str) -> NDArray[np.float64]:
     """Return a shown pose (4, 4). NoLocalizerPoseError: it is invalid."""
-    p, q = shown.pose.pose.position, shown.pose.pose.orientation
-    position, quat = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
-    if not np.isfinite(position).all() or not abs(np.linalg.norm(quat) - 1.0) < _UNIT_TOLERANCE:
+    pose = pose_from_msg(shown.pose.pose)
+    if pose is None:
         raise NoLocalizerPoseError(f'{topic} shows a pose with NaN or a quaternion that is not '
                                    "of length 1: see the localizer's log")
-    return transform_from_pose(position, quat)
+    return pose

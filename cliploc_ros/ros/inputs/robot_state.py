@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the robot knows besides its image: the camera's mount, the vertical and odometry."""
+"""What the robot knows besides its image: mount, vertical, odometry, and where it was."""
 
 import math
 import time
@@ -15,6 +15,7 @@ from std_msgs.msg import Header
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometrySource
+from cliploc_ros.ros.inputs.prior import PriorSource
 from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -58,6 +59,7 @@ class RobotStateSource:
         self.transforms = CoordinateFrames(node)
         self.odometry = OdometrySource(node)
         self._vertical = VerticalSource(node, self.transforms)
+        self.prior = PriorSource(node, self.transforms)
         self._unknown = set[str]()  # coordinate frames that tf2 did not know the last time
 
     def open(self) -> None:
@@ -68,12 +70,14 @@ class RobotStateSource:
             # in the worker, for importing tf2 takes a while
             self._node.worker.run(self.transforms.open)
         self._vertical.open(parameters.gravity)
+        self.prior.open(parameters)
         self.odometry.open()
 
     def close(self) -> None:
         """Unsubscribe."""
         self.odometry.close()
         self._vertical.close()
+        self.prior.close()
         self._node.worker.submit(self.transforms.close)  # after a search that may be under way
 
     def forget(self) -> None:

@@ -1,0 +1,250 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is known before an image: where the robot probably is, and walls.
+
+The topic `~/prior` tells where the robot is, until another message does. Without one it is where
+it was last: the pose of the last accepted request, and what the localizer showed after it, are
+kept in a file. That holds until the first accepted pose; from then on the robot is awake.
+"""
+
+import json
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
+from numpy.typing import NDArray
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.subscription import Subscription
+
+from cliploc_ros.core.geometry.transforms import SAME_SPOT, is_rigid
+from cliploc_ros.core.map.occupancy_grid import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    OccupancyGrid,
+    check_size,
+)
+from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Region, check_planar
+from cliploc_ros.errors import CliplocError
+from cliploc_ros.files.storage import write_text
+from cliploc_ros.ros import qos
+from cliploc_ros.ros.conversions import pose_from_msg, pose_with_covariance_msg
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
+from cliploc_ros.ros.node.lifecycle import ManagedNode
+from cliploc_ros.ros.parameters import BY_TOPIC, RelocalizerParameters
+
+_LOG_PERIOD_S = 5.0
+# Between two poses of a localizer that are written [s].
+_WRITE_PERIOD_S = 1.0
+_PLANAR = np.array([0, 1, 5])  # x, y and yaw in a covariance of ROS
+_LEVEL_COSINE = 0.7
+# Values of a cell as of map_server [percent].
+_OCCUPIED_FROM, _FREE_TO = 65, 25
+
+
+class NoPriorError(CliplocError):
+    """A prior is invalid; the message says what to do."""
+
+
+class Known(NamedTuple):
+    """What is known before an image."""
+
+    region: Region | None = None
+    grid: OccupancyGrid | None = None
+
+
+class PriorSource:
+    """Hears where the robot is and where walls are, and keeps its last pose."""
+
+    def __init__(self, node: ManagedNode[RelocalizerParameters], transforms: CoordinateFrames
+                 ) -> None:
+        self._node, self._transforms = node, transforms
+        self._heard: PoseWithCovarianceStamped | None = None  # also an invalid one
+        self._told: PoseWithCovarianceStamped | None = None
+        self._grid: OccupancyGrid | None = None
+        # Until a pose is accepted: the last one before, and the hash of its map.
+        self._last: tuple[PoseWithCovarianceStamped, str] | None = None
+        # From then on: what was written last, when, and the hash of the map.
+        self._written: NDArray[np.float64] | None = None
+        self._written_at, self._map_hash = 0.0, ''
+        self._subscriptions: list[Subscription] = []
+
+    def open(self, parameters: RelocalizerParameters) -> None:
+        """Subscribe, and read the last pose."""
+        if self._subscriptions:
+            return
+        # a volatile publisher does not match a transient local subscription
+        heard = [(PoseWithCovarianceStamped, '~/prior', self.hear, profile)
+                 for profile in (qos.LATCHED, qos.POSE)]
+        if parameters.occupancy_grid == BY_TOPIC:
+            heard.append((OccupancyGridMsg, 'map', self.hear_grid, qos.LATCHED))
+        group = MutuallyExclusiveCallbackGroup()
+        self._subscriptions = [self._node.create_subscription(
+            *one, callback_group=group) for one in heard]
+        if parameters.last_pose_file and self._written is None:
+            self._last = self._read(Path(parameters.last_pose_file))
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        for one in self._subscriptions:
+            self._node.destroy_subscription(one)
+        self._subscriptions = []
+
+    def hear(self, msg: PoseWithCovarianceStamped) -> None:
+        """Take in where the robot is; an empty frame_id withdraws what was told before."""
+        if msg == self._heard:  # by the other subscription
+            return
+        self._heard, self._told = msg, None
+        if not msg.header.frame_id:
+            return
+        try:
+            planar_of(msg)
+            self._told = msg
+        except CliplocError as error:
+            self._node.get_logger().warning(f'localizing without a prior: ~/prior: {error}')
+
+    def hear_grid(self, msg: OccupancyGridMsg) -> None:
+        """Take in walls; an invalid grid takes the place of the one before, too."""
+        self._grid = None
+        try:
+            self._grid = grid_from_msg(msg)
+        except CliplocError as error:
+            self._node.get_logger().warning(f'localizing without the topic map: {error}')
+
+    def known(self, stamp: Time, parameters: RelocalizerParameters,
+              camera_from_base: NDArray[np.float64], frame_ids: Sequence[str], map_hash: str
+              ) -> Known:
+        """Return what is known of a robot at a stamp, in maps of some frames and a hash."""
+        told, probability = self._told, parameters.prior_probability
+        if told is None and self._last is not None and self._last[1] == map_hash:
+            told, probability = self._last[0], parameters.last_pose_probability
+        region = None
+        if told is not None:
+            try:
+                region = self._region(told, probability, stamp, parameters, camera_from_base,
+                                      frame_ids)
+            except CliplocError as error:
+                self._warn(f'localizing without the prior: {error}')
+        grid = self._grid
+        if grid is not None and grid.frame_id not in frame_ids:
+            self._warn(f"localizing without the topic map: it is in frame '{grid.frame_id}', the "
+                       f"landmarks in '{', '.join(frame_ids)}'")
+        return Known(region, grid)
+
+    def keep(self, accepted: PoseWithCovarianceStamped, parameters: RelocalizerParameters,
+             map_hash: str) -> None:
+        """Keep an accepted pose for the next start; the one of the last start is used up."""
+        self._last, self._map_hash = None, map_hash
+        self._store(accepted, parameters)
+
+    def follow(self, shown: PoseWithCovarianceStamped) -> None:
+        """Keep where the localizer has the robot, once a pose was accepted."""
+        if self._map_hash and time.monotonic() - self._written_at >= _WRITE_PERIOD_S:
+            self._store(shown, self._node.settings.snapshot())
+
+    def _store(self, pose: PoseWithCovarianceStamped, parameters: RelocalizerParameters) -> None:
+        """Write a pose behind what the worker does, if the robot has moved."""
+        if not parameters.last_pose_file:
+            return
+        try:
+            at, _ = planar_of(pose)
+        except CliplocError:
+            return  # of a foreign localizer
+        if self._written is None or not SAME_SPOT.agree(at, self._written):
+            self._written, self._written_at = at, time.monotonic()
+            self._node.worker.submit(partial(
+                self._write, Path(parameters.last_pose_file), pose, at, self._map_hash))
+
+    def _write(self, path: Path, pose: PoseWithCovarianceStamped, at: NDArray[np.float64],
+               map_hash: str) -> None:
+        fields = {'map_hash': map_hash, 'frame_id': pose.header.frame_id,
+                  'written': time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime()),
+                  'map_from_robot': at.tolist(),
+                  'covariance': np.reshape(pose.pose.covariance, (6, 6)).tolist()}
+        try:
+            write_text(path, json.dumps(fields, indent=1))
+        except CliplocError as error:
+            self._warn(f'last_pose_file {error}')
+
+    def _read(self, path: Path) -> tuple[PoseWithCovarianceStamped, str] | None:
+        """Return the last pose and the hash of its map; None without a valid file."""
+        try:
+            fields: dict[str, Any] = json.loads(path.read_text(encoding='utf-8'))
+            pose = np.array(fields['map_from_robot'], dtype=np.float64)
+            if not is_rigid(pose):
+                raise ValueError('map_from_robot is no pose')
+            msg = pose_with_covariance_msg(OccupancyGridMsg().header, pose, np.array(
+                fields['covariance'], dtype=np.float64).reshape(6, 6))
+            msg.header.frame_id = str(fields['frame_id'])
+            planar_of(msg)
+            return msg, str(fields['map_hash'])
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, TypeError, KeyError, CliplocError) as error:
+            self._node.get_logger().warning(f'last_pose_file {path}: not used: {error}')
+            return None
+
+    def _region(self, told: PoseWithCovarianceStamped, probability: float, stamp: Time,
+                parameters: RelocalizerParameters, camera_from_base: NDArray[np.float64],
+                frame_ids: Sequence[str]) -> Region:
+        """Return a pose as a region of a map. NoTransformError: tf2 does not know its frame."""
+        pose, covariance = planar_of(told)
+        frame_id = told.header.frame_id.lstrip('/')
+        if frame_id not in frame_ids:
+            map_from_frame = self._transforms.lookup(
+                frame_ids[0], frame_id, stamp, parameters.tf_timeout_s,
+                'give the prior in the frame of the map')
+            if not is_rigid(map_from_frame):
+                raise NoTransformError(f"the transform of '{frame_id}' is no pose: correct it")
+            pose, turn = map_from_frame @ pose, np.eye(3)
+            turn[:2, :2] = map_from_frame[:2, :2]
+            covariance, frame_id = turn @ covariance @ turn.T, frame_ids[0]
+        camera_from_body = camera_from_base
+        if not parameters.base_frame:
+            camera_from_body = OPTICAL_FROM_BODY
+            if pose[2, 2] < _LEVEL_COSINE:  # a camera with optical axes; RViz gives a level body
+                pose = pose @ OPTICAL_FROM_BODY
+        mean = np.array([*pose[:2, 3], np.arctan2(pose[1, 0], pose[0, 0])])
+        return Region(frame_id, mean, covariance, probability, camera_from_body)
+
+    def _warn(self, text: str) -> None:
+        self._node.get_logger().warning(text, throttle_duration_sec=_LOG_PERIOD_S)
+
+
+def planar_of(msg: PoseWithCovarianceStamped
+              ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return a pose (4, 4) and the covariance (3, 3) of x, y and yaw.
+
+    The covariances of yaw with x and y count as 0. CliplocError: one of both is invalid.
+    """
+    pose = pose_from_msg(msg.pose.pose)
+    covariance = np.reshape(msg.pose.covariance, (6, 6))[np.ix_(_PLANAR, _PLANAR)]
+    if pose is None:
+        raise NoPriorError('a pose with NaN or a quaternion that is not of length 1')
+    covariance = 0.5 * (covariance + covariance.T)
+    covariance[2, :2] = covariance[:2, 2] = 0.0
+    check_planar(covariance)
+    return pose, covariance
+
+
+def grid_from_msg(msg: OccupancyGridMsg) -> OccupancyGrid:
+    """Return the walls of a message. MapError: names the field."""
+    info, origin = msg.info, msg.info.origin
+    check_size(info.width, info.height)
+    values = np.asarray(msg.data, dtype=np.int8)
+    if len(values) != info.width * info.height:
+        raise NoPriorError(f'{len(values)} cells instead of {info.width} x {info.height}')
+    cells = np.full(len(values), UNKNOWN, dtype=np.int8)
+    cells[values >= _OCCUPIED_FROM] = OCCUPIED
+    cells[(values >= 0) & (values <= _FREE_TO)] = FREE
+    q = origin.orientation
+    yaw = float(np.arctan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y ** 2 + q.z ** 2)))
+    return OccupancyGrid(msg.header.frame_id.lstrip('/'), cells.reshape(info.height, info.width),
+                         info.resolution, (origin.position.x, origin.position.y, yaw))
+

@@ -1,0 +1,199 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is known before: a region decides between look-alikes, and walls only lower."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scene import CAMERA, MAP_FROM_CAMERA, doubled_room, make_room, see_room
+from test_joined_map import floor, join
+
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.acceptance.confidence import confidences
+from cliploc_ros.core.acceptance.prior import Walls, region_odds, walls_against
+from cliploc_ros.core.acceptance.verdict import Evidence
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.map.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
+from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Observation, Region
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.errors import OptionsError
+
+TERMS = CALIBRATION.prior
+OPTIONS = RelocalizerOptions(matching='class')
+STRICT = replace(OPTIONS, min_confidence=0.96)
+TWINS = doubled_room(np.array([10.0, 0.0, 0.0]))
+LACKING = TWINS.select(range(22))
+ANY_YAW = 100.0
+
+
+def region(x=0.0, y=0.0, sigma_m=0.5, probability=0.95, frame_id='map', yaw=0.0,
+           yaw_deviation=ANY_YAW):
+    return Region(frame_id, np.array([x, y, yaw]),
+                  np.diag([sigma_m, sigma_m, yaw_deviation]) ** 2, probability)
+
+
+def ask(landmark_map=TWINS, objects=12, options=OPTIONS, **known):
+    seen = Observation(CAMERA, see_room(make_room()).select(np.arange(objects)), **known)
+    return Relocalizer(landmark_map, options).relocalize([seen])
+
+
+def looking(yaw, x=0.0, y=0.0):
+    """Return a level camera pose."""
+    body = np.eye(4)
+    body[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+    body[:2, 3] = x, y
+    return (body @ np.linalg.inv(OPTICAL_FROM_BODY))[None]
+
+
+def test_the_odds_are_those_of_the_mixture():
+    area = np.prod(np.ptp(TWINS.centers[:, :2], axis=0) + 2.0)
+    wide = region(probability=0.5, sigma_m=3.0)
+    variance = 9.0 + TERMS.least_m ** 2
+    density = area / (2 * math.pi * variance) * math.exp(-0.5 * 16.0 / variance)
+    assert 0.5 * density + 0.5 < 1.0
+    assert region_odds(TWINS, wide, looking(0.0, 4.0)) == pytest.approx(
+        [math.log(0.5 * density + 0.5)])
+    assert region_odds(TWINS, region(probability=0.5), looking(0.0, 9.0)) == pytest.approx(
+        [math.log(0.5)])
+    assert region_odds(TWINS, region(), looking(0.0)) == [0.0]
+
+
+def test_a_region_is_never_surer_than_its_limits():
+    sure = region(sigma_m=1e-6, probability=1.0)
+    odds = region_odds(TWINS, sure, np.concatenate([looking(0.0), looking(0.0, 9.0)]))
+    assert odds == pytest.approx([0.0, -TERMS.most])
+
+
+@pytest.mark.parametrize('vague', [region(5.0, sigma_m=1e4), region(probability=0.0),
+                                   region(frame_id='elsewhere')])
+def test_a_region_that_says_nothing_changes_nothing(vague):
+    assert region_odds(TWINS, vague, looking(0.0, 3.0)) == pytest.approx([0.0], abs=1e-3)
+
+
+@pytest.mark.parametrize('fields', [{'x': np.nan}, {'sigma_m': 0.0}, {'sigma_m': np.inf},
+                                    {'probability': 1.5}, {'yaw_deviation': np.nan}])
+def test_what_is_no_region_is_refused(fields):
+    with pytest.raises(OptionsError, match=r'region: |covariance of x, y and yaw'):
+        region(**fields)
+
+
+def test_the_yaw_counts_across_the_seam():
+    ahead = region(yaw=math.pi - 0.05, yaw_deviation=0.1)
+    odds = [region_odds(TWINS, ahead, looking(yaw))[0] for yaw in (0.05 - math.pi, 0.0)]
+    assert odds == pytest.approx([0.0, -TERMS.most])
+
+
+def test_a_camera_that_looks_up_has_no_yaw():
+    ahead = region(yaw=2.0, yaw_deviation=0.01)
+    assert region_odds(TWINS, ahead, np.eye(4)[None]) == [0.0]
+
+
+def test_a_region_decides_between_rooms_that_nearly_look_the_same():
+    """The second room lacks two objects: more than by chance, too little to be sure."""
+    alone = ask(LACKING)
+    assert alone.refusal_kind == 'look_alike'
+    found = ask(LACKING, region=region())
+    assert found.accepted, found.reason
+    assert pose_error(found.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
+    assert not ask(LACKING, region=region(probability=0.3)).accepted
+    wrong = ask(LACKING, region=region(10.0, probability=1.0))
+    assert not wrong.accepted and wrong.confidence < alone.confidence
+
+
+def test_no_region_decides_alone_between_identical_rooms():
+    for x_m in (0.0, 10.0):
+        found = ask(region=region(x_m, probability=1.0))
+        assert found.refusal_kind == 'look_alike'
+        assert found.map_from_camera[0, 3] == pytest.approx(x_m + 0.3, abs=0.05)
+        assert ask().confidence < found.confidence < 0.8
+
+
+def test_a_region_of_another_floor_decides_between_equal_floors():
+    floors = join(floor('floor_1'), floor('floor_2'))
+    seen = Observation(CAMERA, see_room(floor('')))
+    for row, name in enumerate(('floor_1', 'floor_2')):
+        found = Relocalizer(floors, OPTIONS).relocalize(
+            [replace(seen, region=region(frame_id=name))])
+        assert (found.map_from_camera[0, 3] > 1e3) == bool(row)
+
+
+def test_a_confident_wrong_region_accepts_nothing_and_is_named():
+    wrong = region(5.0, probability=1.0)
+    assert not ask(region=wrong).accepted, 'neither room is there'
+    refused = ask(make_room(), 3, region=wrong)
+    assert refused.confidence < ask(make_room(), 3).confidence
+    assert 'the prior has the robot elsewhere' in refused.reason
+    sure = ask(make_room(), region=wrong)
+    assert sure.accepted and pose_error(sure.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
+
+
+def test_a_right_region_lifts_no_weak_pose():
+    alone, told = (ask(make_room(), objects=3, **known) for known in ({}, {'region': region()}))
+    assert not alone.accepted and not told.accepted
+    assert told.confidence <= ask(make_room(), objects=4).confidence
+
+
+@given(st.lists(st.tuples(st.floats(-5, 9), st.floats(-3, 0)), min_size=1, max_size=5))
+def test_no_prior_gives_more_than_the_objects_give_without_rivals(contenders):
+    odds, prior = np.array(contenders).T
+    poses = np.tile(np.eye(4), (len(odds), 1, 1))
+    poses[:, 0, 3] = 5.0 * np.arange(len(odds))
+    told = confidences(odds, poses, 2.0, prior=prior)
+    alone = [confidences(odds[[row]], poses[[row]], 2.0)[0] for row in range(len(odds))]
+    assert (told <= np.array(alone) + 1e-9).all()
+    assert told.sum() <= 1.0 + 1e-9
+
+
+def walled(cells, resolution_m=0.1, origin=(-3.0, -3.0, 0.0), frame_id='map'):
+    return OccupancyGrid(frame_id, cells, resolution_m, origin)
+
+
+OPEN = np.zeros((60, 160), dtype=np.int8)
+
+
+def test_walls_lower_the_confidence_and_are_named():
+    assert ask(make_room(), grid=walled(OPEN)).confidence == ask(make_room()).confidence
+    block, outside = OPEN.copy(), OPEN.copy()
+    block[20:40, 20:45] = OCCUPIED
+    outside[:] = UNKNOWN
+    for cells, text in ((block, 'in a wall'), (outside, 'outside of the known area')):
+        found = ask(make_room(), 4, STRICT, grid=walled(cells))
+        assert found.refusal_kind == 'obstructed'
+        assert text in found.reason
+        assert ask(make_room(), 12, STRICT, grid=walled(cells)).accepted
+    assert ask(make_room(), grid=walled(block, frame_id='else')).evidence.walls is None
+
+
+def test_a_wrong_grid_decides_between_no_twins():
+    wrong = OPEN.copy()
+    wrong[:, :80] = OCCUPIED  # where the camera is
+    assert not ask(grid=walled(wrong)).accepted
+
+
+def test_an_object_in_its_own_cells_is_seen_and_one_behind_a_wall_is_not():
+    room = make_room()
+    behind = OPEN.copy()
+    behind[:, 27:29] = OCCUPIED  # x from -.3 to -.1 m
+    hidden = [row for row in range(12) if room.centers[row, 0] < -1.0]
+    assert len(hidden) > TERMS.most_blocked
+    found = walls_against(room, walled(behind), MAP_FROM_CAMERA, hidden)
+    assert (found.blocked, found.seen) == (len(hidden), 0)
+    assert found.odds == TERMS.blocked * min(len(hidden), TERMS.most_blocked)
+    for row in range(12):
+        at_it = OPEN.copy()
+        x, y = ((room.centers[row, :2] + 3.0) / 0.1).astype(int)
+        at_it[y, x] = OCCUPIED
+        assert walls_against(room, walled(at_it), MAP_FROM_CAMERA, [row]).blocked == 0
+
+
+def test_walls_take_log_odds_from_the_probability():
+    for likely in (0.2, 0.9, 0.9999):
+        plain = Evidence(5, likely)
+        walls = replace(plain, walls=Walls(is_inside=True))
+        odds = [one.confidence / (1 - one.confidence) for one in (plain, walls)]
+        assert math.log(odds[1] / odds[0]) == pytest.approx(TERMS.in_wall)

@@ -1,0 +1,146 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a relocalizer knows before an image: the topic ~/prior, its last pose, and walls."""
+
+import json
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid
+from scene import doubled_room, write_map
+from tester import RELIABLE, make_frame
+
+from cliploc_ros.ros.qos import LATCHED
+
+TWINS = doubled_room(np.array([10.0, 0.0, 0.0])).select(range(22))
+
+
+@pytest.fixture
+def twins_map(tmp_path):
+    """Two rooms, 10 m apart along x; the second one lacks two objects of the first."""
+    path = tmp_path / 'twins.yaml'
+    write_map(TWINS, path)
+    return path
+
+
+def at(x_m, frame_id='map', deviation=0.5, yaw_variance=10.0):
+    msg = PoseWithCovarianceStamped()
+    msg.header.frame_id, msg.pose.pose.position.x = frame_id, x_m
+    msg.pose.pose.orientation.w = 1.0
+    msg.pose.covariance = np.diag([deviation ** 2] * 2 + [0.0] * 3 + [yaw_variance]).ravel()
+    return msg
+
+
+@pytest.fixture
+def tell(tester):
+    """Publish on a topic of the relocalizer until it hears, and what it logs, if it does."""
+    made = []
+
+    def publish(process, msg, expect='', profile=LATCHED, topic='relocalizer/prior'):
+        publisher = tester.create_publisher(type(msg), topic, profile)
+        made.append(publisher)
+        # volatile and transient local subscriptions hear ~/prior
+        matched = 2 if topic.endswith('prior') and profile is LATCHED else 1
+        tester.wait(lambda: publisher.get_subscription_count() >= matched, 'the subscription')
+        publisher.publish(msg)
+        if expect:
+            process.wait_for_output(expect)
+    yield publish
+    for one in made:
+        tester.destroy_publisher(one)
+
+
+def relocalized(tester, expect):
+    """Ask until an answer contains a text: a message may arrive after a request."""
+    for _ in range(20):
+        answer = tester.relocalize(make_frame())
+        if expect in answer.message:
+            return answer
+    raise AssertionError(answer.message)
+
+
+def test_the_topic_decides_between_rooms_that_look_alike(own_relocalizer, tester, tell,
+                                                         twins_map):
+    process = own_relocalizer(map_file=twins_map, algorithm='auto')
+    assert 'kind look_alike' in tester.relocalize(make_frame()).message
+    tell(process, at(10.0))  # wrong: the other room has all objects
+    assert 'refused' in relocalized(tester, 'the prior has the robot elsewhere').message
+    tell(process, at(0.0), profile=RELIABLE)
+    assert 'x 0.3' in relocalized(tester, 'accepted').message
+    for invalid, text in (
+            (at(0.0, deviation=0.0), 'the covariance of x, y and yaw must be finite'),
+            (at(np.nan), 'a pose with NaN'), (at(0.0, deviation=np.nan),
+                                             'the covariance of x, y and yaw must be finite')):
+        tell(process, invalid, f'localizing without a prior: ~/prior: {text}')
+        assert 'look_alike' in relocalized(tester, 'refused').message
+    tell(process, at(0.0, frame_id='elsewhere'))
+    tester.feed_until(lambda: tester.ask() and 'localizing without the prior: '
+                      in process.output(), make_frame())
+    tell(process, at(0.0))
+    relocalized(tester, 'accepted')
+    tell(process, at(0.0, frame_id=''))
+    relocalized(tester, 'refused')
+
+
+def test_a_robot_wakes_where_it_was(own_relocalizer, tester, tell, twins_map, tmp_path):
+    file = tmp_path / 'last_pose.json'
+    known = {'map_file': twins_map, 'algorithm': 'auto', 'last_pose_file': file}
+    first = own_relocalizer(**known)
+    assert 'refused' in tester.relocalize(make_frame()).message
+    tell(first, at(0.0), profile=RELIABLE)  # which the next process does not hear
+    relocalized(tester, 'accepted')
+    tester.wait(file.exists, 'the file')
+    kept = json.loads(file.read_text())
+    assert kept['frame_id'] == 'map' and len(kept['map_hash']) == 12
+    assert kept['map_from_robot'][0][3] == pytest.approx(0.3, abs=0.05)
+    # where the localizer has it now
+    shown = at(12.0, deviation=0.1)
+    tester.wait(lambda: tell(first, shown, topic='amcl_pose') or json.loads(file.read_text())[
+        'map_from_robot'][0][3] == 12.0, 'the pose of the localizer')
+    file.write_text(json.dumps(kept))
+    first.stop()
+
+    second = own_relocalizer(**known)
+    assert 'accepted: x 0.3' in tester.relocalize(make_frame()).message
+    again = tester.relocalize(make_frame()).message
+    assert 'refused' in again and 'prior' not in again, 'used up: the robot is awake'
+    second.stop()
+
+    for content, text in (('{', 'last_pose_file'), (json.dumps(kept | {'covariance': []}), ''),
+                          (json.dumps(kept | {'map_hash': 'another'}), '')):
+        file.write_text(content)
+        process = own_relocalizer(**known)
+        answer = tester.relocalize(make_frame())
+        assert 'look_alike' in answer.message and 'prior' not in answer.message
+        assert text in process.output() and 'Traceback' not in process.output()
+        process.stop()
+
+
+def test_walls_of_the_topic_speak_against_a_pose(own_relocalizer, tester, tell, room_map):
+    process = own_relocalizer(occupancy_grid='topic', min_confidence=0.9985)
+    assert tester.relocalize(make_frame()).success
+    grid = OccupancyGrid()
+    grid.header.frame_id = 'map'
+    grid.info.width = grid.info.height = 40
+    grid.info.resolution = 0.1
+    grid.info.origin.position.x = grid.info.origin.position.y = -2.0
+    grid.info.origin.orientation.w = 1.0
+    grid.data = [100] * 1600
+    tell(process, grid, topic='map')
+    answer = relocalized(tester, 'refused')
+    assert 'in a wall of the occupancy grid' in answer.message
+    assert 'kind obstructed' in answer.message
+    grid.data = [0] * 1600
+    tell(process, grid, topic='map')
+    relocalized(tester, 'accepted')
+    grid.data = [0] * 7
+    tell(process, grid, 'localizing without the topic map: 7 cells', topic='map')
+
+
+def test_a_bad_grid_file_stops_nothing(own_relocalizer, tester, tmp_path):
+    (tmp_path / 'walls.yaml').write_text('image: gone.pgm')
+    process = own_relocalizer(expect='localizing without walls: occupancy_grid',
+                              occupancy_grid=tmp_path / 'walls.yaml')
+    process.wait_for_output('ready after')
+    assert tester.relocalize(make_frame()).success
