@@ -42,6 +42,8 @@ _OF_CAMERA = ('image', 'camera_info', 'detections', 'depth', 'depth_camera_info'
 DETECTOR_PARAMETERS = {
     'profile': 'detector and CLIP: auto, accurate, balanced or fast',
     'model': 'YOLO weights',
+    'vocabulary': 'what a YOLO-World or YOLOE looks for: map, or names',
+    'map_file': 'the map of objects: a path, or package://PACKAGE/PATH',
     'cameras': 'names of several cameras, the namespaces of their topics: [front, left]',
     'image_transport': 'raw or compressed',
     'autostart': 'false: a lifecycle manager configures and activates the nodes',

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from cliploc_ros.datasets.observations import Recorded
     from cliploc_ros.datasets.poses import Poses
     from cliploc_ros.models.clip_weights import ClipOptions
-    from cliploc_ros.models.protocols import DetectorOptions
+    from cliploc_ros.models.protocols import DetectorOptions, Prompts
 
 # Of a recording, these change how its frames are read.
 _READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'max_gap', 'image',
@@ -40,6 +40,11 @@ def add_network_options(group: Any) -> None:
                        help='detector and CLIP: that of the robot, as image embeddings are of one '
                        'CLIP (%(default)s: accurate on a GPU, balanced on a CPU)')
     group.add_argument('--model', default='', help="YOLO weights (the profile's)")
+    group.add_argument('--detector-vocabulary', default='', metavar='NAMES',
+                       help="what a YOLO-World or YOLOE looks for: 'mug, chair', or a map (.yaml) "
+                       'with its classes and labels')
+    group.add_argument('--text-model', default='', metavar='FILE',
+                       help='text tower of that detector (downloaded once)')
     group.add_argument('--clip-model', default='', help="(the profile's)")
     group.add_argument('--clip-pretrained', default='', help="tag or file (the profile's)")
     group.add_argument('--device', default='auto', help='(%(default)s)')
@@ -51,8 +56,20 @@ def detector_options(options: argparse.Namespace, **more: Any) -> 'DetectorOptio
     """Return the detector that the command line names."""
     from cliploc_ros.models.protocols import DetectorOptions
 
-    return with_detector(DetectorOptions(model=options.model, device=options.device,
-                                         inference=options.inference, **more), options.profile)
+    return with_detector(DetectorOptions(
+        model=options.model, device=options.device, inference=options.inference,
+        prompts=_prompts(options.detector_vocabulary), text_model=options.text_model, **more),
+        options.profile)
+
+
+def _prompts(vocabulary: str) -> 'Prompts':
+    if not vocabulary:
+        return ()
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
+    from cliploc_ros.models.open_vocabulary import prompts_of_map, prompts_of_names
+
+    return (prompts_of_map(LandmarkMap.from_file(vocabulary), vocabulary)
+            if vocabulary.endswith('.yaml') else prompts_of_names(vocabulary))
 
 
 def clip_options(options: argparse.Namespace) -> 'ClipOptions':

@@ -15,6 +15,9 @@ if TYPE_CHECKING:  # --help of the programs shows these options, and is fast
 
     from cliploc_ros.core.observation import Detections
 
+#: Texts that a detector looks for, and the class that it reports for each.
+Prompts = tuple[tuple[str, str], ...]
+
 
 @dataclass(frozen=True)
 class DetectorOptions:
@@ -35,6 +38,11 @@ class DetectorOptions:
     cache_dir: str = ''  #: Folder for downloads and converted networks; '' is the user's cache
     #: 'auto' (OpenVINO on a CPU where it is installed), 'pytorch' or 'openvino'
     inference: str = 'auto'
+    #: What a YOLO-World or YOLOE looks for; empty: the classes that it was saved with
+    prompts: Prompts = ()
+    #: File of its text tower: CLIP ViT-B-32 for YOLO-World, mobileclip_blt.ts for YOLOE; '' is
+    #: downloaded once. Any other tower ends on .ts: TorchScript from CLIP's tokens to embeddings
+    text_model: str = ''
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A YOLO network as an object detector, run by PyTorch or by OpenVINO."""
 
+import json
 import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ from cliploc_ros.models.devices import (
 )
 from cliploc_ros.models.files import fingerprint_file, first_line
 from cliploc_ros.models.images import check_image_rgb
+from cliploc_ros.models.open_vocabulary import set_prompts
 from cliploc_ros.models.openvino_networks import (
     Conversion,
     ConversionError,
@@ -137,14 +139,19 @@ def load_converted(file: Path, options: DetectorOptions) -> OpenVinoYolo:
     import torch
 
     identity = [fingerprint_file(file), import_ultralytics().__version__, torch.__version__]
+    loaded = None
+    if options.prompts:  # the tower is part of what the network depends on
+        loaded = load_yolo(file)
+        identity += [set_prompts(loaded, options), json.dumps(options.prompts)]
     return OpenVinoYolo(load_network(options.cache_dir, 'YOLO', identity,
-                                     lambda: _convert(file)))
+                                     lambda: _convert(loaded or load_yolo(file))))
 
 
-def _convert(file: Path) -> Conversion:
+def _convert(loaded: Any) -> Conversion:
     import torch
 
-    loaded = load_yolo(file)
+    if isinstance(loaded, import_ultralytics().YOLOE):
+        raise ConversionError('YOLOE is not converted for OpenVINO')
     model = loaded.model.float().eval().fuse(verbose=False)
     stride = stride_of(model)
     for module in model.modules():
@@ -165,8 +172,11 @@ class TorchYolo:
 
     inference = 'pytorch'
 
-    def __init__(self, file: Path, device: 'torch.device', precision: str) -> None:
+    def __init__(self, file: Path, device: 'torch.device', precision: str,
+                 options: DetectorOptions) -> None:
         self._model = load_yolo(file)
+        if options.prompts:
+            set_prompts(self._model, options)
         self._settings = {'device': str(device), 'verbose': False}
         if precision == 'fp16':
             from ultralytics.utils import DEFAULT_CFG_DICT
@@ -199,8 +209,11 @@ class YoloDetector:
         self.device = str(device)
         self._network = _load(options, device)
         self.inference = self._network.inference  #: 'pytorch' or 'openvino'
+        classes = dict(options.prompts)
+        self._class_of = {number: classes.get(name, name)
+                          for number, name in self._network.names.items()}
         #: All classes that the model knows
-        self.class_names = tuple(self._network.names.values())
+        self.class_names = tuple(dict.fromkeys(self._class_of.values()))
         self.configure(options)
         # The first pass sets up the predictor: do it before the first image.
         side = self._network.stride
@@ -222,10 +235,23 @@ class YoloDetector:
         """
         check_image_rgb(image_rgb)
         rows = self._network.find(np.ascontiguousarray(image_rgb[..., ::-1]), **self._settings)
+        if len(self.class_names) < len(self._class_of):
+            rows = self._without_doubles(rows)
         return Detections(
             bboxes_xyxy=rows[:, :4].astype(np.float64),
-            class_ids=tuple(self._network.names[int(index)] for index in rows[:, 5]),
+            class_ids=tuple(self._class_of[int(index)] for index in rows[:, 5]),
             scores=rows[:, 4].astype(np.float64))
+
+    def _without_doubles(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return boxes (m, 6) without those that another text of the same class found, too."""
+        import torch
+        from torchvision.ops import batched_nms
+
+        classes = [self.class_names.index(self._class_of[int(index)]) for index in rows[:, 5]]
+        boxes = torch.from_numpy(rows[:, :5].copy())
+        kept = batched_nms(boxes[:, :4], boxes[:, 4], torch.tensor(classes, dtype=torch.int64),
+                           self._settings['iou'])
+        return rows[kept.numpy()]
 
 
 def _load(options: DetectorOptions, device: 'torch.device') -> TorchYolo | OpenVinoYolo:
@@ -237,6 +263,9 @@ def _load(options: DetectorOptions, device: 'torch.device') -> TorchYolo | OpenV
     precision = resolve_precision(options.precision, device)
     inference = resolve_inference(options.inference, device, precision)
     if is_export(path):
+        if options.prompts:
+            raise OptionsError(f'{path}: the classes of an export are fixed: a vocabulary needs '
+                               'the .pt file')
         if inference != 'openvino':
             raise OptionsError(f"{path} needs OpenVINO (pip install openvino), device 'cpu', "
                                "precision 'fp32' and inference 'auto' or 'openvino'")
@@ -248,4 +277,4 @@ def _load(options: DetectorOptions, device: 'torch.device') -> TorchYolo | OpenV
             if options.inference == 'openvino':
                 raise
             logger.warning('%s; PyTorch runs it (inference: pytorch saves the attempt)', error)
-    return TorchYolo(path, device, precision)
+    return TorchYolo(path, device, precision, options)

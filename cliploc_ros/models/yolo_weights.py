@@ -73,16 +73,24 @@ def resolve_yolo_weights(options: DetectorOptions) -> Path:
     ModelError: when it is missing, damaged or unknown, or the download fails.
     """
     file = Path(options.model).expanduser().absolute()
-    if is_export(file):
-        return file
-    if file.exists() or Path(options.model).name != options.model:
+    return file if is_export(file) else resolve_published(options.model, options.cache_dir,
+                                                          'model')
+
+
+def resolve_published(given: str, cache_dir: str, option: str) -> Path:
+    """Return a file of weights, by its path or the name under which ultralytics published it.
+
+    Errors as of resolve_yolo_weights; they name the option.
+    """
+    file = Path(given).expanduser().absolute()
+    if file.exists() or Path(given).name != given:
         check_weights_file(file)
         return file
-    name = options.model if options.model.endswith('.pt') else f'{options.model}.pt'
-    folder = resolve_cache_dir(options.cache_dir) / 'weights'
+    name = given if file.suffix in ('.pt', '.ts') else f'{given}.pt'
+    folder = resolve_cache_dir(cache_dir) / 'weights'
     if not _is_restricted(import_ultralytics()):
         raise ModelError(f'this ultralytics or PyTorch would run code that {name} may hold: '
-                         'update them, or set the model to the path of a file that you trust')
+                         f'update them, or set the {option} to the path of a file that you trust')
     if (folder / name).exists():
         check_weights_file(folder / name)
         return folder / name
@@ -91,7 +99,7 @@ def resolve_yolo_weights(options: DetectorOptions) -> Path:
     if name not in GITHUB_ASSETS_NAMES:
         near = difflib.get_close_matches(name, GITHUB_ASSETS_NAMES, n=4, cutoff=0.5)
         hint = f': did you mean {", ".join(near)}?' if near else ''
-        raise ModelError(f"'{options.model}' is neither a file here nor a published YOLO model"
+        raise ModelError(f"'{given}' is neither a file here nor a published YOLO model"
                          f'{hint}')
 
     def fetch() -> Path:
@@ -102,7 +110,7 @@ def resolve_yolo_weights(options: DetectorOptions) -> Path:
 
     return download(name, folder, (
         f'Without a network: download {name} from https://github.com/ultralytics/assets/releases '
-        'on another machine and set the model to the path of the file'), fetch)
+        f'on another machine and set the {option} to the path of the file'), fetch)
 
 
 def stride_of(model: Any) -> int:
@@ -136,7 +144,8 @@ def load_yolo(file: Path) -> Any:
             reason = first_line(error).removeprefix('ERROR').strip()
             raise ModelError(f'{file} is no detection model of YOLO: '
                              f'{reason.replace(str(neutral), "it")}') from error
-    if model.task != 'detect':
+    # YOLOE is published with a head for masks; its boxes are those of a detector.
+    if model.task != 'detect' and not isinstance(model, ultralytics.YOLOE):
         raise ModelError(f"{file} is a YOLO model for the task '{model.task}': one for 'detect' "
                          'is needed')
     return model

@@ -6,20 +6,24 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import NoReturn
 
 from rclpy.event_handler import PublisherEventCallbacks
 from vision_msgs.msg import Detection2DArray
 
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.messages import image_from_msg
+from cliploc_ros.models.open_vocabulary import prompts_of_map, prompts_of_names
 from cliploc_ros.models.profiles import load_detector, with_detector
-from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
+from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector, Prompts
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.inputs.frame_source import ImageSource, TimedImage, of_camera
 from cliploc_ros.ros.inputs.rig import NewestInstant
+from cliploc_ros.ros.map_parameters import path_of
 from cliploc_ros.ros.node.diagnostics import Health, Rates, StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.process import run_node
@@ -63,9 +67,11 @@ class DetectorNode(ManagedNode[DetectorParameters]):
     def load(self) -> str:
         """Load the network."""
         parameters = self.settings.snapshot()
-        options = with_detector(detector_options(parameters), parameters.profile)
+        options = replace(with_detector(detector_options(parameters), parameters.profile),
+                          prompts=_prompts(parameters), text_model=parameters.text_model)
         self._detector = load_detector(options)
-        return f'detector {options.model} ({self._detector.inference})'
+        of_texts = f', {len(options.prompts)} texts' if options.prompts else ''
+        return f'detector {options.model} ({self._detector.inference}{of_texts})'
 
     @property
     def detector(self) -> ObjectDetector | None:
@@ -141,6 +147,14 @@ class DetectorNode(ManagedNode[DetectorParameters]):
             if self._awaited_since < math.inf:
                 self._first_boxes_s = time.monotonic() - self._awaited_since
                 self._awaited_since = math.inf
+
+
+def _prompts(parameters: DetectorParameters) -> Prompts:
+    """Return what the detector looks for; MapError: the map cannot be read."""
+    if parameters.vocabulary != 'map':
+        return prompts_of_names(parameters.vocabulary) if parameters.vocabulary else ()
+    file = path_of(parameters.map_file)
+    return prompts_of_map(LandmarkMap.from_file(file), file)
 
 
 def detector_options(parameters: DetectorParameters) -> DetectorOptions:

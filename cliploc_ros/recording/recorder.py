@@ -132,6 +132,8 @@ def describe(frames: Frames, options: RecordingOptions) -> str:
     """Return all that the observations depend on, as JSON."""
     clip = options.clip
     files = [options.detector.model]
+    if options.detector.text_model:
+        files.append(options.detector.text_model)
     if clip is not None:
         files += [clip.model, clip.pretrained, clip.checkpoint_path]
     return json.dumps({
@@ -343,7 +345,8 @@ def _camera_of(seen: list[SeenFrame], where: str, images: int, varies: bool) -> 
 def _settings(options: DetectorOptions | ClipOptions) -> dict[str, Any]:
     """Return the options that change what a network says."""
     return {name: value for name, value in asdict(options).items()
-            if name not in ('cache_dir', 'max_batch', 'inference')}
+            if name not in ('cache_dir', 'max_batch', 'inference')
+            and (value or name not in ('prompts', 'text_model'))}  # as files of before have it
 
 
 def _state(path: Path) -> tuple[int, int] | None:

@@ -84,6 +84,14 @@ class DetectorParameters(CommonParameters):
     model: str = parameter('',
         'Weights: a local file, a folder with an OpenVINO export, or a name that ultralytics '
         "downloads once; empty: the profile's.", read_only=True)
+    vocabulary: str = parameter('',
+        "What a YOLO-World or YOLOE looks for: 'map', the classes and labels of map_file, or "
+        "names such as 'mug, office chair'; empty: the classes of its file.", read_only=True)
+    map_file: str = parameter('',
+        "Map of the vocabulary 'map', read when the node is configured; as of the relocalizer.")
+    text_model: str = parameter('',
+        'File of the text tower of a YOLO-World (CLIP ViT-B-32) or YOLOE (mobileclip_blt.ts); '
+        'empty: download it once.', read_only=True)
     conf: float = parameter(0.1, 'Drop detections below this confidence.', low=0.0, high=1.0)
     iou: float = parameter(0.7,
         'Drop the weaker of two boxes of one class that overlap more.', low=0.0, high=1.0)
@@ -91,6 +99,12 @@ class DetectorParameters(CommonParameters):
         'Longer side of the image as the network sees it.', unit='px', low=32, high=4096)
     max_det: int = parameter(100,
         'Publish only the most confident detections, this many.', low=1, high=1000)
+
+    def check(self) -> None:
+        """Raise OptionsError where values do not fit together; the message names the parameter."""
+        super().check()
+        if self.vocabulary == 'map' and not self.map_file:
+            raise OptionsError("vocabulary: 'map' needs the parameter map_file")
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.simulation.labels import CLASS_SHARE, shared_noise, similarities_of
-from studies.worlds.things import CLASS_NAMES
+from studies.worlds.things import CLASS_NAMES, rows_of
 
 _SIZE = 128
 # Of a vector's square: what tells an object from other ones of its model.
@@ -38,7 +38,7 @@ class Encoder(NamedTuple):
         """Return the vectors (n, D) of n objects, of unit length."""
         looks = {kind: _directions(1, rng)[0]
                  for kind in dict.fromkeys(zip(class_ids, models.tolist(), strict=True))}
-        rows = [CLASS_NAMES.index(name) for name in class_ids]
+        rows = rows_of(class_ids)
         shared = np.array([looks[kind] for kind in zip(class_ids, models.tolist(), strict=True)])
         found = (np.sqrt(CLASS_SHARE) * self.classes[rows]
                  + np.sqrt(1.0 - CLASS_SHARE - _OWN_SHARE) * shared
@@ -47,8 +47,7 @@ class Encoder(NamedTuple):
 
     def unknown(self, class_ids: tuple[str, ...]) -> NDArray[np.float64]:
         """Return the vectors (n, D) of crops that show nothing but look like some class."""
-        rows = [CLASS_NAMES.index(name) for name in class_ids]
-        return np.asarray(np.sqrt(CLASS_SHARE) * self.classes[rows])
+        return np.asarray(np.sqrt(CLASS_SHARE) * self.classes[rows_of(class_ids)])
 
     def biases(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
         """Return how all crops of each object differ from its vector (n, D)."""

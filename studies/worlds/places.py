@@ -19,6 +19,9 @@ from studies.worlds.things import (
     Thing,
 )
 
+# How far another thing is from one on each axis [m], and from which semi-axis on none is: guesses.
+_ASIDE_M, _LARGE_M = 0.4, 0.5
+
 
 class Place(NamedTuple):
     """Things in a rectangle from (0, 0) to (width, depth) [m]."""
@@ -110,6 +113,21 @@ def two_rooms(rng: np.random.Generator) -> Place:
            for _ in range(2)]
     moved = [thing._replace(x=thing.x + one.width + gap) for thing in own[1]]
     return Place(2.0 * one.width + gap, one.depth, [*one.things, *twin, *own[0], *moved])
+
+
+def denser(place: Place, density: int, rng: np.random.Generator) -> Place:
+    """Return a place with more things, of classes that COCO lacks: `density` times as many.
+
+    Each of them is about half a metre from one that is not large, at its height.
+    """
+    small = [one for one in place.things if max(TYPICAL[one.name][:3]) < _LARGE_M]
+    more = [one._replace(
+        name=f'{one.name}#{number}', x=float(np.clip(one.x + _ASIDE_M * rng.normal(), 0.0,
+                                                     place.width)),
+        y=float(np.clip(one.y + _ASIDE_M * rng.normal(), 0.0, place.depth)),
+        yaw=rng.uniform(0.0, np.pi), model=_new_model(rng))
+        for number in range(2, density + 1) for one in small]
+    return place._replace(things=[*place.things, *more])
 
 
 #: All kinds of places, by name.

@@ -47,7 +47,8 @@ _GROWTH = (0.75, 1.3)
 class Thing(NamedTuple):
     """One object: where its centre is [m], how it is turned [rad], and how it looks.
 
-    Things of one class and model look alike.
+    Things of one class and model look alike. 'cup#2' is of a class that COCO lacks, with the size
+    of a cup.
     """
 
     name: str
@@ -80,10 +81,16 @@ class Objects(NamedTuple):
         return shape_matrices(self.semi_axes, self.quats_xyzw)
 
 
+def rows_of(class_ids: Sequence[str]) -> list[int]:
+    """Return the rows in CLASS_NAMES of classes, or of those that they resemble."""
+    return [CLASS_NAMES.index(name.partition('#')[0]) for name in class_ids]
+
+
 def make_objects(things: Sequence[Thing], rng: np.random.Generator) -> Objects:
     """Return things as objects; those of one class and model have the same size."""
     models = np.array([one.model for one in things])
-    sizes = np.array([TYPICAL[one.name][:3] for one in things])
+    sizes = np.array([TYPICAL[CLASS_NAMES[row]][:3] for row in rows_of([
+        one.name for one in things])])
     growth = {kind: rng.uniform(*_GROWTH, 3)
               for kind in dict.fromkeys((one.name, one.model) for one in things)}
     sizes *= [growth[one.name, one.model] for one in things]

@@ -25,7 +25,7 @@ from studies.worlds.cameras import (
     walk_through,
 )
 from studies.worlds.detector import Detector, detect
-from studies.worlds.places import KINDS, Place
+from studies.worlds.places import KINDS, Place, denser
 from studies.worlds.surveyor import MapErrors, Survey, survey
 from studies.worlds.things import Objects, make_objects
 
@@ -68,7 +68,7 @@ class _Scene(NamedTuple):
 
 
 def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = None,
-               has_depth: bool = False, cameras: int = 1) -> World:
+               has_depth: bool = False, cameras: int = 1, density: int = 1) -> World:
     """Return a world; equal seeds give equal worlds.
 
     Parameters
@@ -83,9 +83,11 @@ def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = No
         Whether the camera measures depth; all else stays the same.
     cameras : int
         The robot has more cameras, in equal angles. They are neighbours of the first one's image.
+    density : int
+        Things over those of COCO's classes, see places.denser.
     """
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
-    place, scene = _make_scene(kind, sigma_m, rng)
+    place, scene = _make_scene(kind, sigma_m, rng, density)
     if has_depth:
         of_depth, = rng.spawn(1)
         scene = scene._replace(depth_scale=float(of_depth.normal(1.0, _DEPTH_SCALE)))
@@ -151,9 +153,11 @@ def make_drive(kind: str, seed: int, images: int, changed: float = 0.0) -> Drive
                  (distances > _WRONG_M) | (found.objects != found.described))
 
 
-def _make_scene(kind: str, sigma_m: float | None, rng: np.random.Generator
+def _make_scene(kind: str, sigma_m: float | None, rng: np.random.Generator, density: int = 1
                 ) -> tuple[Place, _Scene]:
     place = KINDS[kind](rng)
+    if density > 1:
+        place = denser(place, density, rng)
     objects = make_objects(place.things, rng)
     encoder = Encoder.random(rng)
     errors = MapErrors.random(rng)

@@ -182,7 +182,7 @@ def test_the_deviations_of_odometry():
     deviations = odometry_deviations(make_transform(
         Rotation.from_euler('z', 10, degrees=True).as_matrix(), np.array([0.5, 0.0, 0.0])))
     assert deviations[:3] == pytest.approx(0.005 + 0.03 * 0.5)
-    assert deviations[3:] == pytest.approx(np.radians(0.25 + 0.03 * 10.0))
+    assert deviations[3:] == pytest.approx(np.radians(0.25 + 0.03 * 10.0 + 0.15 * 0.5))
 
 
 def test_two_rooms_alike_are_refused_in_any_number_of_frames(room, walk):

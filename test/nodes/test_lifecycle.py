@@ -5,13 +5,16 @@
 import os
 import signal
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import KeyValue
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from open_weights import write_open_yolo, write_tower
 from processes import PROJECT
+from scene import make_room, write_map
 from tester import class_matching, make_frame
 
 ASSETS = PROJECT / 'cliploc_ros/demo/assets'
@@ -251,3 +254,25 @@ def test_an_inactive_detector_costs_nothing(manage, tester):
     share = processor_share(process, tester)
     print(f'\ninactive beside a camera: {100 * share:.1f} % of a core')
     assert share < 0.05
+
+
+def test_a_detector_looks_for_what_its_map_names_when_it_is_configured(manage, tester, tmp_path):
+    """A YOLO-World with random weights: which classes it reports, not where they are."""
+    parameters = {'model': write_open_yolo(tmp_path / 'world.pt', 'yolov8n-worldv2.yaml'),
+                  'vocabulary': 'map', 'map_file': tmp_path / 'map.yaml', 'conf': 0.0,
+                  'imgsz': 320, 'cache_dir': tmp_path / 'cache', 'inference': 'pytorch',
+                  'text_model': write_tower(tmp_path / 'tower.ts')}
+    process, manager = manage('detector', **parameters)
+    assert not manager.change(IDS['configure'])
+    process.wait_for_output('map.yaml: No such file')
+    image = make_frame()[0]
+    for names in (('a', 'b', 'c'), ('mug', 'chair', 'plant')):
+        classes = tuple(names['abc'.index(one)] for one in make_room().class_ids)
+        write_map(replace(make_room(), class_ids=classes), tmp_path / 'map.yaml')
+        manager.do('configure', 'activate')
+        with tester.hearing_detections() as detected:
+            tester.feed_until(lambda found=detected: found, [image], 'detections')
+        found = set(next(iter(detected.values())).class_ids)
+        assert found and found <= set(names)
+        manager.do('deactivate', 'cleanup')
+    assert 'pytorch, 15 texts' in process.output()

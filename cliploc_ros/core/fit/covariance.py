@@ -55,11 +55,13 @@ _STEPS = (1e-5, 1e-5, 1e-5, 1e-6, 1e-6, 1e-6)
 #: Variance of a direction that the boxes do not fix: m^2 and rad^2.
 PRIOR_VARIANCES = (100.0, 100.0, 100.0, 10.0, 10.0, 10.0)
 # Deviation of odometry between two frames, on each axis: a floor, which covers stamps and
-# interpolation, and a share of the way. The shares are guesses: wheels and visual odometry drift
-# by 1 to 5 % of distance and angle. The floors were chosen on the TUM frames.
+# interpolation, a share of the way, and an angle for each metre. The shares are guesses: wheels
+# and visual odometry drift by 1 to 5 % of distance and angle. The floors were chosen on the TUM
+# frames, the angle for each metre by the wheels of a Husky (python -m studies.sensors).
 _ODOMETRY_FLOOR_M = 0.005
 _ODOMETRY_FLOOR_RAD = np.radians(0.25)
 _ODOMETRY_DRIFT = 0.03
+_ODOMETRY_RAD_PER_M = np.radians(0.15)
 # A camera that moves less stands still: rounding [m and rad].
 _STANDS_STILL = 1e-9
 # Weights of the first pose that covariance intersection tries.
@@ -154,7 +156,8 @@ def odometry_deviations(first_from_second: NDArray[np.float64]) -> NDArray[np.fl
     if way_m < _STANDS_STILL and angle < _STANDS_STILL:
         return np.zeros(6)
     return np.repeat([_ODOMETRY_FLOOR_M + _ODOMETRY_DRIFT * way_m,
-                      _ODOMETRY_FLOOR_RAD + _ODOMETRY_DRIFT * angle], 3)
+                      _ODOMETRY_FLOOR_RAD + _ODOMETRY_DRIFT * angle
+                      + _ODOMETRY_RAD_PER_M * way_m], 3)
 
 
 def share_within(radius_m: float, covariance: NDArray[np.float64]) -> float:

@@ -20,7 +20,7 @@ from cliploc_ros.core.geometry.transforms import SAME_SPOT, make_transform, pose
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
-from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
+from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription, Listener
 from cliploc_ros.units import NS_PER_S
 
 _UNIT_TOLERANCE = 0.01
@@ -262,7 +262,7 @@ class BodyPose(NamedTuple):
     way_m: float
 
 
-class OdometrySource:
+class OdometrySource(Listener):
     """Subscribes to odometry while the node is active: it costs little, and links frames."""
 
     def __init__(self, node: Node) -> None:
@@ -273,7 +273,6 @@ class OdometrySource:
         self._newest_at = 0.0
         self._frames = ('', '')
         self._on_restart: list[Callable[[int], None]] = []
-        self._subscription: AdaptiveSubscription | None = None
 
     @property
     def topic(self) -> str:
@@ -297,13 +296,6 @@ class OdometrySource:
         """Subscribe."""
         self._subscription = AdaptiveSubscription(self._node, Odometry, 'odom', self.take,
                                                   qos.ODOM)
-
-    def close(self) -> None:
-        """Unsubscribe, and forget what was heard."""
-        if self._subscription is not None:
-            self._subscription.destroy()
-            self._subscription = None
-        self.forget()
 
     def forget(self) -> None:
         """Forget what was heard: poses that follow belong to another run."""

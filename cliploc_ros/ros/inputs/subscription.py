@@ -5,6 +5,7 @@
 import math
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
 
@@ -129,3 +130,20 @@ class AdaptiveSubscription:
             self._renew(self._subscription)
         self._node.get_logger().warning(
             f'an empty message on {self._topic}: subscribed again')
+
+
+class Listener(ABC):
+    """Remembers what it hears while its subscription is open, and nothing longer."""
+
+    _subscription: AdaptiveSubscription | None = None
+
+    @abstractmethod
+    def forget(self) -> None:
+        """Forget what was heard: what follows belongs to another time or run."""
+
+    def close(self) -> None:
+        """Unsubscribe, and forget what was heard."""
+        if self._subscription is not None:
+            self._subscription.destroy()
+            self._subscription = None
+        self.forget()

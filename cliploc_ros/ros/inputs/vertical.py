@@ -18,7 +18,7 @@ from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
-from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
+from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription, Listener
 from cliploc_ros.ros.inputs.time_jumps import StampOrder
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -31,8 +31,8 @@ _MIN_MEAN_LENGTH = 0.95
 # An orientation is refused where gravity contradicts it by more than this (a guess): a cheap
 # accelerometer at rest is off by up to 3 degrees, a wrong or missing orientation mostly by more.
 _MAX_CONTRADICTION_DEG = 5.0
-# Samples so near an image are averaged: vibration is faster, and robots turn slowly meanwhile.
-_WINDOW_NS = 100_000_000
+#: Samples so near an image are averaged [ns]: vibration is faster, and robots turn slowly.
+WINDOW_NS = 100_000_000
 # A second of the fastest usual IMU.
 _MAX_SAMPLES = 1000
 # sensor_msgs/Imu: the first element of the covariance of a field that is not measured.
@@ -75,7 +75,7 @@ def sample_from_msg(msg: Imu) -> Sample | None:
                   acceleration if has_acceleration else None)
 
 
-class VerticalSource:
+class VerticalSource(Listener):
     """Knows the vertical in the camera's coordinate frame.
 
     An IMU's orientation counts more than its acceleration: its filter knows how the robot moves.
@@ -93,19 +93,11 @@ class VerticalSource:
         self._stamps = StampOrder()
         self._imu_frame = ''
         self._newest_is_empty = False
-        self._subscription: AdaptiveSubscription | None = None
 
     def open(self, source: str) -> None:
         """Listen to the IMU, if the source is 'imu'; does nothing if it already does."""
         if source == 'imu' and self._subscription is None:
             self._subscription = AdaptiveSubscription(self._node, Imu, 'imu', self.take, qos.IMU)
-
-    def close(self) -> None:
-        """Stop listening, and forget all samples."""
-        if self._subscription is not None:
-            self._subscription.destroy()
-            self._subscription = None
-        self.forget()
 
     def forget(self) -> None:
         """Forget all samples: time jumped."""
@@ -156,37 +148,47 @@ class VerticalSource:
         with self._lock:
             frame, samples = self._imu_frame, list(self._samples)
             newest_is_empty = self._newest_is_empty
-        near = [one for one in samples if abs(one.stamp_ns - at_ns) <= _WINDOW_NS]
+        near = [one for one in samples if abs(one.stamp_ns - at_ns) <= WINDOW_NS]
         topic = self._node.resolve_topic_name('imu')
         if not near and newest_is_empty:
             raise NoVerticalError(f'{topic} has neither an orientation nor an acceleration: fill '
                                   'at least one')
         if not near:
-            raise NoVerticalError(f'no message of {topic} is within {_WINDOW_NS // 1_000_000} ms '
+            raise NoVerticalError(f'no message of {topic} is within {WINDOW_NS // 1_000_000} ms '
                                   'of the image')
         if not frame:
             raise NoVerticalError(f'{topic} has no frame_id, so its mount is unknown: fill it')
-        ups = [one.up for one in near if one.up is not None]
-        if not ups:
-            mean = np.mean([one.acceleration for one in near if one.acceleration is not None],
-                           axis=0)
-            if not _is_gravity(mean):
-                raise NoVerticalError(
-                    f'the IMU is moving: it measures {np.linalg.norm(mean):.2f} m/s^2, at rest it '
-                    f'measures {_STANDARD_GRAVITY:.2f}')
-            return np.asarray(mean / np.linalg.norm(mean)), frame
-        contradiction_deg = _contradiction_deg(samples)
-        if contradiction_deg > _MAX_CONTRADICTION_DEG:
+        return mean_up(near, samples, topic), frame
+
+
+def mean_up(near: Sequence[Sample], samples: Sequence[Sample], topic: str
+            ) -> NDArray[np.float64]:
+    """Return the mean vertical (3,) of the samples about an image, a unit vector in the IMU.
+
+    By their orientations, if all recent samples of the topic do not contradict them; else by
+    their accelerations. NoVerticalError: see VerticalSource.up_in_camera.
+    """
+    ups = [one.up for one in near if one.up is not None]
+    if not ups:
+        mean = np.mean([one.acceleration for one in near if one.acceleration is not None],
+                       axis=0)
+        if not _is_gravity(mean):
             raise NoVerticalError(
-                f'the orientation of {topic} is {contradiction_deg:.0f} degrees off gravity '
-                f'(limit {_MAX_CONTRADICTION_DEG:g}): correct it, or set '
-                'orientation_covariance[0] to -1')
-        mean = np.mean(ups, axis=0)
-        length = float(np.linalg.norm(mean))
-        if not length > _MIN_MEAN_LENGTH:
-            raise NoVerticalError(
-                'the IMU turns too fast: its orientations about the image differ')
-        return np.asarray(mean / length), frame
+                f'the IMU is moving: it measures {np.linalg.norm(mean):.2f} m/s^2, at rest it '
+                f'measures {_STANDARD_GRAVITY:.2f}')
+        return np.asarray(mean / np.linalg.norm(mean))
+    contradiction_deg = _contradiction_deg(samples)
+    if contradiction_deg > _MAX_CONTRADICTION_DEG:
+        raise NoVerticalError(
+            f'the orientation of {topic} is {contradiction_deg:.0f} degrees off gravity '
+            f'(limit {_MAX_CONTRADICTION_DEG:g}): correct it, or set '
+            'orientation_covariance[0] to -1')
+    mean = np.mean(ups, axis=0)
+    length = float(np.linalg.norm(mean))
+    if not length > _MIN_MEAN_LENGTH:
+        raise NoVerticalError(
+            'the IMU turns too fast: its orientations about the image differ')
+    return np.asarray(mean / length)
 
 
 def _is_gravity(acceleration: NDArray[np.float64]) -> bool:
