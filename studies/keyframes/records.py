@@ -12,11 +12,9 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.keyframes import features
 from cliploc_ros.core.keyframes.features import DIMENSIONS, Features
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
@@ -57,7 +55,6 @@ from studies.keyframes.cases import (
     World,
     cases,
     make_query,
-    pose_of,
 )
 
 # Of a rendered room: what is mapped, what is asked, and where second looks come from.
@@ -260,8 +257,9 @@ def read_places(where: str, model: str, blocks: Sequence[int]) -> Iterator[Place
                         _walk(folder / walks[2]), folder / 'map.yaml')
         return
     map_file = folder / 'map.yaml' if (folder / 'map.yaml').exists() else None
-    raws = _walk(folder) if map_file else _upright(_posed(rgbd_frames(
-        folder, FolderOptions(depth=DepthFormat(float(unit) if unit else None)))))
+    depth = DepthFormat(float(unit) if unit else None)
+    raws = _walk(folder) if map_file else _posed(rgbd_frames(
+        folder, FolderOptions(depth=depth, level=not (folder / 'rgb.txt').exists())))
     rows = np.arange(len(raws))
     parts = {'interleaved': rows % 2 == 0, 'first half': rows < len(raws) // 2,
              'second half': rows >= len(raws) // 2}
@@ -281,19 +279,3 @@ def _walk(folder: Path) -> tuple[RawFrame, ...]:
 
 def _posed(frames: Frames) -> tuple[RawFrame, ...]:
     return tuple(frames.read_raw(lambda place, stamp_ns, pose: pose is not None))
-
-
-def _upright(raws: tuple[RawFrame, ...]) -> tuple[RawFrame, ...]:
-    """Return images with their poses turned as a whole, until the z axis is up.
-
-    People hold cameras level: the vertical is the direction that the x axes of all cameras have
-    least of. The kitchen's own axes are those of its first camera.
-    """
-    poses = np.array([pose_of(raw) for raw in raws])
-    _, _, axes = np.linalg.svd(poses[:, :3, 0])
-    up = -axes[2] * np.sign(axes[2] @ poses[:, :3, 1].mean(axis=0))
-    turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])
-    # made exactly rigid: text files round
-    rotations = (turn * Rotation.from_matrix(poses[:, :3, :3])).as_matrix()
-    return tuple(replace(raw, map_from_camera=make_transform(rotation, turn.apply(pose[:3, 3])))
-                 for raw, pose, rotation in zip(raws, poses, rotations, strict=True))

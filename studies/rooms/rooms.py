@@ -18,10 +18,8 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.features import Features
 from cliploc_ros.core.keyframes.localization import query_features
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
+from cliploc_ros.datasets.folders import FolderOptions, find_layout, read_folder
 from cliploc_ros.datasets.frames import DepthFormat, Frames, ImageFile, RawFrame, folder_frames
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.evaluation.trials import ImageFeatures, Query
 from cliploc_ros.evaluation.watching import observation_of
@@ -31,7 +29,6 @@ from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
 from cliploc_ros.simulation.sensors import with_vertical
 from cliploc_ros.units import NS_PER_S
-from studies.keyframes.records import _upright
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -132,8 +129,6 @@ def read_room(where: str, options: RoomOptions) -> Room:
     folder = Path(path)
     frames, has_poses = _frames_of(folder, float(unit) if unit else None)
     raws = tuple(frames.read_raw(lambda place, stamp_ns, pose: pose is not None))
-    if not (folder / 'rgb.txt').exists() and has_poses:
-        raws = _upright(raws)
     raws = tuple(replace(raw, place=row) for row, raw in enumerate(raws))
     frames = _frames_of_raws(frames.source, raws)
     make_folder(options.out)
@@ -173,11 +168,12 @@ def _robot_view(color: Callable[[], tuple[NDArray[np.uint8], Camera]]
 
 def _frames_of(folder: Path, depth_unit: float | None) -> tuple[Frames, bool]:
     """Return the frames of a folder, z up, and whether their poses are true."""
-    if not (folder / 'rgb.txt').exists() and (folder / 'images').is_dir():
+    if find_layout(folder) is None and (folder / 'images').is_dir():
         return _without_poses(folder / 'images'), False
-    if (folder / 'rgb.txt').exists() and not (folder / 'depth.txt').exists():
-        return tum_frames(read_tum(folder), find_camera(None, folder)[0]), True
-    return rgbd_frames(folder, FolderOptions(depth=DepthFormat(depth_unit))), True
+    is_tum = (folder / 'rgb.txt').exists()
+    return read_folder(folder, FolderOptions(
+        layout='tum' if is_tum and not (folder / 'depth.txt').exists() else '',
+        depth=DepthFormat(depth_unit), level=not is_tum)), True
 
 
 @dataclass(frozen=True)
@@ -195,14 +191,14 @@ def _without_poses(folder: Path) -> Frames:
     paths = sorted(one for one in folder.iterdir() if one.suffix.lower() in ('.jpg', '.png'))
     if not paths:
         raise DatasetError(f'{folder}: has no images')
-    files = [ImageFile(row * NS_PER_S, path) for row, path in enumerate(paths)]
     first = cv2.imread(str(paths[0]))
     if first is None:
         raise DatasetError(f'{paths[0]} cannot be read as an image')
     height, width = first.shape[:2]
     focal = 0.5 * width / np.tan(np.radians(0.5 * _USUAL_VIEW_DEG))
-    return folder_frames(folder, files, _Nowhere((0, len(files) * NS_PER_S)), Camera(
-        width, height, focal, focal, 0.5 * width, 0.5 * height))
+    camera = Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
+    files = [ImageFile(row * NS_PER_S, path, camera) for row, path in enumerate(paths)]
+    return folder_frames(folder, files, _Nowhere((0, len(files) * NS_PER_S)))
 
 
 def _features_of(raws: tuple[RawFrame, ...], file: Path) -> tuple[tuple[Features, Camera], ...]:

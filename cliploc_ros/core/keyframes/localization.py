@@ -27,8 +27,8 @@ _SIMILAR, _ELSEWHERE, PROPOSED = 5, 2, 3
 # With fewer points that agree, more keyframes are matched: those near the pose, and as many of the
 # next similar ones.
 _ENOUGH_INLIERS, _MORE = 100, 5
-# Where none of these shows the place, words may mislead: so many next similar keyframes are matched
-# by so many of the strongest features. By chance up to 8 of them agree on a pose there.
+# Where none of these shows the place, words may mislead: so many further keyframes are matched by
+# so many of the strongest features. By chance up to 8 of them agree on a pose there.
 _FURTHER, _STRONGEST, _CLEAR = 25, 600, 20
 #: Places of an image that do not agree with each other.
 MOST_PLACES = 3
@@ -372,15 +372,6 @@ class ImageRecognizer:
     def deviation_per_metre(self) -> float:
         """Return the layer's, see KeyframeLayer."""
         return self._keyframes.layer.deviation_per_metre
-
-    def _search_further(self, descriptors: NDArray[np.float32], look: _Look, ranks: Sequence[int],
-                        deadline: float) -> list[int]:
-        """Return the keyframes near a pose that many points of less similar ones agree with."""
-        matched = self._match(descriptors[:_STRONGEST], ranks[:_FURTHER], deadline)
-        place = _place(matched, look, _RIVAL_ITERATIONS)
-        if place is None or place.agreed < _CLEAR:
-            return []
-        return keyframes_near(self.layer.map_from_camera, place.map_from_camera)[:_MORE].tolist()
 
     def coverage(self, map_from_camera: NDArray[np.float64]) -> float:
         """Return KeyframeLocalizer.coverage for the camera of the image."""
