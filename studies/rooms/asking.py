@@ -19,6 +19,7 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.errors import MappingError
 from cliploc_ros.evaluation.trials import Query
 from cliploc_ros.mapping.building import build_map
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
@@ -79,9 +80,10 @@ class Answers:
     """All outcomes of a part, and what it was mapped to."""
 
     task: Task
-    landmark_map: LandmarkMap
-    keyframes: int
-    outcomes: tuple[Outcome, ...]
+    landmark_map: LandmarkMap | None = None
+    keyframes: int = 0
+    outcomes: tuple[Outcome, ...] = ()
+    failure: str = ''  #: Why there is no map
 
 
 def make_ask(folders: Sequence[str], options: RoomOptions, with_sift: bool
@@ -97,8 +99,11 @@ def make_ask(folders: Sequence[str], options: RoomOptions, with_sift: bool
         room = rooms()[task.room]
         mapped, asked = next((mapped, asked) for _, part, mapped, asked in room.parts()
                              if part == task.part)
-        landmark_map = build_map(room.detections.select_frames(mapped)).landmark_map
-        layer = build_layer(room.frames.select(mapped.tolist()), landmark_map, LayerOptions())
+        try:
+            landmark_map = build_map(room.detections.select_frames(mapped)).landmark_map
+            layer = build_layer(room.frames.select(mapped.tolist()), landmark_map, LayerOptions())
+        except MappingError as error:
+            return Answers(task, failure=str(error))
         keyframes, sift = KeyframeLocalizer(layer), None
         if with_sift and room.has_depth:
             sift = SiftMap([room.raws[row].decode() for row in mapped])

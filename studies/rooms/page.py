@@ -42,13 +42,15 @@ def write_page(path: Path, answers: Sequence[Answers], rooms: Sequence[Room], te
     parts = ['<!DOCTYPE html>', '<html lang="en">', '<meta charset="utf-8">',
              '<meta name="viewport" content="width=device-width">', '<title>Rooms</title>',
              f'<style>{_STYLE}</style>', '<h1>Rooms</h1>']
-    for section in text.split('## ')[1:]:
+    failures, *sections = text.split('## ')
+    parts += [f'<p>{escape(line)}</p>' for line in failures.splitlines() if line]
+    for section in sections:
         heading, _, lines = section.partition('\n')
         is_open = ' open' if heading == 'Rooms' else ''
         parts.append(f'<details{is_open}><summary>{escape(heading)}</summary>'
                      f'{_html_table(lines)}</details>')
     for room in rooms:
-        its = [one for one in answers if one.task.room == room.name]
+        its = [one for one in answers if one.task.room == room.name and one.outcomes]
         if its:
             parts.append(f'<h2>{escape(room.name)}</h2>')
             parts += [_picture(_curves(its), 'Share of images whose best pose is within a '
@@ -110,7 +112,8 @@ def _top_views(answers: Sequence[Answers], room: Room) -> Figure:
     for row, way in enumerate((OBJECTS, KEYFRAMES)):
         for column, answer in enumerate(kinds):
             axes: Axes = figure.add_subplot(2, len(kinds), 1 + row * len(kinds) + column)
-            draw_map(axes, answer.landmark_map)
+            if answer.landmark_map is not None:
+                draw_map(axes, answer.landmark_map)
             for one in answer.outcomes:
                 if one.is_here and one.way == way and one.known == NOTHING:
                     axes.plot(*poses[one.number, :2], '.', color=_VERDICTS[_verdict(one)],

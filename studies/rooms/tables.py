@@ -26,7 +26,9 @@ def tables(answers: Sequence[Answers], rooms: Sequence[Room]) -> str:
     columns = ['room', 'split', 'by', 'known', 'images', *(f'{limit:g} m' for limit in LIMITS_M),
                'accepted', 'false', 'recall', 'in 95 %']
     rows = [(*key, *success(its)) for key, its in grouped(here, 'room', 'kind', 'way', 'known')]
-    return '\n\n'.join([
+    failures = [f'{one.task.room}, {one.task.part}: not mapped: {one.failure}'
+                for one in answers if one.failure]
+    return '\n\n'.join([*failures,
         '## Rooms', _room_table(answers, rooms),
         '## Success and acceptance', table(columns, rows),
         '## All splits of a room', table(
@@ -76,13 +78,13 @@ def _false(outcomes: Sequence[Outcome]) -> list[str]:
 def _room_table(answers: Sequence[Answers], rooms: Sequence[Room]) -> str:
     rows = []
     for room in rooms:
-        maps = [one for one in answers if one.task.room == room.name]
+        maps = [one for one in answers if one.task.room == room.name and one.landmark_map]
         boxes = np.diff(room.detections.frame_offsets)
         size = np.ptp(room.detections.map_from_camera[:, :3, 3], axis=0)
         rows.append((room.name, len(room), f'{boxes.mean():.1f}', f'{np.mean(boxes >= 3):.2f}',
                      *([''] * 3 if not maps else (
                          ' x '.join(f'{one:.1f}' for one in size),
-                         _range([len(one.landmark_map) for one in maps]),
+                         _range([len(one.landmark_map) for one in maps if one.landmark_map]),
                          _range([one.keyframes for one in maps])))))
     return table(['room', 'images', 'boxes an image', 'with three or more', 'path [m]',
                   'landmarks of a part', 'keyframes of a part'], rows)

@@ -1,0 +1,61 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The study of real rooms, on the demo's recording and images of elsewhere."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from cliploc_ros.demo import ASSETS
+
+
+@pytest.fixture(scope='module')
+def asked(tmp_path_factory):
+    """Ask the demo's room and images without poses; return the folder, and what was printed."""
+    folder = tmp_path_factory.mktemp('rooms')
+    shutil.copytree(ASSETS / 'sequence', folder / 'demo')
+    (folder / 'elsewhere' / 'images').mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    for number in range(3):
+        coarse = rng.integers(0, 256, (30, 40, 3)).astype(np.uint8)
+        cv2.imwrite(str(folder / 'elsewhere' / 'images' / f'{number}.jpg'),
+                    cv2.resize(coarse, (640, 480)))
+    done = subprocess.run(
+        [sys.executable, '-m', 'studies.rooms', folder / 'demo', folder / 'elsewhere', '--model',
+         ASSETS / 'yolo.pt', '--kinds', 'in turn', 'phone to robot', '--images', '4',
+         '--elsewhere', '2', '--out', folder / 'out'], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return folder / 'out', done.stdout
+
+
+def test_images_between_the_mapped_ones_are_found(asked):
+    outcomes = json.loads((asked[0] / 'outcomes.json').read_text())
+    for way in ('objects', 'both'):
+        errors = [one['error_m'] for one in outcomes if one['way'] == way and one['known'] == '-'
+                  and one['kind'] == 'in turn' and one['asked'] == 'demo']
+        assert len(errors) == 8
+        assert np.mean(np.array(errors) < 0.25) >= 0.75
+    robot = [one['error_m'] for one in outcomes
+             if one['kind'] == 'phone to robot' and one['way'] == 'both']
+    assert np.mean(np.array(robot) < 0.5) > 0.5
+
+
+def test_nothing_is_accepted_elsewhere(asked):
+    outcomes = json.loads((asked[0] / 'outcomes.json').read_text())
+    elsewhere = [one for one in outcomes if one['asked'] == 'elsewhere']
+    assert len(elsewhere) == 4 * 2 * 3  # parts, images, ways
+    assert not any(one['accepted'] for one in elsewhere)
+
+
+def test_the_page_has_tables_and_pictures(asked):
+    folder, printed = asked
+    assert '| demo | in turn | objects | - | 8 |' in printed
+    page = (folder / 'rooms.html').read_text()
+    assert page.count('<table>') == printed.count('## ')
+    assert page.count('data:image/png') == 2
+    assert 'elsewhere' in page
