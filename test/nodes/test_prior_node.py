@@ -13,12 +13,12 @@ from tester import RELIABLE, make_frame
 
 from cliploc_ros.ros.qos import LATCHED
 
-TWINS = doubled_room(np.array([10.0, 0.0, 0.0])).select(range(22))
+TWINS = doubled_room(np.array([10.0, 0.0, 0.0])).select(range(21))
 
 
 @pytest.fixture
 def twins_map(tmp_path):
-    """Two rooms, 10 m apart along x; the second one lacks two objects of the first."""
+    """Two rooms, 10 m apart along x; the second one lacks three objects of the first."""
     path = tmp_path / 'twins.yaml'
     write_map(TWINS, path)
     return path
