@@ -13,12 +13,14 @@ from tester import RELIABLE, make_frame
 
 from cliploc_ros.ros.qos import LATCHED
 
-TWINS = doubled_room(np.array([10.0, 0.0, 0.0])).select(range(22))
+TWINS = doubled_room(np.array([10.0, 0.0, 0.0])).select(range(21))
+# on a busy machine, too
+SEARCH = {'algorithm': 'auto', 'time_budget_ms': 2000.0}
 
 
 @pytest.fixture
 def twins_map(tmp_path):
-    """Two rooms, 10 m apart along x; the second one lacks two objects of the first."""
+    """Two rooms, 10 m apart along x; the second one lacks three objects of the first."""
     path = tmp_path / 'twins.yaml'
     write_map(TWINS, path)
     return path
@@ -62,7 +64,7 @@ def relocalized(tester, expect):
 
 def test_the_topic_decides_between_rooms_that_look_alike(own_relocalizer, tester, tell,
                                                          twins_map):
-    process = own_relocalizer(map_file=twins_map, algorithm='auto')
+    process = own_relocalizer(map_file=twins_map, **SEARCH)
     assert 'kind look_alike' in tester.relocalize(make_frame()).message
     tell(process, at(10.0))  # wrong: the other room has all objects
     assert 'refused' in relocalized(tester, 'the prior has the robot elsewhere').message
@@ -85,7 +87,7 @@ def test_the_topic_decides_between_rooms_that_look_alike(own_relocalizer, tester
 
 def test_a_robot_wakes_where_it_was(own_relocalizer, tester, tell, twins_map, tmp_path):
     file = tmp_path / 'last_pose.json'
-    known = {'map_file': twins_map, 'algorithm': 'auto', 'last_pose_file': file}
+    known = {'map_file': twins_map, 'last_pose_file': file, **SEARCH}
     first = own_relocalizer(**known)
     assert 'refused' in tester.relocalize(make_frame()).message
     tell(first, at(0.0), profile=RELIABLE)  # which the next process does not hear
