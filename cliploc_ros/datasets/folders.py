@@ -110,9 +110,11 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
     """
     layout = find_layout(folder, options.layout)
     if layout is None:
+        remedy = ('it is a recording: give --bag' if (folder / 'metadata.yaml').is_file()
+                  else 'unpack it' if folder.suffix in ('.r3d', '.zip')
+                  else 'images alone need poses, as COLMAP makes them')
         raise DatasetError(f'{folder}: has the files of no known layout: '
-                           f'{", ".join(sorted({one.name for one in LAYOUTS}))}; images alone '
-                           'need poses, as COLMAP makes them')
+                           f'{", ".join(sorted({one.name for one in LAYOUTS}))}; {remedy}')
     if layout.key not in _OPEN and (options.intrinsics or options.trajectory is not None
                                     or options.body_from_camera is not None):
         raise DatasetError(f'{folder}: {layout.name} has its own cameras and poses: '
