@@ -7,7 +7,7 @@ TUM RGB-D, with or without depth, and 7-Scenes are read here, the others in ``ca
 
 import hashlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -110,9 +110,11 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
     """
     layout = find_layout(folder, options.layout)
     if layout is None:
+        remedy = ('it is a recording: give --bag' if (folder / 'metadata.yaml').is_file()
+                  else 'unpack it' if folder.suffix in ('.r3d', '.zip')
+                  else 'images alone need poses, as COLMAP makes them')
         raise DatasetError(f'{folder}: has the files of no known layout: '
-                           f'{", ".join(sorted({one.name for one in LAYOUTS}))}; images alone '
-                           'need poses, as COLMAP makes them')
+                           f'{", ".join(sorted({one.name for one in LAYOUTS}))}; {remedy}')
     if layout.key not in _OPEN and (options.intrinsics or options.trajectory is not None
                                     or options.body_from_camera is not None):
         raise DatasetError(f'{folder}: {layout.name} has its own cameras and poses: '
@@ -154,18 +156,8 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
                            'of a unit (1 where they are metres), --known-distance or '
                            '--object-size')
     poses = replace(poses, scale=scale or 1.0, map_from_stored=UP[capture.up or 'z'])
-    up = find_vertical(np.array([pose for _, pose in poses.all_of(files)])) if posed else None
-    if up is not None and (options.level or not capture.up):
-        rotation, tilt_deg = rotation_to_z(up)
-        if options.level:
-            poses = replace(poses, map_from_stored=rotation @ poses.map_from_stored)
-            notes.append(f'levelled: the vertical of the cameras was {tilt_deg:.1f} degrees off z')
-        elif tilt_deg > _MOST_TILT_DEG:
-            notes.append(f'z is {tilt_deg:.0f} degrees off the vertical of the cameras: --level '
-                         'turns it up')
-    elif options.level:
-        raise DatasetError(f'{folder}: the cameras do not tell the vertical: they turn too '
-                           'little, or were held on their side; leave out --level')
+    poses, note = _levelled(folder, poses, files, options.level, bool(capture.up))
+    notes.append(note)
     frames = folder_frames(folder, files, poses, replace(
         capture.depth, unit_m=options.depth.unit_m or capture.depth.unit_m,
         camera=options.depth.camera or capture.depth.camera))
@@ -173,6 +165,26 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
              for file, pose in poses.all_of(files)]
     return replace(frames, digest=hashlib.sha256(repr(known).encode()).hexdigest()[:12],
                    notes=tuple(filter(None, notes)))
+
+
+def _levelled(folder: Path, poses: PlacedPoses, files: Sequence[ImageFile], level: bool,
+              is_known: bool) -> tuple[PlacedPoses, str]:
+    """Return poses with z up where that is asked for, and a note on the vertical, or ''."""
+    placed = np.array([pose for _, pose in poses.all_of(files)]).reshape(-1, 4, 4)
+    up = find_vertical(placed) if len(placed) else None
+    if up is None:
+        if level:
+            raise DatasetError(f'{folder}: the cameras do not tell the vertical: they turn too '
+                               'little, or were held on their side; leave out --level')
+        return poses, ''
+    rotation, tilt_deg = rotation_to_z(up)
+    if level:
+        return (replace(poses, map_from_stored=rotation @ poses.map_from_stored),
+                f'levelled: the vertical of the cameras was {tilt_deg:.1f} degrees off z')
+    if is_known or tilt_deg < _MOST_TILT_DEG:
+        return poses, ''
+    return poses, (f'z is {tilt_deg:.0f} degrees off the vertical of the cameras: --level turns '
+                   'it up')
 
 
 def tum_frames(sequence: TumSequence, camera: Camera, options: FolderOptions = _NO_OPTIONS

@@ -223,18 +223,23 @@ def _read_depth(file: ImageFile, form: DepthFormat) -> DepthImage:
     return DepthImage(depths_m, form.camera)
 
 
-def undistorted(image_rgb: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
-    """Return an image (h, w, 3) as the pinhole of its camera would show it; black outside."""
-    if not any(camera.distortion):
+def undistorted(image_rgb: NDArray[np.uint8], camera: Camera, pinhole: Camera | None = None
+                ) -> NDArray[np.uint8]:
+    """Return an image (h, w, 3) as a pinhole would show it, its camera's own by default.
+
+    It is black where the camera saw nothing.
+    """
+    pinhole = pinhole or camera.pinhole
+    if pinhole == camera.pinhole and not any(camera.distortion):
         return image_rgb
     # a large image has a coarser grid of places, and those between: a lens is smooth
-    step = max(1, math.isqrt(camera.width * camera.height // _MOST_PLACES))
+    step = max(1, math.isqrt(pinhole.width * pinhole.height // _MOST_PLACES))
     columns, rows = np.meshgrid(*(step * np.arange(-1, side // step + 2) + 0.5 * (step - 1)
-                                  for side in (camera.width, camera.height)))
+                                  for side in (pinhole.width, pinhole.height)))
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
-    places = camera.project_normalized(camera.pinhole.normalize_points(pixels))
+    places = camera.project_normalized(pinhole.normalize_points(pixels))
     places = np.nan_to_num(places, nan=-1.0).reshape(*columns.shape, 2).astype(np.float32)
     places = cv2.resize(places, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)[
-        step:step + camera.height, step:step + camera.width]
+        step:step + pinhole.height, step:step + pinhole.width]
     return np.asarray(cv2.remap(image_rgb, places[..., 0], places[..., 1], cv2.INTER_LINEAR),
                       dtype=np.uint8)

@@ -56,13 +56,14 @@ class Images:
                  cameras: Sequence[str] = ()):
         self._stamps_ns = stamps_ns
         self._cameras = np.array(cameras, dtype=np.str_)
-        self._read: Callable[[int], NDArray[np.uint8]] = lru_cache(_IMAGES_KEPT)(
-            lambda place: undistorted(*read(place)))
+        self._read: Callable[[int, Camera | None], NDArray[np.uint8]] = lru_cache(_IMAGES_KEPT)(
+            lambda place, pinhole: undistorted(*read(place), pinhole))
 
-    def near(self, stamp_s: float, camera: str = '') -> NDArray[np.uint8] | None:
+    def near(self, stamp_s: float, camera: str = '', pinhole: Camera | None = None
+             ) -> NDArray[np.uint8] | None:
         """Return the undistorted image (h, w, 3) of a camera at a time [s], red first.
 
-        None without one.
+        It is as a pinhole shows it, such as that of the boxes. None without one.
         """
         places = (np.nonzero(self._cameras == camera)[0] if len(self._cameras)
                   else np.arange(len(self._stamps_ns)))
@@ -70,7 +71,8 @@ class Images:
             return None
         offsets = np.abs(self._stamps_ns[places] - round(stamp_s * NS_PER_S))
         nearest = int(np.argmin(offsets))
-        return self._read(int(places[nearest])) if offsets[nearest] <= _MAX_DELAY_NS else None
+        return (self._read(int(places[nearest]), pinhole)
+                if offsets[nearest] <= _MAX_DELAY_NS else None)
 
 
 def open_images(path: Path, topics: BagTopics, cameras: Sequence[str] = ('',)) -> Images:

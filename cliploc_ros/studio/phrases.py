@@ -161,7 +161,8 @@ class PhraseFinder:
         embeddings = []
         for view, box in self._recording.best_views(question.landmark)[:_CROPS]:
             detections = self._recording.detections
-            image = self._images.near(float(detections.stamps_s[view]), detections.name_of(view))
+            image = self._images.near(float(detections.stamps_s[view]), detections.name_of(view),
+                                      detections.camera_of(view))
             if image is not None:
                 if self._encoder is None:
                     self._encoder = ClipEncoder(weights, self._clip)

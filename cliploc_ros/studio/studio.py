@@ -129,7 +129,8 @@ class Studio:
         detections = self._recording().detections
         image = None
         if self._images is not None:
-            image = self._images.near(float(detections.stamps_s[self.view]), self.camera_name)
+            image = self._images.near(float(detections.stamps_s[self.view]), self.camera_name,
+                                      self.camera)
         colors = {key: color_of(one.class_id) for key, one in self.document.landmarks.items()}
         return draw(self.camera, image, self.boxes_in_view(), self.drawn.get(self.view),
                     self.outlines(), colors, self.document.selection)

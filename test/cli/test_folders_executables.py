@@ -11,6 +11,7 @@ from capture_folders import ASSETS, shots_of, write_colmap, write_polycam
 from cliploc_ros.cli.build_map import main as build_map
 from cliploc_ros.cli.evaluate import main as evaluate
 from cliploc_ros.cli.studio import make_parser, open_studio
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError
@@ -63,6 +64,9 @@ def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys)
             studio.recording.detections.stamps_s[3])).shape == (480, 640, 3)
     finally:
         studio.document.close()
+    # the studio shows each image as the camera of the boxes does, whatever its own focus is
+    image = open_images(folder, None).near(2.0, '', Camera(640, 480, 250.0, 250.0, 319.5, 239.5))
+    assert (image[:110] == 0).all() and image[240, 320].any()
 
 
 @pytest.mark.parametrize(('options', 'expected'), [
