@@ -159,7 +159,8 @@ class RelocalizerParameters(CommonParameters):
         "0: any tilt is as likely, as where the map's z axis is not up.", unit='deg', low=0.0,
         high=60.0)
     vertical_deviation_deg: float = parameter(1.0,
-        'Standard deviation of that vertical.', unit='deg', low=0.01, high=45.0)
+        'Standard deviation of that vertical; 2 for an accelerometer alone that moves.',
+        unit='deg', low=0.01, high=45.0)
     height_range_m: list[float] = parameter([0.0, 0.0],
         'Least and greatest height of the camera in the map; equal values: any height.', unit='m')
     max_tilt_deg: float = parameter(180.0,

@@ -13,7 +13,7 @@ from studies.acceptance.places import FIVE, MODES, ONE, Simulated
 from studies.acceptance.searches import Task, search
 from studies.worlds import compare
 from studies.worlds.cameras import GROUP_SIZE
-from studies.worlds.places import KINDS
+from studies.worlds.places import KINDS, denser
 from studies.worlds.surveyor import MapErrors, survey
 from studies.worlds.things import make_objects
 from studies.worlds.world import make_world
@@ -32,6 +32,18 @@ def test_worlds_are_reproducible_and_sound(kind):
         assert one.observation.similarities.shape == (len(detections), len(world.landmark_map))
         assert (detections.bboxes_xyxy >= 0).all()
     assert not np.array_equal(world.queries[0].map_from_camera, other.queries[0].map_from_camera)
+
+
+def test_a_denser_place_has_all_its_things_and_more_of_other_classes():
+    place = KINDS['room'](np.random.default_rng(3))
+    more = denser(place, 3, np.random.default_rng(4))
+    count = len(place.things)
+    assert list(more.things[:count]) == list(place.things)
+    assert {one.name.partition('#')[2] for one in more.things[count:]} == {'2', '3'}
+    assert all(0.0 <= one.x <= place.width and 0.0 <= one.y <= place.depth
+               for one in more.things[count:])
+    assert len(make_world('room', 3, density=3).landmark_map) > len(
+        make_world('room', 3).landmark_map)
 
 
 def test_a_map_without_errors_has_each_object_in_its_place():
