@@ -120,8 +120,11 @@ def find_corrections(detections: PosedDetections, views: Views, landmarks: Landm
         fits = [_fit(cause, number, views, landmarks, rows, shown[rows]) for cause in causes]
         best = max(fits, key=lambda one: one.is_significant * one.corrections[0].explained)
         for cause, fit in zip(causes, fits, strict=True):
-            follows = fit is not best and fit.is_significant and not _fit(
-                cause, number, best.views, best.landmarks, rows, shown[rows]).is_significant
+            follows = False
+            if fit is not best and fit.is_significant:
+                again = _fit(cause, number, best.views, best.landmarks, rows, shown[rows])
+                more = again.corrections[0].explained * (1.0 - best.corrections[0].explained)
+                follows = not (again.is_significant and more > _MIN_EXPLAINED)
             found += [replace(one, name=one.name + name, follows=follows)
                       for one in fit.corrections]
     return found
