@@ -84,7 +84,7 @@ def make_parser() -> argparse.ArgumentParser:
     poses = parser.add_argument_group('poses with errors')
     poses.add_argument('--joint', action=argparse.BooleanOptionalAction,
                        help='refine the poses together with the landmarks (default: if '
-                       '--pose-noise or --update is given, or estimated from the boxes)')
+                       '--pose-noise is given, or where the boxes tell that they are off)')
     poses.add_argument('--pose-noise', type=positive, nargs=2, metavar=('METRES', 'DEGREES'),
                        help='standard deviations of the poses on each axis (0.02 0.5 with '
                        '--joint)')

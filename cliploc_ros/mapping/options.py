@@ -171,6 +171,7 @@ class Thresholds:
     max_misled: float = 0.01
     #: Share of the grid positions near the recording in which it accepts some heading
     min_positions: float = 0.4
-    max_faulty: float = 0.15  #: Share of the landmarks with a serious fault
+    #: Share of the landmarks with a serious fault, each counted as often as it was seen
+    max_faulty: float = 0.15
     max_duplicates: int = 0  #: Pairs of landmarks that are one object
     max_look_alikes: int = 0  #: Pairs of places that a detector cannot tell apart

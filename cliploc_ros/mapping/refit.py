@@ -127,7 +127,8 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
     share, iou = explained_boxes(views, landmarks.select(is_fitted | ~chosen))
     details = list(landmark_map.details or [LandmarkDetails()] * len(landmark_map))
     for row in np.nonzero(is_fitted)[0]:
-        details[row] = evidence.details(int(row), details[row])
+        details[row] = evidence.details(int(row), replace(
+            details[row], shared_sigma=None, shared_sigma_deg=None))
     semi_axes, quats_xyzw = ellipsoid_numbers(landmarks.bases)
     fitted = is_fitted[:, None]
     return RefitMap(

@@ -12,7 +12,7 @@ where g are the gradients J^T W r of single viewpoints: edges of one viewpoint e
 sum takes that into account (the sandwich estimator, White 1980).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -65,6 +65,8 @@ class Correction:
     effect_px: float
     is_significant: bool
     explained: float  #: Share of the robust cost of all edges that its cause removes, 0 to 1
+    #: It is hardly significant any more once the cause that explains most is corrected
+    follows: bool = False
 
 
 class Linear(NamedTuple):
@@ -90,6 +92,18 @@ class _Cause(NamedTuple):
     apply: Callable[[Views, NDArray[np.float64]], Views]
 
 
+class _Fit(NamedTuple):
+    """A cause that fits best: its numbers, and the views and landmarks with them."""
+
+    corrections: tuple[Correction, ...]
+    views: Views
+    landmarks: Landmarks
+
+    @property
+    def is_significant(self) -> bool:
+        return any(one.is_significant for one in self.corrections)
+
+
 def find_corrections(detections: PosedDetections, views: Views, landmarks: Landmarks,
                      shown: NDArray[np.int64]) -> list[Correction]:
     """Return the corrections that fit the edges best; none of a camera with too few boxes.
@@ -102,9 +116,17 @@ def find_corrections(detections: PosedDetections, views: Views, landmarks: Landm
         if np.count_nonzero(views.cameras[views.frames[rows]] == number) < _MIN_BOXES:
             continue
         name = f' of {detections.camera_names[number]}' if len(detections.cameras) > 1 else ''
-        found += [replace(one, name=one.name + name) for cause in (
-            _intrinsics(camera), _mount(camera), _stamps(camera, views, number))
-            for one in _fit(cause, number, views, landmarks, rows, shown[rows])]
+        causes = _intrinsics(camera), _mount(camera), _stamps(camera, views, number)
+        fits = [_fit(cause, number, views, landmarks, rows, shown[rows]) for cause in causes]
+        best = max(fits, key=lambda one: one.is_significant * one.corrections[0].explained)
+        for cause, fit in zip(causes, fits, strict=True):
+            follows = False
+            if fit is not best and fit.is_significant:
+                again = _fit(cause, number, best.views, best.landmarks, rows, shown[rows])
+                more = again.corrections[0].explained * (1.0 - best.corrections[0].explained)
+                follows = not (again.is_significant and more > _MIN_EXPLAINED)
+            found += [replace(one, name=one.name + name, follows=follows)
+                      for one in fit.corrections]
     return found
 
 
@@ -191,8 +213,8 @@ def _only(camera: int, moved: Views, given: Views) -> Views:
 
 
 def _fit(cause: _Cause, camera: int, given: Views, landmarks: Landmarks, rows: NDArray[np.int64],
-         numbers: NDArray[np.int64]) -> Iterator[Correction]:
-    """Yield the numbers of a cause that fit one camera best."""
+         numbers: NDArray[np.int64]) -> _Fit:
+    """Return the numbers of a cause that fit one camera best."""
     values, views = np.zeros(len(cause.names)), given
     viewpoints = given.viewpoints[given.frames[rows]]
     own = given.cameras[given.frames[rows]] == camera
@@ -211,14 +233,16 @@ def _fit(cause: _Cause, camera: int, given: Views, landmarks: Landmarks, rows: N
         if (np.abs(step) < 0.2 * deviations).all():
             break
     explained = max(0.0, 1.0 - _cost_of(linear, own) / max(own_before, 1e-12))
+    corrections = []
     for value, deviation, name, unit, factor, effect in zip(
             values, deviations, cause.names, cause.units, cause.factors, cause.effects_px,
             strict=True):
         effect_px = abs(float(value) * factor) * effect
-        yield Correction(
+        corrections.append(Correction(
             cause.cause, name, unit, float(value) * factor, float(deviation) * abs(factor),
             effect_px, bool(abs(value) > _SIGNIFICANT * deviation and effect_px > _NOTABLE_PX
-                            and explained > _MIN_EXPLAINED), explained)
+                            and explained > _MIN_EXPLAINED), explained))
+    return _Fit(tuple(corrections), views, landmarks)
 
 
 def _refit(views: Views, landmarks: Landmarks, rows: NDArray[np.int64],

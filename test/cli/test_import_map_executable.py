@@ -61,7 +61,8 @@ def test_refits_to_a_recording(office, table, observations, tmp_path):
     print(f'{len(found)} landmarks, median error {np.median(errors_m) * 100:.1f} cm')
     assert len(found) >= 30 and np.median(errors_m) < 0.03
     assert {one.source for one in found.details} == {'import_map csv theirs.csv'}
-    assert all(one.support >= 3 for one in found.details)
+    assert all(one.support >= 3 and one.position_sigma < 0.05 and one.shared_sigma is None
+               for one in found.details)
     left_out = {one['landmark_id']: one['reason'] for one in json.loads(report.read_text())[
         'left_out']}
     assert len(left_out) == 42 - len(found)
@@ -75,7 +76,9 @@ def test_keeps_what_cannot_be_fitted_where_asked_for(table, observations, tmp_pa
     assert done.returncode == 0, done.stderr
     found = LandmarkMap.from_file(out)
     assert found.centers[found.landmark_ids.index('ghost')].tolist() == [0.0, 0.0, 9.0]
-    assert found.details[found.landmark_ids.index('ghost')].support is None
+    kept = found.details[found.landmark_ids.index('ghost')]
+    assert kept.support is None
+    assert (kept.position_sigma, kept.shared_sigma, kept.shared_sigma_deg) == (0.05, 0.05, 1.0)
 
 
 @pytest.mark.parametrize(('name', 'write'), [

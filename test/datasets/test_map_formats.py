@@ -4,6 +4,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -77,6 +78,18 @@ def test_goreloc(true_map, tmp_path):
     check_equal(imported, true_map)
     assert imported.landmark_map.landmark_ids == ('cup_0', 'book_1', 'chair_2', 'cup_3')
     assert imported.landmark_map.details[0].class_weights == (('cup', 0.75), ('vase', 0.25))
+
+
+def test_what_the_file_does_not_know_of_its_errors_is_given(true_map, tmp_path):
+    given = read_goreloc(write(tmp_path / 'm.objects', goreloc_file(true_map)), COCO)
+    first = given.landmarks[0]
+    given.landmarks[0] = first._replace(details=replace(first.details, position_sigma=0.2))
+    scale = 0.5
+    known, *others = place(given, 'a test', 'map', scale, np.eye(4),
+                           (0.05, 1.0)).landmark_map.details
+    assert (known.position_sigma, known.shared_sigma) == (0.1, None)
+    assert {(one.position_sigma, one.shared_sigma, one.shared_sigma_deg)
+            for one in others} == {(0.05, 0.05, 1.0)}
 
 
 def test_oaslam_text(true_map, tmp_path):

@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from walk import CAMERA, join_maps, make_table, moved, see, walk_around
 
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError, OptionsError
@@ -100,6 +101,27 @@ def test_a_moved_landmark_is_the_worst_and_named_in_the_advice(detections):
     assert 'is never detected' in report.landmarks[0].faults[0]
     assert any(text.startswith('thing_4 is never detected') for text in report.advice)
     assert report.landmarks[1].severity == 0.0
+
+
+def test_a_landmark_of_few_frames_counts_little(detections):
+    higher = moved(TABLE, {4: TABLE.centers[4] + (0.0, 0.0, 0.45)})
+    rare = replace(higher, details=tuple(LandmarkDetails(support=3 if row == 4 else 50)
+                                         for row in range(len(TABLE))))
+    report = check_map(rare, detections, options=QUICK)
+    assert report.landmarks[0].landmark_id == 'thing_4'
+    assert report.faulty == pytest.approx(3 / (3 + 50 * (len(TABLE) - 1)))
+    assert check_map(higher, detections, options=QUICK).faulty == pytest.approx(1 / len(TABLE))
+
+
+def test_boxes_that_leave_a_place_open_do_not_say_that_a_landmark_moved(detections):
+    """The image cuts them on three sides: they fit a landmark anywhere along their rays."""
+    _, witness = witness_of(TABLE, detections)
+    own = np.nonzero(witness.shown == 4)[0]
+    boxes = detections.bboxes_xyxy.copy()
+    boxes[own, 0], boxes[own, 1], boxes[own, 2] = 0.0, 0.0, 640.0
+    report = check_map(TABLE, replace(detections, bboxes_xyxy=boxes), options=QUICK)
+    (one,) = [one for one in report.landmarks if one.landmark_id == 'thing_4']
+    assert not any('away from where its boxes put it' in fault for fault in one.faults)
 
 
 def test_a_shifted_landmark_is_told_its_offset(detections):
@@ -236,6 +258,9 @@ def test_systematic_errors_are_measured(spoil, name, value, tolerance):
                                                        witness.shown)}
     assert found[name].is_significant
     assert found[name].value == pytest.approx(value, abs=tolerance)
+    # one sensor is blamed, whatever else fits better with its error
+    assert len({one.cause for one in found.values()
+                if one.is_significant and not one.follows}) == 1
     # a turned mount and a shifted principal point look much the same
     assert found[name].explained > 0.8 * max(one.explained for one in found.values())
 

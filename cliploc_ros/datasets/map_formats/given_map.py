@@ -75,7 +75,8 @@ class ImportedMap(NamedTuple):
 
 
 def place(given: GivenMap, source: str, frame_id: str, scale: float,
-          map_from_given: NDArray[np.float64]) -> ImportedMap:
+          map_from_given: NDArray[np.float64], errors: tuple[float, float] | None = None
+          ) -> ImportedMap:
     """Return a given map in the coordinate frame and unit of ours.
 
     Landmarks that no map can hold are left out. DatasetError: no landmark is left; the message
@@ -90,6 +91,9 @@ def place(given: GivenMap, source: str, frame_id: str, scale: float,
     scale : float
         Metres in one unit of length of the file.
     map_from_given : ndarray (4, 4)
+    errors : tuple of two floats, optional
+        How far the landmarks are off on each axis where the file does not say it, each on its own
+        and all together [m], and by how much they are turned together [deg].
     """
     kept: dict[str, GivenLandmark] = {}
     left_out = list(given.left_out)
@@ -110,8 +114,19 @@ def place(given: GivenMap, source: str, frame_id: str, scale: float,
         frame_id, ids, labels, class_ids,
         np.array(centers) * scale @ turn.T + map_from_given[:3, 3],
         np.array(semi_axes) * scale, rotations.as_quat(),
-        tuple(replace(one, source=source) for one in details))
+        tuple(_with_errors(replace(one, source=source), scale, errors) for one in details))
     return ImportedMap(landmark_map, tuple(left_out), tuple(given.notes))
+
+
+def _with_errors(details: LandmarkDetails, scale: float, errors: tuple[float, float] | None
+                 ) -> LandmarkDetails:
+    """Return details with the deviation of the file in metres, or with given ones."""
+    if details.position_sigma is not None:
+        return replace(details, position_sigma=scale * details.position_sigma)
+    if errors is None:
+        return details
+    return replace(details, position_sigma=errors[0], shared_sigma=errors[0],
+                   shared_sigma_deg=errors[1])
 
 
 def refit(imported: ImportedMap, observations: Path, keep_unsupported: bool) -> ImportedMap:

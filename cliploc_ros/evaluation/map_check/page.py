@@ -196,7 +196,9 @@ def _corrections(recording: RecordingCheck) -> str:
         return '<p>Too few boxes to tell.</p>'
     rows = [(one.cause, one.name, f'{one.value:+.2f} {one.unit}',
              f'{one.deviation:.2f} {one.unit}', f'{one.effect_px:.1f}',
-             f'{one.explained:.1%}', 'significant' if one.is_significant else '')
+             f'{one.explained:.1%}', '' if not one.is_significant else (
+                 'may follow from the cause that explains most' if one.follows
+                 else 'significant'))
             for one in recording.corrections]
     return ('<p>The correction that fits the edges of the boxes best, each cause on its own. A '
             'turned mount and a shifted principal point look much the same.</p>'

@@ -96,9 +96,12 @@ def _on_corrections(report: CheckReport) -> Iterator[str]:
     numbers = [f'{one.name} by {one.value:+.2f} {one.unit} (standard deviation '
                f'{one.deviation:.2f})'
                for one in sorted(of_best, key=lambda one: -one.effect_px)]
-    others = sorted({one.cause for one in found} - {cause})
-    rivals = f'; an error of the {" or the ".join(others)} would look similar' if others else ''
-    yield f'{what[cause]}: the boxes fit better with other {", ".join(numbers)}{rivals}'
+    left = sorted({one.cause for one in found if not one.follows} - {cause})
+    follow = sorted({one.cause for one in found if one.follows} - {cause, *left})
+    then = f'; after that, {" and ".join(what[one] for one in left)}' if left else ''
+    if follow:
+        then += f'; only if that was right, look at the {" and the ".join(follow)}'
+    yield f'{what[cause]}: the boxes fit better with other {", ".join(numbers)}{then}'
 
 
 def _on_misled(report: CheckReport) -> Iterator[str]:

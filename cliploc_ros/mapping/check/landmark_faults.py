@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.association import associate, close_pairs, seen_apart
-from cliploc_ros.mapping.evidence import REACH, Evidence, gather_evidence, is_expected
+from cliploc_ros.mapping.evidence import Evidence, gather_evidence
 from cliploc_ros.mapping.fitting import fit_landmarks
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
 from cliploc_ros.mapping.options import MappingOptions
-from cliploc_ros.mapping.views import Views, camera_centers
+from cliploc_ros.mapping.update.sight import look_for
+from cliploc_ros.mapping.views import Views
 
 # Landmarks nearer than this are reported, see normalized_distance. Those of one class are one
 # object, unless they are farther apart than the second distance and frames show both at once.
@@ -54,13 +55,15 @@ class LandmarkCheck:
     #: Greatest angle between two directions from which it was seen [deg]
     baseline_deg: float | None
     position_sigma_m: float | None  #: Standard deviation of its centre on the worst axis [m]
-    offset_m: float | None  #: From its centre to where its boxes put it [m]
+    #: From its centre to where its boxes put it [m]; None where they may put it anywhere
+    offset_m: float | None
     median_iou: float | None  #: Of its boxes
     thinness: float  #: Least semi-axis divided by the greatest one
     #: Landmarks that lie in it, and their normalized distances
     overlaps: tuple[tuple[str, float], ...]
     faults: tuple[str, ...] = ()  #: The faults and what to do, the worst first
     severity: float = 0.0  #: 0: nothing; 1 and more: a serious fault
+    weight: float = 1.0  #: Frames that it was mapped from; 1 for all if the map does not say it
 
 
 class Witness(NamedTuple):
@@ -72,6 +75,7 @@ class Witness(NamedTuple):
     #: (L,): frames that should show each landmark, those without a box included
     expected: NDArray[np.int64]
     fitted: Landmarks  #: The landmarks fitted to the boxes that show them
+    fitted_sigmas: NDArray[np.float64]  #: (L,): deviations of these centres [m]
 
 
 def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str, ...],
@@ -80,19 +84,12 @@ def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str
     landmarks = landmarks_of_map(landmark_map, class_names)
     shown = associate(views, landmarks, options.association_iou)
     evidence = gather_evidence(views, landmarks, shown)
-    expected = evidence.expected.copy()
-    # From how far away landmarks are usually detected [m].
-    farthest = [np.linalg.norm(landmarks.centers[row] - camera_centers(views, views.frames[rows]),
-                               axis=1).max()
-                for row, rows in enumerate(group_boxes(shown, len(landmarks.centers)))
-                if len(rows)]
-    reach = REACH * float(np.median(farthest)) if farthest else 0.0
-    cameras = camera_centers(views)
-    for row in np.nonzero(evidence.support == 0)[0]:
-        expected[row] = is_expected(views, cameras, landmarks.centers[row], landmarks.bases[row],
-                                    reach).sum()
+    # a landmark that nothing shows may be hidden
+    sight = look_for(views, landmarks, shown, np.ones(len(landmarks.centers), dtype=np.bool_))
+    expected = np.where(evidence.support == 0, sight.expected_frames, evidence.expected)
     fitted = fit_landmarks(views, landmarks, group_boxes(shown, len(landmarks.centers)))
-    return Witness(landmarks, shown, evidence, expected, fitted)
+    return Witness(landmarks, shown, evidence, expected, fitted,
+                   gather_evidence(views, fitted, shown).position_sigma)
 
 
 def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views: Views | None
@@ -120,6 +117,8 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
     for one in overlaps:
         partners[one.first].append((one.second, one))
         partners[one.second].append((one.first, one))
+    supports = [one.support for one in landmark_map.details]
+    weights = np.array(supports if all(supports) else [], dtype=np.float64)
     checks = []
     for row, others in enumerate(partners):
         semi_axes = landmark_map.semi_axes[row]
@@ -143,7 +142,8 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
         faults.sort(key=lambda one: -one[0])
         checks.append(replace(
             check, faults=tuple(text for _, text in faults),
-            severity=faults[0][0] + 0.05 * (len(faults) - 1) if faults else 0.0))
+            severity=faults[0][0] + 0.05 * (len(faults) - 1) if faults else 0.0,
+            weight=float(weights[row]) if len(weights) else 1.0))
     return sorted(checks, key=lambda one: -one.severity)
 
 
@@ -161,10 +161,12 @@ def _support(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> di
         values = (0, expected, 0.0 if expected else None, None, None, None, None)
     else:
         evidence = witness.evidence
-        offset = witness.fitted.centers[row] - witness.landmarks.centers[row]
+        offset = float(np.linalg.norm(witness.fitted.centers[row]
+                                      - witness.landmarks.centers[row]))
+        is_told = offset > _OFFSET_SIGMAS * witness.fitted_sigmas[row] or offset < _MIN_OFFSET_M
         values = (support, int(witness.expected[row]), float(evidence.seen_ratio[row]),
                   float(evidence.baseline_deg[row]), float(evidence.position_sigma[row]),
-                  float(np.linalg.norm(offset)), float(evidence.median_iou[row]))
+                  offset if is_told else None, float(evidence.median_iou[row]))
     return dict(zip(names, values, strict=True))
 
 

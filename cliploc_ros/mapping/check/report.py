@@ -171,8 +171,12 @@ class CheckReport:
 
     @property
     def faulty(self) -> float:
-        """Return the share of the landmarks with a serious fault."""
-        return sum(one.severity >= SERIOUS for one in self.landmarks) / len(self.landmarks)
+        """Return the share of the landmarks with a serious fault.
+
+        A landmark counts as often as it was seen: one of a few frames is seen as rarely again.
+        """
+        return sum(one.weight for one in self.landmarks if one.severity >= SERIOUS) / sum(
+            one.weight for one in self.landmarks)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as plain values, for JSON."""
