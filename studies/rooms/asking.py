@@ -106,7 +106,7 @@ def make_ask(folders: Sequence[str], options: RoomOptions, with_sift: bool
             return Answers(task, failure=str(error))
         keyframes, sift = KeyframeLocalizer(layer), None
         if with_sift and room.has_depth:
-            sift = SiftMap([room.raws[row].decode() for row in mapped])
+            sift = SiftMap(room.raws[row].decode() for row in mapped)
         asking = room.by_robot if task.kind == ROBOT else room
         if len(asked) > task.images:  # evenly spread over the time
             asked = asked[np.linspace(0, len(asked) - 1, task.images).astype(np.int64)]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What users have without this package: SIFT (Lowe 2004), points by depth, PnP with RANSAC."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import cv2
 import numpy as np
@@ -22,12 +22,13 @@ _LEAST_INLIERS, _REPROJECTION_PX, _ITERATIONS = 12, 4.0, 2000
 class SiftMap:
     """The SIFT features of posed images with depth; those without depth are left out."""
 
-    def __init__(self, frames: Sequence[Frame]) -> None:
+    def __init__(self, frames: Iterable[Frame]) -> None:
         self._sift = cv2.SIFT.create(_MOST_FEATURES)
         self._points: list[NDArray[np.float64]] = []
         self._descriptors: list[NDArray[np.float32]] = []
         for frame in frames:
-            assert frame.depth is not None and frame.map_from_camera is not None
+            if frame.depth is None or frame.map_from_camera is None:
+                continue
             pixels, descriptors = self._features(frame.image_rgb)
             depths = depths_of_points(frame.depth, frame.camera, pixels)
             kept = np.isfinite(depths)
