@@ -60,6 +60,10 @@ def run() -> int:
     make_folder(options.out)
     reading = RoomOptions(options.model, options.out, options.conf)
     rooms = [read_room(one, reading) for one in options.folders]
+    if ROBOT in options.kinds:  # recorded once, before several workers need it
+        for room in rooms:
+            if room.has_poses:
+                room.by_robot  # noqa: B018
     tasks = [task for room in rooms
              for task in tasks_of(room, options.kinds, options.images, options.elsewhere)]
     found: list[Answers] = [answers for _, answers in tqdm(run_tasks(
