@@ -29,6 +29,7 @@ img { max-width: 100% } figure { margin: 1.5rem 0 } figcaption { font-size: 14px
 table { border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums }
 th, td { text-align: left; padding: .2rem .7rem; border-bottom: 1px solid #ddd }
 summary { font-weight: 600; cursor: pointer; margin: .8rem 0 } .row { display: flex; gap: 1rem }
+.row figure { flex: 1 }
 """
 _VERDICTS = {'accepted, right': ACCEPTED, 'refused, right within 1 m': REFUSED,
              'refused, no right pose': FAINT, 'accepted, wrong': MISLED}
@@ -140,7 +141,8 @@ def _failures(answers: Sequence[Answers], room: Room) -> Iterator[str]:
         data = b64encode(cv2.imencode('.jpg', small[..., ::-1], [
             cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()).decode('ascii')
         images.append(f'<figure><img alt="" src="data:image/jpeg;base64,{data}"><figcaption>'
-                      f'image {one.number}, {escape(one.part)}: {escape(one.reason)}'
+                      f'image {one.number}, {escape(one.part)}: '
+                      + escape(one.reason or f'accepted, {one.error_m:.1f} m off') +
                       '</figcaption></figure>')
     if images:
         yield ('<h3>Images without a right pose by both, the most confident first</h3>'
