@@ -87,8 +87,8 @@ def test_missing_fields_are_named(tmp_path, field):
     ('a: &x [1]\nb: *x\n', 'an alias'),
     ('a: 1\na: 2\n', "'a' is repeated"),
     ('{[1, 2]: 3}', 'a key must be a name'),
-    ('[' * 1_000_000, 'nested deeper than'),
-    ('{a: ' * 1_000_000, 'nested deeper than'),
+    ('[' * 1_000_000, 'nested deeper than|nesting depth'),  # PyYAML from 6.0.4
+    ('{a: ' * 1_000_000, 'nested deeper than|nesting depth'),
     (b'\x7fELF\xff\xfe\x00', 'not a text file'),
     ('a: 1\n', 'no map'),
     ('/**:\n  ros__parameters:\n    map:\n', 'expected the fields frame_id, landmarks'),

@@ -153,7 +153,7 @@ def test_without_a_watch_nothing_is_published_or_listened_to(own_relocalizer, te
     assert not tester.count_publishers('/relocalizer/localization_state')
     assert tester.listened_to() == 0
     tester.wait(lambda: 'relocalizer' in tester.get_node_names(), 'its name')
-    tester.wait(lambda: {'/odom', '/amcl_pose'} == {
+    tester.wait(lambda: {'/odom', '/amcl_pose', '/relocalizer/prior'} == {
         name for name, _ in tester.get_subscriber_names_and_types_by_node('relocalizer', '/')},
         'its subscriptions')
 
