@@ -115,7 +115,7 @@ def test_a_covered_camera_has_no_wrong_mount(rng):
 
 
 def test_a_map_that_is_out_of_date_is_not_blamed_on_a_mount(rng):
-    """All objects have exchanged places; no pose is accepted, so none tells of mounts."""
+    """All objects have swapped places. No pose is accepted, so no mount is judged by one."""
     exchanged = replace(MAP, centers=MAP.centers[np.random.default_rng(0).permutation(len(MAP))])
     localizer = Localizer(Relocalizer(exchanged, OPTIONS))
     for _ in range(10):

@@ -109,7 +109,8 @@ def test_a_robot_wakes_where_it_was(own_relocalizer, tester, tell, twins_map, tm
     assert 'refused' in again and 'prior' not in again, 'used up: the robot is awake'
     second.stop()
 
-    for content, text in (('{', 'last_pose_file'), (json.dumps(kept | {'covariance': []}), ''),
+    for content, text in (('{', 'last_pose_file'), ('[' * 100_000, 'last_pose_file'),
+                          (json.dumps(kept | {'covariance': []}), ''),
                           (json.dumps(kept | {'map_hash': 'another'}), '')):
         file.write_text(content)
         process = own_relocalizer(**known)

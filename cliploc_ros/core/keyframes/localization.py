@@ -27,8 +27,9 @@ _SIMILAR, _ELSEWHERE, PROPOSED = 5, 2, 3
 # With fewer points that agree, more keyframes are matched: those near the pose, and as many of the
 # next similar ones.
 _ENOUGH_INLIERS, _MORE = 100, 5
-# Where none of these shows the place, words may mislead: so many further keyframes are matched by
-# so many of the strongest features. By chance up to 8 of them agree on a pose there.
+# An image's words may resemble those of the wrong keyframes. Where none of the above shows the
+# place, the next 25 are matched by the strongest 600 features. A chance pose has up to 8 inliers
+# there, so 20 are required.
 _FURTHER, _STRONGEST, _CLEAR = 25, 600, 20
 #: Places of an image that do not agree with each other.
 MOST_PLACES = 3

@@ -92,7 +92,8 @@ def read_occupancy_grid(file: Path, frame_id: str) -> OccupancyGrid:
         return _grid(fields, file, frame_id)
     except MapError as error:
         raise MapError(f'occupancy_grid {file}: {error}') from error
-    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError) as error:
+    except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError,
+            yaml.YAMLError) as error:
         text = f'{error} is missing' if isinstance(error, KeyError) else str(error)
         raise MapError(f'occupancy_grid {file}: {text.splitlines()[0]}') from error
 

@@ -186,7 +186,8 @@ class PriorSource:
             return msg, str(fields['map_hash'])
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, TypeError, KeyError, CliplocError) as error:
+        except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError,
+                CliplocError) as error:
             self._node.get_logger().warning(f'last_pose_file {path}: not used: {error}')
             return None
 
