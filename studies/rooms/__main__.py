@@ -54,6 +54,8 @@ def run() -> int:
                         help='also keeps what networks say of the images (%(default)s)')
     parser.add_argument('--workers', type=positive_int, default=1, metavar='N')
     options = parser.parse_args()
+    if options.elsewhere < 0:
+        raise OptionsError('--elsewhere must not be below 0')
     names = [Path(one.partition('@')[0]).name for one in options.folders]
     if len(set(names)) < len(names):
         raise OptionsError('two folders have one name: rename one')

@@ -3,6 +3,7 @@
 """Recordings of real rooms: what detector and features say of each image, and their parts."""
 
 import pickle
+from argparse import ArgumentTypeError
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -14,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.command import positive
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.features import Features
 from cliploc_ros.core.keyframes.localization import query_features
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.datasets.folders import FolderOptions, find_layout, read_folder
 from cliploc_ros.datasets.frames import DepthFormat, Frames, ImageFile, RawFrame, folder_frames
-from cliploc_ros.errors import DatasetError
+from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.evaluation.trials import ImageFeatures, Query
 from cliploc_ros.evaluation.watching import observation_of
 from cliploc_ros.files.storage import make_folder, write_file
@@ -125,9 +127,13 @@ def read_room(where: str, options: RoomOptions) -> Room:
 
     ``DIR@METRES`` gives the unit of depth.
     """
-    path, _, unit = where.partition('@')
+    path, _, text = where.partition('@')
     folder = Path(path)
-    frames, has_poses = _frames_of(folder, float(unit) if unit else None)
+    try:
+        unit = positive(text) if text else None
+    except (ValueError, ArgumentTypeError):
+        raise OptionsError(f'{where}: {text!r} is no unit of depth in metres') from None
+    frames, has_poses = _frames_of(folder, unit)
     raws = tuple(frames.read_raw(lambda place, stamp_ns, pose: pose is not None))
     raws = tuple(replace(raw, place=row) for row, raw in enumerate(raws))
     frames = _frames_of_raws(frames.source, raws)
