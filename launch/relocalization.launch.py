@@ -53,6 +53,7 @@ RELOCALIZER_PARAMETERS = {
     'profile': 'detector and CLIP: auto, accurate, balanced or fast',
     'map_file': 'the map of objects: a path, or package://PACKAGE/PATH',
     'map_files': 'instead of map_file, the maps of several floors: [ground.yaml, first.yaml]',
+    'keyframes_file': "layer of keyframes; 'auto': next to map_file",
     'base_frame': "the robot's frame, whose pose is published; empty: the camera's",
     'cameras': 'names of several cameras, the namespaces of their topics: [front, left]',
     'gravity': 'source of the vertical: none, base_frame or imu',
@@ -60,6 +61,7 @@ RELOCALIZER_PARAMETERS = {
     'mode': 'on_request or continuous',
     'watch': "where the localizer's pose is watched: none, tf or amcl_pose",
     'on_lost': 'report, or relocalize once the robot stands',
+    'require_localizer': 'false: a request succeeds without AMCL, for ~/pose or publish_tf',
     'clip_model': 'open_clip architecture',
     'clip_pretrained': 'tag or file',
     'image_transport': 'raw or compressed',
@@ -74,7 +76,7 @@ OTHERS = {
     'detector': ('true', 'false: another program publishes detections'),
     'log_level': ('info', 'debug, info, warn or error'),
 }
-_TRUTH_VALUES = ('autostart', 'use_sim_time')
+_TRUTH_VALUES = ('autostart', 'require_localizer', 'use_sim_time')
 _LISTS = ('map_files', 'cameras')
 
 

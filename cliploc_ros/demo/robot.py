@@ -57,8 +57,8 @@ class WakeUp:
 
     @property
     def inliers(self) -> int:
-        """Return the number of inliers in the message."""
-        return int(self._stated(r'(\d+) inliers'))
+        """Return the number of landmarks matched in the message."""
+        return int(self._stated(r'(\d+) landmarks'))
 
     @property
     def stage_ms(self) -> dict[str, int]:

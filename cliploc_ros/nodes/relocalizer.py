@@ -9,11 +9,13 @@ import traceback
 from dataclasses import replace
 from typing import NoReturn
 
+from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.srv import SelfTest
 from std_srvs.srv import Empty, Trigger
 
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.answer import Answer, RequestCounters, Verdict
+from cliploc_ros.ros.answer import Answer, RequestCounters, Verdict, answer_msg
 from cliploc_ros.ros.case_recorder import CaseRecorder
 from cliploc_ros.ros.inputs.frame_source import LINGER_S, Frame, FrameSource
 from cliploc_ros.ros.inputs.rig import Rig
@@ -58,11 +60,13 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._watcher = Watcher(self, self._frames.main, self._robot, self._jumps, self._pipeline,
                                 self._requests, self._handoff, self._answer)
         self._counters = RequestCounters()
+        self._answers = self.create_publisher(DiagnosticArray, '~/answer', qos.LATCHED)
         self._last_verdict = 'none yet'
         self._verdicts: dict[str, int] = dict.fromkeys(Verdict, 0)
         group = BoundedCallbackGroup(MAX_REQUESTS)
         for service_type, name, callback in (
                 (Trigger, '~/relocalize', self._on_relocalize),
+                (SelfTest, '~/relocalize_fields', self._on_relocalize_fields),
                 (Trigger, '~/record', self._on_record),
                 (Empty, 'reinitialize_global_localization', self._on_reinitialize)):
             self.create_service(service_type, name, callback, qos_profile=qos.SERVICE,
@@ -148,6 +152,15 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         response.message = answer.message
         return response
 
+    def _on_relocalize_fields(self, _: SelfTest.Request, response: SelfTest.Response
+                              ) -> SelfTest.Response:
+        """Answer as ~/relocalize does, in fields."""
+        answer = self._answer()
+        response.id = str(answer.number)
+        response.passed = bytes([answer.verdict is Verdict.ACCEPTED])
+        response.status = answer_msg(answer, self.get_fully_qualified_name()).status
+        return response
+
     def _on_reinitialize(self, _: Empty.Request, response: Empty.Response) -> Empty.Response:
         self._answer()
         return response
@@ -192,7 +205,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self.get_logger().info(answer.message, throttle_duration_sec=_LOG_PERIOD_S)
 
     def _record(self, answer: Answer) -> None:
-        """Keep the verdict for the diagnostics, and publish them."""
+        """Publish the answer, keep the verdict for the diagnostics, and publish them."""
+        self._answers.publish(answer_msg(answer, self.get_fully_qualified_name()))
         self._last_verdict = answer.message
         self._verdicts[answer.verdict] += 1
         self.diagnostics.publish()

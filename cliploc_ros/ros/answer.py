@@ -9,7 +9,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from numpy.typing import NDArray
+from std_msgs.msg import Header
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.ros.inputs.frame_source import Frame
@@ -48,6 +52,12 @@ class Answer:
     #: Of the map that was searched, see cliploc_ros.ros.map_parameters; empty without one
     map_hash: str = ''
     kind: RefusalKind | None = None  #: Of a refusal; None for other verdicts
+    header: Header | None = None  #: Stamp of the image, frame of the map; None without an image
+    #: What decided, as doc/interface.md describes it
+    figures: Mapping[str, object] = field(default_factory=dict)
+    #: Where the robot's x axis points, or the camera looks, from the map's x axis to its y axis
+    heading_deg: float = 0.0
+    number: int = 0  #: From 1, in the order of the answers to requests; 0: to no request
 
     @property
     def is_linked(self) -> bool:
@@ -61,6 +71,40 @@ class Answer:
         if self.kind is not None:
             text = f'{text}; kind {self.kind}'
         return f'{text}; map {self.map_hash}' if self.map_hash else text
+
+
+def answer_msg(answer: Answer, node: str) -> DiagnosticArray:
+    """Return an answer as fields: its message, and keys that doc/interface.md describes.
+
+    `node` is the name of the relocalizer with its namespace.
+    """
+    level = {Verdict.ACCEPTED: DiagnosticStatus.OK, Verdict.FAILED: DiagnosticStatus.ERROR}
+    header, name = answer.header or Header(), node.lstrip('/')
+    stamp = f'{header.stamp.sec}.{header.stamp.nanosec:09d}'
+    values = {'answer': answer.number, 'verdict': answer.verdict, 'kind': answer.kind or '',
+              'stamp [s]': stamp, 'frame': header.frame_id, **answer.figures,
+              **({} if answer.pose is None else _pose_values(answer.pose, answer.heading_deg)),
+              **{f'{stage} [ms]': f'{ms:.1f}' for stage, ms in answer.stages_ms.items()},
+              'map hash': answer.map_hash}
+    return DiagnosticArray(header=header, status=[DiagnosticStatus(
+        level=level.get(answer.verdict, DiagnosticStatus.WARN), name=f'{name}: answer',
+        message=answer.message, hardware_id=name,
+        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])])
+
+
+def deviations(covariance: NDArray[np.float64]) -> tuple[float, float]:
+    """Return standard deviations by a pose's covariance (6, 6): position [m], heading [deg]."""
+    return math.sqrt(np.trace(covariance[:3, :3])), math.degrees(math.sqrt(covariance[5, 5]))
+
+
+def _pose_values(msg: PoseWithCovarianceStamped, heading_deg: float) -> dict[str, object]:
+    p, q = msg.pose.pose.position, msg.pose.pose.orientation
+    position_m, turn_deg = deviations(np.reshape(msg.pose.covariance, (6, 6)))
+    return {'x [m]': p.x, 'y [m]': p.y, 'z [m]': p.z,
+            'orientation xyzw': f'{q.x} {q.y} {q.z} {q.w}', 'heading [deg]': f'{heading_deg:.2f}',
+            'position deviation [m]': f'{position_m:.4f}',
+            'heading deviation [deg]': f'{turn_deg:.3f}',
+            'covariance': ' '.join(map(repr, map(float, msg.pose.covariance)))}
 
 
 class RequestCounters:

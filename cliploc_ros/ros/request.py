@@ -10,15 +10,17 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import count
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from std_msgs.msg import Header
 
-from cliploc_ros.core.acceptance.verdict import RefusalKind
+from cliploc_ros.core.acceptance.verdict import RefusalKind, needed_confidence
 from cliploc_ros.core.geometry.transforms import move_covariance
 from cliploc_ros.errors import CliplocError, TimeUpError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.answer import Answer, Verdict
+from cliploc_ros.ros.answer import Answer, Verdict, deviations
 from cliploc_ros.ros.case_recorder import CaseRecorder
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Localized, load_localizer
@@ -135,7 +137,8 @@ class Pipeline:
         found = localized.found
         answer = Answer(Verdict.REFUSED, f'{found.reason} {_summary(localized, stages_ms)}',
                         None, frame.received_at, state, localized.is_cut, tuple(beside),
-                        stages_ms, localizer.map_hash, found.refusal_kind)
+                        stages_ms, localizer.map_hash, found.refusal_kind,
+                        header, _figures(localized, parameters))
         if found.accepted:
             answer = self._publish(header, localized, state, replace(
                 answer, verdict=Verdict.ACCEPTED, detail=_summary(localized, stages_ms)))
@@ -176,17 +179,23 @@ class Pipeline:
         lever = map_from_base[:3, 3] - found.map_from_camera[:3, 3]
         pose, for_filter = (pose_with_covariance_msg(header, map_from_base, move_covariance(
             covariance, lever)) for covariance in (found.covariance, localized.for_filter))
+        parameters = self._node.settings.snapshot()
         x, y, z = map_from_base[:3, 3]
+        # of a robot where its x axis points, of a camera where it looks
+        ahead = map_from_base[:2, 0 if parameters.base_frame else 2]
+        heading_deg = math.degrees(math.atan2(ahead[1], ahead[0]))
+        position_m, turn_deg = deviations(np.reshape(pose.pose.covariance, (6, 6)))
         answer = replace(answer, pose=pose, detail=(
-            f'x {x:.2f} y {y:.2f} z {z:.2f} m in {header.frame_id} {answer.detail}'))
+            f'x {x:.2f} y {y:.2f} z {z:.2f} m in {header.frame_id}, heading {heading_deg:.0f} '
+            f'deg, deviation {position_m:.2f} m and {turn_deg:.1f} deg {answer.detail}'),
+            heading_deg=heading_deg)
         try:
-            self._map_to_odom.update(header, map_from_base, self._node.settings.snapshot(),
-                                     answer.received_at)
+            self._map_to_odom.update(header, map_from_base, parameters, answer.received_at)
         except NoTransformError as error:
             answer = replace(answer, verdict=Verdict.WITHHELD, pose=None,
                              detail=f'publish_tf: {error} (accepted: {answer.detail})')
         self._pose.publish(for_filter)
-        self._robot.prior.keep(pose, self._node.settings.snapshot(), answer.map_hash)
+        self._robot.prior.keep(pose, parameters, answer.map_hash)
         return answer
 
 
@@ -208,6 +217,7 @@ class Requests:
         self._cases = cases
         self._handoff = handoff
         self._turn = threading.Lock()
+        self._numbers = count(1)
         self._previous = Answer(Verdict.FAILED, 'no request yet')
 
     @property
@@ -220,7 +230,8 @@ class Requests:
         arrived_at = time.monotonic()
         deadline = arrived_at + self._node.settings.values.timeout_s
         if not self._turn.acquire(timeout=deadline - arrived_at + _GRACE_S):
-            return Answer(Verdict.FAILED, 'earlier requests took all of timeout_s: retry')
+            return Answer(Verdict.FAILED, 'earlier requests took all of timeout_s: retry',
+                          number=next(self._numbers))
         try:
             if self._previous.received_at <= arrived_at:
                 self._previous = self._guarded(arrived_at, deadline)
@@ -241,7 +252,7 @@ class Requests:
             answer = Answer(Verdict.FAILED,
                             f'internal error: {error} (the traceback is in the log)')
         self._node.get_logger().info(answer.message)
-        return answer
+        return replace(answer, number=next(self._numbers))
 
     def _look_until(self, deadline: float, arrived_at: float) -> Answer:
         """Look at one frame after another while another frame can change the answer."""
@@ -326,12 +337,28 @@ def _summary(localized: Localized, stages_ms: Mapping[str, float]) -> str:
     prior = ''
     if found.evidence is not None and found.evidence.prior:
         prior = f', prior {found.evidence.prior:.1f}'
-    return (f'[confidence {found.confidence:.3f}, score {found.score:.2f}, '
-            f'{sum(map(len, found.frame_matches[-localized.cameras:]))} inliers, '
+    # a refusal that compares a confidence with its limit is not contradicted by a rounded one
+    confidence = '' if 'confidence' in found.reason else f'confidence {found.confidence:.3f}, '
+    frames = f' in {len(found.frame_matches)} frames' if len(found.frame_matches) > 1 else ''
+    return (f'[{confidence}score {found.score:.2f}, '
+            f'{0 if found.evidence is None else found.evidence.inliers} landmarks{frames}, '
             f'{found.tried} hypotheses, '
             f'{100 * found.coverage:.3g} % of the search{crops}{keyframes}{depth}{cameras}'
             f'{prior}; '
             f'{in_words(stages_ms)}]')
+
+
+def _figures(localized: Localized, parameters: RelocalizerParameters) -> dict[str, object]:
+    """Return what decided the answer to a frame."""
+    found = localized.found
+    evidence, points = found.evidence, found.recognized
+    needed = parameters.min_confidence if evidence is None else needed_confidence(
+        evidence, parameters.options())
+    return {'source': found.source if found.solved else '', 'frames': len(found.frame_matches),
+            'cameras': localized.cameras, 'confidence': f'{found.confidence:.6f}',
+            'confidence needed': f'{needed:g}',
+            'landmarks': 0 if evidence is None else evidence.inliers,
+            'keyframe points': 0 if points is None else points.inliers}
 
 
 def _time_is_up(stages_ms: Mapping[str, float]) -> str:

@@ -2,15 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """The relocalizer as a process: requests and answers."""
 
+import re
+import subprocess
+import sys
 import time
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.srv import SelfTest
+from processes import PROJECT
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from scene import MAP_FROM_CAMERA
+from scene import MAP_FROM_CAMERA, make_room, see_room
 from sensor_msgs.msg import Image
 from tester import make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.ros.qos import LATCHED
 
 
 def test_a_request_is_answered_with_a_pose(relocalizer, tester):
@@ -26,6 +33,47 @@ def test_a_request_is_answered_with_a_pose(relocalizer, tester):
     covariance = np.array(pose.pose.covariance).reshape(6, 6)
     assert np.linalg.eigvalsh(covariance).min() > 0
     assert tester.hypotheses[0].poses[0] == pose.pose.pose
+
+
+def test_an_answer_has_its_pose_and_evidence_in_fields(relocalizer, tester):
+    """The client of the documents; ~/answer tells the same to those who come later."""
+    page = (PROJECT / 'doc/interface.md').read_text()
+    client = subprocess.Popen(
+        [sys.executable, '-c', re.search('```python\n(import rclpy.*?)```', page, re.DOTALL)[1]],
+        stdout=subprocess.PIPE, text=True)
+    tester.feed_until(lambda: client.poll() is not None, make_frame(stamp_s=12.5))
+    verdict, x, y, _ = client.stdout.read().split()
+    assert (verdict, client.returncode) == ('accepted', 0)
+    heard = []
+    subscription = tester.create_subscription(DiagnosticArray, 'relocalizer/answer', heard.append,
+                                              LATCHED)
+    tester.wait(lambda: heard, 'the last answer')
+    (status,), header = heard[-1].status, heard[-1].header
+    fields = {one.key: one.value for one in status.values}
+    assert (header.frame_id, header.stamp.sec, fields['stamp [s]']) == (
+        'map', 12, '12.500000000')
+    pose = tester.poses[-1].pose
+    assert [float(x), float(y), float(fields['z [m]'])] == [
+        pose.pose.position.x, pose.pose.position.y, pose.pose.position.z]
+    assert fields['covariance'].split() == [repr(float(one)) for one in pose.covariance]
+    assert (fields['source'], fields['frames'], fields['landmarks']) == ('objects', '1', '12')
+    assert 1.0 >= float(fields['confidence']) >= float(fields['confidence needed']) > 0.5
+    assert 0.0 < float(fields['position deviation [m]']) < 0.2
+    assert status.message.startswith('accepted: ') and float(fields['search [ms]']) > 0.0
+    ahead = MAP_FROM_CAMERA[:2, 2]
+    assert abs(float(fields['heading [deg]']) - np.degrees(np.arctan2(*ahead[::-1]))) < 15.0
+    documented = set(re.findall('`([a-z ]+(?: \\[\\w+\\])?|orientation xyzw)`',
+                                page.split('### Answers in fields')[1].split('### What')[0]))
+    assert {one for one in fields if not one.endswith('[ms]')} <= documented
+    refused = tester.call_while(SelfTest, 'relocalizer/relocalize_fields', make_frame(
+        see_room(make_room()).select(np.array([0, 1]))))
+    fields = {one.key: one.value for one in refused.status[0].values}
+    assert (refused.passed, fields['verdict'], fields['kind']) == (
+        b'\x00', 'refused', 'too_few_objects')
+    assert 'x [m]' not in fields
+    tester.wait(lambda: heard[-1].status == refused.status, 'the same on the topic')
+    assert int(refused.id) == int(fields['answer']) > 1
+    tester.destroy_subscription(subscription)
 
 
 def test_the_navigation_stacks_own_service_wakes_up_too(relocalizer, tester):

@@ -47,7 +47,7 @@ def test_each_floor_answers_in_its_own_coordinate_frame(own_relocalizer, tester,
         tester.forget()
         answer = tester.relocalize(make_frame(see_room(room), stamp_s=100.0 + number))
         assert answer.success, answer.message
-        assert f' m in floor_{number} ' in answer.message
+        assert f' m in floor_{number}, ' in answer.message
         tester.wait(lambda: tester.poses, 'a pose')
         assert tester.poses[-1].header.frame_id == f'floor_{number}'
         assert tester.poses[-1].pose.pose.position.x == pytest.approx(0.3, abs=0.05)

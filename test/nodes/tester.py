@@ -148,6 +148,15 @@ class Tester(Node):
                 self.spin()
         wait_for(condition, what, work=work)
 
+    def call_while(self, service_type, name, frame):
+        """Call a service without arguments, and publish a frame until the answer comes."""
+        client = self.create_client(service_type, name)
+        self.wait(client.service_is_ready, name)
+        future = client.call_async(service_type.Request())
+        self.feed_until(future.done, frame)
+        self.destroy_client(client)
+        return future.result()
+
     def relocalize(self, frame):
         """Send a request, publish a frame until the answer comes, and return the answer."""
         future = self.ask()

@@ -163,12 +163,12 @@ def refusal(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
 
     What the search of objects lacks does not matter where keyframes alone are sure enough.
     """
-    by_points = evidence.by_points >= _needed(evidence, options)
+    by_points = evidence.by_points >= needed_confidence(evidence, options)
     lacks = None if by_points else _too_short(evidence, options) or _too_few(evidence, options)
     return lacks or _too_unlikely(evidence, options) or _contradicted(evidence, options)
 
 
-def _needed(evidence: Evidence, options: RelocalizerOptions) -> float:
+def needed_confidence(evidence: Evidence, options: RelocalizerOptions) -> float:
     """Return the confidence that a pose needs; more while crops are left.
 
     Each search with more crops is another chance of a false accept, as in the interim analyses of
@@ -205,7 +205,7 @@ def _too_few(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
 
 def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
     """Return a refusal that names the evidence which takes most of the missing probability."""
-    confidence, needed = evidence.confidence, _needed(evidence, options)
+    confidence, needed = evidence.confidence, needed_confidence(evidence, options)
     if confidence >= needed:
         return None
     if confidence >= options.min_confidence:
