@@ -12,7 +12,7 @@ PACKAGE = 'cliploc_ros'
 # programs share one name space: there they are named cliploc_evaluate and so on.
 COMMANDS = ('build_map', 'check_map', 'evaluate', 'import_map', 'studio', 'tum_to_bag')
 # These need ROS. Without it they would only print that, so a wheel has none of them.
-ROS_COMMANDS = ('demo', 'prepare', 'replay', 'wake_up')
+ROS_COMMANDS = ('demo', 'doctor', 'prepare', 'replay', 'wake_up')
 NODES = ('detector', 'relocalizer')
 BUILDS_WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel'}.isdisjoint(sys.argv)
 

@@ -3,7 +3,6 @@
 """The relocalizer node: from image and detections to the robot's pose, on request."""
 
 import math
-import re
 import time
 import traceback
 from dataclasses import replace
@@ -17,8 +16,8 @@ from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, RequestCounters, Verdict, answer_msg
 from cliploc_ros.ros.case_recorder import CaseRecorder
-from cliploc_ros.ros.inputs.frame_source import LINGER_S, Frame, FrameSource
-from cliploc_ros.ros.inputs.rig import Rig
+from cliploc_ros.ros.inputs.frame_source import LINGER_S, Frame
+from cliploc_ros.ros.inputs.rig import frames_of
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumps
 from cliploc_ros.ros.map_services import MapServices
@@ -28,11 +27,17 @@ from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.process import run_node
 from cliploc_ros.ros.node.worker import LatestOnly
 from cliploc_ros.ros.outputs.handoff import HandOff
-from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
+from cliploc_ros.ros.parameters import (
+    DetectorParameters,
+    RelocalizerParameters,
+    doubt_of_rectified,
+)
 from cliploc_ros.ros.request import Pipeline, Requests
 from cliploc_ros.ros.watch import Watcher
 
 _LOG_PERIOD_S = 5.0
+# Its diagnostics name them, and those of its cameras, for doctor.
+_OTHER_TOPICS = ('odom', 'imu', 'initialpose', '/tf', '/tf_static')
 
 
 class RelocalizerNode(ManagedNode[RelocalizerParameters]):
@@ -48,10 +53,10 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._newest = LatestOnly(self.worker, self._localize_and_log)
         linger_s = math.inf if continuous else LINGER_S
         on_frame = self._newest.offer if continuous else lambda frame: None
-        self._frames: FrameSource | Rig = Rig(
-            self, parameters, linger_s, on_frame) if parameters.camera_names else FrameSource(
-                self, parameters.image_transport, linger_s, on_frame, parameters.detections_type,
-                parameters.depth_transport, parameters.depth_tolerance_s)
+        self._frames = frames_of(self, parameters, linger_s, on_frame)
+        self.facts['topics'] = ' '.join(
+            f'{name}:={self.resolve_topic_name(name)}' for name in (
+                *self._frames.topics, *_OTHER_TOPICS, parameters.localizer_pose) if name)
         self._handoff = HandOff(self, self._robot.odometry)
         self._handoff.on_shown(self._robot.prior.follow)
         self._cases = CaseRecorder(bool(parameters.record_folder))
@@ -89,11 +94,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._pipeline.open()
         self._frames.open()
         self._watcher.open()
-        topic = self._frames.image_topic
-        if re.search('[/_]rect', topic) and not parameters.rectified:
-            self.get_logger().warning(
-                f'{topic} sounds rectified, but the parameter rectified is false: poses would be '
-                'wrong by the distortion of the lens')
+        if doubt := doubt_of_rectified(self._frames.image_topic, parameters):
+            self.get_logger().warning(doubt)
 
     def close(self) -> None:
         """Release the request that waits for frames, and unsubscribe."""

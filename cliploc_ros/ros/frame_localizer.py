@@ -444,17 +444,23 @@ def _clip_options(parameters: RelocalizerParameters) -> ClipOptions:
     return with_encoder(named, parameters.profile)
 
 
+def keyframes_path(parameters: RelocalizerParameters) -> Path | None:
+    """Return the layer that the parameters name, or the one next to the map; None without one."""
+    named, map_file = parameters.keyframes_file, parameters.map_file
+    if named != NEXT_TO_MAP:
+        return Path(named) if named else None
+    path = layer_path(path_of(map_file)) if map_file else None
+    return path if path is not None and path.exists() else None
+
+
 def load_keyframes(parameters: RelocalizerParameters, landmark_map: LandmarkMap
                    ) -> Keyframes | None:
     """Return the layer that the parameters name; None without one, or where it is bad.
 
     A bad layer is logged with what to do, and the relocalizer goes on with the landmarks.
     """
-    named, map_file = parameters.keyframes_file, parameters.map_file
-    if not named or (named == NEXT_TO_MAP and not map_file):
-        return None
-    path = layer_path(path_of(map_file)) if named == NEXT_TO_MAP else Path(named)
-    if named == NEXT_TO_MAP and not path.exists():
+    path = keyframes_path(parameters)
+    if path is None:
         return None
     try:
         layer = load_layer_of_map(path, landmark_map)

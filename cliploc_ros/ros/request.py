@@ -283,7 +283,7 @@ class Requests:
                     break
                 if isinstance(error, NoFrameError):
                     raise problem or error from error
-                return Answer(Verdict.REFUSED, _time_is_up(times.ms), kind=RefusalKind.TIME_UP)
+                return Answer(Verdict.REFUSED, time_is_up(times.ms), kind=RefusalKind.TIME_UP)
             may_go_on = may_go_on and self._robot.is_linked_soon(frame.image.header.stamp,
                                                                  deadline)
             last, is_up, after = answer, answer.is_cut, time.monotonic()
@@ -294,7 +294,7 @@ class Requests:
         # more images of a place without objects are no remedy
         if is_up and last.verdict is Verdict.REFUSED and (
                 last.is_cut or last.kind is not RefusalKind.TOO_FEW_OBJECTS):
-            last = replace(last, detail=f'{last.detail}; {_time_is_up(stages_ms)}')
+            last = replace(last, detail=f'{last.detail}; {time_is_up(stages_ms)}')
         if looks == 1:
             return last
         return replace(last, detail=f'{last.detail} [{looks} frames in '
@@ -361,7 +361,7 @@ def _figures(localized: Localized, parameters: RelocalizerParameters) -> dict[st
             'keyframe points': 0 if points is None else points.inliers}
 
 
-def _time_is_up(stages_ms: Mapping[str, float]) -> str:
+def time_is_up(stages_ms: Mapping[str, float]) -> str:
     """Return which stage used up the time of a request, and what to do about it."""
     stage = max(stages_ms, key=lambda name: stages_ms[name])
     total_s = sum(stages_ms.values()) / 1e3

@@ -71,12 +71,12 @@ def test_maps_change_while_the_node_runs(own_relocalizer, tester, floors):
     assert 'map_file and map_files both name files' in reload_map(tester).message
     assert tester.set_parameter('map_file', '').successful
     assert reload_map(tester).success
-    assert ' in floor_1 ' in tester.relocalize(frame).message
+    assert ' in floor_1, ' in tester.relocalize(frame).message
     assert tester.set_parameter('map_files', [first, first]).successful
     assert "both have frame_id 'floor_0'" in reload_map(tester).message
     assert tester.set_parameter('map_files', [first, '/nowhere.yaml']).successful
     assert '/nowhere.yaml' in reload_map(tester).message
-    assert ' in floor_1 ' in tester.relocalize(frame).message
+    assert ' in floor_1, ' in tester.relocalize(frame).message
     assert tester.set_parameter('map_files', ['']).successful
     assert tester.set_parameter('map_file', first).successful
     assert reload_map(tester).message.startswith(

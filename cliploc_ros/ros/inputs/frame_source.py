@@ -133,6 +133,11 @@ class FrameSource:
                           Clock(clock_type=ClockType.STEADY_TIME))
 
     @property
+    def topics(self) -> list[str]:
+        """Return the relative names of the topics."""
+        return list(self._topics.values())
+
+    @property
     def image_topic(self) -> str:
         """Return the resolved name of the image topic."""
         return self._resolved('image')
@@ -325,12 +330,15 @@ class FrameSource:
             self.changed.notify_all()
         self._on_frame(frame)
 
+    def unheard(self, since: float) -> dict[str, str]:
+        """Return the inputs that were silent since a moment of the monotonic clock, and why."""
+        return {of_camera(self._camera, name): self._silence(name) for name in self._topics
+                if name not in _OF_DEPTH and self._heard_at.get(name, -math.inf) < since}
+
     def why_none(self, since: float) -> str:
         """Return what was missing since a moment of the monotonic clock."""
-        missing = [self._silence(name) for name in self._topics
-                   if name not in _OF_DEPTH and self._heard_at.get(name, -math.inf) < since]
-        if missing:
-            return '; '.join(missing)
+        if missing := self.unheard(since):
+            return '; '.join(missing.values())
         if self._pairing.outrun:
             return (f'detections come {self._pairing.outrun} images late, and memory holds '
                     f'{_MAX_IMAGE_BYTES // 2**20} MiB of images: use smaller images, '

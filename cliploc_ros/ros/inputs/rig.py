@@ -45,6 +45,11 @@ class Rig:
             for name in parameters.camera_names}
 
     @property
+    def topics(self) -> list[str]:
+        """Return the relative names of the topics of all cameras."""
+        return [topic for source in self._sources.values() for topic in source.topics]
+
+    @property
     def image_topic(self) -> str:
         """Return the resolved name of the image topic of the first camera."""
         return self.main.image_topic
@@ -94,6 +99,11 @@ class Rig:
         """Return for each input that nothing publishes a line that says what to do."""
         return [line for source in self._sources.values() for line in source.missing()]
 
+    def unheard(self, since: float) -> dict[str, str]:
+        """Return the inputs that were silent since a moment, and why; see FrameSource."""
+        return {name: why for source in self._sources.values()
+                for name, why in source.unheard(since).items()}
+
     def examine(self, health: Health, stale_after_s: float) -> None:
         """Report the inputs of each camera."""
         for name, source in self._sources.items():
@@ -118,6 +128,16 @@ class Rig:
         left_out = tuple(name for name in self._sources if name not in {
             one.camera for one in near})
         return replace(near[0], beside=tuple(near[1:]), left_out=left_out)
+
+
+def frames_of(node: Node, parameters: RelocalizerParameters, linger_s: float,
+              on_frame: Callable[[Frame], None] = lambda frame: None) -> FrameSource | Rig:
+    """Return the source of the frames of one camera or several; see FrameSource."""
+    if parameters.camera_names:
+        return Rig(node, parameters, linger_s, on_frame)
+    return FrameSource(node, parameters.image_transport, linger_s, on_frame,
+                       parameters.detections_type, parameters.depth_transport,
+                       parameters.depth_tolerance_s)
 
 
 class NewestInstant:

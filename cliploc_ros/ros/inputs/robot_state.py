@@ -58,7 +58,7 @@ class RobotStateSource:
         self._node = node
         self.transforms = CoordinateFrames(node)
         self.odometry = OdometrySource(node)
-        self._vertical = VerticalSource(node, self.transforms)
+        self.vertical = VerticalSource(node, self.transforms)
         self.prior = PriorSource(node, self.transforms)
         self._unknown = set[str]()  # coordinate frames that tf2 did not know the last time
 
@@ -69,21 +69,21 @@ class RobotStateSource:
                 parameters.base_frame and not any(parameters.base_from_camera)):
             # in the worker, for importing tf2 takes a while
             self._node.worker.run(self.transforms.open)
-        self._vertical.open(parameters.gravity)
+        self.vertical.open(parameters.gravity)
         self.prior.open(parameters)
         self.odometry.open()
 
     def close(self) -> None:
         """Unsubscribe."""
         self.odometry.close()
-        self._vertical.close()
+        self.vertical.close()
         self.prior.close()
         self._node.worker.submit(self.transforms.close)  # after a search that may be under way
 
     def forget(self) -> None:
         """Forget what was heard: time jumped."""
         self.transforms.forget()
-        self._vertical.forget()
+        self.vertical.forget()
         self.odometry.forget()
 
     def is_linked_soon(self, stamp: Time, deadline: float) -> bool:
@@ -110,7 +110,7 @@ class RobotStateSource:
         camera_from_base = self._mount(image, parameters, deadline)
         up_in_camera = None
         try:
-            up_in_camera = self._vertical.up_in_camera(parameters, camera_from_base,
+            up_in_camera = self.vertical.up_in_camera(parameters, camera_from_base,
                                                        image.frame_id, image.stamp)
         except (NoVerticalError, NoTransformError) as error:
             self._warn(f'localizing without the vertical: {error}')

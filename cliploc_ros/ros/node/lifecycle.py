@@ -105,11 +105,13 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         Its parameters.
     others : type, optional
         Parameters of the nodes that may be given the same file.
+    options
+        Of rclpy's Node.
     """
 
     def __init__(self, name: str, parameters: type[P],
-                 others: type[Parameters] = Parameters) -> None:
-        Node.__init__(self, name, automatically_declare_parameters_from_overrides=True)
+                 others: type[Parameters] = Parameters, **options: Any) -> None:
+        Node.__init__(self, name, automatically_declare_parameters_from_overrides=True, **options)
         LifecycleNodeMixin.__init__(
             self, callback_group=BoundedCallbackGroup(_MAX_TRANSITION_REQUESTS))
         self._log_handler = RosLogHandler(self)
@@ -118,6 +120,8 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         self.worker = Worker(self.report)
         self.settings = NodeParameters(self, parameters, others)
         self.active = False
+        #: What the diagnostics tell in every state
+        self.facts: dict[str, object] = {}
         self._transition = threading.Lock()
         self._failure = ''
         self._bond: Any = None
@@ -205,7 +209,7 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
             self.get_logger().error(traceback_text, throttle_duration_sec=1.0)
 
     def _health(self) -> Health:
-        health = Health()
+        health = Health(values=dict(self.facts))
         if self._failure:
             health.fail(self._failure)
         if self.active:

@@ -1,0 +1,64 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable ``doctor``: check all that a request needs, and say what to do."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from cliploc_ros.command import needs_ros, positive, printable, run_main, running_ros
+
+EPILOG = """\
+It asks the running relocalizer for its parameters and topics, listens to the same topics, and
+localizes once. It changes nothing: no pose is handed over. Before the nodes run, give their
+parameter files, and remap the topics as for them.
+
+exit codes: 0 nothing failed, 1 something did
+
+examples:
+  doctor
+  doctor --relocalizer /robot1/relocalizer
+  doctor --params-file robot.yaml --ros-args -r image:=/camera/image_raw
+"""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Check a robot; return the exit code."""
+    return run_main(make_parser(), run, args)
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='doctor', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
+        usage='doctor [options] [--ros-args ...]',
+        description='Check parameters, map, camera, calibration, clock, tf, odometry, detector, '
+        'localizer and the time of a request, each with what to do.')
+    parser.add_argument('--relocalizer', default='relocalizer', metavar='NAME',
+                        help='its name, in the namespace of this node or absolute (%(default)s)')
+    parser.add_argument('--params-file', type=Path, action='append', default=[], metavar='FILE',
+                        help='check with these parameters; repeat it as on the command line of '
+                        'the node (default: ask the running relocalizer)')
+    parser.add_argument('--timeout', type=positive, default=10.0, metavar='S',
+                        help='wait S seconds for an input (%(default)g)')
+    return parser
+
+
+def run(options: argparse.Namespace) -> int:
+    """Check and print; return the exit code. CliplocError: a parameter file cannot be read."""
+    with needs_ros('doctor'):
+        from cliploc_ros.ros.doctor import Report, State, doctor
+
+    report = Report(lambda one: print(
+        f'{one.what:<12} {one.state:<12} {printable(one.text)}', flush=True))
+    with running_ros(options.ros_args):
+        doctor(options.params_file, options.relocalizer, options.timeout, report)
+    failed = [one.what for one in report.findings if one.state is State.FAIL]
+    print(f'{len(failed)} of {len(report.findings)} failed: {", ".join(failed)}' if failed else
+          f'nothing failed in {len(report.findings)} checks')
+    return int(bool(failed))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
