@@ -168,7 +168,8 @@ class Doctor(ManagedNode[RelocalizerParameters]):
     def open(self) -> None:
         """Listen to all inputs."""
         self.handoff.open(self.settings.values.localizer_pose)
-        self.robot.open()
+        with suppress(NoTransformError):  # tf2 is not installed; the check of tf says so
+            self.robot.open()
         self.frames.open()
         for name, source in zip(self.cameras, self._sources, strict=True):
             source.open()

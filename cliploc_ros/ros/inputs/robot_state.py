@@ -65,13 +65,13 @@ class RobotStateSource:
     def open(self) -> None:
         """Subscribe to what the parameters ask for."""
         parameters = self._node.settings.values
+        self.vertical.open(parameters.gravity)
+        self.prior.open(parameters)
+        self.odometry.open()
         if parameters.publish_tf or parameters.watch == 'tf' or (
                 parameters.base_frame and not any(parameters.base_from_camera)):
             # in the worker, for importing tf2 takes a while
             self._node.worker.run(self.transforms.open)
-        self.vertical.open(parameters.gravity)
-        self.prior.open(parameters)
-        self.odometry.open()
 
     def close(self) -> None:
         """Unsubscribe."""

@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable doctor on a robot of real nodes, where each thing is broken once."""
+
+import re
+import shutil
+import time
+
+import pytest
+import yaml
+from nav_msgs.msg import Odometry
+from processes import wait_for
+from rclpy.qos import qos_profile_system_default
+from tester import class_matching, make_frame
+
+LINE = re.compile('^(.{12}) (pass|fail|not checked) +(.*)$', re.MULTILINE)
+WHOLE = {'parameters': 'valid', 'map': '12 landmarks', 'camera': '640 x 480 px',
+         'clock': 'images come', 'calibration': '65 degrees wide', 'tf': '0.50 m above',
+         'odometry': 'the robot rests', 'detector': '12 boxes', 'localizer': 'amcl_pose',
+         'time': 'search', 'pose': 'accepted with'}
+# Upright, and half a metre above the robot.
+MOUNT = [0.0, 0.0, 0.5, -0.70710678, 0.0, 0.0, 0.70710678]
+
+
+class Robot:
+    """Publishes what a robot does, and what a test broke; it changes frame and odometry."""
+
+    def __init__(self, tester):
+        self._tester = tester
+        self._odometry = tester.create_publisher(Odometry, 'odom', qos_profile_system_default)
+        self.speed_m_s, self.late_s, self.change = 0.0, 0.0, lambda *frame: frame
+
+    def pass_time(self):
+        now = time.time()
+        self._tester.publish(self.change(*make_frame(stamp_s=now - self.late_s)))
+        odometry = Odometry(child_frame_id='base_link')
+        odometry.header.frame_id = 'odom'
+        odometry.header.stamp = make_frame(stamp_s=now)[0].header.stamp
+        odometry.twist.twist.linear.x = self.speed_m_s
+        self._odometry.publish(odometry)
+        for _ in range(3):
+            self._tester.spin()
+
+    def close(self):
+        self._tester.destroy_publisher(self._odometry)
+
+
+@pytest.fixture
+def robot(tester):
+    found = Robot(tester)
+    yield found
+    found.close()
+
+
+@pytest.fixture
+def examine(start, robot, room_map, tmp_path):
+    """Run the doctor with parameters; return its lines, what to (state, text), and exit code."""
+    def run(*arguments, **parameters):
+        shutil.copy(room_map, tmp_path / 'map.yaml')
+        file = tmp_path / 'robot.yaml'
+        given = {**class_matching(str(tmp_path / 'map.yaml'), base_frame='base_link',
+                                  base_from_camera=MOUNT), **parameters}
+        file.write_text(yaml.safe_dump({'relocalizer': {'ros__parameters': given}}))
+        process = start('cli.doctor', '--timeout', 4, *(arguments or ('--params-file', file)))
+        wait_for(lambda: not process.alive, 'the end', work=robot.pass_time)
+        print(process.output())
+        assert 'Traceback' not in process.output()
+        return {what.strip(): (state, text) for what, state, text in LINE.findall(
+            process.output())}, process.stop()[0]
+    return run
+
+
+def without(number):
+    return lambda *frame: [one for row, one in enumerate(frame) if row != number]
+
+
+def uncalibrated(image, info, detections):
+    info.k = [0.0] * 9
+    return image, info, detections
+
+
+def of_another_detector(image, info, detections):
+    for one in detections.detections:
+        one.results[0].hypothesis.class_id = 'sofa'
+    return image, info, detections
+
+
+def test_a_whole_robot_passes_and_nothing_is_handed_over(own_relocalizer, examine, tester):
+    """The parameters and topics are those of the running relocalizer."""
+    own_relocalizer('--ros-args', '-r', 'odom:=/odom', base_frame='base_link',
+                    base_from_camera=MOUNT)
+    found, code = examine('--relocalizer', '/relocalizer')
+    assert code == 0
+    assert found['relocalizer'] == ('pass', '/relocalizer is active')
+    for what, text in WHOLE.items():
+        assert found[what][0] == 'pass' and text in found[what][1]
+    assert {what for what, (state, _) in found.items() if state == 'not checked'} == {
+        'keyframes', 'vertical'}
+    assert not tester.initial_poses and not tester.poses
+
+
+@pytest.mark.parametrize(('what', 'text', 'broken', 'parameters'), [
+    ('parameters', 'k: -3 must be 1 to 1000', {}, {'k': -3}),
+    ('map', '/nowhere.yaml: No such file', {}, {'map_file': '/nowhere.yaml'}),
+    ('keyframes', 'make it again with build_map', {}, {'keyframes_file': '/nowhere.npz'}),
+    ('camera', 'no image on /image from its', {'change': without(0)}, {}),
+    ('calibration', 'K: ', {'change': uncalibrated}, {}),
+    ('clock', 'synchronize the clocks', {'late_s': 100.0}, {}),
+    ('tf', 'set base_from_camera', {}, {'base_from_camera': [0.0] * 7}),  # with and without tf2
+    ('odometry', 'the robot moves at 1.00 m/s', {'speed_m_s': 1.0}, {}),
+    ('vertical', 'no message of /imu', {}, {'gravity': 'imu'}),
+    ('detector', 'no detections on /detections', {'change': without(2)}, {}),
+    ('detector', 'no class of the map is among its sofa', {'change': of_another_detector}, {}),
+    ('localizer', 'nobody publishes /nowhere: start the localizer', {},
+     {'localizer_pose': 'nowhere'}),
+    ('time', 'raise timeout_s', {}, {'timeout_s': 0.1})])
+def test_what_is_broken_fails_with_what_to_do(examine, robot, what, text, broken, parameters):
+    for name, value in broken.items():
+        setattr(robot, name, value)
+    found, code = examine(**parameters)
+    assert code == 1
+    assert found[what][0] == 'fail' and text in found[what][1]
+    failed = {one for one, (state, _) in found.items() if state == 'fail'}
+    assert failed <= {what, *CONSEQUENCES.get(what, ())}
+
+
+#: Without an image no detections come with one; old images are from before all odometry.
+CONSEQUENCES = {'camera': ('detector',), 'calibration': ('pose',), 'clock': ('odometry',),
+                'tf': ('time',)}
+
+
+def test_a_relocalizer_that_does_not_run_is_named(examine):
+    found, code = examine('--relocalizer', 'nobody')
+    assert (code, found) == (1, {'relocalizer': (
+        'fail', '/nobody is not running: start it, name it with --relocalizer, or give its '
+        '--params-file')})
