@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -68,6 +67,8 @@ _MOST_LAG_S = 1.0
 # So many detections, none of a class of the map, are of a detector with other names (a guess).
 _FOREIGN = 3
 _SPIN_S = 0.05
+# A rate is that of so many images, as far as they come within this time.
+_RATE_IMAGES, _RATE_S = 10, 2.0
 
 
 class State(StrEnum):
@@ -115,20 +116,12 @@ class Report:
             self.add(what, State.FAIL, str(error))
 
 
-@dataclass(frozen=True)
-class SeenImages:
+class SeenImages(NamedTuple):
     """What came from one camera."""
 
     newest: Any  #: Image or CompressedImage
-    count: int
-    first_at: float  #: When the first one came (monotonic clock) [s]
-    last_at: float
     lag_s: float  #: How long after its stamp the newest one came, by the node's clock
-
-    @property
-    def rate_hz(self) -> float:
-        """Return the rate; 0 for a single image."""
-        return (self.count - 1) / max(self.last_at - self.first_at, 1e-9)
+    came_at: tuple[float, ...]  #: When the last ones came (monotonic clock) [s]
 
 
 class Doctor(ManagedNode[RelocalizerParameters]):
@@ -155,6 +148,7 @@ class Doctor(ManagedNode[RelocalizerParameters]):
         self.cameras = parameters.camera_names or ('',)
         self.images: dict[str, SeenImages] = {}
         self.infos: dict[str, CameraInfo] = {}
+        self._changed = threading.Condition()
         self._sources = [ImageSource(self, parameters.image_transport, partial(self._take, name),
                                      name) for name in self.cameras]
 
@@ -185,13 +179,19 @@ class Doctor(ManagedNode[RelocalizerParameters]):
     def examine(self, health: Health) -> None:
         """Report nothing."""
 
+    def wait_for_rates(self) -> None:
+        """Wait a moment until the rate of each camera that has sent an image is known."""
+        with self._changed:
+            self._changed.wait_for(lambda: all(
+                len(one.came_at) == _RATE_IMAGES for one in self.images.values()), _RATE_S)
+
     def _take(self, camera: str, image: TimedImage) -> None:
-        before = self.images.get(camera)
+        before = self.images[camera].came_at if camera in self.images else ()
         lag_ns = self.get_clock().now().nanoseconds - stamp_ns(image.msg.header.stamp)
-        self.images[camera] = SeenImages(
-            image.msg, before.count + 1 if before else 1,
-            before.first_at if before else image.received_at, image.received_at,
-            lag_ns / NS_PER_S)
+        with self._changed:
+            self.images[camera] = SeenImages(image.msg, lag_ns / NS_PER_S,
+                                             (*before[1 - _RATE_IMAGES:], image.received_at))
+            self._changed.notify_all()
 
 
 def parameters_of_files(files: Sequence[Path], name: str) -> list[Parameter]:
@@ -231,27 +231,26 @@ def parameters_of_running(name: str, patience_s: float, report: Report
     full_name = node.resolve_service_name(name)
     status, client = RelocalizerStatus(node, full_name), AsyncParameterClient(node, full_name)
     deadline = time.monotonic() + patience_s
-
-    def wait(condition: Callable[[], bool]) -> bool:
-        while not condition() and time.monotonic() < deadline:
-            executor.spin_once(timeout_sec=_SPIN_S)
-        return condition()
     try:
-        if not wait(lambda: bool(status.values) and client.services_are_ready()):
-            report.add('relocalizer', State.FAIL, f'{full_name} is not running: start it, name it '
-                       'with --relocalizer, or give its --params-file')
-            return None
-        names = client.list_parameters()
-        wait(names.done)
-        values = client.get_parameters(names.result().result.names if names.done() else [])
-        if not wait(values.done):
+        while not status.values or not client.services_are_ready():
+            if time.monotonic() > deadline:
+                report.add('relocalizer', State.FAIL, f'{full_name} is not running: start it, '
+                           'name it with --relocalizer, or give its --params-file')
+                return None
+            executor.spin_once(timeout_sec=_SPIN_S)
+        listed = client.list_parameters()
+        executor.spin_until_future_complete(listed, patience_s)
+        names = listed.result().result.names if listed.done() else []
+        got = client.get_parameters(names)
+        executor.spin_until_future_complete(got, patience_s)
+        if not names or not got.done():
             report.add('relocalizer', State.FAIL, f'{full_name} does not answer: restart it')
             return None
         # what an active one misses has lines of its own
         report.judge('relocalizer', '' if status.values['state'] == 'active' else
                      status.problem(), f'{full_name} is active')
-        given = [Parameter.from_parameter_msg(ParameterMsg(name=one, value=value)) for one, value
-                 in zip(names.result().result.names, values.result().values, strict=True)]
+        given = [Parameter.from_parameter_msg(ParameterMsg(name=one, value=value))
+                 for one, value in zip(names, got.result().values, strict=True)]
         return given, status.values.get('topics', '').split()
     finally:
         node.destroy_node()
@@ -272,6 +271,7 @@ def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
         frame = node.frames.next_frame(after, after + patience_s)
     except NoFrameError as error:
         why = str(error)
+    node.wait_for_rates()
     silent = {name: text for name, text in node.frames.unheard(after).items()
               if frame is None or name.rpartition('/')[0] in frame.left_out}
     for name in node.cameras:
@@ -283,8 +283,11 @@ def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
     else:
         for what in ('tf', 'odometry', 'vertical'):
             report.skip(what, 'needs an image')
-    _check_detections(parameters, localizer, frame,
-                      silent.get(of_camera(name, 'detections'), why), report)
+    if of_camera(name, 'image') in silent:
+        report.skip('detector', 'needs an image')
+    else:
+        _check_detections(parameters, localizer, frame,
+                          silent.get(of_camera(name, 'detections'), why), report)
     if parameters.require_localizer:
         report.judge('localizer', node.handoff.missing(), 'it subscribes to initialpose'
                      + f' and publishes {parameters.localizer_pose}' * bool(
@@ -326,7 +329,9 @@ def _check_camera(node: Doctor, parameters: RelocalizerParameters, name: str,
     else:
         with report.failing(camera):
             size = image_from_msg(images.newest).shape[1::-1]
-            report.add(camera, State.PASS, f'{size[0]} x {size[1]} px at {images.rate_hz:.1f} Hz, '
+            count, seconds = len(images.came_at), images.came_at[-1] - images.came_at[0]
+            rate = f', {(count - 1) / seconds:.1f} Hz' if count > 1 else ''
+            report.add(camera, State.PASS, f'{size[0]} x {size[1]} px{rate}, '
                                            f"frame '{images.newest.header.frame_id}'")
         report.judge(clock, _doubt_of_clock(node, images),
                      f'images come {1e3 * images.lag_s:.0f} ms after their stamps')

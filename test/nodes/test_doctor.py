@@ -124,9 +124,8 @@ def test_what_is_broken_fails_with_what_to_do(examine, robot, what, text, broken
     assert failed <= {what, *CONSEQUENCES.get(what, ())}
 
 
-#: Without an image no detections come with one; old images are from before all odometry.
-CONSEQUENCES = {'camera': ('detector',), 'calibration': ('pose',), 'clock': ('odometry',),
-                'tf': ('time',)}
+#: Old images are from before all odometry.
+CONSEQUENCES = {'calibration': ('pose',), 'clock': ('odometry',), 'tf': ('time',)}
 
 
 def test_a_relocalizer_that_does_not_run_is_named(examine):
