@@ -16,17 +16,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from rcl_interfaces.msg import Parameter as ParameterMsg
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity
-from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.parameter_client import AsyncParameterClient
-from sensor_msgs.msg import CameraInfo
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.map.parameter_file import read_parameter_file
-from cliploc_ros.errors import CliplocError, OptionsError
+from cliploc_ros.errors import CliplocError
 from cliploc_ros.messages import (
     camera_from_msg,
     detections_from_msg,
@@ -45,9 +40,8 @@ from cliploc_ros.ros.inputs.frame_source import (
     TimedImage,
     of_camera,
 )
-from cliploc_ros.ros.inputs.odometry import NoOdometryError
 from cliploc_ros.ros.inputs.rig import frames_of
-from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
+from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.node.diagnostics import Health, StageTimes, in_words
 from cliploc_ros.ros.node.executor import NodeExecutor
@@ -59,7 +53,7 @@ from cliploc_ros.ros.parameters import (
     doubt_of_rectified,
 )
 from cliploc_ros.ros.request import time_is_up
-from cliploc_ros.ros.wake_up import RelocalizerStatus
+from cliploc_ros.ros.running import NotRunningError, ask, parameters_of_files
 from cliploc_ros.units import NS_PER_S
 
 # Images that come later after their stamps show clocks that differ (a guess).
@@ -67,8 +61,6 @@ _MOST_LAG_S = 1.0
 # So many detections, none of a class of the map, are of a detector with other names (a guess).
 _FOREIGN = 3
 _SPIN_S = 0.05
-# A rate is that of so many images, as far as they come within this time.
-_RATE_IMAGES, _RATE_S = 10, 2.0
 
 
 class State(StrEnum):
@@ -116,14 +108,6 @@ class Report:
             self.add(what, State.FAIL, str(error))
 
 
-class SeenImages(NamedTuple):
-    """What came from one camera."""
-
-    newest: Any  #: Image or CompressedImage
-    lag_s: float  #: How long after its stamp the newest one came, by the node's clock
-    came_at: tuple[float, ...]  #: When the last ones came (monotonic clock) [s]
-
-
 class Doctor(ManagedNode[RelocalizerParameters]):
     """Has the inputs of a relocalizer, and none of its outputs.
 
@@ -146,9 +130,9 @@ class Doctor(ManagedNode[RelocalizerParameters]):
         self.frames = frames_of(self, parameters, LINGER_S)
         self.handoff = HandOff(self, self.robot.odometry)
         self.cameras = parameters.camera_names or ('',)
-        self.images: dict[str, SeenImages] = {}
+        #: Of each camera the newest image, and how long after its stamp it came [s].
+        self.images: dict[str, tuple[Image | CompressedImage, float]] = {}
         self.infos: dict[str, CameraInfo] = {}
-        self._changed = threading.Condition()
         self._sources = [ImageSource(self, parameters.image_transport, partial(self._take, name),
                                      name) for name in self.cameras]
 
@@ -179,81 +163,9 @@ class Doctor(ManagedNode[RelocalizerParameters]):
     def examine(self, health: Health) -> None:
         """Report nothing."""
 
-    def wait_for_rates(self) -> None:
-        """Wait a moment until the rate of each camera that has sent an image is known."""
-        with self._changed:
-            self._changed.wait_for(lambda: all(
-                len(one.came_at) == _RATE_IMAGES for one in self.images.values()), _RATE_S)
-
     def _take(self, camera: str, image: TimedImage) -> None:
-        before = self.images[camera].came_at if camera in self.images else ()
         lag_ns = self.get_clock().now().nanoseconds - stamp_ns(image.msg.header.stamp)
-        with self._changed:
-            self.images[camera] = SeenImages(image.msg, lag_ns / NS_PER_S,
-                                             (*before[1 - _RATE_IMAGES:], image.received_at))
-            self._changed.notify_all()
-
-
-def parameters_of_files(files: Sequence[Path], name: str) -> list[Parameter]:
-    """Return the relocalizer's parameters in files; the later ones count more.
-
-    CliplocError: names the file and what is wrong with it.
-    """
-    found: dict[str, Any] = {}
-    base = name.rpartition('/')[2]
-    for file in files:
-        for node, content in read_parameter_file(file).items():
-            if node.rpartition('/')[2] in ('**', '*', base) and isinstance(content, dict):
-                found |= _flat(content.get('ros__parameters') or {})
-    if not found:
-        raise OptionsError(f'{", ".join(map(str, files))}: no parameters of {base} or /**; name '
-                           'the node with --relocalizer')
-    return [Parameter(name, value=value) for name, value in found.items() if value is not None]
-
-
-def _flat(tree: dict[str, Any], prefix: str = '') -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, value in tree.items():
-        found |= _flat(value, f'{prefix}{name}.') if isinstance(value, dict) else {
-            f'{prefix}{name}': value}
-    return found
-
-
-def parameters_of_running(name: str, patience_s: float, report: Report
-                          ) -> tuple[list[Parameter], list[str]] | None:
-    """Return the parameters and remappings of a running relocalizer; None if it does not answer.
-
-    Reports whether it can take a request.
-    """
-    node = Node('doctor_asks', start_parameter_services=False)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    full_name = node.resolve_service_name(name)
-    status, client = RelocalizerStatus(node, full_name), AsyncParameterClient(node, full_name)
-    deadline = time.monotonic() + patience_s
-    try:
-        while not status.values or not client.services_are_ready():
-            if time.monotonic() > deadline:
-                report.add('relocalizer', State.FAIL, f'{full_name} is not running: start it, '
-                           'name it with --relocalizer, or give its --params-file')
-                return None
-            executor.spin_once(timeout_sec=_SPIN_S)
-        listed = client.list_parameters()
-        executor.spin_until_future_complete(listed, patience_s)
-        names = listed.result().result.names if listed.done() else []
-        got = client.get_parameters(names)
-        executor.spin_until_future_complete(got, patience_s)
-        if not names or not got.done():
-            report.add('relocalizer', State.FAIL, f'{full_name} does not answer: restart it')
-            return None
-        # what an active one misses has lines of its own
-        report.judge('relocalizer', '' if status.values['state'] == 'active' else
-                     status.problem(), f'{full_name} is active')
-        given = [Parameter.from_parameter_msg(ParameterMsg(name=one, value=value))
-                 for one, value in zip(names, got.result().values, strict=True)]
-        return given, status.values.get('topics', '').split()
-    finally:
-        node.destroy_node()
+        self.images[camera] = image.msg, lag_ns / NS_PER_S
 
 
 def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
@@ -271,18 +183,16 @@ def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
         frame = node.frames.next_frame(after, after + patience_s)
     except NoFrameError as error:
         why = str(error)
-    node.wait_for_rates()
     silent = {name: text for name, text in node.frames.unheard(after).items()
               if frame is None or name.rpartition('/')[0] in frame.left_out}
     for name in node.cameras:
         _check_camera(node, parameters, name, silent, report)
     name = node.cameras[0] if frame is None else frame.camera
     if name in node.images:
-        _check_place(node, parameters.of_camera(name), node.images[name].newest.header, patience_s,
+        _check_place(node, parameters.of_camera(name), node.images[name][0].header, patience_s,
                      report)
     else:
-        for what in ('tf', 'odometry', 'vertical'):
-            report.skip(what, 'needs an image')
+        report.skip('tf, odometry', 'need an image')
     if of_camera(name, 'image') in silent:
         report.skip('detector', 'needs an image')
     else:
@@ -321,20 +231,18 @@ def _check_camera(node: Doctor, parameters: RelocalizerParameters, name: str,
     """Check images, calibration and clock of a camera."""
     camera, calibration, clock = (of_camera(name, what) for what in (
         'camera', 'calibration', 'clock'))
-    images, info = node.images.get(name), node.infos.get(name)
-    if images is None:
+    (image, lag_s), info = node.images.get(name, (None, 0.0)), node.infos.get(name)
+    size = None
+    if image is None:
         report.add(camera, State.FAIL, silent.get(of_camera(name, 'image'), 'no image in time'))
         report.skip(clock, 'needs an image')
-        size = None
     else:
         with report.failing(camera):
-            size = image_from_msg(images.newest).shape[1::-1]
-            count, seconds = len(images.came_at), images.came_at[-1] - images.came_at[0]
-            rate = f', {(count - 1) / seconds:.1f} Hz' if count > 1 else ''
-            report.add(camera, State.PASS, f'{size[0]} x {size[1]} px{rate}, '
-                                           f"frame '{images.newest.header.frame_id}'")
-        report.judge(clock, _doubt_of_clock(node, images),
-                     f'images come {1e3 * images.lag_s:.0f} ms after their stamps')
+            size = image_from_msg(image).shape[1::-1]
+            report.add(camera, State.PASS, f'{size[0]} x {size[1]} px, frame '
+                                           f"'{image.header.frame_id}'")
+        report.judge(clock, _doubt_of_clock(node, lag_s),
+                     f'images come {1e3 * lag_s:.0f} ms after their stamps')
     if info is None:
         return report.add(calibration, State.FAIL,
                           silent.get(of_camera(name, 'camera_info'), 'no camera_info in time'))
@@ -346,15 +254,15 @@ def _check_camera(node: Doctor, parameters: RelocalizerParameters, name: str,
             name, 'image')), parameters), f'{width_deg:.0f} degrees wide, {lens}')
 
 
-def _doubt_of_clock(node: Doctor, images: SeenImages) -> str:
+def _doubt_of_clock(node: Doctor, lag_s: float) -> str:
     """Return what is wrong with the clocks of camera and node; empty if nothing is."""
     uses_sim_time = node.get_parameter('use_sim_time').value
     if uses_sim_time and not node.get_clock().now().nanoseconds:
         return ('use_sim_time is true, but nobody publishes /clock: start the simulation, play '
                 'the bag with --clock, or set it to false')
-    if abs(images.lag_s) <= _MOST_LAG_S:
+    if abs(lag_s) <= _MOST_LAG_S:
         return ''
-    return (f'images come {images.lag_s:.1f} s after their stamps by '
+    return (f'images come {lag_s:.1f} s after their stamps by '
             f"{'/clock' if uses_sim_time else 'the clock of this machine'} (limit "
             f'{_MOST_LAG_S:g}): synchronize the clocks; play a bag with --clock and use_sim_time')
 
@@ -386,28 +294,16 @@ def _check_place(node: Doctor, parameters: RelocalizerParameters, image: Any, pa
         with report.failing('odometry'):
             node.handoff.check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s,
                                     time.monotonic() + patience_s)
-            report.judge('odometry', _doubt_of_odometry(node, image, mount, parameters),
-                         'the robot rests, and poses cover the image')
+            body = odometry.pose_at(image.stamp)
+            if mount is not None and body.body_frame not in (image.frame_id, base):
+                robot.transforms.lookup(image.frame_id, body.body_frame, image.stamp,
+                                        parameters.tf_timeout_s, 'correct its child_frame_id')
+            report.add('odometry', State.PASS, 'the robot rests, and poses cover the image')
     if parameters.gravity == 'none' or mount is None:
         return report.skip('vertical', 'needs tf' if mount is None else 'gravity: none')
     with report.failing('vertical'):
         robot.vertical.up_in_camera(parameters, mount, image.frame_id, image.stamp)
         report.add('vertical', State.PASS, f'known by {parameters.gravity}')
-
-
-def _doubt_of_odometry(node: Doctor, image: Any, mount: Any, parameters: RelocalizerParameters
-                       ) -> str:
-    """Return why odometry cannot join images; empty if it can."""
-    try:
-        body = node.robot.odometry.pose_at(image.stamp)
-        if mount is not None and body.body_frame not in (image.frame_id, parameters.base_frame):
-            node.robot.transforms.lookup(image.frame_id, body.body_frame, image.stamp,
-                                         parameters.tf_timeout_s, 'correct its child_frame_id')
-    except NoOdometryError as error:
-        return f'{error}: stamp images and {node.robot.odometry.topic} by one clock'
-    except NoTransformError as error:
-        return str(error)
-    return ''
 
 
 def _check_detections(parameters: RelocalizerParameters, localizer: FrameLocalizer | None,
@@ -433,17 +329,11 @@ def _check_request(node: Doctor, parameters: RelocalizerParameters,
                    localizer: FrameLocalizer | None, frame: Frame | None, report: Report) -> None:
     """Localize with a frame as a request does: how long each stage takes, and the verdict."""
     if localizer is None or frame is None:
-        report.skip('time', 'needs a map and an image with detections')
-        return report.skip('pose', 'needs a map and an image with detections')
+        return report.skip('time, pose', 'need a map and an image with detections')
     with report.failing('pose'):
-        states: list[tuple[Frame, RobotState]] = []
-        for one in (frame, *frame.beside):
-            with suppress(NoTransformError) if states else report.failing('time'):
-                states.append((one, node.robot.at(
-                    one.image.header, parameters.of_camera(one.camera),
-                    time.monotonic() + parameters.tf_timeout_s, one.depth_frame)))
-        if not states:
-            return report.skip('pose', 'needs tf')
+        deadline = time.monotonic() + parameters.tf_timeout_s
+        states = [(one, node.robot.at(one.image.header, parameters.of_camera(one.camera), deadline,
+                                      one.depth_frame)) for one in (frame, *frame.beside)]
         times = StageTimes('waiting', time.monotonic())
         localized = node.worker.run(partial(
             localizer.localize, frame, parameters, states[0][1], times, math.inf, states[1:]))
@@ -453,9 +343,10 @@ def _check_request(node: Doctor, parameters: RelocalizerParameters,
                                                               f'{parameters.timeout_s:g}')
         found = localized.found
         if found.accepted:
-            return report.add('pose', State.PASS,
-                              f'accepted with confidence {found.confidence:.3f}; not handed over')
-        report.skip('pose', f'refused here: {found.reason}')
+            report.add('pose', State.PASS,
+                       f'accepted with confidence {found.confidence:.3f}; not handed over')
+        else:
+            report.skip('pose', f'refused here: {found.reason}')
 
 
 def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) -> None:
@@ -463,12 +354,18 @@ def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) 
 
     CliplocError: a parameter file cannot be read.
     """
-    found = parameters_of_running(name, patience_s, report) if not files else (
-        parameters_of_files(files, name), [])
-    if found is None:
-        return
+    if files:
+        given, topics = parameters_of_files(files, name), []
+    else:
+        try:
+            running = ask(name, patience_s)
+        except NotRunningError as error:
+            return report.add('relocalizer', State.FAIL, str(error))
+        given, topics = running.parameters, running.topics
+        # what an active one misses has lines of its own
+        report.judge('relocalizer', running.problem, f'{running.name} is active')
     executor, ended = NodeExecutor(), threading.Event()
-    node = Doctor(*found)
+    node = Doctor(given, topics)
     node.get_logger().set_level(LoggingSeverity.ERROR)
     executor.add_node(node)
 

@@ -14,13 +14,12 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, NamedTuple
 
 from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Duration
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -28,6 +27,7 @@ from std_srvs.srv import Trigger
 
 from cliploc_ros.command import Interruption
 from cliploc_ros.ros.answer import Verdict
+from cliploc_ros.ros.running import SILENT_S, RelocalizerStatus
 
 # Nav2's default limit of a turn, and what its answer may take beyond [s].
 _ALLOWANCE_S = 10.0
@@ -37,8 +37,6 @@ _ENDS = {GoalStatus.STATUS_ABORTED: 'aborted', GoalStatus.STATUS_CANCELED: 'canc
 
 #: Spins the node until a condition holds or a number of seconds is over; returns whether it holds.
 Wait = Callable[[Callable[[], bool], float], bool]
-#: The diagnostics come once a second; a relocalizer that is silent for longer is taken for dead.
-SILENT_S = 5.0
 _SPIN_S = 0.05
 # What is there is not seen at once.
 _DISCOVERY_S = 2.0
@@ -148,73 +146,6 @@ def _reason(result: Any) -> str:
              for name in ('TIMEOUT', 'TF_ERROR', 'COLLISION_AHEAD')}
     words = [names.get(code, ''), getattr(result, 'error_msg', '')]
     return ', '.join([*filter(None, words), f'code {code}'])
-
-
-@dataclass(frozen=True)
-class Report:
-    """One report of the relocalizer."""
-
-    received_at: float = -math.inf  #: Monotonic clock [s]
-    message: str = ''  #: Its problems in one line, or its state
-    values: dict[str, str] = field(default_factory=dict)
-
-
-class RelocalizerStatus:
-    """Listens to the diagnostics of one relocalizer.
-
-    Parameters
-    ----------
-    node : Node
-        Spun by the caller.
-    name : str
-        The relocalizer's name with its namespace, as ``/robot/relocalizer``.
-    """
-
-    def __init__(self, node: Node, name: str) -> None:
-        self._name = name
-        self._begun_at = time.monotonic()
-        self._report = Report()
-        node.create_subscription(DiagnosticArray, '/diagnostics', self._take, 10)
-
-    @property
-    def silent_s(self) -> float:
-        """Return how long the relocalizer has been silent [s]."""
-        return time.monotonic() - max(self._report.received_at, self._begun_at)
-
-    @property
-    def time_limit_s(self) -> float:
-        """Return within which time it answers a request [s]; infinite if that is not known."""
-        return float(self._report.values.get('time limit [s]', math.inf))
-
-    @property
-    def values(self) -> dict[str, str]:
-        """Return the values of its last report."""
-        return self._report.values
-
-    def has_reported_since(self, moment: float) -> bool:
-        """Return whether it was active and reported since a moment (monotonic clock) [s]."""
-        return self._report.received_at > moment and self._report.values.get('state') == 'active'
-
-    def problem(self) -> str:
-        """Return why the relocalizer cannot take a request, and what to do; empty if it can."""
-        state, silent_s = self._report.values.get('state'), self.silent_s
-        if state is None:
-            return (f'{self._name} has sent no diagnostics yet: it is starting, or its '
-                    '/diagnostics is remapped')
-        if silent_s > SILENT_S:
-            return (f'{self._name} has been silent for {silent_s:.0f} s: it died, or its '
-                    'machine is overloaded; start it again if it died')
-        if state != 'active':
-            reason = self._report.message if self._report.message != state else \
-                'it is loading, or its lifecycle manager must configure and activate it'
-            return f'{self._name} is {state}: {reason}'
-        return self._report.values.get('missing', '')
-
-    def _take(self, msg: DiagnosticArray) -> None:
-        for status in msg.status:
-            if status.hardware_id == self._name.lstrip('/'):
-                self._report = Report(time.monotonic(), status.message,
-                                      {value.key: value.value for value in status.values})
 
 
 class Outcome(IntEnum):

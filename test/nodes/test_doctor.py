@@ -125,7 +125,7 @@ def test_what_is_broken_fails_with_what_to_do(examine, robot, what, text, broken
 
 
 #: Old images are from before all odometry.
-CONSEQUENCES = {'calibration': ('pose',), 'clock': ('odometry',), 'tf': ('time',)}
+CONSEQUENCES = {'calibration': ('pose',), 'clock': ('odometry',), 'tf': ('pose',)}
 
 
 def test_a_relocalizer_that_does_not_run_is_named(examine):

@@ -181,10 +181,12 @@ class OdometryWindow:
             raise NoOdometryError('no odometry yet')
         if row == len(self._poses):
             late_s = (stamp_ns - self._poses[-1].stamp_ns) / NS_PER_S
-            raise NoOdometryError(f'the newest odometry is {late_s:.3f} s older than the image')
+            raise NoOdometryError(f'the newest odometry is {late_s:.3f} s older than the image: '
+                                  'stamp both by one clock')
         if row == 0:
             early_s = (self._poses[0].stamp_ns - stamp_ns) / NS_PER_S
-            raise NoOdometryError(f'the oldest odometry is {early_s:.3f} s newer than the image')
+            raise NoOdometryError(f'the oldest odometry is {early_s:.3f} s newer than the image: '
+                                  'stamp both by one clock')
         before, after = self._poses[row - 1], self._poses[row]
         gap_ns = after.stamp_ns - before.stamp_ns
         if gap_ns > _MAX_GAP_NS:

@@ -1,0 +1,163 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What other programs learn of a relocalizer: its diagnostics, its parameters, its topics."""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Parameter as ParameterMsg
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+
+from cliploc_ros.core.map.parameter_file import read_parameter_file
+from cliploc_ros.errors import CliplocError, OptionsError
+
+#: The diagnostics come once a second; a relocalizer that is silent for longer is taken for dead.
+SILENT_S = 5.0
+_SPIN_S = 0.05
+
+
+@dataclass(frozen=True)
+class Report:
+    """One report of the relocalizer."""
+
+    received_at: float = -math.inf  #: Monotonic clock [s]
+    message: str = ''  #: Its problems in one line, or its state
+    values: dict[str, str] = field(default_factory=dict)
+
+
+class RelocalizerStatus:
+    """Listens to the diagnostics of one relocalizer.
+
+    Parameters
+    ----------
+    node : Node
+        Spun by the caller.
+    name : str
+        The relocalizer's name with its namespace, as ``/robot/relocalizer``.
+    """
+
+    def __init__(self, node: Node, name: str) -> None:
+        self._name = name
+        self._begun_at = time.monotonic()
+        self._report = Report()
+        node.create_subscription(DiagnosticArray, '/diagnostics', self._take, 10)
+
+    @property
+    def silent_s(self) -> float:
+        """Return how long the relocalizer has been silent [s]."""
+        return time.monotonic() - max(self._report.received_at, self._begun_at)
+
+    @property
+    def time_limit_s(self) -> float:
+        """Return within which time it answers a request [s]; infinite if that is not known."""
+        return float(self._report.values.get('time limit [s]', math.inf))
+
+    @property
+    def values(self) -> dict[str, str]:
+        """Return the values of its last report."""
+        return self._report.values
+
+    def has_reported_since(self, moment: float) -> bool:
+        """Return whether it was active and reported since a moment (monotonic clock) [s]."""
+        return self._report.received_at > moment and self._report.values.get('state') == 'active'
+
+    def problem(self) -> str:
+        """Return why the relocalizer cannot take a request, and what to do; empty if it can."""
+        state, silent_s = self._report.values.get('state'), self.silent_s
+        if state is None:
+            return (f'{self._name} has sent no diagnostics yet: it is starting, or its '
+                    '/diagnostics is remapped')
+        if silent_s > SILENT_S:
+            return (f'{self._name} has been silent for {silent_s:.0f} s: it died, or its '
+                    'machine is overloaded; start it again if it died')
+        if state != 'active':
+            reason = self._report.message if self._report.message != state else \
+                'it is loading, or its lifecycle manager must configure and activate it'
+            return f'{self._name} is {state}: {reason}'
+        return self._report.values.get('missing', '')
+
+    def _take(self, msg: DiagnosticArray) -> None:
+        for status in msg.status:
+            if status.hardware_id == self._name.lstrip('/'):
+                self._report = Report(time.monotonic(), status.message,
+                                      {value.key: value.value for value in status.values})
+
+
+class NotRunningError(CliplocError):
+    """The relocalizer does not run, or does not answer; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class Running:
+    """A relocalizer that runs."""
+
+    name: str  #: With its namespace
+    problem: str  #: Why it is not active, and what to do; empty if it is
+    parameters: list[Parameter]
+    topics: list[str]  #: Its remappings, NAME:=TOPIC
+
+
+def ask(name: str, patience_s: float) -> Running:
+    """Return what a running relocalizer tells of itself; it may take `patience_s` to be found.
+
+    NotRunningError: it does not answer.
+    """
+    node = Node('doctor_asks', start_parameter_services=False)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    name = node.resolve_service_name(name)
+    status, client = RelocalizerStatus(node, name), AsyncParameterClient(node, name)
+    deadline = time.monotonic() + patience_s
+    try:
+        while not status.values or not client.services_are_ready():
+            if time.monotonic() > deadline:
+                raise NotRunningError(f'{name} is not running: start it, name it with '
+                                      '--relocalizer, or give its --params-file')
+            executor.spin_once(timeout_sec=_SPIN_S)
+        listed = client.list_parameters()
+        executor.spin_until_future_complete(listed, patience_s)
+        names = listed.result().result.names if listed.done() else []
+        got = client.get_parameters(names)
+        executor.spin_until_future_complete(got, patience_s)
+        if not names or not got.done():
+            raise NotRunningError(f'{name} does not answer: restart it')
+        return Running(
+            name, '' if status.values['state'] == 'active' else status.problem(),
+            [Parameter.from_parameter_msg(ParameterMsg(name=one, value=value))
+             for one, value in zip(names, got.result().values, strict=True)],
+            status.values.get('topics', '').split())
+    finally:
+        node.destroy_node()
+
+
+def parameters_of_files(files: Sequence[Path], name: str) -> list[Parameter]:
+    """Return the relocalizer's parameters in files; the later ones count more.
+
+    CliplocError: names the file and what is wrong with it.
+    """
+    found: dict[str, Any] = {}
+    base = name.rpartition('/')[2]
+    for file in files:
+        for node, content in read_parameter_file(file).items():
+            if node.rpartition('/')[2] in ('**', '*', base) and isinstance(content, dict):
+                found |= _flat(content.get('ros__parameters') or {})
+    if not found:
+        raise OptionsError(f'{", ".join(map(str, files))}: no parameters of {base} or /**; name '
+                           'the node with --relocalizer')
+    return [Parameter(name, value=value) for name, value in found.items() if value is not None]
+
+
+def _flat(tree: dict[str, Any], prefix: str = '') -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in tree.items():
+        found |= _flat(value, f'{prefix}{name}.') if isinstance(value, dict) else {
+            f'{prefix}{name}': value}
+    return found
