@@ -80,9 +80,10 @@ def answer_msg(answer: Answer, node: str) -> DiagnosticArray:
     """
     level = {Verdict.ACCEPTED: DiagnosticStatus.OK, Verdict.FAILED: DiagnosticStatus.ERROR}
     header, name = answer.header or Header(), node.lstrip('/')
-    stamp = f'{header.stamp.sec}.{header.stamp.nanosec:09d}'
+    seen = {} if answer.header is None else {
+        'stamp [s]': f'{header.stamp.sec}.{header.stamp.nanosec:09d}', 'frame': header.frame_id}
     values = {'answer': answer.number, 'verdict': answer.verdict, 'kind': answer.kind or '',
-              'stamp [s]': stamp, 'frame': header.frame_id, **answer.figures,
+              **seen, **answer.figures,
               **({} if answer.pose is None else _pose_values(answer.pose, answer.heading_deg)),
               **{f'{stage} [ms]': f'{ms:.1f}' for stage, ms in answer.stages_ms.items()},
               'map hash': answer.map_hash}

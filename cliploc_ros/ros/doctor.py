@@ -130,7 +130,7 @@ class Doctor(ManagedNode[RelocalizerParameters]):
         self.frames = frames_of(self, parameters, LINGER_S)
         self.handoff = HandOff(self, self.robot.odometry)
         self.cameras = parameters.camera_names or ('',)
-        #: Of each camera the newest image, and how long after its stamp it came [s].
+        #: Of each camera the newest image, and how soon after its stamp one came [s].
         self.images: dict[str, tuple[Image | CompressedImage, float]] = {}
         self.infos: dict[str, CameraInfo] = {}
         self._sources = [ImageSource(self, parameters.image_transport, partial(self._take, name),
@@ -164,8 +164,10 @@ class Doctor(ManagedNode[RelocalizerParameters]):
         """Report nothing."""
 
     def _take(self, camera: str, image: TimedImage) -> None:
-        lag_ns = self.get_clock().now().nanoseconds - stamp_ns(image.msg.header.stamp)
-        self.images[camera] = image.msg, lag_ns / NS_PER_S
+        lag_s = (self.get_clock().now().nanoseconds
+                 - stamp_ns(image.msg.header.stamp)) / NS_PER_S
+        _, least_s = self.images.get(camera, (None, math.inf))  # a busy machine takes some late
+        self.images[camera] = image.msg, min(lag_s, least_s, key=abs)
 
 
 def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
@@ -193,15 +195,14 @@ def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
                      report)
     else:
         report.skip('tf, odometry', 'need an image')
-    if of_camera(name, 'image') in silent:
-        report.skip('detector', 'needs an image')
+    if silent.keys() & {of_camera(name, 'image'), of_camera(name, 'camera_info')}:
+        report.skip('detector', 'needs an image with camera_info')
     else:
         _check_detections(parameters, localizer, frame,
                           silent.get(of_camera(name, 'detections'), why), report)
     if parameters.require_localizer:
-        report.judge('localizer', node.handoff.missing(), 'it subscribes to initialpose'
-                     + f' and publishes {parameters.localizer_pose}' * bool(
-                         parameters.localizer_pose))
+        report.judge('localizer', node.handoff.missing(), 'it subscribes to initialpose, and '
+                     f'publishes {parameters.localizer_pose or "nothing that is checked"}')
     else:
         report.skip('localizer', 'require_localizer is false')
     _check_request(node, parameters, localizer, frame, report)
@@ -233,7 +234,7 @@ def _check_camera(node: Doctor, parameters: RelocalizerParameters, name: str,
         'camera', 'calibration', 'clock'))
     (image, lag_s), info = node.images.get(name, (None, 0.0)), node.infos.get(name)
     size = None
-    if image is None:
+    if image is None or of_camera(name, 'image') in silent:
         report.add(camera, State.FAIL, silent.get(of_camera(name, 'image'), 'no image in time'))
         report.skip(clock, 'needs an image')
     else:
@@ -282,10 +283,11 @@ def _check_place(node: Doctor, parameters: RelocalizerParameters, image: Any, pa
             up_deg = math.degrees(math.asin(float(np.clip(base_from_camera[2, 2], -1.0, 1.0))))
             report.add('tf', State.PASS, f"the camera is {base_from_camera[2, 3]:.2f} m above "
                                          f"'{base}' and looks {up_deg:+.0f} degrees up")
+        elif parameters.require_localizer:
+            report.add('tf', State.FAIL, 'base_frame is empty: initialpose would carry the pose '
+                       "of the camera: set it to AMCL's base_frame_id")
         else:
-            report.judge('tf', 'base_frame is empty, so initialpose would carry the pose of the '
-                         "camera: set it to AMCL's base_frame_id" * parameters.require_localizer,
-                         'base_frame is empty: the pose is that of the camera')
+            report.add('tf', State.PASS, 'base_frame is empty: the pose is that of the camera')
     odometry = robot.odometry
     if not odometry.is_published:
         report.skip('odometry', f'nobody publishes {odometry.topic}: the robot is taken to rest, '
@@ -339,8 +341,8 @@ def _check_request(node: Doctor, parameters: RelocalizerParameters,
             localizer.localize, frame, parameters, states[0][1], times, math.inf, states[1:]))
         stages_ms = {'detection': 1e3 * (frame.detected_at - frame.received_at), **times.ms}
         is_slow = sum(stages_ms.values()) > 1e3 * parameters.timeout_s
-        report.judge('time', time_is_up(stages_ms) * is_slow, f'{in_words(stages_ms)}; timeout_s '
-                                                              f'{parameters.timeout_s:g}')
+        report.judge('time', time_is_up(stages_ms) if is_slow else '',
+                     f'{in_words(stages_ms)}; timeout_s {parameters.timeout_s:g}')
         found = localized.found
         if found.accepted:
             report.add('pose', State.PASS,

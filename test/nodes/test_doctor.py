@@ -104,6 +104,7 @@ def test_a_whole_robot_passes_and_nothing_is_handed_over(own_relocalizer, examin
     ('map', '/nowhere.yaml: No such file', {}, {'map_file': '/nowhere.yaml'}),
     ('keyframes', 'make it again with build_map', {}, {'keyframes_file': '/nowhere.npz'}),
     ('camera', 'no image on /image from its', {'change': without(0)}, {}),
+    ('calibration', 'no camera_info on', {'change': without(1)}, {}),
     ('calibration', 'K: ', {'change': uncalibrated}, {}),
     ('clock', 'synchronize the clocks', {'late_s': 100.0}, {}),
     ('tf', 'set base_from_camera', {}, {'base_from_camera': [0.0] * 7}),  # with and without tf2
