@@ -9,7 +9,6 @@ It turns with Nav2's action `spin`, the only part that needs nav2_msgs.
 
 import importlib
 import math
-import re
 import sys
 import time
 from collections import Counter
@@ -20,10 +19,10 @@ from typing import Any, NamedTuple
 
 from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Duration
+from diagnostic_msgs.srv import SelfTest
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from std_srvs.srv import Trigger
 
 from cliploc_ros.command import Interruption
 from cliploc_ros.ros.answer import Verdict
@@ -38,6 +37,7 @@ _ENDS = {GoalStatus.STATUS_ABORTED: 'aborted', GoalStatus.STATUS_CANCELED: 'canc
 #: Spins the node until a condition holds or a number of seconds is over; returns whether it holds.
 Wait = Callable[[Callable[[], bool], float], bool]
 _SPIN_S = 0.05
+_SERVICE = 'relocalize_fields'
 # What is there is not seen at once.
 _DISCOVERY_S = 2.0
 # What the relocalizer knows is reported within this time.
@@ -182,9 +182,9 @@ class WakeUp(Node):
         super().__init__('wake_up', start_parameter_services=False)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
-        self._service = self.resolve_service_name(f'{options.relocalizer}/relocalize')
-        self._client = self.create_client(Trigger, self._service)
-        self._status = RelocalizerStatus(self, self._service.removesuffix('/relocalize'))
+        self._service = self.resolve_service_name(f'{options.relocalizer}/{_SERVICE}')
+        self._client = self.create_client(SelfTest, self._service)
+        self._status = RelocalizerStatus(self, self._service.removesuffix(f'/{_SERVICE}'))
         self._turning = Turning(self, self._wait, math.radians(options.turn_deg))
         self._began_at = time.monotonic()
         self._options = options
@@ -212,9 +212,8 @@ class WakeUp(Node):
         looks, turned, kinds = 0, '', Counter[str]()
         while not (problem := self._until_ready()):
             looks += 1
-            verdict, message = self._look()
-            kind_of = re.findall(r'; kind (\w+)(?:; map \w+)?$', message)
-            kinds.update(kind_of)
+            verdict, kind, message = self._look()
+            kinds.update([kind] if kind else [])
             print(f'look {looks} [{self._elapsed_s:.1f} s]{turned}: {message}', flush=True)
             if verdict is Verdict.ACCEPTED:
                 return Outcome.ACCEPTED
@@ -260,9 +259,9 @@ class WakeUp(Node):
                     '--relocalizer or a namespace')
         return self._status.problem()
 
-    def _look(self) -> tuple[Verdict, str]:
-        """Request the pose once; return the verdict and the answer."""
-        begun_at, future = time.monotonic(), self._client.call_async(Trigger.Request())
+    def _look(self) -> tuple[Verdict, str, str]:
+        """Request the pose once; return the verdict, the kind of a refusal, and the answer."""
+        begun_at, future = time.monotonic(), self._client.call_async(SelfTest.Request())
 
         def is_over() -> bool:
             waited_s = time.monotonic() - begun_at
@@ -270,10 +269,11 @@ class WakeUp(Node):
                         or waited_s > self._status.time_limit_s + _ON_ITS_WAY_S)
         self._wait(is_over, math.inf)
         if future.done():
-            message = future.result().message
-            return _verdict_of(message), message
+            (status,) = future.result().status
+            fields = {field.key: field.value for field in status.values}
+            return Verdict(fields['verdict']), fields['kind'], status.message
         self._client.remove_pending_request(future)
-        return Verdict.FAILED, self._status.problem() or (
+        return Verdict.FAILED, '', self._status.problem() or (
             f'no answer within {time.monotonic() - begun_at:.0f} s: the relocalizer was '
             'restarted, or the network lost it')
 
@@ -319,12 +319,6 @@ class WakeUp(Node):
         if self._interrupted.is_set():
             raise KeyboardInterrupt
         self._executor.spin_once(timeout_sec=_SPIN_S)
-
-
-def _verdict_of(message: str) -> Verdict:
-    """Return the verdict that an answer begins with."""
-    return next((verdict for verdict in Verdict if message.startswith(f'{verdict}: ')),
-                Verdict.FAILED)
 
 
 def _in_words(kinds: Counter[str]) -> str:

@@ -188,7 +188,8 @@ def test_a_relocalizer_that_does_not_watch_is_named(relocalizer, start, end):
 
 def test_each_thing_that_is_missing_has_its_message(start, end, tester, room_map):
     process = start('cli.wake_up', '--timeout', 60, '--ros-args', '-r', '__ns:=/bare')
-    process.wait_for_output('waiting: nothing serves /bare/relocalizer/relocalize: start the ')
+    process.wait_for_output(
+        'waiting: nothing serves /bare/relocalizer/relocalize_fields: start the ')
     start('nodes.relocalizer', '--ros-args', '-r', '__ns:=/bare',
           parameters=class_matching(room_map))
     image, info, detections = make_frame()
@@ -220,8 +221,8 @@ def test_without_a_relocalizer_it_is_not_ready(start, end):
     process = start('cli.wake_up', '--relocalizer', '/nowhere/relocalizer', '--timeout', 1)
     assert end(process) == NOT_READY
     assert process.output().endswith(
-        'not ready: nothing serves /nowhere/relocalizer/relocalize: start the relocalizer, or '
-        'name it with --relocalizer or a namespace\n')
+        'not ready: nothing serves /nowhere/relocalizer/relocalize_fields: start the relocalizer, '
+        'or name it with --relocalizer or a namespace\n')
 
 
 def test_a_relocalizer_that_cannot_start_says_why(start, wake_up_until):
