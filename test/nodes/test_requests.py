@@ -17,6 +17,7 @@ from sensor_msgs.msg import Image
 from tester import make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.ros.qos import LATCHED
 
 
@@ -59,7 +60,10 @@ def test_an_answer_has_its_pose_and_evidence_in_fields(relocalizer, tester):
     assert (fields['source'], fields['frames'], fields['landmarks']) == ('objects', '1', '12')
     assert 1.0 >= float(fields['confidence']) >= float(fields['confidence needed']) > 0.5
     assert 0.0 < float(fields['position deviation [m]']) < 0.2
-    assert status.message.startswith('accepted: ') and float(fields['search [ms]']) > 0.0
+    assert re.match(r'accepted: x [0-9. yz-]+ m in map, heading -?\d+ deg, deviation [0-9.]+ m '
+                    r'and [0-9.]+ deg \[confidence 1.000, score [0-9.]+, 12 landmarks, ',
+                    status.message)
+    assert float(fields['search [ms]']) > 0.0
     ahead = MAP_FROM_CAMERA[:2, 2]
     assert abs(float(fields['heading [deg]']) - np.degrees(np.arctan2(*ahead[::-1]))) < 15.0
     documented = set(re.findall('`([a-z ]+(?: \\[\\w+\\])?|orientation xyzw)`',
@@ -74,6 +78,14 @@ def test_an_answer_has_its_pose_and_evidence_in_fields(relocalizer, tester):
     tester.wait(lambda: heard[-1].status == refused.status, 'the same on the topic')
     assert int(refused.id) == int(fields['answer']) > 1
     tester.destroy_subscription(subscription)
+
+
+def test_a_refusal_states_one_confidence(relocalizer, tester):
+    assert tester.set_parameter('min_confidence', 0.9999).successful
+    few = make_frame(see_room(make_room()).select(np.arange(5)))
+    message, usual = tester.relocalize(few).message, RelocalizerParameters().min_confidence
+    assert tester.set_parameter('min_confidence', usual).successful
+    assert re.match(r'refused: confidence 0\.\d+ < 0\.9999; .* \[score ', message), message
 
 
 def test_the_navigation_stacks_own_service_wakes_up_too(relocalizer, tester):
