@@ -16,7 +16,6 @@ from cliploc_ros.command import (
     split_ros_args,
     within,
 )
-from cliploc_ros.errors import OptionsError
 
 _NOT_READY = 2
 
@@ -65,14 +64,9 @@ def wake_up(options: argparse.Namespace, ros_args: list[str], interrupted: Inter
     OptionsError: there is no ROS, or it does not start with these arguments.
     """
     with needs_ros('wake_up'):
-        from rclpy.exceptions import InvalidServiceNameException
-        from rclpy.validate_topic_name import validate_topic_name
-
+        from cliploc_ros.ros.running import check_name
         from cliploc_ros.ros.wake_up import WakeUp, WakeUpOptions
-    try:
-        validate_topic_name(f'{options.relocalizer}/relocalize', is_service=True)
-    except InvalidServiceNameException as error:
-        raise OptionsError(f'--relocalizer: {error}') from error
+    check_name(options.relocalizer)
     with running_ros(ros_args):
         node = WakeUp(WakeUpOptions(options.relocalizer, options.timeout, options.turn_deg,
                                     options.watch == 'true'), interrupted)

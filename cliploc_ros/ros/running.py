@@ -11,10 +11,12 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter as ParameterMsg
+from rclpy.exceptions import InvalidServiceNameException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
+from rclpy.validate_topic_name import validate_topic_name
 
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import CliplocError, OptionsError
@@ -95,6 +97,14 @@ class NotRunningError(CliplocError):
     """The relocalizer does not run, or does not answer; the message says what to do."""
 
 
+def check_name(name: str) -> None:
+    """Raise OptionsError unless `--relocalizer` can be the name of a node."""
+    try:
+        validate_topic_name(f'{name}/relocalize', is_service=True)
+    except InvalidServiceNameException as error:
+        raise OptionsError(f'--relocalizer: {error}') from error
+
+
 @dataclass(frozen=True)
 class Running:
     """A relocalizer that runs."""
@@ -108,8 +118,9 @@ class Running:
 def ask(name: str, patience_s: float) -> Running:
     """Return what a running relocalizer tells of itself; it may take `patience_s` to be found.
 
-    NotRunningError: it does not answer.
+    NotRunningError: it does not answer. OptionsError: no node can have this name.
     """
+    check_name(name)
     node = Node('doctor_asks', start_parameter_services=False)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
