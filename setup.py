@@ -27,6 +27,7 @@ EXTRAS = {
         OPENCV, 'huggingface_hub', 'open_clip_torch', 'openvino', 'pillow', 'safetensors', 'torch',
         'torchvision', 'ultralytics-opencv-headless',
     ],
+    'transformers': ['transformers>=5,<6'],  # an Apache-licensed detector, beside 'models'
     'cluster': ['distributed'],
 }
 EXTRAS['all'] = sorted({name for extra in EXTRAS.values() for name in extra})

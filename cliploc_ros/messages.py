@@ -58,6 +58,9 @@ class CameraInfoMessage(Protocol):
     k: Sequence[float]
     d: Sequence[float]
     p: Sequence[float]
+    binning_x: int
+    binning_y: int
+    roi: Any
 
 
 def image_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.uint8]:
@@ -175,6 +178,10 @@ def camera_from_msg(msg: CameraInfoMessage, image_size: tuple[int, int], rectifi
                     ) -> Camera:
     """Return the camera that took an image.
 
+    K and P are those of the whole sensor (REP 104); the camera is that of the image: region of
+    interest and binning move and scale its pixels, as in image_geometry, and not the distortion.
+    ``roi.do_rectify`` changes nothing, there as here: the region is the same in a rectified image.
+
     Parameters
     ----------
     image_size : tuple of int
@@ -187,19 +194,44 @@ def camera_from_msg(msg: CameraInfoMessage, image_size: tuple[int, int], rectifi
     CameraError
         The values are invalid, or they are for another image size.
     """
-    width, height = image_size
-    if (msg.width or width, msg.height or height) != image_size:
-        raise CameraError(f'camera_info is for {msg.width}x{msg.height} px, but the image has '
-                          f'{width}x{height}: scale the intrinsics with the image')
+    _check_image_size(msg, image_size)
     name, matrix = ('P', msg.p) if rectified else ('K', msg.k)
     fx, fy, cx, cy = (matrix[0], matrix[5], matrix[2], matrix[6]) if rectified else (
         matrix[0], matrix[4], matrix[2], matrix[5])
     distortion = () if rectified else tuple(map(float, msg.d))
+    columns, rows = _binning(msg)
     try:
-        return Camera(width, height, float(fx), float(fy), float(cx), float(cy),
-                      msg.distortion_model, distortion)
+        return Camera(*image_size, float(fx) / columns, float(fy) / rows,
+                      (float(cx) - msg.roi.x_offset) / columns,
+                      (float(cy) - msg.roi.y_offset) / rows, msg.distortion_model, distortion)
     except CameraError as error:
         raise CameraError(f'camera_info: {name}: {error}') from error
+
+
+def _binning(msg: CameraInfoMessage) -> tuple[int, int]:
+    """Return how many columns and rows of the sensor are one pixel; 0 stands for 1."""
+    return max(msg.binning_x, 1), max(msg.binning_y, 1)
+
+
+def _check_image_size(msg: CameraInfoMessage, image_size: tuple[int, int]) -> None:
+    """Refuse an image of another size than camera_info says; 0 stands for any, or for all."""
+    roi, (columns, rows) = msg.roi, _binning(msg)
+    for pixels, whole, offset, given, binning in (
+            (image_size[0], msg.width, roi.x_offset, roi.width, columns),
+            (image_size[1], msg.height, roi.y_offset, roi.height, rows)):
+        region = given or whole - offset
+        # A last bin that is not full is in the image or not.
+        if (whole and offset + region > whole) or (
+                (whole or given) and abs(pixels * binning - region) >= binning):
+            break
+    else:
+        return
+    sensor = f'{msg.width}x{msg.height} px'
+    if max(columns, rows, roi.x_offset + 1, roi.y_offset + 1) > 1 or roi.width or roi.height:
+        sensor += (f', binning {columns}x{rows} and roi {roi.width}x{roi.height} at '
+                   f'({roi.x_offset}, {roi.y_offset})')
+    raise CameraError(f'camera_info is for {sensor}, but the image has {image_size[0]}x'
+                      f'{image_size[1]}: scale the intrinsics with the image')
 
 
 def detections_from_msg(msg: Any, class_map: Mapping[str, str] | None = None) -> Detections:

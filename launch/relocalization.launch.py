@@ -41,7 +41,7 @@ _OF_CAMERA = ('image', 'camera_info', 'detections', 'depth', 'depth_camera_info'
 # An argument that is not given leaves the choice to the file `parameters`, then to the default.
 DETECTOR_PARAMETERS = {
     'profile': 'detector and CLIP: auto, accurate, balanced or fast',
-    'model': 'YOLO weights',
+    'model': 'weights of the detector',
     'vocabulary': 'what a YOLO-World or YOLOE looks for: map, or names',
     'map_file': 'the map of objects: a path, or package://PACKAGE/PATH',
     'cameras': 'names of several cameras, the namespaces of their topics: [front, left]',

@@ -33,6 +33,19 @@ def test_the_date_is_that_of_the_changelog():
     assert yaml.safe_load(read('CITATION.cff'))['date-released'] == released
 
 
+def test_the_manifest_says_where_to_look_and_to_report():
+    urls = ElementTree.parse(PROJECT / 'package.xml').findall('url')
+    assert {url.get('type') for url in urls} == {'website', 'repository', 'bugtracker'}
+
+
+def test_dependabot_looks_where_versions_are():
+    for update in yaml.safe_load(read('.github/dependabot.yml'))['updates']:
+        folder = PROJECT / update['directory'].lstrip('/')
+        pattern = {'pip': 'requirements*.txt', 'docker': 'Dockerfile',
+                   'github-actions': '.github/workflows/*.yml'}[update['package-ecosystem']]
+        assert list(folder.glob(pattern)), update
+
+
 def test_rosdep_can_resolve_every_key():
     manifest = ElementTree.parse(PROJECT / 'package.xml').getroot()
     keys = {entry.text for entry in manifest if entry.tag.endswith('depend')}
@@ -59,7 +72,7 @@ def test_extras_are_what_the_tests_run_with(extras):
 
 
 def test_all_has_all(extras):
-    parts = {'evaluate', 'build_map', 'studio', 'models', 'cluster'}
+    parts = {'evaluate', 'build_map', 'studio', 'models', 'transformers', 'cluster'}
     assert extras.keys() == parts | {'all', 'test'}
     assert set(extras['all']) == {one for name in parts for one in extras[name]}
 

@@ -39,7 +39,9 @@ def add_network_options(group: Any) -> None:
     group.add_argument('--profile', choices=PROFILE_NAMES, default='auto',
                        help='detector and CLIP: that of the robot, as image embeddings are of one '
                        'CLIP (%(default)s: accurate on a GPU, balanced on a CPU)')
-    group.add_argument('--model', default='', help="YOLO weights (the profile's)")
+    group.add_argument('--model', default='', help=
+                       "YOLO weights, or a detector of transformers: folder or OWNER/NAME "
+                       "(the profile's)")
     group.add_argument('--detector-vocabulary', default='', metavar='NAMES',
                        help="what a YOLO-World or YOLOE looks for: 'mug, chair', or a map (.yaml) "
                        'with its classes and labels')

@@ -82,8 +82,9 @@ class DetectorParameters(CommonParameters):
         "Detector of a profile: 'accurate', 'balanced' or 'fast'; 'auto': accurate on a GPU, "
         'balanced on a CPU.', choices=PROFILE_NAMES, read_only=True)
     model: str = parameter('',
-        'Weights: a local file, a folder with an OpenVINO export, or a name that ultralytics '
-        "downloads once; empty: the profile's.", read_only=True)
+        'Weights: a local file, a folder with an OpenVINO export or a model of transformers, or a '
+        'name that is downloaded once: of ultralytics, or OWNER/NAME of the Hugging Face hub; '
+        "empty: the profile's.", read_only=True)
     vocabulary: str = parameter('',
         "What a YOLO-World or YOLOE looks for: 'map', the classes and labels of map_file, or "
         "names such as 'mug, office chair'; empty: the classes of its file.", read_only=True)

@@ -6,14 +6,15 @@ import re
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from diagnostic_msgs.srv import SelfTest
 from processes import PROJECT
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from scene import MAP_FROM_CAMERA, make_room, see_room
-from sensor_msgs.msg import Image
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from sensor_msgs.msg import Image, RegionOfInterest
 from tester import make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import pose_error
@@ -86,6 +87,30 @@ def test_a_refusal_states_one_confidence(relocalizer, tester):
     message, usual = tester.relocalize(few).message, RelocalizerParameters().min_confidence
     assert tester.set_parameter('min_confidence', usual).successful
     assert re.match(r'refused: confidence 0\.\d+ < 0\.9999; .* \[score ', message), message
+
+
+def test_a_region_of_a_binned_sensor_gives_the_same_pose(relocalizer, tester):
+    """A pixel is two by two of the sensor's; its first 40 columns and 20 rows are left out."""
+    seen = see_room(make_room())
+    boxes = np.clip(seen.bboxes_xyxy - [20, 10, 20, 10], 0, [
+        CAMERA.width - 20, CAMERA.height - 10] * 2)
+    window = make_frame(replace(seen, bboxes_xyxy=boxes))
+    pixels = np.frombuffer(window[0].data, np.uint8).reshape(CAMERA.height, CAMERA.width, 3)
+    window[0].data = pixels[10:, 20:].tobytes()
+    window[0].height, window[0].width = CAMERA.height - 10, CAMERA.width - 20
+    window[0].step = 3 * window[0].width
+    window[1].height, window[1].width = 2 * CAMERA.height, 2 * CAMERA.width
+    window[1].k = (np.diag([2.0, 2.0, 1.0]) @ CAMERA.matrix).ravel()
+    window[1].binning_x = window[1].binning_y = 2
+    window[1].roi = RegionOfInterest(x_offset=40, y_offset=20, width=2 * CAMERA.width - 40,
+                                     height=2 * CAMERA.height - 20, do_rectify=True)
+    assert tester.relocalize(window).success
+    tester.wait(lambda: tester.poses, 'a pose')
+    assert pose_error(transform_of(tester.poses[0].pose.pose), MAP_FROM_CAMERA) < (0.05, 1.0)
+    window[1].binning_x = 0
+    answer = tester.relocalize(window)
+    assert not answer.success
+    assert 'binning 1x2' in answer.message
 
 
 def test_the_navigation_stacks_own_service_wakes_up_too(relocalizer, tester):

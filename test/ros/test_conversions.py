@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 from scene import MAP_FROM_CAMERA
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest
 from std_msgs.msg import Header
 from vision_msgs.msg import (
     Detection2D,
@@ -205,7 +205,46 @@ def test_a_size_that_is_not_given_is_the_images():
     assert (camera.width, camera.height) == (320, 200)
 
 
+SENSOR = {'width': 1280, 'height': 961,
+          'k': [1000.0, 0.0, 641.0, 0.0, 1020.0, 482.0, 0.0, 0.0, 1.0],
+          'p': [800.0, 0.0, 601.0, -96.0, 0.0, 820.0, 402.0, 0.0, 0.0, 0.0, 1.0, 0.0]}
+
+
+def region(**changes):
+    return RegionOfInterest(**({'x_offset': 200, 'y_offset': 100, 'width': 400,
+                                'height': 300} | changes))
+
+
+@pytest.mark.parametrize(('changes', 'size', 'k', 'p'), [  # fx, fy, cx, cy
+    ({'binning_x': 2, 'binning_y': 2}, (640, 480), (500, 510, 320.5, 241), (400, 410, 300.5, 201)),
+    ({'binning_x': 4}, (320, 961), (250, 1020, 160.25, 482), (200, 820, 150.25, 402)),
+    ({'roi': region()}, (400, 300), (1000, 1020, 441, 382), (800, 820, 401, 302)),
+    ({'roi': region(do_rectify=True), 'binning_x': 1, 'binning_y': 2}, (400, 150),
+     (1000, 510, 441, 191), (800, 410, 401, 151)),
+    ({'roi': region(width=0, height=0), 'binning_x': 2, 'binning_y': 2}, (540, 431),
+     (500, 510, 220.5, 191), (400, 410, 200.5, 151))])
+def test_binning_and_a_region_of_interest(changes, size, k, p):
+    """Whatever the image, a pixel of the sensor is the same ray through the same lens."""
+    info = camera_info(**SENSOR | changes)
+    raw, rectified = (camera_from_msg(info, size, is_rectified) for is_rectified in (False, True))
+    assert (raw.width, raw.height) == size
+    assert (raw.fx, raw.fy, raw.cx, raw.cy) == k
+    assert (rectified.fx, rectified.fy, rectified.cx, rectified.cy) == p
+    whole = camera_from_msg(camera_info(**SENSOR), (1280, 961), rectified=False)
+    on_sensor = np.array([[210.0, 110.0], [590.0, 390.0]])
+    in_image = (on_sensor - [info.roi.x_offset, info.roi.y_offset]) / [
+        info.binning_x or 1, info.binning_y or 1]
+    np.testing.assert_allclose(raw.normalize_points(in_image), whole.normalize_points(on_sensor),
+                               rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize(('changes', 'rectified', 'message'), [
+    ({'binning_x': 2, 'binning_y': 2}, False, 'for 640x480 px, binning 2x2 and roi 0x0 at'),
+    ({'binning_x': 2, 'width': 1282}, True, 'for 1282x480 px, binning 2x1.* image has 640x480'),
+    ({'width': 1280, 'roi': region(x_offset=641, y_offset=0, width=640, height=480)}, False,
+     r'for 1280x480 px, binning 1x1 and roi 640x480 at \(641, 0\), but the image has 640x480'),
+    ({'roi': region(x_offset=640, y_offset=0, width=0, height=0)}, False, r'at \(640, 0\)'),
+    ({'width': 0, 'height': 0, 'roi': region()}, False, 'roi 400x300'),
     ({'width': 1280, 'height': 960}, False, 'for 1280x960 px, but the image has 640x480'),
     ({'height': 400}, True, 'for 640x400 px, but the image has 640x480'),
     ({'k': [0.0] * 9}, False, 'camera_info: K: fx=0 fy=0'),
