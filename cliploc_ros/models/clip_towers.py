@@ -168,16 +168,17 @@ class TextTower:
                 for part in tokens.split(batch)])
 
 
-def _text_identity(weights: ClipWeights) -> tuple[str, ...]:
+def text_identity(weights: ClipWeights) -> tuple[str, ...]:
+    """Return what the text tower of some weights is stored under."""
     return (*weights.identity, 'text')
 
 
 def _stored_text_tower(weights: ClipWeights, options: ClipOptions) -> Network | None:
     """Return the text tower that `keep_text_tower` stored, if one is there and sound."""
-    for folder in stored_folders(options.cache_dir, weights.model, _text_identity(weights),
+    for folder in stored_folders(options.cache_dir, weights.model, text_identity(weights),
                                  weights.file):
         try:
-            return open_stored(folder, identity=_text_identity(weights))
+            return open_stored(folder, identity=text_identity(weights))
         except Exception as error:  # OpenVINO has no exceptions of its own
             logger.warning('%s cannot be used: %s', folder, first_line(error))
     return None
@@ -189,7 +190,7 @@ def keep_text_tower(weights: ClipWeights, options: ClipOptions) -> None:
     A ConversionError: OpenVINO cannot run it, or it has a tokenizer of its own. Then machines
     without PyTorch know the labels that the cache has, and no others.
     """
-    load_network(options.cache_dir, weights.model, _text_identity(weights),
+    load_network(options.cache_dir, weights.model, text_identity(weights),
                  lambda: convert_text_tower(weights), beside=weights.file)
 
 

@@ -115,7 +115,7 @@ def load_network(cache_dir: str, name: str, identity: Sequence[str],
                 os.utime(folder)
             return network
     started = time.monotonic()
-    folder = _folder(resolve_cache_dir(cache_dir), name, identity)
+    folder = network_folder(resolve_cache_dir(cache_dir), name, identity)
     logger.info('converting %s for OpenVINO: once, into %s', name, folder)
     try:
         conversion = convert()
@@ -124,7 +124,7 @@ def load_network(cache_dir: str, name: str, identity: Sequence[str],
     except Exception as error:  # tracing and converting raise exceptions of all kinds
         raise ConversionError(f'OpenVINO cannot convert {name}: {first_line(error)}') from error
     try:
-        network = _store(folder, identity, conversion, precisions)
+        network = store_network(folder, identity, conversion, precisions)
     except Exception as error:  # OpenVINO reports a full disk as it reports a bad network
         try:
             network = _checked(conversion, precisions)
@@ -144,7 +144,7 @@ def stored_folders(cache_dir: str, name: str, identity: Sequence[str], beside: P
                    ) -> Iterator[Path]:
     """Yield the folders that hold a converted network: in the cache, and beside its weights."""
     for root in (resolve_cache_dir(cache_dir), *([beside.parent] if beside else [])):
-        folder = _folder(root, name, identity)
+        folder = network_folder(root, name, identity)
         if folder.exists():
             yield folder
 
@@ -162,14 +162,18 @@ def stored_identity(folder: Path) -> list[str]:
     return list(json.loads((folder / ABOUT).read_text())['identity'])
 
 
-def _folder(root: Path, name: str, identity: Sequence[str]) -> Path:
+def network_folder(root: Path, name: str, identity: Sequence[str]) -> Path:
+    """Return the folder of a converted network in a cache."""
     digest = hashlib.sha256(json.dumps([str(_FORMAT), *identity]).encode()).hexdigest()
     return root / 'openvino' / f'{Path(name).name}-{digest[:32]}'
 
 
-def _store(folder: Path, identity: Sequence[str], conversion: Conversion, precisions: Precisions,
-           in_half: bool = False) -> Network:
-    """Write a network to the cache; return it with its weights mapped from the file."""
+def store_network(folder: Path, identity: Sequence[str], conversion: Conversion,
+                  precisions: Precisions = FP32, in_half: bool = False) -> Network:
+    """Write a network to the cache; return it with its weights mapped from the file.
+
+    In half precision, the file has half the size and the network runs in fp32 nevertheless.
+    """
     folder.parent.mkdir(parents=True, exist_ok=True)
     remove_unused([one for one in folder.parent.iterdir() if not one.name.startswith('.')],
                   folder.parent.glob('.*.tmp'), _MOST_NETWORKS - 1)
@@ -178,8 +182,9 @@ def _store(folder: Path, identity: Sequence[str], conversion: Conversion, precis
         whole = Path(desk) / folder.name
         whole.mkdir()
         import_openvino().save_model(conversion.network, whole / _XML, compress_to_fp16=in_half)
-        arrays: dict[str, Any] = {'probe': conversion.probe, 'expected': conversion.expected}
-        np.savez(whole / _PROBE, **arrays, **conversion.arrays)
+        arrays: dict[str, Any] = {'probe': conversion.probe, 'expected': conversion.expected,
+                                  **conversion.arrays}
+        np.savez(whole / _PROBE, **arrays)
         prints = {name: fingerprint_file(whole / name) for name in (_XML, _WEIGHTS, _PROBE)}
         (whole / ABOUT).write_text(json.dumps(
             {'identity': list(identity), 'files': prints, 'about': conversion.about}))

@@ -137,14 +137,19 @@ def load_converted(file: Path, options: DetectorOptions) -> OpenVinoYolo:
     ConversionError: OpenVINO cannot run it as PyTorch does. ModelError: the file is damaged or no
     detection model, or has to be converted where PyTorch is missing.
     """
+    with needs_pytorch(f'{file}, which is not converted for OpenVINO,'):
+        return OpenVinoYolo(load_network(options.cache_dir, 'YOLO', identity_of(file, options),
+                                         lambda: convert_yolo(file, options), beside=file))
+
+
+def identity_of(file: Path, options: DetectorOptions) -> list[str]:
+    """Return what a converted network depends on: the weights and the texts that it looks for."""
     identity = [fingerprint_file(file)]
-    if options.prompts:  # the tower is part of what the network depends on
+    if options.prompts:
         tower = Path(options.text_model).expanduser()
         identity += [fingerprint_file(tower) if tower.is_file() else options.text_model,
                      json.dumps(options.prompts)]
-    with needs_pytorch(f'{file}, which is not converted for OpenVINO,'):
-        return OpenVinoYolo(load_network(options.cache_dir, 'YOLO', identity,
-                                         lambda: convert_yolo(file, options), beside=file))
+    return identity
 
 
 def convert_yolo(file: Path, options: DetectorOptions) -> Conversion:
