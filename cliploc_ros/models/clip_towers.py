@@ -15,7 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.errors import ModelError
-from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, is_torchscript
+from cliploc_ros.models.clip_weights import (
+    WITHOUT_CLIP,
+    ClipOptions,
+    ClipWeights,
+    is_torchscript,
+)
 from cliploc_ros.models.crops import CropPreparation
 from cliploc_ros.models.devices import (
     needs_pytorch,
@@ -99,7 +104,8 @@ def load_image_tower(weights: ClipWeights, options: ClipOptions, device: str
     ModelError, OptionsError: see ClipEncoder.
     """
     precision = resolve_precision(options.precision, device)
-    with needs_pytorch(f'CLIP {weights.model}, which is not converted for OpenVINO,'):
+    with needs_pytorch(f'CLIP {weights.model}, which is not converted for OpenVINO,',
+                       WITHOUT_CLIP):
         if resolve_inference(options.inference, device, precision) == 'openvino':
             try:
                 return OpenVinoTower(load_network(
@@ -145,7 +151,7 @@ class TextTower:
             self._tokens: Callable[[list[str]], Any] = tokenizer
             return
         with needs_pytorch(f'the text tower of CLIP {weights.model}, which is not converted for '
-                           'OpenVINO,'):
+                           'OpenVINO,', WITHOUT_CLIP):
             import open_clip
 
             with quiet_root_logger():

@@ -22,6 +22,9 @@ from cliploc_ros.models.openvino_networks import (
     stored_identity,
 )
 
+#: The remedy of who has no CLIP, and how each program is told of a file of weights.
+WITHOUT_CLIP = ", or do without CLIP ('matching: class', --no-clip)"
+_FILE = 'clip_checkpoint_path (of programs: --clip-pretrained) to the file'
 _CONFIG_PARTS = ('embed_dim', 'vision_cfg', 'text_cfg')
 _WEIGHT_SUFFIXES = ('.pt', '.pth', '.bin', '.safetensors', '.npz', '.npy')
 
@@ -97,7 +100,8 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
             if described := stored_about(folder).get('clip'):
                 return ClipWeights(file=given if given.is_file() else folder.parent,
                                    identity=identity, **described)
-    with needs_pytorch(f'CLIP {identity[1]}, which is not converted for OpenVINO,'):
+    with needs_pytorch(f'CLIP {identity[1]}, which is not converted for OpenVINO,',
+                       WITHOUT_CLIP):
         return _resolve_by_open_clip(options, identity)
 
 
@@ -202,7 +206,7 @@ def _downloaded(model: str, tag: dict[str, Any], options: ClipOptions) -> Path:
     repository, name = os.path.split(tag.get('hf_hub', ''))
     if not repository:
         raise ModelError(f'{what} are on no model hub: download {tag.get("url", "them")} and set '
-                         'clip_checkpoint_path to the file')
+                         f'{_FILE}{WITHOUT_CLIP}')
     newer, older = ((str(Path(name).with_suffix('.safetensors')), name) if name
                     else (HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME))
     own = resolve_cache_dir(options.cache_dir) / 'weights'
@@ -219,4 +223,4 @@ def _downloaded(model: str, tag: dict[str, Any], options: ClipOptions) -> Path:
 
     return download(what, own, (
         f'Without a network: download {newer} or {older} from https://huggingface.co/{repository} '
-        'on another machine and set clip_checkpoint_path to the file'), fetch)
+        f'on another machine and set {_FILE}{WITHOUT_CLIP}'), fetch)

@@ -60,15 +60,18 @@ def resolve_device(device: str) -> str:
 
 
 @contextlib.contextmanager
-def needs_pytorch(what: str) -> Iterator[None]:
-    """Raise a ModelError in place of a missing library's error; it names what needs PyTorch."""
+def needs_pytorch(what: str, otherwise: str = '') -> Iterator[None]:
+    """Raise a ModelError in place of a missing library's error; it names what needs PyTorch.
+
+    ``otherwise`` is a remedy besides converted networks and PyTorch.
+    """
     try:
         yield
     except ModuleNotFoundError as error:
         raise ModelError(
-            f"{error.name} is not installed, and {what} needs it: run 'prepare --cache-dir' on a "
-            "machine with the extra 'models' and copy its folder, or install that extra here, see "
-            'doc/install.md') from error
+            f"{error.name} is not installed, and {what} needs it: carry the folder of 'prepare "
+            "--cache-dir' here from a machine with the extra 'models', or install that extra"
+            f'{otherwise}, see doc/install.md') from error
 
 
 def count_threads() -> int:
