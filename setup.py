@@ -16,22 +16,32 @@ ROS_COMMANDS = ('demo', 'doctor', 'prepare', 'replay', 'wake_up')
 NODES = ('detector', 'relocalizer')
 BUILDS_WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel'}.isdisjoint(sys.argv)
 
-# OpenCV is no requirement of its own: pip's and apt's packages of it have different names.
-OPENCV = 'opencv-python-headless'
+# script/requirements*.txt have the same versions. OpenCV is no requirement of its own: pip's and
+# apt's packages of it have different names.
+REQUIRED = ['PyYAML>=6,<7', 'numba>=0.59,<1', 'numpy>=1.26,<3', 'scipy>=1.11,<2', 'setuptools',
+            'tqdm>=4.66,<5']
+OPENCV = 'opencv-python-headless>=4.6,<6'
 EXTRAS = {
-    'evaluate': [OPENCV, 'matplotlib', 'rosbags'],
-    'build_map': [OPENCV, 'matplotlib', 'rosbags'],
-    'studio': [OPENCV, 'rosbags', 'viser==1.1.1'],
-    # Detector and CLIP: what looks at images. The others read observation files without it.
+    # Detector and CLIP as networks that were converted: all that looks at images on a robot.
+    'runtime': [OPENCV, 'openvino>=2025.0,<2028', 'pillow>=10,<15'],
+    # The same from their weights, on a GPU or to convert them.
     'models': [
-        OPENCV, 'huggingface_hub', 'open_clip_torch', 'openvino', 'pillow', 'safetensors', 'torch',
-        'torchvision', 'ultralytics-opencv-headless',
+        OPENCV, 'huggingface_hub>=0.30,<4', 'open_clip_torch>=3.0,<4', 'openvino>=2025.0,<2028',
+        'pillow>=10,<15', 'safetensors>=0.4,<1', 'torch>=2.4,<3', 'torchvision>=0.19,<1',
+        'ultralytics-opencv-headless>=8.4,<9',
     ],
     'transformers': ['transformers>=5,<6'],  # an Apache-licensed detector, beside 'models'
-    'cluster': ['distributed'],
+    # The programs that make, check and measure maps.
+    'evaluate': [OPENCV, 'matplotlib>=3.8,<4', 'rosbags>=0.11,<0.12'],
+    'studio': [OPENCV, 'rosbags>=0.11,<0.12', 'viser==1.1.1'],
+    'cluster': ['distributed>=2024.8,<2028'],
 }
 EXTRAS['all'] = sorted({name for extra in EXTRAS.values() for name in extra})
-EXTRAS['test'] = ['hypothesis', 'pytest', 'pytest-rerunfailures', 'pytest-xdist']
+EXTRAS['test'] = ['hypothesis>=6.100,<7', 'pytest>=7.4,<10', 'pytest-rerunfailures>=14,<17',
+                  'pytest-xdist>=3.5,<4']
+EXTRAS['docs'] = ['myst-parser>=4,<6', 'sphinx>=8,<10', 'sphinx-rtd-theme>=3,<4']
+# A placeholder, as the address of the maintainers: the project has no public repository yet.
+REPOSITORY = 'https://example.org/cliploc_ros'
 
 
 def files(folder: str, pattern: str) -> list[str]:
@@ -54,10 +64,12 @@ setup(
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
         f'{PACKAGE}.datasets': ['vision_msgs/msg/*.msg'],
-        # By name: evaluate and build_map put files of their own beside a recording.
-        f'{PACKAGE}.demo': [
+        # By name: evaluate and build_map put files of their own beside a recording. A wheel has no
+        # command that shows the demo.
+        f'{PACKAGE}.demo': [] if BUILDS_WHEEL else [
             'assets/clip.*', 'assets/map.yaml', 'assets/yolo.pt', 'assets/*/*.*',
             'assets/*/rgb/*.jpg', 'assets/rig/*/*.*', 'assets/rig/*/rgb/*.jpg',
+            'assets/openvino/*/*.*',
         ],
         f'{PACKAGE}.core.acceptance': ['calibration.yaml'],
         f'{PACKAGE}.vocabulary': ['*.yaml'],
@@ -69,13 +81,17 @@ setup(
         (f'share/{PACKAGE}/launch', files('launch', '*.launch.*')),
     ],
     python_requires='>=3.12',
-    # script/requirements*.txt hold the versions.
-    install_requires=['setuptools', 'numba', 'numpy', 'PyYAML', 'scipy', 'tqdm'],
+    install_requires=REQUIRED,
     extras_require=EXTRAS,
     zip_safe=False,
     maintainer='the cliploc_ros authors',
     maintainer_email='cliploc-ros@example.org',
     description='Global localization from one image in a map of labelled objects (CLIP-Loc).',
+    long_description=(Path(__file__).parent / 'README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    url=REPOSITORY,
+    project_urls={'Changelog': f'{REPOSITORY}/blob/main/CHANGELOG.rst',
+                  'Issues': f'{REPOSITORY}/issues'},
     license='Apache-2.0',
     entry_points={'console_scripts': console_scripts()},
 )

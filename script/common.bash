@@ -62,8 +62,9 @@ pip_install() {
   hash=$(hash_of "$file" "$root"/script/constraints*.txt)
   is_done "$prefix/.$name.done" "$hash" && return
   say "installing script/$name.txt with pip"
+  # Python compiles a module when it is first used, and most of them never are.
   run_step "$(basename "$prefix")-$name" "$prefix/bin/python" -m pip install --resume-retries 20 \
-    --disable-pip-version-check --no-input --constraint "$root/script/constraints.txt" --requirement "$file" "$@"
+    --no-compile --disable-pip-version-check --no-input --constraint "$root/script/constraints.txt" --requirement "$file" "$@"
   set_done "$prefix/.$name.done" "$hash"
 }
 

@@ -53,6 +53,7 @@ examples:
   evaluate --queries office.npz --map office.yaml --methods all --trials 5
   evaluate --folder second_walk --map office.yaml --methods auto --every 5
   evaluate --bag office --map office.yaml --image /camera/image_raw --save-queries office.npz
+  evaluate --bag office --map office.yaml --methods class_bf auto --no-clip
   evaluate --queries office.npz --map office.yaml --methods auto --gravity --height-range 0.8 2.2
   evaluate --queries office.npz --map office.yaml --methods auto --fuse --odometry-noise 0.01 0.5
   evaluate --bag case_20260101T120000.000_refused --map office.yaml
@@ -145,6 +146,8 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--save-queries', type=Path, metavar='NPZ',
                        help='write the recorded boxes and similarities, for --queries')
     add_network_options(group)
+    group.add_argument('--no-clip', dest='clip', action='store_false',
+                       help=f"run no CLIP: '{AUTO}' matches by class, as class_* do")
     group.add_argument('--landmark-embeddings', choices=COMPARED, default='image',
                        help="compare crops with the map's labels (text), with the images next to "
                        'it, or with both (%(default)s)')
@@ -193,12 +196,14 @@ def evaluate(options: argparse.Namespace) -> int:
     if options.bag is not None and _is_case(options):
         return _replay_case(options, landmark_map)
     paper = RelocalizerOptions(
+        matching=RelocalizerOptions.matching if options.clip else 'class',
         iterations=options.iterations, k=options.k, iou_threshold=options.iou_threshold,
         random_seed=options.seed, time_budget_s=options.time_budget_ms / 1e3,
         height_range_m=tuple(options.height_range),
         tilt_deviation_deg=options.tilt_deviation,
         vertical_deviation_deg=max(1.0, options.gravity_noise_deg), crops=options.crops)
     methods = parse_methods(options.methods, paper, len(landmark_map))
+    options.clip = _needs_clip(options, methods)
     layer = _read_layer(options, landmark_map, methods)
     make_folder(options.out)
     of_cameras = {camera: _read_queries(options, landmark_map, camera)
@@ -266,6 +271,21 @@ def _watch(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
     looks = watch_recording(recorded, Watch(relocalizer), truth, options.watch_period)
     print(write_watch(options.out, looks, options.figures), flush=True)
     return 0
+
+
+def _needs_clip(options: argparse.Namespace, methods: 'Sequence[Method]') -> bool:
+    """Return whether crops are compared with labels; OptionsError: they are, and CLIP may not run.
+
+    A file of queries is for other methods, too.
+    """
+    comparing = [one.name for one in methods if one.options.needs_similarities]
+    if options.clip or options.queries is not None:
+        return bool(comparing or options.save_queries)
+    if comparing or options.save_queries:
+        what = f"method '{comparing[0]}'" if comparing else '--save-queries'
+        raise OptionsError(f"--no-clip: {what} compares crops with labels; give --methods "
+                           f"class_bf or {AUTO}, or 'matching: class' in a file of methods")
+    return False
 
 
 def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
@@ -342,8 +362,9 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
     reading = repr([options.every, options.intrinsics, options.image, options.camera_info,
                     options.ground_truth, options.body_from_camera, options.rectified,
                     *([camera] if camera else [])])
-    recording = RecordingOptions(detector_options(options), clip_options(options), EVERY_FRAME,
-                                 reading, options.workers or 1, options.scheduler)
+    recording = RecordingOptions(
+        detector_options(options), clip_options(options) if options.clip else None, EVERY_FRAME,
+        reading, options.workers or 1, options.scheduler)
     queries = recorded_queries(frames, landmark_map, recording, list(map(str, options.map)),
                                options.landmark_embeddings)
     if without := frames.count - len(queries):

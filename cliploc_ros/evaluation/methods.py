@@ -50,7 +50,7 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
         says whether keyframes are used; the paper's methods never use them.
     paper : RelocalizerOptions
         Options of the paper's methods besides matching and algorithm. auto takes its seed,
-        height range, deviations of vertical and tilt, and crops from them.
+        height range, deviations of vertical and tilt, crops and matching from them.
     landmarks : int
         Number of landmarks of the map; it limits k.
     """
@@ -75,7 +75,8 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
 def _named(name: str, paper: RelocalizerOptions, landmarks: int) -> Method:
     if name == AUTO:
         options = RelocalizerOptions(
-            random_seed=paper.random_seed, height_range_m=paper.height_range_m,
+            matching=paper.matching, random_seed=paper.random_seed,
+            height_range_m=paper.height_range_m,
             vertical_deviation_deg=paper.vertical_deviation_deg,
             tilt_deviation_deg=paper.tilt_deviation_deg, crops=paper.crops)
     elif name in PAPER_METHODS:

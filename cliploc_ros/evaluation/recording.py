@@ -37,12 +37,12 @@ def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: Recordi
     Parameters
     ----------
     options : RecordingOptions
-        With CLIP.
+        Without CLIP, all similarities are 0: for methods that match by class.
     map_files, compare
         See load_encoder_for_map.
     """
-    assert options.clip is not None
-    labels = embed_map(options.clip, landmark_map, map_files, compare)
+    labels = (None if options.clip is None
+              else embed_map(options.clip, landmark_map, map_files, compare))
     file = observation_file(frames, options)
     if file.exists() or os.access(file.parent, os.W_OK):
         return make_queries_of(record_once(frames, options), landmark_map, labels)
@@ -52,11 +52,10 @@ def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: Recordi
     return make_queries_of(recorded, landmark_map, labels)
 
 
-def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap, labels: LabelEmbeddings
-                    ) -> Queries:
+def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap,
+                    labels: LabelEmbeddings | None) -> Queries:
     """Return recorded frames as queries, each a group of its own; true landmarks are unknown."""
     detections = recorded.detections
-    assert detections.embeddings is not None
     camera, names = detections.cameras[0], detections.class_names
     frames = []
     for frame, stamp_ns in enumerate(recorded.stamps_ns):
@@ -64,13 +63,16 @@ def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap, labels: Label
         boxes = detections.bboxes_xyxy[rows]
         if detections.camera_of(frame) != camera:  # queries have one camera
             boxes = camera.bboxes_in_pixels(detections.camera_of(frame).normalize_bboxes(boxes))
-        crops = detections.embeddings[rows].astype(np.float32)
-        similarities = np.asarray(CropSimilarities(crops, labels)).astype(np.float64)
+        similarities = np.zeros((len(boxes), len(landmark_map)))
+        if labels is not None:
+            assert detections.embeddings is not None
+            crops = detections.embeddings[rows].astype(np.float32)
+            similarities = np.asarray(CropSimilarities(crops, labels)).astype(np.float64)
         frames.append(QueryFrame(
             stamp_ns=int(stamp_ns), bboxes_xyxy=boxes,
             class_ids=tuple(names[number] for number in detections.classes[rows]),
             scores=detections.scores[rows], similarities=similarities,
-            true_landmark=np.full(len(crops), -1, dtype=np.int64),
+            true_landmark=np.full(len(boxes), -1, dtype=np.int64),
             map_from_camera=detections.map_from_camera[frame], group=frame, is_main=True,
             depths=None if detections.depths is None
             else detections.depths[rows].astype(np.float64),

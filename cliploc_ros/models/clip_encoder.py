@@ -1,13 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""CLIP through open_clip: crops and labels in, unit embeddings out."""
+"""CLIP: crops and labels in, unit embeddings out."""
 
 import logging
-import sys
 import time
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,25 +15,15 @@ from cliploc_ros.core.map.landmark_details import WeightedLabels
 from cliploc_ros.core.map.similarities import LabelEmbeddings
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.clip_towers import (
-    cut_padding,
-    load_image_tower,
-    load_one_tower,
-    quiet_root_logger,
-)
+from cliploc_ros.models.clip_towers import TextTower, load_image_tower
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
 from cliploc_ros.models.devices import free_memory, resolve_device
 from cliploc_ros.models.images import check_image_rgb, crop_bounds
 from cliploc_ros.models.label_embeddings import LabelCache, mixed_rows
 
-if TYPE_CHECKING:
-    import torch
-
 Label = str | WeightedLabels
 
 _LABEL_BATCH = 64
-# CLIP sees only the middle square of a long crop; beyond this ratio the rest has no influence.
-_MAX_ASPECT = 16
 
 logger = logging.getLogger(__name__)
 
@@ -84,7 +73,7 @@ def _encoded_once(weights: ClipWeights, options: ClipOptions, labels: Sequence[s
     source = 'cached'
     if embeddings is None:
         source = 'encoded'
-        embeddings = encode_labels(weights, labels, resolve_device(options.device))
+        embeddings = encode_labels(weights, labels, options)
         cache.store(weights.key, labels, embeddings)
     logger.info('CLIP %s: %d labels %s', weights.model, len(labels), source)
     return embeddings
@@ -99,14 +88,11 @@ class ClipEncoder:
 
     def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
         self._weights = weights
-        self._max_batch = options.max_batch
-        device = resolve_device(options.device)
-        self._tower = load_image_tower(weights, options, device)
-        shortens = weights.preprocess.get('image_resize_mode', 'shortest') == 'shortest'
-        self._max_aspect = _MAX_ASPECT if shortens else sys.maxsize
+        self._options = options
+        self.device = resolve_device(options.device)
+        self._tower = load_image_tower(weights, options, self.device)
         #: Equal keys (model and weights) give equal label embeddings.
         self.key = weights.key
-        self.device = str(device)
         self.inference = self._tower.inference  #: 'pytorch' or 'openvino'
         self.embed_dim = weights.embed_dim  #: The length d of an embedding
         # The first pass sets up kernels and memory: do it before the first request.
@@ -117,37 +103,29 @@ class ClipEncoder:
         """Return one embedding (n, d), of unit length, for each box of an image (h, w, 3).
 
         The boxes (n, 4) are left, top, right, bottom [px]; `visible_boxes` finds those that can be
-        cropped. A crop holds every pixel that its box touches. open_clip's own preprocessing
-        prepares the crops; the tower takes at most ``max_batch`` of them at once.
+        cropped. A crop holds every pixel that its box touches. The tower takes at most
+        ``max_batch`` of them at once.
 
         ImageError: for an image of another shape or type, or without pixels. CliplocError: for
         boxes that are not finite, are empty, or lie outside the image. ModelError: when memory
         runs out, or the tower gives no finite numbers.
         """
-        import torch
-        from PIL import Image
-
         check_image_rgb(image_rgb)
         bounds = crop_bounds(bboxes_xyxy, image_rgb.shape[1], image_rgb.shape[0])
-        embeddings = []
-        for start in range(0, len(bounds), self._max_batch):
-            crops = [Image.fromarray(np.ascontiguousarray(_cut(image_rgb, row, self._max_aspect)))
-                     for row in bounds[start:start + self._max_batch]]
-            batch = torch.stack([self._tower.preprocess(crop) for crop in crops])
-            try:
-                with torch.inference_mode():
-                    embeddings.append(_normalize(self._tower(batch)))
-            except torch.cuda.OutOfMemoryError as error:
-                raise ModelError(f'the GPU has no memory left for {len(crops)} crops at once: '
-                                 'lower max_batch or choose a smaller model') from error
-        return _as_rows(embeddings, self._weights)
+        features = []
+        for start in range(0, len(bounds), self._options.max_batch):
+            features.append(self._tower(np.stack([
+                self._tower.prepare(image_rgb[top:bottom, left:right])
+                for left, top, right, bottom in
+                bounds[start:start + self._options.max_batch].tolist()])))
+        return _unit_rows(features, self._weights)
 
     def encode_labels(self, labels: Sequence[str]) -> NDArray[np.float32]:
         """Return the embeddings (L, d) of labels; loads the text tower and frees it again."""
-        return encode_labels(self._weights, labels, resolve_device(self.device))
+        return encode_labels(self._weights, labels, self._options)
 
 
-def encode_labels(weights: ClipWeights, labels: Sequence[str], device: 'torch.device'
+def encode_labels(weights: ClipWeights, labels: Sequence[str], options: ClipOptions
                   ) -> NDArray[np.float32]:
     """Return one embedding (L, d) for each label, float32 rows of unit length.
 
@@ -155,55 +133,27 @@ def encode_labels(weights: ClipWeights, labels: Sequence[str], device: 'torch.de
     that a cache made on one machine serves another. A label longer than the model's context is
     cut, with a warning.
     """
-    embeddings = _run_text_tower(weights, labels, device) if labels else []
+    features = [_run_text_tower(weights, labels, options)] if labels else []
     free_memory()
-    return _as_rows(embeddings, weights)
+    return _unit_rows(features, weights)
 
 
-def _run_text_tower(weights: ClipWeights, labels: Sequence[str], device: 'torch.device'
-                    ) -> 'list[torch.Tensor]':
-    import open_clip
-    import torch
-
-    with quiet_root_logger():
-        tokenizer = open_clip.get_tokenizer(weights.model)
-    room = tokenizer.context_length - 2  # between the start and end tokens
+def _run_text_tower(weights: ClipWeights, labels: Sequence[str], options: ClipOptions
+                    ) -> NDArray[np.float32]:
+    tower = TextTower(weights, options)
+    room = tower.context - 2  # between the start and end tokens
     for label in labels:
-        if (count := len(tokenizer.encode(label))) > room:
+        if (count := len(tower.encode(label))) > room:
             logger.warning("label '%s' has %d tokens: CLIP reads the first %d and ignores the "
                            'rest', label, count, room)
-    model, _ = load_one_tower(weights, 'text', device, 'fp32')
-    tokens = cut_padding(model, tokenizer(list(labels)))
-    with torch.inference_mode():
-        return [_normalize(model.encode_text(batch.to(device), normalize=False))
-                for batch in tokens.split(_LABEL_BATCH)]
+    return tower(labels, _LABEL_BATCH)
 
 
-def _cut(image_rgb: NDArray[np.uint8], bounds: NDArray[np.int64], max_aspect: int
-         ) -> NDArray[np.uint8]:
-    """Return a crop; cut a very long one to its middle.
-
-    open_clip scales the short side up to the tower's input before it cuts a square from the
-    middle: a crop of 1 x 2000 pixels would first become an image of 224 x 448,000.
-    """
-    left, top, right, bottom = bounds.tolist()
-    longest = max_aspect * min(right - left, bottom - top)
-    cut_x = max(right - left - longest, 0) // 2
-    cut_y = max(bottom - top - longest, 0) // 2
-    return image_rgb[top + cut_y:bottom - cut_y, left + cut_x:right - cut_x]
-
-
-def _normalize(features: 'torch.Tensor') -> 'torch.Tensor':
-    """Return unit rows in fp32 on the CPU: fp16 would round their length to 1e-3."""
-    import torch
-
-    return torch.nn.functional.normalize(features.float(), dim=-1).cpu()
-
-
-def _as_rows(embeddings: 'list[torch.Tensor]', weights: ClipWeights) -> NDArray[np.float32]:
-    rows = np.concatenate([np.empty((0, weights.embed_dim), dtype=np.float32),
-                           *(batch.numpy() for batch in embeddings)])
+def _unit_rows(features: Sequence[NDArray[np.float32]], weights: ClipWeights
+               ) -> NDArray[np.float32]:
+    """Return features in rows of unit length, in fp32: fp16 would round their length to 1e-3."""
+    rows = np.concatenate([np.empty((0, weights.embed_dim), dtype=np.float32), *features])
     if not np.isfinite(rows).all():
         raise ModelError(f'{weights.file} gives embeddings that are not finite: the weights are '
                          'corrupt, or overflow in fp16 (set the precision to fp32)')
-    return rows
+    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)

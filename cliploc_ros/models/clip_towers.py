@@ -1,22 +1,33 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The image tower or the text tower of CLIP alone; PyTorch or OpenVINO runs the image tower."""
+"""The image tower or the text tower of CLIP alone, in PyTorch or OpenVINO."""
 
 import contextlib
-import json
 import logging
 import pickle
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cliploc_ros.errors import ModelError
-from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, is_torchscript
-from cliploc_ros.models.devices import resolve_inference, resolve_precision
+from cliploc_ros.models.clip_weights import (
+    WITHOUT_CLIP,
+    ClipOptions,
+    ClipWeights,
+    is_torchscript,
+)
+from cliploc_ros.models.crops import CropPreparation
+from cliploc_ros.models.devices import (
+    needs_pytorch,
+    resolve_device,
+    resolve_inference,
+    resolve_precision,
+)
 from cliploc_ros.models.files import check_weights_file, damaged, first_line
 from cliploc_ros.models.openvino_networks import (
     FASTEST,
@@ -26,11 +37,13 @@ from cliploc_ros.models.openvino_networks import (
     Network,
     convert_module,
     load_network,
+    open_stored,
+    stored_folders,
 )
+from cliploc_ros.models.tokenizer import ClipTokenizer
 
 if TYPE_CHECKING:
     import torch
-    from PIL.Image import Image
 
 # Apple's MobileCLIP and Google's big_vision: open_clip converts these into the model it fills.
 _FOREIGN_PREFIX = 'image_encoder.'
@@ -46,18 +59,26 @@ class TorchTower:
 
     inference = 'pytorch'
 
-    def __init__(self, weights: ClipWeights, device: 'torch.device', precision: str) -> None:
+    def __init__(self, weights: ClipWeights, device: str, precision: str) -> None:
         import open_clip
 
         self._device = device
         self._dtype = open_clip.get_input_dtype(precision)
-        self.model, self.preprocess = load_one_tower(weights, 'visual', device, precision)
+        self.model, crops = load_one_tower(weights, 'visual', device, precision)
+        self.prepare = CropPreparation(crops)
 
-    def __call__(self, batch: 'torch.Tensor') -> 'torch.Tensor':
-        """Return the features (n, d) of preprocessed crops (n, 3, s, s)."""
-        features: torch.Tensor = self.model.encode_image(
-            batch.to(self._device, dtype=self._dtype), normalize=False)
-        return features
+    def __call__(self, batch: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the features (n, d) of prepared crops (n, 3, s, s); ModelError: no memory."""
+        import torch
+
+        try:
+            with torch.inference_mode():
+                features = self.model.encode_image(torch.from_numpy(batch).to(
+                    self._device, dtype=self._dtype), normalize=False)
+                return np.asarray(features.float().cpu().numpy())
+        except torch.cuda.OutOfMemoryError as error:
+            raise ModelError(f'the GPU has no memory left for {len(batch)} crops at once: '
+                             'lower max_batch or choose a smaller model') from error
 
 
 class OpenVinoTower:
@@ -65,18 +86,16 @@ class OpenVinoTower:
 
     inference = 'openvino'
 
-    def __init__(self, network: Network, preprocess: 'Callable[[Image], torch.Tensor]') -> None:
+    def __init__(self, network: Network) -> None:
         self._network = network
-        self.preprocess = preprocess
+        self.prepare = CropPreparation(network.about['crops'])
 
-    def __call__(self, batch: 'torch.Tensor') -> 'torch.Tensor':
-        """Return the features (n, d) of preprocessed crops (n, 3, s, s)."""
-        import torch
-
-        return torch.from_numpy(self._network(batch.numpy()))
+    def __call__(self, batch: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the features (n, d) of prepared crops (n, 3, s, s)."""
+        return self._network(batch)
 
 
-def load_image_tower(weights: ClipWeights, options: ClipOptions, device: 'torch.device'
+def load_image_tower(weights: ClipWeights, options: ClipOptions, device: str
                      ) -> TorchTower | OpenVinoTower:
     """Load the image tower for the inference engine that the options choose.
 
@@ -85,50 +104,135 @@ def load_image_tower(weights: ClipWeights, options: ClipOptions, device: 'torch.
     ModelError, OptionsError: see ClipEncoder.
     """
     precision = resolve_precision(options.precision, device)
-    if resolve_inference(options.inference, device, precision) == 'openvino':
-        import open_clip
-        import timm
-
-        # weights, architecture, and the code that has it
-        identity = [weights.key,
-                    json.dumps(open_clip.get_model_config(weights.model), sort_keys=True),
-                    open_clip.__version__, timm.__version__]
-        try:
-            network = load_network(options.cache_dir, weights.model, identity,
-                                   lambda: _convert(weights, device),
-                                   FP32 if options.precision == 'fp32' else FASTEST)
-            return OpenVinoTower(network, _build_without_memory(weights, 'fp32')[1])
-        except ConversionError as error:
-            if options.inference == 'openvino':
-                raise
-            logger.warning('%s; PyTorch runs it (inference: pytorch saves the attempt)', error)
-    return TorchTower(weights, device, precision)
+    with needs_pytorch(f'CLIP {weights.model}, which is not converted for OpenVINO,',
+                       WITHOUT_CLIP):
+        if resolve_inference(options.inference, device, precision) == 'openvino':
+            try:
+                return OpenVinoTower(load_network(
+                    options.cache_dir, weights.model, weights.identity,
+                    lambda: convert_image_tower(weights),
+                    FP32 if options.precision == 'fp32' else FASTEST, weights.file))
+            except ConversionError as error:
+                if options.inference == 'openvino':
+                    raise
+                logger.warning('%s; PyTorch runs it (inference: pytorch saves the attempt)', error)
+        return TorchTower(weights, device, precision)
 
 
-def _convert(weights: ClipWeights, device: 'torch.device') -> Conversion:
+def convert_image_tower(weights: ClipWeights) -> Conversion:
+    """Return the image tower for OpenVINO, with all that replaces open_clip where it runs."""
     import torch
 
-    model, _ = load_one_tower(weights, 'visual', device, 'fp32')
-    size: Any = model.visual.image_size
+    model, crops = load_one_tower(weights, 'visual', 'cpu', 'fp32')
+    size: Any = crops['size']
     shape = (3, size, size) if isinstance(size, int) else (3, *size)
     probe = np.random.default_rng(0).standard_normal((3, *shape)).astype(np.float32)
     with torch.inference_mode():
         expected = model.visual(torch.from_numpy(probe)).numpy()
     network = convert_module(model.visual, torch.zeros(2, *shape), (-1, *shape))
-    return Conversion(network, probe, expected, {})
+    return Conversion(network, probe, expected, {'clip': weights.described(), 'crops': crops})
+
+
+# ---- the text tower with what runs it -----------------------------------------------------------
+
+class TextTower:
+    """A text tower with its tokenizer, in PyTorch or OpenVINO."""
+
+    def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
+        self._network = None
+        device = resolve_device(options.device)
+        if resolve_inference(options.inference, device, 'fp32' if device == 'cpu' else 'fp16'
+                             ) == 'openvino':
+            self._network = _stored_text_tower(weights, options)
+        if self._network is not None:
+            self.context = int(self._network.about['context'])
+            tokenizer = ClipTokenizer(self._network.arrays['merges'].tobytes(), self.context)
+            self.encode: Callable[[str], Sequence[int]] = tokenizer.encode
+            self._tokens: Callable[[list[str]], Any] = tokenizer
+            return
+        with needs_pytorch(f'the text tower of CLIP {weights.model}, which is not converted for '
+                           'OpenVINO,', WITHOUT_CLIP):
+            import open_clip
+
+            with quiet_root_logger():
+                self._tokens = tokenizer = open_clip.get_tokenizer(weights.model)
+            self.context, self.encode = int(tokenizer.context_length), tokenizer.encode
+            self._device, self._model = device, load_one_tower(weights, 'text', device, 'fp32')[0]
+
+    def __call__(self, labels: Sequence[str], batch: int) -> NDArray[np.float32]:
+        """Return the features (L, d) of labels, some of them at once."""
+        tokens = self._tokens(list(labels))
+        if self._network is not None:
+            return np.concatenate([self._network(tokens[start:start + batch])
+                                   for start in range(0, len(tokens), batch)])
+        import torch
+
+        tokens = cut_padding(self._model, tokens)
+        with torch.inference_mode():
+            return np.concatenate([
+                self._model.encode_text(part.to(self._device), normalize=False).cpu().numpy()
+                for part in tokens.split(batch)])
+
+
+def text_identity(weights: ClipWeights) -> tuple[str, ...]:
+    """Return what the text tower of some weights is stored under."""
+    return (*weights.identity, 'text')
+
+
+def _stored_text_tower(weights: ClipWeights, options: ClipOptions) -> Network | None:
+    """Return the text tower that `keep_text_tower` stored, if one is there and sound."""
+    for folder in stored_folders(options.cache_dir, weights.model, text_identity(weights),
+                                 weights.file):
+        try:
+            return open_stored(folder, identity=text_identity(weights))
+        except Exception as error:  # OpenVINO has no exceptions of its own
+            logger.warning('%s cannot be used: %s', folder, first_line(error))
+    return None
+
+
+def keep_text_tower(weights: ClipWeights, options: ClipOptions) -> None:
+    """Convert the text tower for machines without PyTorch, unless the cache has it.
+
+    A ConversionError: OpenVINO cannot run it, or it has a tokenizer of its own. Then machines
+    without PyTorch know the labels that the cache has, and no others.
+    """
+    load_network(options.cache_dir, weights.model, text_identity(weights),
+                 lambda: convert_text_tower(weights), beside=weights.file)
+
+
+def convert_text_tower(weights: ClipWeights) -> Conversion:
+    """Return the text tower for OpenVINO, with the merges of its tokenizer."""
+    import open_clip
+    import torch
+
+    with quiet_root_logger():
+        tokenizer = open_clip.get_tokenizer(weights.model)
+    merges = Path(open_clip.tokenizer.default_bpe()).read_bytes()
+    tokens = tokenizer(['a photo of a red mug', "the dog's 2 bowls!", ''])
+    if not np.array_equal(tokens.numpy(), ClipTokenizer(merges, tokenizer.context_length)(
+            ['a photo of a red mug', "the dog's 2 bowls!", ''])):
+        raise ConversionError(f'CLIP {weights.model} has a tokenizer of its own, which needs '
+                              'PyTorch')
+    model, _ = load_one_tower(weights, 'text', 'cpu', 'fp32')
+    with torch.inference_mode():
+        expected = model.text(tokens).numpy()
+    network = convert_module(model.text, tokens[:2], (-1, tokenizer.context_length))
+    return Conversion(network, tokens.numpy(), expected, {'context': tokenizer.context_length},
+                      {'merges': np.frombuffer(merges, dtype=np.uint8)})
 
 
 # ---- one tower in PyTorch -----------------------------------------------------------------------
 
-def load_one_tower(weights: ClipWeights, tower: str, device: 'torch.device', precision: str
-                   ) -> tuple[Any, Any]:
-    """Return a CLIP with one tower, 'visual' or 'text', and open_clip's preprocessing of crops.
+def load_one_tower(weights: ClipWeights, tower: str, device: str, precision: str
+                   ) -> tuple[Any, dict[str, Any]]:
+    """Return a CLIP with one tower, 'visual' or 'text', and how it takes crops.
 
     ModelError: the file does not hold the weights of the model.
     """
     from open_clip.transformer import TextTransformer
 
-    model, preprocess = _build_without_memory(weights, precision)
+    model = _build_without_memory(weights, precision)
+    crops = dict(model.visual.preprocess_cfg)
     state = {} if weights.file.suffix in _FOREIGN_SUFFIXES else read_state_dict(weights.file)
     is_foreign = not state or any(name.startswith(_FOREIGN_PREFIX) for name in state)
     module = getattr(model, tower)
@@ -143,11 +247,11 @@ def load_one_tower(weights: ClipWeights, tower: str, device: 'torch.device', pre
     for name, _ in list(model.named_children()):
         if name != tower:
             delattr(model, name)
-    return model.requires_grad_(False).eval(), preprocess
+    return model.requires_grad_(False).eval(), crops
 
 
-def _build_without_memory(weights: ClipWeights, precision: str) -> tuple[Any, Any]:
-    """Return the model on torch's meta device (shapes and types alone) and its preprocessing.
+def _build_without_memory(weights: ClipWeights, precision: str) -> Any:
+    """Return the model on torch's meta device: shapes and types alone.
 
     Drawing random weights only to overwrite them takes seconds and the memory of both towers.
     """
@@ -155,13 +259,13 @@ def _build_without_memory(weights: ClipWeights, precision: str) -> tuple[Any, An
     import torch
 
     with quiet_root_logger(), torch.device('meta'):
-        model, _, preprocess = open_clip.create_model_and_transforms(
+        model, _, _ = open_clip.create_model_and_transforms(
             weights.model, load_weights=False, precision=precision, device='meta',
             force_quick_gelu=weights.quick_gelu, force_custom_text=True, **weights.preprocess)
-    return model, preprocess
+    return model
 
 
-def _load_by_open_clip(weights: ClipWeights, device: 'torch.device', precision: str) -> Any:
+def _load_by_open_clip(weights: ClipWeights, device: str, precision: str) -> Any:
     """Return the model as open_clip itself loads it: slower, with twice the memory."""
     import open_clip
 
@@ -176,7 +280,7 @@ def _load_by_open_clip(weights: ClipWeights, device: 'torch.device', precision: 
 
 
 def _fill(module: 'torch.nn.Module', tower: str, state: 'dict[str, torch.Tensor]',
-          weights: ClipWeights, device: 'torch.device') -> None:
+          weights: ClipWeights, device: str) -> None:
     """Fill a tower on the meta device with all of its weights.
 
     The tower gets copies, not the mapped tensors: a process dies when a file that it has mapped is

@@ -13,9 +13,18 @@ from typing import Any
 
 from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.devices import check_run
+from cliploc_ros.models.devices import check_run, needs_pytorch
 from cliploc_ros.models.files import check_weights_file, download, fingerprint_file
+from cliploc_ros.models.openvino_networks import (
+    ABOUT,
+    stored_about,
+    stored_folders,
+    stored_identity,
+)
 
+#: The remedy of who has no CLIP, and how each program is told of a file of weights.
+WITHOUT_CLIP = ", or do without CLIP ('matching: class', --no-clip)"
+_FILE = 'clip_checkpoint_path (of programs: --clip-pretrained) to the file'
 _CONFIG_PARTS = ('embed_dim', 'vision_cfg', 'text_cfg')
 _WEIGHT_SUFFIXES = ('.pt', '.pth', '.bin', '.safetensors', '.npz', '.npy')
 
@@ -30,8 +39,9 @@ class ClipOptions:
     #: Architecture: a name of ``open_clip.list_models()``, or the path of an open_clip model
     #: config (.json), whose name is then the file's
     model: str = 'ViT-L-14'
-    #: A tag of ``open_clip.list_pretrained()``, or the path of a checkpoint. A tag also determines
-    #: activation and colour normalization; with a path the architecture's own values hold.
+    #: A tag of ``open_clip.list_pretrained()``, or the path of a checkpoint, or of a folder with a
+    #: converted image tower, which knows its model. A tag also determines activation and colour
+    #: normalization; with a path the architecture's own values hold.
     pretrained: str = 'openai'
     #: Local file with the weights of the tag, instead of a download; '' downloads
     checkpoint_path: str = ''
@@ -65,14 +75,55 @@ class ClipWeights:
     preprocess: dict[str, Any]
     embed_dim: int  #: Length of an embedding
     key: str  #: Identifies model and weights
+    #: The same for the folders of converted networks: known without open_clip
+    identity: tuple[str, ...] = ()
+
+    def described(self) -> dict[str, Any]:
+        """Return all that open_clip knows of the weights, as JSON."""
+        return {name: value for name, value in vars(self).items()
+                if name not in ('file', 'identity')}
 
 
 def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
     """Find the weights that the options name; download them if they are not here yet.
 
     ModelError: for an unknown model or tag (the message lists the nearest names), a missing or
-    damaged file, and a failed download.
+    damaged file, and a failed download. A network that was converted for OpenVINO knows its
+    weights: then neither open_clip nor the file of a tag is needed.
     """
+    given = Path(options.checkpoint_path or options.pretrained).expanduser().absolute()
+    if (given / ABOUT).exists():
+        return _stored_weights(given)
+    identity = _identity_of(options, given)
+    if options.inference != 'pytorch':
+        for folder in stored_folders(options.cache_dir, identity[1], identity, given):
+            if described := stored_about(folder).get('clip'):
+                return ClipWeights(file=given if given.is_file() else folder.parent,
+                                   identity=identity, **described)
+    with needs_pytorch(f'CLIP {identity[1]}, which is not converted for OpenVINO,',
+                       WITHOUT_CLIP):
+        return _resolve_by_open_clip(options, identity)
+
+
+def _stored_weights(folder: Path) -> ClipWeights:
+    """Return the weights of a folder that holds a converted image tower."""
+    described = stored_about(folder).get('clip')
+    if not described:
+        raise ModelError(f'{folder} holds no image tower of CLIP: name the folder of one')
+    # its text tower is a neighbour
+    return ClipWeights(file=folder.parent, identity=tuple(stored_identity(folder)), **described)
+
+
+def _identity_of(options: ClipOptions, given: Path) -> tuple[str, ...]:
+    """Return what distinguishes a CLIP, without open_clip: architecture, tag, file."""
+    model, config = options.model.replace('/', '-'), ''
+    if options.model.endswith('.json') and (file := Path(options.model).expanduser()).is_file():
+        model, config = file.stem, fingerprint_file(file)
+    tag = options.pretrained if options.checkpoint_path or not given.is_file() else ''
+    return ('CLIP', model, config, tag, fingerprint_file(given) if given.is_file() else '')
+
+
+def _resolve_by_open_clip(options: ClipOptions, identity: tuple[str, ...]) -> ClipWeights:
     import open_clip
 
     own = options.model.endswith('.json')
@@ -103,7 +154,7 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
         model=model, file=file, quick_gelu=quick_gelu,
         preprocess={f'image_{name}': tag[name] for name in
                     ('mean', 'std', 'interpolation', 'resize_mode') if name in tag},
-        embed_dim=config['embed_dim'],
+        embed_dim=config['embed_dim'], identity=identity,
         key=f'{model}:{"quick_gelu" if quick_gelu else "gelu"}:{fingerprint_file(file)}')
 
 
@@ -155,7 +206,7 @@ def _downloaded(model: str, tag: dict[str, Any], options: ClipOptions) -> Path:
     repository, name = os.path.split(tag.get('hf_hub', ''))
     if not repository:
         raise ModelError(f'{what} are on no model hub: download {tag.get("url", "them")} and set '
-                         'clip_checkpoint_path to the file')
+                         f'{_FILE}{WITHOUT_CLIP}')
     newer, older = ((str(Path(name).with_suffix('.safetensors')), name) if name
                     else (HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME))
     own = resolve_cache_dir(options.cache_dir) / 'weights'
@@ -172,4 +223,4 @@ def _downloaded(model: str, tag: dict[str, Any], options: ClipOptions) -> Path:
 
     return download(what, own, (
         f'Without a network: download {newer} or {older} from https://huggingface.co/{repository} '
-        'on another machine and set clip_checkpoint_path to the file'), fetch)
+        f'on another machine and set {_FILE}{WITHOUT_CLIP}'), fetch)

@@ -2,18 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Device, inference engine, precision and memory of networks."""
 
+import contextlib
 import ctypes
 import gc
 import logging
+import os
+import re
 import sys
+from collections.abc import Iterator
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
 from cliploc_ros.errors import ModelError, OptionsError
 
-if TYPE_CHECKING:
-    import torch
-
+# NVIDIA's driver on a computer, on a Jetson, in Windows' Linux; AMD's.
+_GPU_FILES = ('nvidia[0-9]*', 'nvhost-gpu', 'nvgpu', 'dxg', 'kfd')
 PRECISIONS = ('auto', 'fp16', 'fp32')
 INFERENCES = ('auto', 'pytorch', 'openvino')
 
@@ -28,47 +33,82 @@ def check_run(precision: str, inference: str) -> None:
             raise OptionsError(f"{name} '{value}' is none of {', '.join(known)}")
 
 
-def resolve_device(device: str) -> 'torch.device':
-    """Return the torch device for 'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'.
+def has_gpu() -> bool:
+    """Return whether this machine shows a GPU that PyTorch may run on, without loading PyTorch."""
+    return any(any(Path('/dev').glob(pattern)) for pattern in _GPU_FILES)
 
-    OptionsError: for another name, or a GPU that torch does not see. ModelError: where PyTorch is
-    not installed.
+
+def resolve_device(device: str) -> str:
+    """Return 'cpu', 'cuda' or 'cuda:N' for one of them or 'auto' (a GPU if there is one).
+
+    PyTorch is loaded only where a GPU is asked for, or found by 'auto'. OptionsError: for another
+    name, or a GPU that torch does not see. ModelError: a GPU is asked for without PyTorch.
     """
-    try:
+    if not re.fullmatch(r'auto|cpu|cuda(:\d+)?', device):
+        raise OptionsError(f"device '{device}' is none of auto, cpu, cuda, cuda:0, cuda:1 ...")
+    if device == 'cpu' or (device == 'auto' and not (has_gpu() and find_spec('torch'))):
+        return 'cpu'
+    with needs_pytorch(f"device '{device}'"):
         import torch
-    except ModuleNotFoundError as error:
-        raise ModelError(f'{error.name} is not installed: detector and CLIP need it; pip install '
-                         "the extra 'models', see doc/install.md") from error
 
     if device == 'auto':
-        device = 'cuda' if torch.cuda.is_available() else 'cpu'
-    try:
-        resolved = torch.device(device)
-    except RuntimeError:
-        resolved = None
-    if resolved is None or resolved.type not in ('cpu', 'cuda'):
-        raise OptionsError(f"device '{device}' is none of auto, cpu, cuda, cuda:0, cuda:1 ...")
-    if resolved.type == 'cuda' and (resolved.index or 0) >= torch.cuda.device_count():
+        return 'cuda' if torch.cuda.is_available() else 'cpu'
+    if int(device.partition(':')[2] or 0) >= torch.cuda.device_count():
         raise OptionsError(f"device '{device}' is missing: torch {torch.__version__} sees "
                            f"{torch.cuda.device_count()} GPUs; set the device to 'auto' or 'cpu'")
-    return resolved
+    return device
 
 
-def resolve_precision(precision: str, device: 'torch.device') -> str:
+@contextlib.contextmanager
+def needs_pytorch(what: str, otherwise: str = '') -> Iterator[None]:
+    """Raise a ModelError in place of a missing library's error; it names what needs PyTorch.
+
+    ``otherwise`` is a remedy besides converted networks and PyTorch.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ModelError(
+            f"{error.name} is not installed, and {what} needs it: carry the folder of 'prepare "
+            "--cache-dir' here from a machine with the extra 'models', or install that extra"
+            f'{otherwise}, see doc/install.md') from error
+
+
+def count_threads() -> int:
+    """Return the number of threads for a network: those of PyTorch, where it is loaded."""
+    torch = sys.modules.get('torch')
+    if torch is not None and hasattr(torch, 'get_num_threads'):
+        return int(torch.get_num_threads())
+    limit = os.environ.get('OMP_NUM_THREADS', '')
+    if limit.isdecimal() and int(limit):
+        return int(limit)
+    siblings = Path('/sys/devices/system/cpu/smt/active')
+    is_doubled = siblings.exists() and siblings.read_text().strip() == '1'
+    return max(1, len(os.sched_getaffinity(0)) // (2 if is_doubled else 1))
+
+
+def set_threads(count: int) -> None:
+    """Limit the threads of networks that this process loads from now on."""
+    os.environ['OMP_NUM_THREADS'] = str(count)  # PyTorch reads it when it is loaded
+    if 'torch' in sys.modules:
+        sys.modules['torch'].set_num_threads(count)
+
+
+def resolve_precision(precision: str, device: str) -> str:
     """Return 'fp16' or 'fp32'; 'auto' means fp16 on a GPU and fp32 on a CPU."""
     if precision == 'auto':
-        return 'fp16' if device.type == 'cuda' else 'fp32'
+        return 'fp32' if device == 'cpu' else 'fp16'
     return precision
 
 
-def resolve_inference(inference: str, device: 'torch.device', precision: str) -> str:
+def resolve_inference(inference: str, device: str, precision: str) -> str:
     """Return 'pytorch' or 'openvino'; 'auto' means OpenVINO on a CPU, where it is installed.
 
     The precision is 'fp16' or 'fp32'.
 
     OptionsError: when OpenVINO is required on a GPU, in fp16, or where it is not installed.
     """
-    fits = device.type == 'cpu' and precision == 'fp32'
+    fits = device == 'cpu' and precision == 'fp32'
     if inference == 'pytorch' or (inference == 'auto' and not fits):
         return 'pytorch'
     if not fits:

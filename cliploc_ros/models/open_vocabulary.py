@@ -21,7 +21,6 @@ from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.clip_encoder import encode_labels
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
-from cliploc_ros.models.devices import resolve_device
 from cliploc_ros.models.files import fingerprint_file, first_line
 from cliploc_ros.models.label_embeddings import LabelCache
 from cliploc_ros.models.protocols import DetectorOptions, Prompts
@@ -116,14 +115,13 @@ def _tower(name: str, options: DetectorOptions
     """Return the key of a text tower, and what embeds texts with it; errors as of set_prompts."""
     if name == 'clip' and not options.text_model.endswith('.ts'):
         try:
-            weights = resolve_clip_weights(ClipOptions(
-                'ViT-B-32', 'openai', checkpoint_path=options.text_model, device=options.device,
-                cache_dir=options.cache_dir))
+            clip = ClipOptions('ViT-B-32', 'openai', checkpoint_path=options.text_model,
+                               device=options.device, cache_dir=options.cache_dir)
+            weights = resolve_clip_weights(clip)
         except ModelError as error:
             raise ModelError(f'the text tower of {options.model}: '
                              + str(error).replace('clip_checkpoint_path', 'text_model')) from error
-        return weights.key, lambda texts: encode_labels(weights, texts,
-                                                        resolve_device(options.device))
+        return weights.key, lambda texts: encode_labels(weights, texts, clip)
     if name not in ('clip', *_TOWERS):
         raise ModelError(f"{options.model} needs the text tower '{name}', which is unknown: "
                          f'expected {", ".join(_TOWERS)}')

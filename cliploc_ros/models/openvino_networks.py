@@ -12,25 +12,29 @@ import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.errors import ModelError
+from cliploc_ros.errors import CliplocError, ModelError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.devices import free_memory, import_openvino
+from cliploc_ros.models.devices import count_threads, free_memory, import_openvino
 from cliploc_ros.models.files import fingerprint_file, first_line, remove_unused
 
 if TYPE_CHECKING:
     import torch
 
-_FORMAT = 1
+# Of this folder, and of how the modules here convert.
+_FORMAT = 2
 # ViT-L-14 takes 1.2 GB, YOLOv8x .3 GB.
 _MOST_NETWORKS = 8
-_XML, _WEIGHTS, _PROBE, _ABOUT = 'network.xml', 'network.bin', 'probe.npz', 'about.json'
+_XML, _WEIGHTS, _PROBE = 'network.xml', 'network.bin', 'probe.npz'
+#: The file that a folder with a converted network has, and no export of ultralytics.
+ABOUT = 'about.json'
 #: Precisions to try, the fastest first, and how far an output may be off, as a share of its
 #: length. None is the processor's own choice: bf16 where it multiplies matrices in it.
 FP32 = (('f32', 1e-3),)  # measured: 1e-5
@@ -49,58 +53,60 @@ class Conversion(NamedTuple):
     """A network that was converted."""
 
     network: Any
-    #: float32: an input of another shape than the one that the network was traced with
-    probe: NDArray[np.float32]
-    expected: NDArray[np.float32]  #: float32: what PyTorch makes of the probe
+    #: An input of another shape than the one that the network was traced with
+    probe: NDArray[Any]
+    expected: NDArray[np.float32]  #: What PyTorch makes of the probe
     about: dict[str, Any]  #: What else the user of the network needs, as JSON
+    arrays: Mapping[str, NDArray[Any]] = MappingProxyType({})  #: The same, as arrays
 
 
 class Network:
     """A compiled network with one input and one output that is used.
 
-    ``about`` is as in Conversion, the precision 'f32'; None is the processor's own choice.
+    ``about`` and ``arrays`` are as in Conversion, the precision 'f32'; None is the processor's own
+    choice.
     """
 
-    def __init__(self, network: Any, about: dict[str, Any], precision: str | None = 'f32'
-                 ) -> None:
-        import torch
-
+    def __init__(self, network: Any, about: dict[str, Any], precision: str | None = 'f32',
+                 arrays: Mapping[str, NDArray[Any]] = MappingProxyType({})) -> None:
         self.about = about
+        self.arrays = arrays
         # Threads that are pinned to cores wait there for other processes; as many as PyTorch uses
         # keep to its limits.
         settings = {'PERFORMANCE_HINT': 'LATENCY', 'NUM_STREAMS': 1, 'ENABLE_CPU_PINNING': False,
-                    'INFERENCE_NUM_THREADS': torch.get_num_threads()}
+                    'INFERENCE_NUM_THREADS': count_threads()}
         if precision is not None:
             settings['INFERENCE_PRECISION_HINT'] = precision
         self._compiled = import_openvino().Core().compile_model(network, 'CPU', settings)
         self._lock = threading.Lock()
 
-    def __call__(self, inputs: NDArray[np.float32]) -> NDArray[np.float32]:
+    def __call__(self, inputs: NDArray[Any]) -> NDArray[np.float32]:
         """Return the first output for some inputs."""
         with self._lock:  # a compiled network runs one input at a time
             return np.asarray(self._compiled(inputs)[0])
 
 
 def load_network(cache_dir: str, name: str, identity: Sequence[str],
-                 convert: Callable[[], Conversion], precisions: Precisions = FP32) -> Network:
+                 convert: Callable[[], Conversion], precisions: Precisions = FP32,
+                 beside: Path | None = None) -> Network:
     """Return a network from the cache, or convert it, which takes seconds to minutes.
 
     The name of a folder in the cache is the hash of everything that the network depends on. A
     start runs a stored input and compares the output with PyTorch's, so that a damaged file, and
     a CPU that calculates otherwise, are noticed. Folders are written under another name and
-    renamed: any number of processes may share the cache.
+    renamed: any number of processes may share the cache. A folder ``openvino`` beside the file of
+    weights is a second cache, which is only read.
 
-    The name is for people. The identity is all that the network depends on, other than OpenVINO's
-    version. The first precision in which the network runs as in PyTorch is taken, see FP32.
+    The name is for people. The identity is the weights and their architecture: no library is
+    imported to know it. The first precision in which the network runs as in PyTorch is taken, see
+    FP32.
 
     ConversionError: OpenVINO cannot run the network as PyTorch does. ModelError: from convert.
+    ModuleNotFoundError: the network has to be converted, and PyTorch is not installed.
     """
-    identity = [str(_FORMAT), import_openvino().__version__, *identity]
-    digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
-    folder = resolve_cache_dir(cache_dir) / 'openvino' / f'{Path(name).name}-{digest[:32]}'
-    if folder.exists():
+    for folder in stored_folders(cache_dir, name, identity, beside):
         try:
-            network = _open(folder, identity, precisions)
+            network = open_stored(folder, precisions, identity)
         except Exception as error:  # OpenVINO has no exceptions of its own
             logger.warning('%s cannot be used (%s): converting %s again', folder,
                            first_line(error), name)
@@ -109,15 +115,16 @@ def load_network(cache_dir: str, name: str, identity: Sequence[str],
                 os.utime(folder)
             return network
     started = time.monotonic()
+    folder = network_folder(resolve_cache_dir(cache_dir), name, identity)
     logger.info('converting %s for OpenVINO: once, into %s', name, folder)
     try:
         conversion = convert()
-    except ModelError:
+    except (CliplocError, ModuleNotFoundError):
         raise
     except Exception as error:  # tracing and converting raise exceptions of all kinds
         raise ConversionError(f'OpenVINO cannot convert {name}: {first_line(error)}') from error
     try:
-        network = _store(folder, identity, conversion, precisions)
+        network = store_network(folder, identity, conversion, precisions)
     except Exception as error:  # OpenVINO reports a full disk as it reports a bad network
         try:
             network = _checked(conversion, precisions)
@@ -133,9 +140,40 @@ def load_network(cache_dir: str, name: str, identity: Sequence[str],
     return network
 
 
-def _store(folder: Path, identity: Sequence[str], conversion: Conversion, precisions: Precisions
-           ) -> Network:
-    """Write a network to the cache; return it with its weights mapped from the file."""
+def stored_folders(cache_dir: str, name: str, identity: Sequence[str], beside: Path | None
+                   ) -> Iterator[Path]:
+    """Yield the folders that hold a converted network: in the cache, and beside its weights."""
+    for root in (resolve_cache_dir(cache_dir), *([beside.parent] if beside else [])):
+        folder = network_folder(root, name, identity)
+        if folder.exists():
+            yield folder
+
+
+def stored_about(folder: Path) -> dict[str, Any]:
+    """Return what the user of a stored network needs; empty where the file is damaged."""
+    try:
+        return dict(json.loads((folder / ABOUT).read_text())['about'])
+    except (OSError, ValueError, LookupError, TypeError):
+        return {}
+
+
+def stored_identity(folder: Path) -> list[str]:
+    """Return the identity of a stored network, whose description is sound."""
+    return list(json.loads((folder / ABOUT).read_text())['identity'])
+
+
+def network_folder(root: Path, name: str, identity: Sequence[str]) -> Path:
+    """Return the folder of a converted network in a cache."""
+    digest = hashlib.sha256(json.dumps([str(_FORMAT), *identity]).encode()).hexdigest()
+    return root / 'openvino' / f'{Path(name).name}-{digest[:32]}'
+
+
+def store_network(folder: Path, identity: Sequence[str], conversion: Conversion,
+                  precisions: Precisions = FP32, in_half: bool = False) -> Network:
+    """Write a network to the cache; return it with its weights mapped from the file.
+
+    In half precision, the file has half the size and the network runs in fp32 nevertheless.
+    """
     folder.parent.mkdir(parents=True, exist_ok=True)
     remove_unused([one for one in folder.parent.iterdir() if not one.name.startswith('.')],
                   folder.parent.glob('.*.tmp'), _MOST_NETWORKS - 1)
@@ -143,33 +181,40 @@ def _store(folder: Path, identity: Sequence[str], conversion: Conversion, precis
                                      ignore_cleanup_errors=True) as desk:
         whole = Path(desk) / folder.name
         whole.mkdir()
-        import_openvino().save_model(conversion.network, whole / _XML, compress_to_fp16=False)
-        np.savez(whole / _PROBE, probe=conversion.probe, expected=conversion.expected)
+        import_openvino().save_model(conversion.network, whole / _XML, compress_to_fp16=in_half)
+        arrays: dict[str, Any] = {'probe': conversion.probe, 'expected': conversion.expected,
+                                  **conversion.arrays}
+        np.savez(whole / _PROBE, **arrays)
         prints = {name: fingerprint_file(whole / name) for name in (_XML, _WEIGHTS, _PROBE)}
-        (whole / _ABOUT).write_text(json.dumps(
+        (whole / ABOUT).write_text(json.dumps(
             {'identity': list(identity), 'files': prints, 'about': conversion.about}))
         for file in whole.iterdir():
             with file.open('rb+') as opened:
                 os.fsync(opened.fileno())
-        network = _open(whole, identity, precisions)
+        network = open_stored(whole, precisions, identity)
         if folder.exists():  # damaged, or of another process
             folder.rename(Path(desk) / 'old')
         whole.rename(folder)
     return network
 
 
-def _open(folder: Path, identity: Sequence[str], precisions: Precisions) -> Network:
-    """Return the network in a folder; raise ValueError and others where it is not sound."""
-    stored = json.loads((folder / _ABOUT).read_text())
-    if stored['identity'] != list(identity):
+def open_stored(folder: Path, precisions: Precisions = FP32, identity: Sequence[str] = ()
+                ) -> Network:
+    """Return the network in a folder; raise ValueError and others where it is not sound.
+
+    Without an identity, that of the folder is taken.
+    """
+    stored = json.loads((folder / ABOUT).read_text())
+    if identity and stored['identity'] != list(identity):
         raise ValueError('it belongs to another network')
     for name in (_XML, _WEIGHTS, _PROBE):
         if fingerprint_file(folder / name) != stored['files'][name]:
             raise ValueError(f'{name} is damaged')
-    with np.load(folder / _PROBE, allow_pickle=False) as arrays:
-        probe, expected = arrays['probe'], arrays['expected']
+    with np.load(folder / _PROBE, allow_pickle=False) as file:
+        arrays = dict(file)
     read = import_openvino().Core().read_model(folder / _XML)
-    network = _checked(Conversion(read, probe, expected, stored['about']), precisions)
+    network = _checked(Conversion(read, arrays.pop('probe'), arrays.pop('expected'),
+                                  stored['about'], arrays), precisions)
     release_pages(folder / _WEIGHTS)
     return network
 
@@ -197,7 +242,7 @@ def _checked(conversion: Conversion, precisions: Precisions) -> Network:
     """Return a network that gives PyTorch's output; raise ValueError where none does."""
     expected = conversion.expected
     for precision, tolerance in precisions:
-        network = Network(conversion.network, conversion.about, precision)
+        network = Network(conversion.network, conversion.about, precision, conversion.arrays)
         found = network(conversion.probe)
         if found.shape != expected.shape:
             raise ValueError(f'its output has the shape {found.shape}, not {expected.shape}')

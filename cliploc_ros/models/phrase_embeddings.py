@@ -12,7 +12,6 @@ from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.mapping.labelling import Phrases
 from cliploc_ros.models.clip_encoder import encode_labels
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights
-from cliploc_ros.models.devices import resolve_device
 from cliploc_ros.models.label_embeddings import LabelCache
 
 # The COCO classes and as many of a user; a file of ViT-L-14 takes 3 MB at most.
@@ -41,7 +40,7 @@ def embed_phrases(weights: ClipWeights, options: ClipOptions,
         all_texts = [text for texts in missing.values() for text in texts]
         logger.warning('CLIP reads %d phrases of %d classes; the next run finds them in the cache',
                        len(all_texts), len(missing))
-        encoded = encode_labels(weights, all_texts, resolve_device(options.device))
+        encoded = encode_labels(weights, all_texts, options)
         ends = np.cumsum([len(texts) for texts in missing.values()])
         for name, rows in zip(missing, np.split(encoded, ends[:-1]), strict=True):
             cache.store(weights.key, missing[name], rows)

@@ -38,7 +38,7 @@ def resolve_profile(profile: str, device: str) -> Profile:
     if profile not in PROFILE_NAMES:
         raise OptionsError(f"profile '{profile}' is none of {', '.join(PROFILE_NAMES)}")
     if profile == 'auto':
-        profile = 'accurate' if resolve_device(device).type == 'cuda' else 'balanced'
+        profile = 'balanced' if resolve_device(device) == 'cpu' else 'accurate'
     return PROFILES[profile]
 
 

@@ -5,7 +5,7 @@
 import json
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import yaml
@@ -15,6 +15,7 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.models.devices import (
     import_openvino,
+    needs_pytorch,
     resolve_device,
     resolve_inference,
     resolve_precision,
@@ -23,14 +24,17 @@ from cliploc_ros.models.files import fingerprint_file, first_line
 from cliploc_ros.models.images import check_image_rgb
 from cliploc_ros.models.open_vocabulary import set_prompts
 from cliploc_ros.models.openvino_networks import (
+    ABOUT,
     Conversion,
     ConversionError,
     Network,
     convert_module,
     load_network,
+    open_stored,
     release_pages,
 )
 from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.yolo_boxes import Letterbox, select_boxes, without_doubles
 from cliploc_ros.models.yolo_weights import (
     import_ultralytics,
     is_export,
@@ -39,16 +43,13 @@ from cliploc_ros.models.yolo_weights import (
     stride_of,
 )
 
-if TYPE_CHECKING:
-    import torch
-
 # Of an export, in metadata.yaml, with their types.
 _FIELDS = {'names': dict, 'stride': int, 'task': str}
 logger = logging.getLogger(__name__)
 
 
 class OpenVinoYolo:
-    """A detection network in OpenVINO, with ultralytics' own steps before and after it.
+    """A detection network in OpenVINO, with ultralytics' steps before and after it.
 
     The network's field ``about`` holds names (by their number), stride, end2end and size: the
     height and width of its input, None where that varies.
@@ -67,26 +68,26 @@ class OpenVinoYolo:
     def find(self, image_bgr: NDArray[np.uint8], conf: float, iou: float, max_det: int,
              imgsz: int) -> NDArray[np.float32]:
         """Return the boxes (n, 6) in an image: left, top, right, bottom, score, class."""
-        import_ultralytics()
-        import torch
-        from ultralytics.data.augment import LetterBox
-        from ultralytics.utils import nms, ops
-
-        letterbox = LetterBox(self._size or (imgsz, imgsz), auto=self._size is None,
-                              stride=self.stride)
-        pixels = letterbox(image=image_bgr)[..., ::-1].transpose(2, 0, 1)[None]
+        height, width = self._size or (imgsz, imgsz)
+        letterbox = Letterbox.of(image_bgr.shape[1::-1], height, width,
+                                 None if self._size else self.stride)
+        pixels = letterbox.fill(image_bgr)[..., ::-1].transpose(2, 0, 1)[None]
         inputs = np.ascontiguousarray(pixels, dtype=np.float32) / np.float32(255)
-        rows = nms.non_max_suppression(torch.from_numpy(self._network(inputs)), conf, iou,
-                                       max_det=max_det, end2end=self._is_end2end)[0]
-        rows[:, :4] = ops.scale_boxes(inputs.shape[2:], rows[:, :4], image_bgr.shape)
-        return np.asarray(rows[:, :6].numpy())
+        rows = select_boxes(self._network(inputs)[0], conf, iou, max_det, self._is_end2end)
+        return np.hstack([letterbox.in_image(rows[:, :4]), rows[:, 4:]])
 
 
 def open_export(folder: Path, options: DetectorOptions) -> OpenVinoYolo:
-    """Return the network of a folder that ``yolo export format=openvino`` made.
+    """Return the network of a folder of the cache, or of ``yolo export format=openvino``.
 
     ModelError: files are missing or damaged, or the network is for another task.
     """
+    if (folder / ABOUT).exists():
+        try:
+            return OpenVinoYolo(open_stored(folder))
+        except Exception as error:  # OpenVINO has no exceptions of its own
+            raise ModelError(f'{folder} holds no sound detection network: {first_line(error)}'
+                             ) from error
     about = _read_metadata(folder / 'metadata.yaml')
     file = sorted(folder.glob('*.xml'))[0]
     try:
@@ -134,22 +135,28 @@ def load_converted(file: Path, options: DetectorOptions) -> OpenVinoYolo:
     """Return the network of a ``.pt`` file, converted once.
 
     ConversionError: OpenVINO cannot run it as PyTorch does. ModelError: the file is damaged or no
-    detection model.
+    detection model, or has to be converted where PyTorch is missing.
     """
+    with needs_pytorch(f'{file}, which is not converted for OpenVINO,'):
+        return OpenVinoYolo(load_network(options.cache_dir, 'YOLO', identity_of(file, options),
+                                         lambda: convert_yolo(file, options), beside=file))
+
+
+def identity_of(file: Path, options: DetectorOptions) -> list[str]:
+    """Return what a converted network depends on: the weights and the texts that it looks for."""
+    identity = [fingerprint_file(file)]
+    if options.prompts:
+        tower = Path(options.text_model).expanduser()
+        identity += [fingerprint_file(tower) if tower.is_file() else options.text_model,
+                     json.dumps(options.prompts)]
+    return identity
+
+
+def convert_yolo(file: Path, options: DetectorOptions) -> Conversion:
+    """Return the network of a ``.pt`` file for OpenVINO; errors as of load_converted."""
     import torch
 
-    identity = [fingerprint_file(file), import_ultralytics().__version__, torch.__version__]
-    loaded = None
-    if options.prompts:  # the tower is part of what the network depends on
-        loaded = load_yolo(file)
-        identity += [set_prompts(loaded, options), json.dumps(options.prompts)]
-    return OpenVinoYolo(load_network(options.cache_dir, 'YOLO', identity,
-                                     lambda: _convert(loaded or load_yolo(file))))
-
-
-def _convert(loaded: Any) -> Conversion:
-    import torch
-
+    loaded = _load_for(options, file)
     if isinstance(loaded, import_ultralytics().YOLOE):
         raise ConversionError('YOLOE is not converted for OpenVINO')
     model = loaded.model.float().eval().fuse(verbose=False)
@@ -167,17 +174,26 @@ def _convert(loaded: Any) -> Conversion:
     return Conversion(network, probe, expected.numpy(), about)
 
 
+def _load_for(options: DetectorOptions, file: Path) -> Any:
+    """Return ultralytics' model of a file, with the prompts of the options."""
+    loaded = load_yolo(file, is_download=Path(options.model).expanduser().absolute() != file)
+    if options.prompts:
+        set_prompts(loaded, options)
+    return loaded
+
+
 class TorchYolo:
     """A detection network in PyTorch, of a ``.pt`` file; the precision is 'fp16' or 'fp32'."""
 
     inference = 'pytorch'
 
-    def __init__(self, file: Path, device: 'torch.device', precision: str,
+    def __init__(self, file: Path, device: str, precision: str,
                  options: DetectorOptions) -> None:
-        self._model = load_yolo(file)
-        if options.prompts:
-            set_prompts(self._model, options)
-        self._settings = {'device': str(device), 'verbose': False}
+        import torch
+
+        threads = torch.get_num_threads()
+        self._model = _load_for(options, file)
+        self._settings = {'device': device, 'verbose': False}
         if precision == 'fp16':
             from ultralytics.utils import DEFAULT_CFG_DICT
 
@@ -186,6 +202,9 @@ class TorchYolo:
             self._settings |= {'quantize': 16} if has_new_name else {'half': True}
         self.stride = stride_of(self._model.model)
         self.names: dict[int, str] = self._model.names
+        # The first pass sets up the predictor. It leaves one core free on a CPU, for the process.
+        self.find(np.zeros((self.stride, self.stride, 3), dtype=np.uint8), imgsz=self.stride)
+        torch.set_num_threads(threads)
 
     def find(self, image_bgr: NDArray[np.uint8], **settings: float) -> NDArray[np.float32]:
         """Return the boxes (n, 6) in an image, see OpenVinoYolo.find."""
@@ -201,13 +220,8 @@ class YoloDetector:
     """
 
     def __init__(self, options: DetectorOptions) -> None:
-        import torch
-
-        threads = torch.get_num_threads()
-        import_ultralytics()
-        device = resolve_device(options.device)
-        self.device = str(device)
-        self._network = _load(options, device)
+        self.device = resolve_device(options.device)
+        self._network = _load(options, self.device)
         self.inference = self._network.inference  #: 'pytorch' or 'openvino'
         classes = dict(options.prompts)
         self._class_of = {number: classes.get(name, name)
@@ -215,11 +229,9 @@ class YoloDetector:
         #: All classes that the model knows
         self.class_names = tuple(dict.fromkeys(self._class_of.values()))
         self.configure(options)
-        # The first pass sets up the predictor: do it before the first image.
+        # The first pass sets up kernels and memory: do it before the first image.
         side = self._network.stride
         self.detect(np.zeros((side, side, 3), dtype=np.uint8))
-        # Ultralytics leaves one core free on a CPU, for the whole process.
-        torch.set_num_threads(threads)
 
     def configure(self, options: DetectorOptions) -> None:
         """Change the options, except for model, device and inference."""
@@ -236,25 +248,17 @@ class YoloDetector:
         check_image_rgb(image_rgb)
         rows = self._network.find(np.ascontiguousarray(image_rgb[..., ::-1]), **self._settings)
         if len(self.class_names) < len(self._class_of):
-            rows = self._without_doubles(rows)
+            # of another text of the same class
+            classes = [self.class_names.index(self._class_of[int(index)]) for index in rows[:, 5]]
+            rows = rows[without_doubles(rows[:, :4], np.array(classes, dtype=np.int64),
+                                        self._settings['iou'], len(rows))]
         return Detections(
             bboxes_xyxy=rows[:, :4].astype(np.float64),
             class_ids=tuple(self._class_of[int(index)] for index in rows[:, 5]),
             scores=rows[:, 4].astype(np.float64))
 
-    def _without_doubles(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return boxes (m, 6) without those that another text of the same class found, too."""
-        import torch
-        from torchvision.ops import batched_nms
 
-        classes = [self.class_names.index(self._class_of[int(index)]) for index in rows[:, 5]]
-        boxes = torch.from_numpy(rows[:, :5].copy())
-        kept = batched_nms(boxes[:, :4], boxes[:, 4], torch.tensor(classes, dtype=torch.int64),
-                           self._settings['iou'])
-        return rows[kept.numpy()]
-
-
-def _load(options: DetectorOptions, device: 'torch.device') -> TorchYolo | OpenVinoYolo:
+def _load(options: DetectorOptions, device: str) -> TorchYolo | OpenVinoYolo:
     """Load the network for the inference engine that the options choose.
 
     With 'auto', PyTorch runs a network that OpenVINO cannot run as PyTorch does.
@@ -277,4 +281,5 @@ def _load(options: DetectorOptions, device: 'torch.device') -> TorchYolo | OpenV
             if options.inference == 'openvino':
                 raise
             logger.warning('%s; PyTorch runs it (inference: pytorch saves the attempt)', error)
-    return TorchYolo(path, device, precision, options)
+    with needs_pytorch(f'{path}, which OpenVINO does not run,'):
+        return TorchYolo(path, device, precision, options)

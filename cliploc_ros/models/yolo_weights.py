@@ -19,6 +19,7 @@ from typing import Any
 
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import resolve_cache_dir
+from cliploc_ros.models.devices import needs_pytorch
 from cliploc_ros.models.files import check_weights_file, download, first_line
 from cliploc_ros.models.protocols import DetectorOptions
 
@@ -88,12 +89,11 @@ def resolve_published(given: str, cache_dir: str, option: str) -> Path:
         return file
     name = given if file.suffix in ('.pt', '.ts') else f'{given}.pt'
     folder = resolve_cache_dir(cache_dir) / 'weights'
-    if not _is_restricted(import_ultralytics()):
-        raise ModelError(f'this ultralytics or PyTorch would run code that {name} may hold: '
-                         f'update them, or set the {option} to the path of a file that you trust')
     if (folder / name).exists():
         check_weights_file(folder / name)
         return folder / name
+    with needs_pytorch(f'{name}, which is not in {folder},'):
+        _refuse_code(folder / name)
     from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES, attempt_download_asset
 
     if name not in GITHUB_ASSETS_NAMES:
@@ -113,6 +113,13 @@ def resolve_published(given: str, cache_dir: str, option: str) -> Path:
         f'on another machine and set the {option} to the path of the file'), fetch)
 
 
+def _refuse_code(file: Path) -> None:
+    """Raise a ModelError where a file that was or will be downloaded could run code."""
+    if not _is_restricted(import_ultralytics()):
+        raise ModelError(f'this ultralytics or PyTorch would run code that {file.name} may hold: '
+                         'update them, or name the path of a file that you trust')
+
+
 def stride_of(model: Any) -> int:
     """Return what height and width of an input must be multiples of, as ultralytics has it."""
     return max(int(model.stride.max()), _LEAST_STRIDE)
@@ -123,7 +130,7 @@ def is_export(path: Path) -> bool:
     return path.is_dir() and any(path.glob('*.xml'))
 
 
-def load_yolo(file: Path) -> Any:
+def load_yolo(file: Path, is_download: bool = False) -> Any:
     """Return ultralytics' detection model of a ``.pt`` file.
 
     Such a file is a pickle, which can run code. This function reads it in ultralytics' restricted
@@ -134,6 +141,8 @@ def load_yolo(file: Path) -> Any:
     ModelError: for a file that is damaged or no detection model.
     """
     ultralytics = import_ultralytics()
+    if is_download:
+        _refuse_code(file)
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_yolo_') as desk:
         # Ultralytics rewrites some paths (quotes, yolov5) and requires the suffix.
         neutral = Path(desk) / 'weights.pt'

@@ -19,6 +19,7 @@ from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import at_border
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.models.devices import set_threads
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions, ImageTextEncoder
 
@@ -73,7 +74,7 @@ class LoadNetworks:
 
     detector: DetectorOptions
     clip: ClipOptions | None  #: None: classes and boxes only
-    threads: int = 0  #: Of PyTorch on a CPU; 0 leaves its own choice
+    threads: int = 0  #: Of a network on a CPU; 0 leaves its own choice
 
     def __call__(self) -> Callable[[RawFrame], SeenFrame]:
         """Return the function that looks at a frame.
@@ -81,9 +82,7 @@ class LoadNetworks:
         ModelError or OptionsError: from loading.
         """
         if self.threads:
-            import torch
-
-            torch.set_num_threads(self.threads)
+            set_threads(self.threads)
         encoder = (None if self.clip is None
                    else ClipEncoder(resolve_clip_weights(self.clip), self.clip))
         return Look(load_detector(self.detector).detect, encoder)

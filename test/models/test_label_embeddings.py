@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.models import label_embeddings
@@ -225,7 +224,7 @@ def test_each_class_is_encoded_once(clip, caplog):
     found = embed_phrases(weights, clip, PHRASES)
     assert list(found) == list(PHRASES)
     for name, texts in PHRASES.items():
-        alone = encode_labels(weights, texts, torch.device('cpu'))
+        alone = encode_labels(weights, texts, clip)
         np.testing.assert_allclose(found[name], alone, atol=1e-6)
     assert 'CLIP reads 3 phrases of 2 classes' in caplog.text
     caplog.clear()
