@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cliploc_ros.cli import check_map
 from cliploc_ros.cli.map_layer import (
     add_layer_options,
     check_layer_options,
@@ -28,7 +29,7 @@ from cliploc_ros.cli.sources import (
     source_of,
 )
 from cliploc_ros.command import StageBar, not_negative, positive, positive_int, run_main
-from cliploc_ros.errors import MappingError, OptionsError
+from cliploc_ros.errors import CliplocError, MappingError, OptionsError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -37,10 +38,11 @@ if TYPE_CHECKING:
     from cliploc_ros.mapping.options import MappingOptions, PoseErrors
     from cliploc_ros.mapping.posed_detections import PosedDetections
 
+# A check at the end of a build: it takes seconds, not the minute of all views.
+_QUICK = ('--positions', '40', '--headings', '6', '--frames', '50')
 EPILOG = """\
 examples:
-  build_map --bag drive --image /camera/image_raw --camera-info /camera/camera_info \\
-            --map-frame map --out office.yaml
+  build_map --bag drive --out office.yaml
   build_map --bag drive --cameras front left back --map-frame map --out office.yaml
   build_map --rgbd kitchen --model yolov8n.pt --no-clip --out kitchen.yaml
   build_map --observations office.npz --out office.yaml
@@ -49,7 +51,7 @@ examples:
   build_map --folder phone_scan --out office.yaml
   build_map --colmap office --known-distance a.jpg b.jpg 1.5 --level --out office.yaml
   build_map --observations office.npz --out office.yaml --every 5 --report office.json
-  build_map --rgbd kitchen --out kitchen.yaml --keyframe-layer
+  build_map --rgbd kitchen --level --out kitchen.yaml --no-keyframe-layer
   build_map --bag today --map-frame map --update office.yaml --out office.yaml --report today.json
 """
 
@@ -76,6 +78,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--every', type=positive_int, default=1, metavar='N',
                         help='use each N-th frame only (%(default)s)')
     parser.add_argument('--seed', type=int, default=0, help='(%(default)s)')
+    parser.add_argument('--check', action=argparse.BooleanOptionalAction, default=True,
+                        help='at the end, check the map as check_map does, with fewer views, into '
+                        'NAME_check; the exit code tells of the build alone (%(default)s)')
     labels = parser.add_argument_group('labels')
     labels.add_argument('--vocabulary', type=Path, metavar='FILE',
                         help='phrases by class (YAML), besides the shipped ones')
@@ -152,18 +157,29 @@ def build(options: argparse.Namespace) -> int:
         lines = made.report.lines()
         head = [f'{update.name}, updated by build_map from {name}', lines[0]]
     write_map(path, made.landmark_map, head, made.embeddings)
-    is_same_map = update is not None and path.resolve() == update.resolve()
-    if not is_same_map and (note := remove_layer(path)):
-        lines.append(note)
     save_recording(path, recording_of(options, source.file, scale, rotation))
+    is_same_map = update is not None and path.resolve() == update.resolve()
     if layer is not None:
         lines.append(write_layer(path, layer))
+    elif not is_same_map and (removed := remove_layer(path)):
+        lines.append(removed)
     if options.report is not None:
         write_text(options.report, json.dumps(made.report.as_dict(), indent=1))
     print('\n'.join(lines))
     for text in filter(None, (labeller.note, note)):
         print(f'note: {text}')
-    print(f'wrote {path} in {time.monotonic() - begin:.1f} s')
+    print(f'wrote {path} in {time.monotonic() - begin:.1f} s', flush=True)
+    return _check_map(path, options.check)
+
+
+def _check_map(path: Path, wanted: bool) -> int:
+    """Check the map that was written; one that cannot be checked stays. Return 0."""
+    try:
+        if wanted:
+            check_map.check(check_map.make_parser().parse_args([str(path), *_QUICK]))
+    except CliplocError as error:
+        print(f'note: not checked: {error}')
+    print(f'to correct it: studio {path}')
     return 0
 
 

@@ -21,6 +21,7 @@ from cliploc_ros.command import (
     within,
 )
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.errors import DatasetError
 from cliploc_ros.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.units import NS_PER_S
 
@@ -157,7 +158,10 @@ def _read_recording(options: argparse.Namespace
     elif recording is not None:
         print(f'observations: {os.path.relpath(recording.observations)}', flush=True)
         detections = recording.load()
-        images = images_of_recording(recording, detections.camera_names)
+        try:
+            images = images_of_recording(recording, detections.camera_names)
+        except DatasetError as error:
+            print(f'without images: {error}', flush=True)
     else:
         return None, None
     if options.every > 1:

@@ -297,8 +297,10 @@ def recording_of(options: argparse.Namespace, file: Path, scale: float,
     if options.bag is not None:
         return MapRecording(file, source, options.image, options.camera_info, options.rectified,
                             scale=scale, rotation=rotation.tolist())
-    return MapRecording(file, source, layout=layout, intrinsics=options.intrinsics,
-                        images=options.images, scale=scale, rotation=rotation.tolist())
+    # --rgbd finds its layout itself
+    return MapRecording(file, source, layout='' if layout == 'rgbd' else layout,
+                        intrinsics=options.intrinsics, images=options.images, scale=scale,
+                        rotation=rotation.tolist())
 
 
 def check_folder_options(options: argparse.Namespace) -> None:

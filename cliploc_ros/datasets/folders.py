@@ -21,6 +21,7 @@ from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     is_rigid,
     make_transform,
+    quaternion_from_transform,
 )
 from cliploc_ros.datasets.captures.capture import Capture, StampedPoses
 from cliploc_ros.datasets.captures.colmap import is_colmap, read_colmap
@@ -122,6 +123,30 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
         return _placed(folder, layout, layout.read(folder, options), options)
     except OSError as error:
         raise DatasetError(f'{folder}: cannot be read: {error}') from error
+
+
+def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Camera, str]:
+    """Return images and poses of a folder of one camera, the camera, and what says it.
+
+    DatasetError: it has several cameras, a video, or no unit.
+    """
+    layout = find_layout(folder)
+    if layout is None or layout.key == 'rgbd':
+        return read_tum(folder), *find_camera(intrinsics, folder)
+    capture = layout.read(folder, FolderOptions(intrinsics))
+    cameras = {one.camera for one in capture.files}
+    if len(cameras) > 1 or not capture.is_metric or any(
+            one.number is not None for one in capture.files):
+        raise DatasetError(f'{folder}: {layout.name} with {len(cameras)} cameras: a recording '
+                           'needs image files of one camera, and poses in metres')
+    posed = PlacedPoses(capture.poses, capture.axes, map_from_stored=UP[capture.up or 'z']
+                        ).all_of(capture.files)
+    trajectory = TimedPoses.from_samples(
+        [one.stamp_ns for one, _ in posed],
+        [[*pose[:3, 3], *quaternion_from_transform(pose)] for _, pose in posed], str(folder))
+    return (TumSequence(folder, tuple(one.stamp_ns for one in capture.files),
+                        tuple(one.color for one in capture.files), trajectory), cameras.pop(),
+            intrinsics or f'those of {layout.name}')
 
 
 def find_layout(folder: Path, key: str = '') -> Layout | None:

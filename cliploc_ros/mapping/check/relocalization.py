@@ -314,10 +314,13 @@ def count_verdicts(trials: Sequence[Trial]) -> dict[str, int]:
 
 
 def refused_spans(trials: Sequence[Trial]) -> Iterator[list[Trial]]:
-    """Yield the runs of recorded frames without an accepted right pose, the longest first."""
+    """Yield the runs of recorded frames without an accepted right pose, the longest first.
+
+    Frames that do not tell are left out.
+    """
     runs: list[list[Trial]] = [[]]
     for one in trials:
-        if one.verdict == 'accepted':
+        if one.verdict == 'accepted' or not one.is_judged:
             runs.append([])
         else:
             runs[-1].append(one)
