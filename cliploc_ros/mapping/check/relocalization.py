@@ -39,6 +39,8 @@ from cliploc_ros.simulation.labels import LabelModel
 
 _MAX_SAMPLED_FRAMES = 600
 _CLUTTER_IOU = 0.1
+# Half a block of cross-validation.
+_SAME_TIME_S = 0.5 * CheckOptions.block_s
 #: A pose needs this number of landmarks.
 LANDMARKS_FOR_A_POSE = 3
 
@@ -63,6 +65,15 @@ class RecordedKeyframes(NamedTuple):
 
     layer: KeyframeLayer
     image_of: ImageOf
+
+    def recognizer(self, detections: PosedDetections, frame: int) -> ImageRecognizer | None:
+        """Return the keyframe search of a frame, without keyframes of its time; None without."""
+        is_other = np.abs(detections.stamps_s[_frames_of(self.layer, detections)]
+                          - detections.stamps_s[frame]) > _SAME_TIME_S
+        image = self.image_of(frame) if is_other.any() else None
+        return None if image is None else ImageRecognizer(
+            KeyframeLocalizer(self.layer.select(is_other)), query_features(image),
+            detections.camera_of(frame))
 
 
 @dataclass(frozen=True)
