@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from cliploc_ros.mapping.posed_detections import PosedDetections
 
 # A check at the end of a build: it takes seconds, not the minute of all views.
-_QUICK = ('--positions', '40', '--headings', '6', '--frames', '50')
+_QUICK = ('--positions', '25', '--headings', '6', '--frames', '30')
 EPILOG = """\
 examples:
   build_map --bag drive --out office.yaml

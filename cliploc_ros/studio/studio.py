@@ -331,7 +331,7 @@ class Studio:
 
     def _keyframes(self) -> RecordedKeyframes | None:
         """Return the keyframes and the images of the views; None without them."""
-        images, detections = self.images, self._recording().detections
+        images, detections = self._images, self._recording().detections
         return None if self.layer is None or images is None else RecordedKeyframes(
             self.layer, lambda view: images.near(float(detections.stamps_s[view]),
                                                  detections.name_of(view),

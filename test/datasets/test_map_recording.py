@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from scene import make_table, see, walk_around
+from scene import CAMERA
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.datasets.map_recording import (
@@ -15,6 +15,7 @@ from cliploc_ros.datasets.map_recording import (
 )
 from cliploc_ros.datasets.observations import save_observations
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.mapping.posed_detections import PosedDetections
 
 
 @pytest.fixture
@@ -22,13 +23,16 @@ def built(tmp_path):
     """Return a map file, whose observations are scaled and turned, and their poses."""
     folder = tmp_path / 'here'
     (folder / 'drive').mkdir(parents=True)
-    detections = see(make_table(), walk_around(frames=4))
-    save_observations(folder / 'drive.npz', detections)
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, :3, 3] = 1.0, 2.0, 3.0
+    save_observations(folder / 'drive.npz', PosedDetections(
+        (CAMERA,), poses, np.array([0.0, 1.0]), np.array([0, 1, 1]),
+        np.array([[1.0, 2.0, 30.0, 40.0]]), ('cup',), np.zeros(1, dtype=np.int64), np.ones(1)))
     turn = Rotation.from_euler('x', 90, degrees=True).as_matrix()
     save_recording(folder / 'm.yaml', MapRecording(
         folder / 'drive.npz', folder / 'drive', '/image', '/info', scale=2.0,
         rotation=turn.tolist()))
-    return folder / 'm.yaml', detections.map_from_camera
+    return folder / 'm.yaml', poses
 
 
 def test_a_moved_folder_keeps_its_recording(built, tmp_path):
