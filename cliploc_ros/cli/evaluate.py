@@ -382,10 +382,15 @@ def _frames(options: argparse.Namespace, camera: str) -> 'Frames':
         poses_of_topic,
     )
     from cliploc_ros.datasets.folders import FolderOptions
+    from cliploc_ros.datasets.map_recording import load_recording
 
     if options.bag is None:
         frames = read_named_folder(options, FolderOptions(options.intrinsics))
         return frames.select(range(0, frames.count, options.every))
+    if (built_from := load_recording(options.map[0])) is not None and built_from.is_moved:
+        raise OptionsError(f'{options.map[0]}: was turned or scaled by build_map, but the poses of '
+                           '--bag are not; evaluate with a map built without --level and '
+                           '--object-size')
     mount, max_gap_ns = mount_of(options.body_from_camera), round(options.max_gap * NS_PER_S)
     if options.map_frame is not None:
         if options.ground_truth is not None or mount is not None:

@@ -41,6 +41,11 @@ class MapRecording:
     scale: float = 1.0
     rotation: list[list[float]] = field(default_factory=lambda: np.eye(3).tolist())
 
+    @property
+    def is_moved(self) -> bool:
+        """Return whether the poses of the map are others than those of the recording."""
+        return self.scale != 1.0 or not np.array_equal(self.rotation, np.eye(3))
+
     def load(self) -> PosedDetections:
         """Return the observations in the map; DatasetError: they cannot be read."""
         return load_observations(self.observations).moved(self.scale, np.array(self.rotation))
