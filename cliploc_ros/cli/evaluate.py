@@ -388,9 +388,8 @@ def _frames(options: argparse.Namespace, camera: str) -> 'Frames':
         frames = read_named_folder(options, FolderOptions(options.intrinsics))
         return frames.select(range(0, frames.count, options.every))
     if (built_from := load_recording(options.map[0])) is not None and built_from.is_moved:
-        raise OptionsError(f'{options.map[0]}: was turned or scaled by build_map, but the poses of '
-                           '--bag are not; evaluate with a map built without --level and '
-                           '--object-size')
+        raise OptionsError(f'{options.map[0]}: was turned or scaled by build_map, the poses of '
+                           '--bag are not; build it without --level and --object-size')
     mount, max_gap_ns = mount_of(options.body_from_camera), round(options.max_gap * NS_PER_S)
     if options.map_frame is not None:
         if options.ground_truth is not None or mount is not None:
