@@ -177,7 +177,7 @@ def scale_of_objects(detections: PosedDetections, options: MappingOptions, class
                            '--scale where the poses are not')
     scale = 1.0
     for _ in range(_TRIALS):
-        built = build_map(detections.scaled(scale), options).landmark_map
+        built = build_map(detections.moved(scale, np.eye(3)), options).landmark_map
         own = [row for row, one in enumerate(built.class_ids) if one == class_name]
         if not own:
             raise MappingError(

@@ -11,22 +11,25 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cliploc_ros.cli import check_map
 from cliploc_ros.cli.map_layer import (
     add_layer_options,
     check_layer_options,
-    layer_input,
+    make_layer,
     write_layer,
 )
 from cliploc_ros.cli.sources import (
     add_source_options,
     clip_options,
+    folder_of,
     metres_of,
     mount_of,
     read_source,
+    recording_of,
     source_of,
 )
 from cliploc_ros.command import StageBar, not_negative, positive, positive_int, run_main
-from cliploc_ros.errors import MappingError, OptionsError
+from cliploc_ros.errors import CliplocError, MappingError, OptionsError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,10 +38,11 @@ if TYPE_CHECKING:
     from cliploc_ros.mapping.options import MappingOptions, PoseErrors
     from cliploc_ros.mapping.posed_detections import PosedDetections
 
+# A check at the end of a build: it takes seconds, not the minute of all views.
+_QUICK = ('--positions', '25', '--headings', '6', '--frames', '30')
 EPILOG = """\
 examples:
-  build_map --bag drive --image /camera/image_raw --camera-info /camera/camera_info \\
-            --map-frame map --out office.yaml
+  build_map --bag drive --out office.yaml
   build_map --bag drive --cameras front left back --map-frame map --out office.yaml
   build_map --rgbd kitchen --model yolov8n.pt --no-clip --out kitchen.yaml
   build_map --observations office.npz --out office.yaml
@@ -47,7 +51,7 @@ examples:
   build_map --folder phone_scan --out office.yaml
   build_map --colmap office --known-distance a.jpg b.jpg 1.5 --level --out office.yaml
   build_map --observations office.npz --out office.yaml --every 5 --report office.json
-  build_map --rgbd kitchen --out kitchen.yaml --keyframe-layer
+  build_map --rgbd kitchen --level --out kitchen.yaml --no-keyframe-layer
   build_map --bag today --map-frame map --update office.yaml --out office.yaml --report today.json
 """
 
@@ -74,6 +78,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--every', type=positive_int, default=1, metavar='N',
                         help='use each N-th frame only (%(default)s)')
     parser.add_argument('--seed', type=int, default=0, help='(%(default)s)')
+    parser.add_argument('--check', action=argparse.BooleanOptionalAction, default=True,
+                        help='at the end, check the map as check_map does, with fewer views, into '
+                        'NAME_check; the exit code tells of the build alone (%(default)s)')
     labels = parser.add_argument_group('labels')
     labels.add_argument('--vocabulary', type=Path, metavar='FILE',
                         help='phrases by class (YAML), besides the shipped ones')
@@ -109,6 +116,8 @@ def build(options: argparse.Namespace) -> int:
     from cliploc_ros.core.keyframes.layer import remove_layer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.core.map.map_file import write_map
+    from cliploc_ros.datasets.frames import move_frames
+    from cliploc_ros.datasets.map_recording import save_recording
     from cliploc_ros.files.storage import write_text
     from cliploc_ros.make_map import find_labeller, make_map, update_map
     from cliploc_ros.mapping.options import MappingOptions, OdometryErrors
@@ -124,19 +133,21 @@ def build(options: argparse.Namespace) -> int:
         refine_mount=options.refine_mount, min_viewpoints=options.min_viewpoints,
         min_baseline_deg=options.min_baseline, frame_id=options.frame_id,
         source=f'build_map {name}', random_seed=options.seed)
-    recorded = read_source(options)
-    detections = recorded.detections
-    if options.object_size is not None:
-        detections = _scaled(detections, options, mapping)
+    source = read_source(options)
+    recorded = source.recorded
+    detections, scale, rotation = _placed(recorded.detections, options, mapping)
     if recorded.without_pose:
         print(f'no pose: {recorded.without_pose} of {recorded.images} images', flush=True)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
     labeller = find_labeller(detections, partial(clip_options, options) if options.clip else None,
                              options.vocabulary)
+    layer, note = None, ''
     if update is None:
         with StageBar() as bar:
-            made = make_map(detections, labeller, mapping, *layer_input(options), bar.show)
+            made = make_map(detections, labeller, mapping, progress=bar.show)
+        frames = source.frames and move_frames(source.frames, scale, rotation)
+        layer, note = make_layer(options, frames, made.landmark_map)
         lines = made.report.lines()
         head = [f'built by build_map from {name}', *lines[:2]]
         if made.mount is not None:
@@ -146,17 +157,29 @@ def build(options: argparse.Namespace) -> int:
         lines = made.report.lines()
         head = [f'{update.name}, updated by build_map from {name}', lines[0]]
     write_map(path, made.landmark_map, head, made.embeddings)
+    save_recording(path, recording_of(options, source.file, scale, rotation))
     is_same_map = update is not None and path.resolve() == update.resolve()
-    if not is_same_map and (note := remove_layer(path)):
-        lines.append(note)
-    if made.layer is not None:
-        lines.append(write_layer(path, made.layer))
+    if layer is not None:
+        lines.append(write_layer(path, layer))
+    elif not is_same_map and (removed := remove_layer(path)):
+        lines.append(removed)
     if options.report is not None:
         write_text(options.report, json.dumps(made.report.as_dict(), indent=1))
     print('\n'.join(lines))
-    if labeller.note:
-        print(f'note: {labeller.note}')
-    print(f'wrote {path} in {time.monotonic() - begin:.1f} s')
+    for text in filter(None, (labeller.note, note)):
+        print(f'note: {text}')
+    print(f'wrote {path} in {time.monotonic() - begin:.1f} s', flush=True)
+    return _check_map(path, options.check)
+
+
+def _check_map(path: Path, wanted: bool) -> int:
+    """Check the map that was written; one that cannot be checked stays. Return 0."""
+    try:
+        if wanted:
+            check_map.check(check_map.make_parser().parse_args([str(path), *_QUICK]))
+    except CliplocError as error:
+        print(f'note: not checked: {error}')
+    print(f'to correct it: studio {path}')
     return 0
 
 
@@ -168,6 +191,8 @@ def _check(options: argparse.Namespace) -> None:
     if path.is_dir():
         raise MappingError(f'{path} is a folder; name the map file to write')
     check_layer_options(options)
+    if options.level and options.update is not None:
+        raise OptionsError('--level is for new maps, not for --update')
     if options.object_size is not None and (options.scale or options.known_distance
                                             or options.update is not None):
         raise OptionsError('--object-size is not for --scale, --known-distance or --update')
@@ -178,16 +203,32 @@ def _check(options: argparse.Namespace) -> None:
                            '--cameras NAME alone')
 
 
-def _scaled(detections: 'PosedDetections', options: argparse.Namespace, mapping: 'MappingOptions'
-            ) -> 'PosedDetections':
-    """Return detections with poses in metres, by the size of known objects."""
+def _placed(detections: 'PosedDetections', options: argparse.Namespace,
+            mapping: 'MappingOptions'
+            ) -> 'tuple[PosedDetections, float, NDArray[np.float64]]':
+    """Return detections in the map, and the scale and rotation (3, 3) that moved them there."""
+    import numpy as np
+
+    from cliploc_ros.core.geometry.tilt import NO_VERTICAL, find_tilt, tilt_note
     from cliploc_ros.make_map import scale_of_objects
 
-    class_name, metres = options.object_size[0], metres_of(options.object_size[1], '--object-size')
-    scale, objects = scale_of_objects(detections, mapping, class_name, metres)
-    print(f'a unit is {scale:.5g} m, by {objects} objects of class {class_name}', flush=True)
-    options.scale = scale  # for the images of the keyframes
-    return detections.scaled(scale)
+    scale, rotation = 1.0, np.eye(3)
+    if folder_of(options) is None:  # whoever reads a folder levels it
+        found, note = find_tilt(detections.map_from_camera), tilt_note(detections.map_from_camera)
+        if options.level:
+            if found is None:
+                raise OptionsError(f'--level: {NO_VERTICAL}')
+            rotation = found[0]
+            note = f'levelled: the vertical of the cameras was {found[1]:.1f} degrees off z'
+        print(note + '\n' if note else '', end='', flush=True)
+        detections = detections.moved(scale, rotation)
+    if options.object_size is not None:
+        class_name = options.object_size[0]
+        metres = metres_of(options.object_size[1], '--object-size')
+        scale, objects = scale_of_objects(detections, mapping, class_name, metres)
+        print(f'a unit is {scale:.5g} m, by {objects} objects of class {class_name}', flush=True)
+        detections = detections.moved(scale, np.eye(3))
+    return detections, scale, rotation
 
 
 def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':

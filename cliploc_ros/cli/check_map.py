@@ -3,6 +3,7 @@
 """The executable ``check_map``: how good a map is, and what to do about it."""
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -20,12 +21,14 @@ from cliploc_ros.command import (
     within,
 )
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.errors import DatasetError
 from cliploc_ros.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.mapping.check.relocalization import PosedObservation
+    from cliploc_ros.mapping.check.relocalization import ImageOf, PosedObservation
+    from cliploc_ros.mapping.posed_detections import PosedDetections
 
 _ADVICE_SHOWN = 8
 EPILOG = """\
@@ -52,11 +55,12 @@ def make_parser() -> argparse.ArgumentParser:
         'check.json. Without observations the report is shorter. Needs no sourced ROS.')
     parser.add_argument('map', type=Path, metavar='MAP', help='a map file')
     parser.add_argument('--observations', type=Path, metavar='NPZ',
-                        help='boxes and poses of a recording of the place')
+                        help='boxes and poses of a recording of the place (those that build_map '
+                        'made the map from, if NAME.recording.json next to the map names them)')
     parser.add_argument('--queries', type=Path, metavar='NPZ',
                         help='a query file of this map: frames with similarities')
-    parser.add_argument('--out', type=Path, required=True, metavar='DIR',
-                        help='folder of check.html and check.json')
+    parser.add_argument('--out', type=Path, metavar='DIR',
+                        help='folder of check.html and check.json (NAME_check next to the map)')
     parser.add_argument('--every', type=positive_int, default=1, metavar='N',
                         help='use each N-th frame of the observations only (%(default)s)')
     parser.add_argument('--seed', type=int, default=0, help='(%(default)s)')
@@ -106,7 +110,6 @@ def check(options: argparse.Namespace) -> int:
     """Check as the command line asks; return the exit code."""
     # Late, so that --help is fast.
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.datasets.observations import load_observations
     from cliploc_ros.evaluation.map_check.page import PAGE, summary_lines, write_report
     from cliploc_ros.evaluation.map_check.pictures import draw_pictures
     from cliploc_ros.files.storage import make_folder
@@ -122,27 +125,52 @@ def check(options: argparse.Namespace) -> int:
         random_seed=options.seed)
     thresholds = Thresholds(**{field.name: getattr(options, field.name)
                                for field in fields(Thresholds)})
-    detections = None
-    if options.observations is not None:
-        detections = load_observations(options.observations)
-        if options.every > 1:
-            detections = detections.select_frames(range(0, len(detections), options.every))
+    detections, image_of = _read_recording(options)
     queries = _read_queries(options.queries, landmark_map) if options.queries else []
     layer = read_layer(options.map, landmark_map, options.keyframes)
-    make_folder(options.out)
+    out = options.out or options.map.with_name(f'{options.map.stem}_check')
+    make_folder(out)
     with StageBar() as bar:
         report = check_map(landmark_map, detections, queries, check_options, thresholds, bar.show,
-                           layer)
-        write_report(options.out, options.map.name, report,
+                           layer, image_of)
+        write_report(out, options.map.name, report,
                      draw_pictures(landmark_map, report))
     print('\n'.join(summary_lines(report)))
     print('what to do:')
     print('\n'.join(f'  {printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
     for failure in report.failures:
         print(f'fails: {failure}')
-    print(f'wrote {options.out / PAGE} in {time.monotonic() - begin:.1f} s: '
+    print(f'wrote {out / PAGE} in {time.monotonic() - begin:.1f} s: '
           f'{"passed" if report.passed else "failed"}')
     return 0 if report.passed else 1
+
+
+def _read_recording(options: argparse.Namespace
+                    ) -> 'tuple[PosedDetections | None, ImageOf | None]':
+    """Return the recording of the command line or of the map, and its images where they are."""
+    from cliploc_ros.datasets.map_recording import load_recording
+    from cliploc_ros.datasets.observations import load_observations
+    from cliploc_ros.studio.images import images_of_recording
+
+    recording, images = load_recording(options.map), None
+    if options.observations is not None:
+        detections = load_observations(options.observations)
+    elif recording is not None:
+        print(f'observations: {os.path.relpath(recording.observations)}', flush=True)
+        detections = recording.load()
+        try:
+            images = images_of_recording(recording, detections.camera_names)
+        except DatasetError as error:
+            print(f'without images: {error}', flush=True)
+    else:
+        return None, None
+    if options.every > 1:
+        detections = detections.select_frames(range(0, len(detections), options.every))
+    if images is None:
+        return detections, None
+    found = images
+    return detections, lambda frame: found.near(
+        float(detections.stamps_s[frame]), detections.name_of(frame), detections.camera_of(frame))
 
 
 def _read_queries(path: Path, landmark_map: 'LandmarkMap') -> list['PosedObservation']:

@@ -21,6 +21,8 @@ from cliploc_ros.cli.sources import (
     check_folder_options,
     clip_options,
     detector_options,
+    find_topics,
+    folder_of,
     mount_of,
     read_named_folder,
 )
@@ -28,6 +30,7 @@ from cliploc_ros.command import not_negative, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.methods import ALL, AUTO, PAPER_METHODS
+from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
 
@@ -159,8 +162,13 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--sync-tolerance', type=not_negative, default=0.05, metavar='SECONDS',
                        help='images of several --cameras within this time are of one instant, and '
                        'localized together, from the first camera (%(default)s)')
-    group.add_argument('--ground-truth', default='/ground_truth', metavar='TOPIC',
-                       help='PoseStamped, PoseWithCovarianceStamped or Odometry (%(default)s)')
+    group.add_argument('--ground-truth', metavar='TOPIC',
+                       help='PoseStamped, PoseWithCovarianceStamped or Odometry (/ground_truth; '
+                       'where the bag has none, tf)')
+    group.add_argument('--map-frame', metavar='FRAME',
+                       help="take ground truth from /tf: the map's coordinate frame (map)")
+    group.add_argument('--max-gap', type=not_negative, default=0.5, metavar='SECONDS',
+                       help='of tf: interpolate between poses so far apart (%(default)s)')
     group.add_argument('--body-from-camera', type=float, nargs=7, metavar='V',
                        help='x y z qx qy qz qw of the camera on the body of the ground truth')
     group.add_argument('--watch', metavar='TOPIC',
@@ -189,6 +197,10 @@ def evaluate(options: argparse.Namespace) -> int:
     if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):
         raise OptionsError('--cameras is for --bag, without --fuse and --save-queries')
     check_folder_options(options)
+    if options.level and folder_of(options) is None:
+        raise OptionsError('--level is for folders of images only')
+    if options.queries is None:
+        find_topics(options, options.bag)
     landmark_map = join_maps([LandmarkMap.from_file(file) for file in options.map],
                              [str(file) for file in options.map])
     if options.watch is not None:
@@ -258,7 +270,7 @@ def _watch(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
     odometry, truth = (bag_odometry(options.bag, options.image, read(topic))
                        if (topic and topic in pose_sources(options.bag)) or required else None
                        for topic, required in ((options.odometry, bool(options.odometry)),
-                                               (options.ground_truth, False)))
+                                               (_truth(options), False)))
     recorded = record_once(
         bag_frames(options.bag, BagTopics(options.image, options.camera_info, options.rectified),
                    read(options.watch)),
@@ -318,7 +330,13 @@ def _is_case(options: argparse.Namespace) -> bool:
     from cliploc_ros.datasets.cases import is_case
 
     with BagReader(options.bag) as reader:
-        return options.ground_truth not in reader.topics and is_case(options.bag)
+        return _truth(options) not in reader.topics and is_case(options.bag)
+
+
+def _truth(options: argparse.Namespace) -> str:
+    from cliploc_ros.datasets.bag_poses import GROUND_TRUTH
+
+    return str(options.ground_truth or GROUND_TRUTH)
 
 
 def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
@@ -360,8 +378,8 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
     frames = _frames(options, camera)
     print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
     reading = repr([options.every, options.intrinsics, options.image, options.camera_info,
-                    options.ground_truth, options.body_from_camera, options.rectified,
-                    *([camera] if camera else [])])
+                    _truth(options), options.body_from_camera, options.rectified,
+                    *filter(None, (options.map_frame, camera))])
     recording = RecordingOptions(
         detector_options(options), clip_options(options) if options.clip else None, EVERY_FRAME,
         reading, options.workers or 1, options.scheduler)
@@ -378,17 +396,33 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
 
 def _frames(options: argparse.Namespace, camera: str) -> 'Frames':
     from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames, topic_of
-    from cliploc_ros.datasets.bag_poses import poses_of_topic
+    from cliploc_ros.datasets.bag_poses import (
+        GROUND_TRUTH,
+        find_poses,
+        poses_of_tf,
+        poses_of_topic,
+    )
     from cliploc_ros.datasets.folders import FolderOptions
+    from cliploc_ros.datasets.map_recording import load_recording
 
     if options.bag is None:
         frames = read_named_folder(options, FolderOptions(options.intrinsics))
         return frames.select(range(0, frames.count, options.every))
+    if (built_from := load_recording(options.map[0])) is not None and built_from.is_moved:
+        raise OptionsError(f'{options.map[0]}: was turned or scaled by build_map, the poses of '
+                           '--bag are not; build it without --level and --object-size')
+    mount, max_gap_ns = mount_of(options.body_from_camera), round(options.max_gap * NS_PER_S)
+    if options.map_frame is not None:
+        if options.ground_truth is not None or mount is not None:
+            raise OptionsError('--map-frame is not for --ground-truth or --body-from-camera')
+        poses = poses_of_tf(options.map_frame, None, max_gap_ns)
+    elif options.ground_truth is None and mount is None:
+        poses = find_poses(max_gap_ns, topic_of(camera, GROUND_TRUTH), topic_gap_ns=0)
+    else:
+        poses = poses_of_topic(topic_of(camera, options.ground_truth or GROUND_TRUTH),
+                               body_from_camera=mount)
     topics = BagTopics(options.image, options.camera_info, options.rectified)
-    return bag_frames(
-        options.bag, topics.of_camera(camera),
-        poses_of_topic(topic_of(camera, options.ground_truth),
-                       body_from_camera=mount_of(options.body_from_camera)))
+    return bag_frames(options.bag, topics.of_camera(camera), poses)
 
 
 def _cores() -> int:

@@ -81,6 +81,7 @@ def import_map(options: argparse.Namespace) -> int:
     from cliploc_ros.core.keyframes.layer import remove_layer
     from cliploc_ros.core.map.map_file import write_map
     from cliploc_ros.datasets.map_formats.given_map import place, refit
+    from cliploc_ros.datasets.map_recording import recording_path
     from cliploc_ros.datasets.poses import mount_from_numbers
     from cliploc_ros.files.storage import write_text
 
@@ -109,6 +110,7 @@ def import_map(options: argparse.Namespace) -> int:
     write_map(options.out, result.landmark_map,
               [f'imported by import_map from {options.input.name} ({options.format})',
                *result.notes[:1]])
+    recording_path(options.out).unlink(missing_ok=True)  # of the map before
     if note := remove_layer(options.out):
         print(note)
     if options.report is not None:

@@ -6,15 +6,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cliploc_ros.cli.sources import read_frames
 from cliploc_ros.command import positive_int
-from cliploc_ros.errors import MapError, OptionsError
+from cliploc_ros.errors import MapError, MappingError, OptionsError
 
 if TYPE_CHECKING:
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.datasets.frames import Frames
-    from cliploc_ros.recording.keyframe_layer import LayerOptions
 
 _DEFAULT_POINTS = 600
 
@@ -22,9 +20,10 @@ _DEFAULT_POINTS = 600
 def add_layer_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the layer to a parser."""
     group = parser.add_argument_group('keyframes next to the map')
-    group.add_argument('--keyframe-layer', action='store_true',
-                       help='also write NAME.keyframes.npz: local features of the images of '
-                       '--keyframes, with their places from depth or triangulated')
+    group.add_argument('--keyframe-layer', action=argparse.BooleanOptionalAction,
+                       help='write NAME.keyframes.npz: local features of the images of '
+                       '--keyframes, with their places from depth or triangulated (default: '
+                       'where the source has images, and a layer can be made of them)')
     group.add_argument('--keyframe-points', type=positive_int, default=_DEFAULT_POINTS,
                        metavar='N', help='the most points of a keyframe, 146 bytes each '
                        '(%(default)s)')
@@ -38,32 +37,46 @@ def check_layer_options(options: argparse.Namespace) -> None:
 
     OptionsError: the message names the options that do not go together.
     """
-    if not options.keyframe_layer:
-        if options.keyframe_images:
-            raise OptionsError('--keyframe-images is for --keyframe-layer')
-        return
+    problem = _problem(options)
+    if options.keyframe_layer and problem:
+        raise OptionsError(f'--keyframe-layer is not for {problem}')
+    if options.keyframe_images and (problem or options.keyframe_layer is False):
+        raise OptionsError('--keyframe-images is for --keyframe-layer')
+
+
+def _problem(options: argparse.Namespace) -> str:
+    """Return the option that leaves no keyframes, and what to do; '' where there is none."""
     for name in ('observations', 'update'):
         if getattr(options, name) is not None:
-            raise OptionsError(f'--keyframe-layer is not for --{name}: keyframes need the images '
-                               'of the recording that the map is built from; give --bag or a '
-                               'folder')
+            return (f'--{name}: keyframes need the images of the recording that the map is built '
+                    'from; give --bag or a folder')
     if options.every > 1:
-        raise OptionsError('--keyframe-layer is not for --every: choose frames with '
-                           '--keyframes METRES DEGREES')
-    if options.refine_mount:
-        raise OptionsError('--keyframe-layer is not for --refine-mount: build again with the '
-                           'corrected --mount')
+        return '--every: choose frames with --keyframes METRES DEGREES'
+    return ('--refine-mount: build again with the corrected --mount' if options.refine_mount
+            else '')
 
 
-def layer_input(options: argparse.Namespace) -> 'tuple[Frames | None, LayerOptions | None]':
-    """Return the images that become keyframes, and how; None where no layer is asked for."""
-    from cliploc_ros.recording.keyframe_layer import LayerOptions
+def make_layer(options: argparse.Namespace, frames: 'Frames | None', landmark_map: 'LandmarkMap'
+               ) -> 'tuple[KeyframeLayer | None, str]':
+    """Return the layer of a map, and a note where there is none though nobody declined it.
 
-    if not options.keyframe_layer:
-        return None, None
+    MappingError: a layer is asked for, and the images give none.
+    """
+    from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
+
+    if options.keyframe_layer is False:
+        return None, ''
+    if problem := _problem(options):
+        return None, f'no keyframes with {problem}'
+    assert frames is not None  # only --observations has none
     distance_m, angle_deg = options.keyframes
-    return read_frames(options), LayerOptions(distance_m, angle_deg, options.keyframe_points,
-                                              options.keyframe_images)
+    try:
+        return build_layer(frames, landmark_map, LayerOptions(
+            distance_m, angle_deg, options.keyframe_points, options.keyframe_images)), ''
+    except MappingError as error:
+        if options.keyframe_layer:
+            raise
+        return None, f'no keyframes: {error}'
 
 
 def write_layer(map_file: Path, layer: 'KeyframeLayer') -> str:

@@ -114,6 +114,10 @@ def replay(args: list[str], stop: Interruption) -> int:
 def _play(player: 'Player', options: argparse.Namespace, stop: Interruption) -> int:
     if options.wait_for_subscribers is not None:
         player.wait_for_subscribers(options.wait_for_subscribers, options.wait_timeout)
+    for topic in player.without_type:
+        print(f'not replayed: {topic.name}: {topic.msgtype} is not installed; '
+              f'apt install ros-jazzy-{topic.msgtype.partition("/")[0].replace("_", "-")}, or '
+              'source ROS', flush=True)
     length_s = (player.end_ns - player.start_ns) / NS_PER_S
     print(f'replaying {options.bag}: {len(player.topics)} topics, {length_s:.1f} s '
           f'at rate {options.rate:g}', flush=True)

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cliploc_ros.command import positive
 from cliploc_ros.errors import DatasetError, OptionsError
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from cliploc_ros.datasets.bag_poses import ReadPoses
     from cliploc_ros.datasets.folders import FolderOptions
     from cliploc_ros.datasets.frames import DepthFormat, Frames
+    from cliploc_ros.datasets.map_recording import MapRecording
     from cliploc_ros.datasets.observations import Recorded
     from cliploc_ros.datasets.poses import Poses
     from cliploc_ros.models.clip_weights import ClipOptions
@@ -31,7 +32,7 @@ _READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'm
             'camera_info', 'rectified', 'depth', 'depth_unit', 'depth_intrinsics',
             'depth_baseline', 'intrinsics')
 # Of folders only.
-_PLACING = ('images', 'axes', 'scale', 'known_distance', 'level')
+_PLACING = ('images', 'axes', 'scale', 'known_distance')
 
 
 def add_network_options(group: Any) -> None:
@@ -120,7 +121,8 @@ def add_folder_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--known-distance', nargs=3, metavar=('IMAGE_A', 'IMAGE_B', 'METRES'),
                        help='between the cameras of two images: another way to say the scale')
     group.add_argument('--level', action='store_true',
-                       help='turn z up, by the tilt of the cameras')
+                       help='turn z up, by the tilt of the cameras; of --bag and --observations, '
+                       'too')
     group.add_argument('--axes', choices=('opencv', 'opengl', 'opencv-inverse', 'opengl-inverse'),
                        help='what the poses are: of cameras with these axes, or inverse '
                        "(the layout's own)")
@@ -165,7 +167,8 @@ def _add_pose_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--pose-topic', metavar='TOPIC',
                        help='PoseStamped, PoseWithCovarianceStamped or Odometry')
     group.add_argument('--map-frame', metavar='FRAME',
-                       help='take poses from /tf: the coordinate frame of the map')
+                       help='take poses from /tf: the coordinate frame of the map (map, where '
+                       'the bag has no /ground_truth and nothing else is named)')
     group.add_argument('--camera-frame', metavar='FRAME',
                        help="the camera's optical coordinate frame in /tf (that of the images)")
     group.add_argument('--trajectory', type=Path, metavar='FILE',
@@ -188,9 +191,9 @@ def add_topic_options(group: Any) -> None:
     group.add_argument('--cameras', nargs='+', default=[''], metavar='NAME',
                        help='several cameras of the recording, by the namespaces of their topics: '
                        '/NAME/image, /NAME/camera_info and so on')
-    group.add_argument('--image', default='/image', metavar='TOPIC', help='(%(default)s)')
-    group.add_argument('--camera-info', default='/camera_info', metavar='TOPIC',
-                       help='(%(default)s)')
+    group.add_argument('--image', metavar='TOPIC',
+                       help="(the recording's only colour image; /image of --cameras)")
+    group.add_argument('--camera-info', metavar='TOPIC', help='(the one beside the image)')
     group.add_argument('--rectified', action='store_true', help='the bag has rectified images')
 
 
@@ -227,30 +230,79 @@ def _add_network_options(parser: argparse.ArgumentParser) -> None:
                        help='of a Dask cluster, instead of local processes')
 
 
-def read_source(options: argparse.Namespace) -> 'Recorded':
+def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
+    """Set the topics of image and camera_info that the command line leaves open.
+
+    DatasetError: the bag has none, or several.
+    """
+    from cliploc_ros.datasets import bag_frames
+
+    open_topics = [name for name in ('image', 'camera_info') if getattr(options, name) is None]
+    if bag is None or options.cameras != ['']:
+        options.image = options.image or bag_frames.BagTopics.image
+        options.camera_info = options.camera_info or bag_frames.BagTopics.camera_info
+    elif open_topics:
+        options.image, options.camera_info = bag_frames.find_topics(bag, options.image,
+                                                                    options.camera_info)
+        print(f'{bag}: {" and ".join(getattr(options, name) for name in open_topics)}', flush=True)
+
+
+class Source(NamedTuple):
+    """What a source says: observations, the file that has them, and its images if there are."""
+
+    recorded: 'Recorded'
+    file: Path
+    frames: 'Frames | None'
+
+
+def read_source(options: argparse.Namespace) -> Source:
     """Return the observations of the source that the command line names.
 
     CliplocError: the source, the networks or the options cannot be used.
     """
     from cliploc_ros.datasets.observations import load_recorded
-    from cliploc_ros.recording.recorder import KeyframeOptions, RecordingOptions, record_once
+    from cliploc_ros.recording.recorder import (
+        KeyframeOptions,
+        RecordingOptions,
+        observation_file,
+        record_once,
+    )
 
     if options.bag is None and (options.odometry_topic or options.odometry_frame):
         raise OptionsError('--odometry-topic and --odometry-frame are for --bag')
     camera_names(options)
     check_folder_options(options)
+    find_topics(options, options.bag)
     if options.observations is not None:
-        return load_recorded(options.observations)
+        return Source(load_recorded(options.observations), options.observations, None)
     if options.workers < 1:
         raise OptionsError(f'--workers {options.workers}: give 1 or more')
     frames = read_frames(options)
     print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
-    return record_once(frames, RecordingOptions(
+    recording = RecordingOptions(
         detector_options(options, conf=options.conf),
         clip_options(options) if options.clip else None, KeyframeOptions(*options.keyframes),
         repr([str(getattr(options, name)) for name in _READING]
              + (options.cameras if options.cameras != [''] else [])), options.workers,
-        options.scheduler), options.record_to, _odometry(options))
+        options.scheduler)
+    file = options.record_to or observation_file(frames, recording)
+    return Source(record_once(frames, recording, file, _odometry(options)), file, frames)
+
+
+def recording_of(options: argparse.Namespace, file: Path, scale: float,
+                 rotation: 'NDArray[np.float64]') -> 'MapRecording':
+    """Return what a map is built from; its poses are those of a file, scaled and turned."""
+    from cliploc_ros.datasets.map_recording import MapRecording
+
+    folder = folder_of(options)
+    source, layout = folder or (options.bag, '')
+    if options.bag is not None:
+        return MapRecording(file, source, options.image, options.camera_info, options.rectified,
+                            scale=scale, rotation=rotation.tolist())
+    # --rgbd finds its layout itself
+    return MapRecording(file, source, layout='' if layout == 'rgbd' else layout,
+                        intrinsics=options.intrinsics, images=options.images, scale=scale,
+                        rotation=rotation.tolist())
 
 
 def check_folder_options(options: argparse.Namespace) -> None:
@@ -342,16 +394,24 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: 'NDArray[np.flo
     A topic without a mount is the camera's own, in its namespace.
     """
     from cliploc_ros.datasets.bag_frames import topic_of
-    from cliploc_ros.datasets.bag_poses import pose_sources, poses_of_tf, poses_of_topic
+    from cliploc_ros.datasets.bag_poses import (
+        GROUND_TRUTH,
+        find_poses,
+        poses_of_tf,
+        poses_of_topic,
+    )
     from cliploc_ros.datasets.tum import read_tum_trajectory
 
     given = [name for name in ('pose_topic', 'map_frame', 'trajectory')
              if getattr(options, name) is not None]
-    if len(given) != 1:
-        there = ', '.join(pose_sources(options.bag)) or 'none'
-        raise DatasetError(f'{options.bag}: say where the poses are: --pose-topic, --map-frame '
-                           f'(tf) or --trajectory; topics with poses here: {there}')
     max_gap_ns = round(options.max_gap * NS_PER_S)
+    if len(given) > 1:
+        raise OptionsError(f'{", ".join("--" + name.replace("_", "-") for name in given)}: poses '
+                           'come from one of them')
+    if not given:
+        if mount is not None:
+            raise OptionsError('--mount is for --pose-topic and --trajectory: name one of them')
+        return find_poses(max_gap_ns, topic_of(camera, GROUND_TRUTH), options.camera_frame)
     if options.pose_topic is not None:
         topic = options.pose_topic if mount is not None else topic_of(camera, options.pose_topic)
         return poses_of_topic(topic, max_gap_ns, mount)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import read_layer
-from cliploc_ros.cli.sources import add_topic_options
+from cliploc_ros.cli.sources import add_topic_options, find_topics
 from cliploc_ros.command import run_main, within
 from cliploc_ros.errors import OptionsError
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 _LOOPBACK = '127.0.0.1'
 EPILOG = """\
 examples:
+  studio office.yaml         a map of build_map, with its recording
   studio office.yaml --observations office.npz --images office_bag
   studio office.yaml --images tum_folder_with_ground_truth
   studio                     an empty map, to be saved as map.yaml
@@ -116,18 +117,26 @@ def follow(options: argparse.Namespace) -> 'AbstractContextManager[LiveRelocaliz
 def open_studio(options: argparse.Namespace) -> 'Studio':
     """Return the studio that the command line asks for."""
     from cliploc_ros.datasets.bag_frames import BagTopics
+    from cliploc_ros.datasets.folders import find_layout
+    from cliploc_ros.datasets.map_recording import load_recording
     from cliploc_ros.datasets.observations import load_observations
     from cliploc_ros.studio.document import Document
-    from cliploc_ros.studio.images import open_images, views_of_folder
+    from cliploc_ros.studio.images import images_of_recording, open_images, views_of_folder
     from cliploc_ros.studio.recording import Recording
     from cliploc_ros.studio.studio import Studio
 
     images = detections = None
+    built_from = None if options.map is None else load_recording(options.map)
     if options.observations is not None:
         detections = load_observations(options.observations)
+    elif built_from is not None:
+        detections = built_from.load()
     if options.images is not None:
+        find_topics(options, None if find_layout(options.images) else options.images)
         topics = BagTopics(options.image, options.camera_info, options.rectified)
         images = open_images(options.images, topics, _cameras(options, detections))
+    elif built_from is not None and detections is not None:
+        images = images_of_recording(built_from, _cameras(options, detections))
     if detections is None and options.images is not None:
         detections = views_of_folder(options.images)
     recording = None if detections is None else Recording(detections)

@@ -34,9 +34,10 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='tum_to_bag', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Convert a TUM RGB-D folder (rgb.txt, rgb/, groundtruth.txt) into a rosbag2 '
-        'recording with the topics of the nodes. Needs no sourced ROS.')
-    parser.add_argument('folder', type=Path, help='the TUM folder')
+        description='Convert a TUM RGB-D folder (rgb.txt, rgb/, groundtruth.txt), 7-Scenes or '
+        'another folder of build_map --folder into a rosbag2 recording with the topics of the '
+        'nodes, without depth. Needs no sourced ROS.')
+    parser.add_argument('folder', type=Path, help='the folder')
     parser.add_argument('output', type=Path, help='folder of the recording; must not exist')
     parser.add_argument('--every', type=int, default=1, metavar='N',
                         help='take every N-th image only (default: 1)')
@@ -65,14 +66,13 @@ def convert(options: argparse.Namespace) -> int:
     # Late, so that --help is fast.
     from tqdm import tqdm
 
-    from cliploc_ros.datasets.intrinsics import find_camera
+    from cliploc_ros.datasets.folders import read_sequence
     from cliploc_ros.datasets.recorded_detections import read_recorded_detections
-    from cliploc_ros.datasets.tum import read_tum
     from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum
 
     begin = time.monotonic()
-    sequence = read_tum(options.folder).every(options.every)
-    camera, origin = find_camera(options.intrinsics, options.folder)
+    sequence, camera, origin = read_sequence(options.folder, options.intrinsics)
+    sequence = sequence.every(options.every)
     detections = None
     if options.detections is not None:
         detections = read_recorded_detections(options.detections, (camera.width, camera.height))

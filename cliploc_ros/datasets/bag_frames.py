@@ -4,7 +4,7 @@
 
 import struct
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,6 +26,7 @@ from cliploc_ros.units import NS_PER_S
 _IMAGE = 'sensor_msgs/msg/Image'
 _IMAGES = (_IMAGE, 'sensor_msgs/msg/CompressedImage')
 _CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+_COMPRESSED = '/compressed'
 # A depth image belongs to a colour image at most this far away in time.
 _MAX_DEPTH_DELAY_NS = 20_000_000
 # Images that wait for their depth. A depth image is recorded at most this many images later.
@@ -55,6 +56,34 @@ class BagTopics:
 def topic_of(camera: str, topic: str) -> str:
     """Return the topic of one of several cameras: NAME/topic; '' changes nothing."""
     return f'/{camera.strip("/")}/{topic.lstrip("/")}' if camera and topic else topic
+
+
+def find_topics(bag: Path, image: str | None, camera_info: str | None) -> tuple[str, str]:
+    """Return the topics of image and camera_info; None is found where there is one candidate.
+
+    Depth and debug images are no candidates; raw images go before compressed ones of the same
+    camera. DatasetError: there is none, or there are several; names them and the option.
+    """
+    with BagReader(bag) as reader:
+        def named(types: Sequence[str]) -> list[str]:
+            return [one.name for one in reader.topics.values()
+                    if one.msgtype in types and one.message_count]
+
+        def only(candidates: Sequence[str], what: str, option: str) -> str:
+            if len(candidates) == 1:
+                return candidates[0]
+            raise DatasetError(f'{bag}: {len(candidates)} topics of {what}'
+                               f'{": " if candidates else ""}{", ".join(candidates)}; '
+                               f'{f"give {option} TOPIC" if candidates else "record one"}')
+        images = [name for name in named(_IMAGES) if 'depth' not in name.lower()
+                  and 'debug_image' not in name]
+        raw = [name for name in images if name.removesuffix(_COMPRESSED) == name
+               or name.removesuffix(_COMPRESSED) not in images]
+        image = image or only(raw, 'colour images', '--image')
+        beside = image.removesuffix(_COMPRESSED).rpartition('/')[0] + '/camera_info'
+        infos = named((_CAMERA_INFO,))
+        return image, camera_info or (
+            beside if beside in infos else only(infos, 'camera_info', '--camera-info'))
 
 
 def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,

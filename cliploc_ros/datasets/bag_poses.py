@@ -28,6 +28,8 @@ _POSE_TYPES: dict[str, Callable[[Any], Any]] = {
 }
 #: Makes the poses of an open recording; given the coordinate frame of its images.
 ReadPoses = Callable[[BagReader, str], Poses]
+#: Where poses are looked for: the topic that tum_to_bag writes, and the map's frame in tf.
+GROUND_TRUTH, MAP_FRAME = '/ground_truth', 'map'
 _TF, _TF_STATIC = '/tf', '/tf_static'
 _TF_TYPE = 'tf2_msgs/msg/TFMessage'
 
@@ -59,6 +61,31 @@ def poses_of_topic(name: str, max_gap_ns: int = 0,
             rows.append(_numbers(pose.position, pose.orientation))
         poses = TimedPoses.from_samples(stamps, rows, f'{reader.path}: {name}')
         return replace(poses, max_gap_ns=max_gap_ns, body_from_camera=body_from_camera)
+    return read
+
+
+def find_poses(max_gap_ns: int, ground_truth: str = GROUND_TRUTH,
+               camera_frame: str | None = None, topic_gap_ns: int | None = None) -> ReadPoses:
+    """Return what reads the camera's poses where nobody says where they are.
+
+    They are those of the topic of ground truth, else of tf in the coordinate frame `map`. Other
+    topics are not taken: nothing says what their poses are of. The greatest gap of a topic may
+    differ from that of tf. DatasetError, when it reads: there are none.
+    """
+    def read(reader: BagReader, image_frame: str) -> Poses:
+        if ground_truth in reader.topics:
+            return poses_of_topic(ground_truth, max_gap_ns if topic_gap_ns is None
+                                  else topic_gap_ns)(reader, image_frame)
+        problem = 'no tf'
+        if _TF in reader.topics:
+            try:
+                return poses_of_tf(MAP_FRAME, camera_frame, max_gap_ns)(reader, image_frame)
+            except DatasetError as error:
+                problem = str(error).removeprefix(f'{reader.path}: ')
+        there = ', '.join(name for name, topic in reader.topics.items()
+                          if topic.msgtype in _POSE_TYPES and topic.message_count) or 'none'
+        raise DatasetError(f'{reader.path}: say where the poses are: --pose-topic, --map-frame '
+                           f'(tf) or --trajectory; topics with poses here: {there}; {problem}')
     return read
 
 

@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.tilt import NO_VERTICAL, find_tilt, tilt_note
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     is_rigid,
     make_transform,
+    quaternion_from_transform,
 )
 from cliploc_ros.datasets.captures.capture import Capture, StampedPoses
 from cliploc_ros.datasets.captures.colmap import is_colmap, read_colmap
@@ -41,8 +43,6 @@ from cliploc_ros.datasets.captures.placing import (
     PlacedPoses,
     check_axes,
     find_scale,
-    find_vertical,
-    rotation_to_z,
 )
 from cliploc_ros.datasets.depth import MILLIMETRE, TUM_UNIT, DepthCamera
 from cliploc_ros.datasets.frames import DepthFormat, Frames, ImageFile, folder_frames
@@ -61,8 +61,6 @@ _SEVEN_SCENES_NAME = re.compile(r'frame-(\d+)\.color\.(?:jpe?g|png)')
 _SEVEN_SCENES_HZ = 30
 _MAX_DEPTH_DELAY_NS = 20_000_000
 _NO_CHANGE = DepthFormat()
-# A vertical by the tilt of hand-held cameras is as good as this.
-_MOST_TILT_DEG = 5.0
 
 
 @dataclass(frozen=True)
@@ -127,6 +125,30 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
         raise DatasetError(f'{folder}: cannot be read: {error}') from error
 
 
+def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Camera, str]:
+    """Return images and poses of a folder of one camera, the camera, and what says it.
+
+    DatasetError: it has several cameras, a video, or no unit.
+    """
+    layout = find_layout(folder)
+    if layout is None or layout.key == 'rgbd':
+        return read_tum(folder), *find_camera(intrinsics, folder)
+    capture = layout.read(folder, FolderOptions(intrinsics))
+    cameras = {one.camera for one in capture.files}
+    if len(cameras) > 1 or not capture.is_metric or any(
+            one.number is not None for one in capture.files):
+        raise DatasetError(f'{folder}: {layout.name} with {len(cameras)} cameras: a recording '
+                           'needs image files of one camera, and poses in metres')
+    posed = PlacedPoses(capture.poses, capture.axes, map_from_stored=UP[capture.up or 'z']
+                        ).all_of(capture.files)
+    trajectory = TimedPoses.from_samples(
+        [one.stamp_ns for one, _ in posed],
+        [[*pose[:3, 3], *quaternion_from_transform(pose)] for _, pose in posed], str(folder))
+    return (TumSequence(folder, tuple(one.stamp_ns for one in capture.files),
+                        tuple(one.color for one in capture.files), trajectory), cameras.pop(),
+            intrinsics or f'those of {layout.name}')
+
+
 def find_layout(folder: Path, key: str = '') -> Layout | None:
     """Return the layout of a key, or the one whose files are there; None for none.
 
@@ -171,20 +193,14 @@ def _levelled(folder: Path, poses: PlacedPoses, files: Sequence[ImageFile], leve
               is_known: bool) -> tuple[PlacedPoses, str]:
     """Return poses with z up where that is asked for, and a note on the vertical, or ''."""
     placed = np.array([pose for _, pose in poses.all_of(files)]).reshape(-1, 4, 4)
-    up = find_vertical(placed) if len(placed) else None
-    if up is None:
-        if level:
-            raise DatasetError(f'{folder}: the cameras do not tell the vertical: they turn too '
-                               'little, or were held on their side; leave out --level')
-        return poses, ''
-    rotation, tilt_deg = rotation_to_z(up)
     if level:
+        found = find_tilt(placed)
+        if found is None:
+            raise DatasetError(f'{folder}: {NO_VERTICAL}')
+        rotation, tilt_deg = found
         return (replace(poses, map_from_stored=rotation @ poses.map_from_stored),
                 f'levelled: the vertical of the cameras was {tilt_deg:.1f} degrees off z')
-    if is_known or tilt_deg < _MOST_TILT_DEG:
-        return poses, ''
-    return poses, (f'z is {tilt_deg:.0f} degrees off the vertical of the cameras: --level turns '
-                   'it up')
+    return poses, '' if is_known else tilt_note(placed)
 
 
 def tum_frames(sequence: TumSequence, camera: Camera, options: FolderOptions = _NO_OPTIONS

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import move_poses
 from cliploc_ros.datasets.depth import DepthCamera, DepthImage, depth_from_counts
 from cliploc_ros.datasets.poses import Poses, check_clock
 from cliploc_ros.errors import DatasetError
@@ -105,6 +106,19 @@ class Frames:
                                  and is_wanted(place, stamp_ns, pose))
         return Frames(self.source, len(chosen), read_raw, varies=self.varies, digest=self.digest,
                       notes=self.notes)
+
+
+def move_frames(frames: Frames, scale: float, rotation: NDArray[np.float64]) -> Frames:
+    """Return frames with other poses, see move_poses."""
+    def moved(pose: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+        return None if pose is None else move_poses(pose[None], scale, rotation)[0]
+
+    def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
+        for raw in frames.read_raw(lambda place, stamp_ns, pose: is_wanted(place, stamp_ns,
+                                                                           moved(pose))):
+            yield replace(raw, map_from_camera=moved(raw.map_from_camera))
+    return replace(frames, read_raw=read_raw, of_cameras=tuple(
+        move_frames(one, scale, rotation) for one in frames.of_cameras))
 
 
 def join_frames(of_cameras: Mapping[str, Frames]) -> Frames:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import move_poses
 
 # A focal length and a principal point that differ by less are of one camera that focuses.
 _SAME_CAMERA = 0.02
@@ -118,11 +119,9 @@ class PosedDetections:
         """Return the same detections with other poses (F, 4, 4)."""
         return replace(self, map_from_camera=map_from_camera)
 
-    def scaled(self, scale: float) -> 'PosedDetections':
-        """Return the same detections with positions times a scale."""
-        poses = self.map_from_camera.copy()
-        poses[:, :3, 3] *= scale
-        return self.with_poses(poses)
+    def moved(self, scale: float, rotation: NDArray[np.float64]) -> 'PosedDetections':
+        """Return the same detections with other poses, see move_poses."""
+        return self.with_poses(move_poses(self.map_from_camera, scale, rotation))
 
 
 def group_cameras(cameras: Sequence[Camera]) -> tuple[tuple[Camera, ...], NDArray[np.int64]]:

@@ -87,7 +87,7 @@ class Player:
         self, node: Node, reader: BagReader, options: PlayOptions, stop: Interruption
     ) -> None:
         self._reader, self._options, self._stop = reader, options, stop
-        self.topics = select_topics(reader, options)
+        self.topics, self.without_type = _playable(select_topics(reader, options), options)
         self.start_ns = reader.start_ns + round(options.start_offset_s * NS_PER_S)
         self.end_ns = reader.end_ns
         if self.start_ns > self.end_ns:
@@ -261,6 +261,26 @@ def select_topics(reader: BagReader, options: PlayOptions) -> list[BagTopic]:
     if not sum(topic.message_count for topic in topics):
         raise DatasetError(f'{reader.path}: holds no messages on the topics to play')
     return topics
+
+
+def _playable(topics: list[BagTopic], options: PlayOptions
+              ) -> tuple[list[BagTopic], list[BagTopic]]:
+    """Return the topics whose types are installed, and the others.
+
+    DatasetError: a topic that is asked for by name, or each of them, lacks its type.
+    """
+    lacking = []
+    for topic in topics:
+        try:
+            message_class(topic)
+        except DatasetError:
+            if options.topics is not None:
+                raise
+            lacking.append(topic)
+    playable = [topic for topic in topics if topic not in lacking]
+    if not sum(topic.message_count for topic in playable):
+        message_class(lacking[0])
+    return playable, lacking
 
 
 def create_publisher(node: Node, topic: BagTopic, name: str) -> Publisher:

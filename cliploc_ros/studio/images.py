@@ -22,6 +22,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.datasets.bag_frames import BagTopics, bag_images
 from cliploc_ros.datasets.folders import FolderOptions, find_layout, read_folder
 from cliploc_ros.datasets.frames import read_color, undistorted
+from cliploc_ros.datasets.map_recording import MapRecording
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.mapping.posed_detections import PosedDetections, group_cameras, names_of_group
 from cliploc_ros.studio.landmark import Landmark
@@ -39,6 +40,7 @@ _MAX_OUTLINES = 200
 # Subpixel bits of OpenCV's drawing functions; larger coordinates overflow its integers.
 _SHIFT = 4
 _MAX_PIXEL = 20_000.0
+_NO_OPTIONS = FolderOptions()
 
 #: x and y [px].
 Pixel = Sequence[float] | NDArray[np.float64]
@@ -75,15 +77,25 @@ class Images:
                 if offsets[nearest] <= _MAX_DELAY_NS else None)
 
 
-def open_images(path: Path, topics: BagTopics, cameras: Sequence[str] = ('',)) -> Images:
+def images_of_recording(recording: MapRecording, cameras: Sequence[str]) -> Images | None:
+    """Open the images that a map was built from; None where they are gone."""
+    if recording.source is None:
+        return None
+    return open_images(recording.source, BagTopics(
+        recording.image, recording.camera_info, recording.rectified), cameras, FolderOptions(
+        recording.intrinsics, images=recording.images, layout=recording.layout))
+
+
+def open_images(path: Path, topics: BagTopics, cameras: Sequence[str] = ('',),
+                folder: FolderOptions = _NO_OPTIONS) -> Images:
     """Open the images of a folder, or those of each camera of a rosbag2 recording.
 
     DatasetError: it is neither, or lacks a camera.
     """
     if not path.exists():
         raise DatasetError(f'{path}: no such folder or recording')
-    if (layout := find_layout(path)) is not None:
-        files = layout.read(path, FolderOptions()).files
+    if (layout := find_layout(path, folder.layout)) is not None:
+        files = layout.read(path, folder).files
         return Images(np.array([one.stamp_ns for one in files], dtype=np.int64),
                       lambda place: read_color(files[place]))
     of_cameras = [bag_images(path, topics.of_camera(name)) for name in cameras]

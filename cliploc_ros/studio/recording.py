@@ -29,6 +29,7 @@ from cliploc_ros.mapping.check.landmark_faults import (
     find_map_overlaps,
     hear_witness,
 )
+from cliploc_ros.mapping.check.relocalization import RecordedKeyframes
 from cliploc_ros.mapping.evidence import widest_angle_deg
 from cliploc_ros.mapping.fitting import Fit, fit_ellipsoid
 from cliploc_ros.mapping.labelling import embed_landmarks
@@ -71,6 +72,8 @@ class Answer(NamedTuple):
             parts.append(result.reason)
         if self.error_m is not None and self.error_deg is not None:
             parts.append(f'pose off by {self.error_m:.2f} m, {self.error_deg:.1f} degrees')
+        if result.recognized is not None and result.solved:
+            parts.append(f'pose by {result.source}')
         parts.append(f'confidence {result.confidence:.2f}, {len(result.matches)} inliers'
                      + (f' ({found})' if found else ''))
         parts.append(f'{max(0, len(result.hypotheses) - 1)} rivals; similarities are simulated')
@@ -149,10 +152,12 @@ class Recording:
         overlaps = find_map_overlaps(landmark_map, witness, self.views)
         return check_landmarks(landmark_map, witness, overlaps, self.options)
 
-    def relocalize(self, landmarks: Landmarks, views: Sequence[int]) -> list[Answer]:
+    def relocalize(self, landmarks: Landmarks, views: Sequence[int],
+                   keyframes: RecordedKeyframes | None = None) -> list[Answer]:
         """Return the relocalizer's answers in some views; MapError without landmarks.
 
-        An accepted pose that is off by more than a metre is wrong.
+        An accepted pose that is off by more than a metre is wrong. Keyframes of a view's time are
+        not used for it.
         """
         landmark_map = map_of(landmarks, 'map', 'studio')
         relocalizer = Relocalizer(landmark_map, RelocalizerOptions(
@@ -171,7 +176,8 @@ class Recording:
                                                np.random.default_rng([0, view]))
             result = relocalizer.relocalize([Observation(
                 detections.camera_of(view), Detections(boxes, class_ids, detections.scores[rows]),
-                similarities)])
+                similarities)], None if keyframes is None
+                else keyframes.recognizer(detections, view))
             if result.map_from_camera is None:
                 answers.append(Answer(view, 'refused', None, None, result))
                 continue

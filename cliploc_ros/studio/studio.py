@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.mapping.check.landmark_faults import LandmarkCheck
-from cliploc_ros.mapping.check.relocalization import sample_frames
+from cliploc_ros.mapping.check.relocalization import RecordedKeyframes, sample_frames
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.edits import EditError
@@ -329,16 +329,26 @@ class Studio:
 
     # ---- the relocalizer ------------------------------------------------------------------------
 
+    def _keyframes(self) -> RecordedKeyframes | None:
+        """Return the keyframes and the images of the views; None without them."""
+        images, detections = self._images, self._recording().detections
+        return None if self.layer is None or images is None else RecordedKeyframes(
+            self.layer, lambda view: images.near(float(detections.stamps_s[view]),
+                                                 detections.name_of(view),
+                                                 detections.camera_of(view)))
+
     def relocalize_here(self) -> str:
         """Relocalize in the selected view."""
-        self.answers = tuple(self._recording().relocalize(self.document.landmarks, [self.view]))
+        self.answers = tuple(self._recording().relocalize(self.document.landmarks, [self.view],
+                                                          self._keyframes()))
         return self.answers[0].text(self.document.to_map())
 
     def relocalize_all(self) -> str:
         """Relocalize in views along the trajectory, and compare with the time before."""
         recording = self._recording()
         views = sample_frames(recording.detections, _MAX_TRIALS).tolist()
-        self.answers = tuple(recording.relocalize(self.document.landmarks, views))
+        self.answers = tuple(recording.relocalize(self.document.landmarks, views,
+                                                  self._keyframes()))
         before = self._counts
         self._counts = {verdict: sum(one.verdict == verdict for one in self.answers)
                         for verdict in ('accepted', 'refused', 'wrong')}

@@ -20,7 +20,7 @@ ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 CLIP = ('--clip-model', ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'clip.safetensors',
         '--device', 'cpu')
 # a short walk sees objects from one side
-SHORT = ('--min-baseline', '0.5')
+SHORT = ('--min-baseline', '0.5', '--no-check')
 IMAGES = 10
 COLOURS = ('red', 'orange', 'yellow', 'green', 'blue', 'purple', 'pink', 'brown', 'black', 'white')
 

@@ -23,7 +23,7 @@ CLIP = ('--clip-model', ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'cli
 
 
 def run(main, *arguments):
-    return main([*map(str, arguments)])
+    return main([*map(str, arguments), *(['--no-check'] if main is build_map else [])])
 
 
 def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys):

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from cliploc_ros.cli.build_map import main, make_parser
-from cliploc_ros.cli.map_layer import layer_input, write_layer
+from cliploc_ros.cli.map_layer import make_layer, write_layer
+from cliploc_ros.cli.sources import read_frames
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map, remove_layer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError, MappingError
-from cliploc_ros.recording.keyframe_layer import build_layer
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 WALK = ['--tum', str(ASSETS / 'mapping')]
@@ -38,22 +38,29 @@ def test_a_walk_gives_a_layer_next_to_its_map(tmp_path):
     landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
     options = make_parser().parse_args([
         *WALK, '--keyframe-layer', '--keyframe-points', '100', '--out', str(tmp_path / 'a.yaml')])
-    frames, wanted = layer_input(options)
-    line = write_layer(options.out, build_layer(frames, landmark_map, wanted))
+    made, note = make_layer(options, read_frames(options), landmark_map)
+    assert not note
+    line = write_layer(options.out, made)
     layer = load_layer_of_map(tmp_path / 'a.keyframes.npz', landmark_map)
     assert line.startswith(f'keyframes: {len(layer)} with {len(layer.points)} points, ')
     assert len(layer) >= 20
     assert np.diff(layer.offsets).max() <= 100
-    without = make_parser().parse_args([*WALK, '--out', str(tmp_path / 'b.yaml')])
-    assert layer_input(without) == (None, None)
+    for declined, why in (('--no-keyframe-layer', ''), ('--every=2', 'no keyframes with --every')):
+        without = make_parser().parse_args([*WALK, declined, '--out', str(tmp_path / 'b.yaml')])
+        layer, note = make_layer(without, read_frames(without), landmark_map)
+        assert layer is None and note.startswith(why)
 
 
-def test_images_that_do_not_overlap_give_an_error(tmp_path):
-    options = make_parser().parse_args([*WALK, '--keyframe-layer', '--keyframes', '50', '360',
-                                        '--out', str(tmp_path / 'a.yaml')])
-    with pytest.raises(MappingError, match='no keyframe: of 1 images none has'):
-        frames, wanted = layer_input(options)
-        build_layer(frames, LandmarkMap.from_file(ASSETS / 'map.yaml'), wanted)
+def test_images_that_do_not_overlap_give_an_error_or_a_note(tmp_path):
+    landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
+    options = make_parser().parse_args([*WALK, '--keyframes', '50', '360', '--out',
+                                        str(tmp_path / 'a.yaml')])
+    why = 'no keyframe: of 1 images none has'
+    layer, note = make_layer(options, read_frames(options), landmark_map)
+    assert layer is None and why in note
+    options.keyframe_layer = True
+    with pytest.raises(MappingError, match=why):
+        make_layer(options, read_frames(options), landmark_map)
 
 
 def test_the_layer_of_a_map_that_is_replaced_is_removed(tmp_path):

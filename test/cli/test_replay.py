@@ -240,6 +240,20 @@ def test_foreign_types_are_named(tmp_path, msgtype, definition, messages):
     assert_refused(run('replay', write_foreign(tmp_path / 'bag', msgtype, definition)), *messages)
 
 
+def test_a_type_that_is_not_installed_is_left_out_with_a_note(tmp_path):
+    with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        for name, msgtype, definition in (('/odd', 'my_msgs/msg/Odd', 'int32 x'),
+                                          ('/number', 'std_msgs/msg/Int32', 'int32 data')):
+            connection = bag.add_connection(name, msgtype, msgdef=definition, rihs01='',
+                                            offered_qos_profiles=[RECORDED_QOS])
+            bag.write(connection, START_NS, b'\x00\x01\x00\x00\x01\x00\x00\x00')
+    done = run('replay', tmp_path / 'bag')
+    assert done.returncode == 0, done.stderr
+    assert 'not replayed: /odd: my_msgs/msg/Odd is not installed' in done.stdout
+    assert 'published 1 messages on 1 topics' in done.stdout
+    assert_refused(run('replay', tmp_path / 'bag', '--topics', '/odd'), '/odd needs')
+
+
 @pytest.mark.parametrize(
     ('args', 'messages'),
     [

@@ -13,8 +13,13 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames, bag_odometry
-from cliploc_ros.datasets.bag_poses import pose_sources, poses_of_tf, poses_of_topic
+from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames, bag_odometry, find_topics
+from cliploc_ros.datasets.bag_poses import (
+    find_poses,
+    pose_sources,
+    poses_of_tf,
+    poses_of_topic,
+)
 from cliploc_ros.datasets.bags import BagWriter, typestore
 from cliploc_ros.datasets.poses import mount_from_numbers
 from cliploc_ros.errors import DatasetError
@@ -109,6 +114,29 @@ def test_poses_are_interpolated_within_a_gap(tmp_path):
     # another process decodes it
     decoded = pickle.loads(pickle.dumps(raw[0])).decode()
     assert (decoded.image_rgb == 500 % 200).all() and decoded.camera.fx == 50.0
+
+
+def test_the_only_topics_and_poses_are_found(tmp_path):
+    bag = write_bag(tmp_path / 'bag', [450], [
+        *tf_messages(), (450, '/image/compressed', COMPRESSED, make(
+            COMPRESSED, header=header(START, 'camera'), format='jpeg',
+            data=np.zeros(1, np.uint8))),
+        (450, '/depth/image', bag_messages.IMAGE, depth_message(START, np.ones((2, 2))))])
+    assert find_topics(bag, None, None) == ('/image', '/camera_info')
+    frame, = bag_frames(bag, BagTopics(), find_poses(1000 * MS)).read()
+    expected, = bag_frames(bag, BagTopics(), poses_of_tf('map', None, 1000 * MS)).read()
+    np.testing.assert_array_equal(frame.map_from_camera, expected.map_from_camera)
+
+
+def test_topics_and_poses_that_are_not_plain_are_asked_for(tmp_path):
+    bag = write_bag(tmp_path / 'bag', [450], [
+        *drive(), (450, '/left', bag_messages.IMAGE, depth_message(START, np.ones((2, 2))))])
+    with pytest.raises(DatasetError, match=r'2 topics of colour images.*give --image TOPIC'):
+        find_topics(bag, None, None)
+    assert find_topics(bag, '/image', None) == ('/image', '/camera_info')
+    # nothing says what a pose is of: a camera or a robot
+    with pytest.raises(DatasetError, match=r'say where the poses are.*poses here: /pose; no tf'):
+        bag_frames(bag, BagTopics(), find_poses(0))
 
 
 def test_odometry_and_covariance_with_a_mount(tmp_path):

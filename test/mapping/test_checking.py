@@ -288,7 +288,25 @@ def test_frames_for_which_no_landmark_is_left_count_as_refused(detections):
     of_bare = [one for one in trials if one.stamp_s in bare_stamps]
     assert of_bare
     assert {one.reason for one in of_bare} == {'the other parts show no landmark'}
+    # the other parts tell nothing of the map there
+    assert not any(one.is_judged for one in of_bare)
+    assert all(one.is_judged for one in trials if one not in of_bare)
     assert any(one.verdict == 'accepted' for one in trials)
+
+
+def test_a_walk_that_passes_each_object_once_is_judged_by_what_it_can_tell():
+    # each object is detected in one block of 4 s only, so that no other block knows it
+    detections = see(TABLE, walk_around(frames=120))
+    _, witness = witness_of(TABLE, detections)
+    once = detections.select_boxes(witness.shown % 6 == detections.frames // 20)
+    report = check_map(TABLE, once, options=QUICK)
+    assert not report.recording.can_judge_boxes
+    assert not any(text.startswith('held-out') for text in report.failures)
+    assert any('cross-validation cannot judge boxes' in note for note in report.notes)
+    # a landmark at a wrong place explains none of its boxes, and is seen as such
+    moved = replace(TABLE, centers=TABLE.centers + np.array([0.4, 0.0, 0.0]))
+    wrong = check_map(moved, detections, options=QUICK)
+    assert wrong.recording.can_judge_boxes and not wrong.passed
 
 
 def test_stretches_without_landmarks_become_advice(detections):

@@ -53,6 +53,15 @@ def quaternion_from_transform(a_from_b: NDArray[np.float64]) -> NDArray[np.float
     return quat_xyzw if quat_xyzw[3] >= 0.0 else -quat_xyzw
 
 
+def move_poses(poses: NDArray[np.float64], scale: float, rotation: NDArray[np.float64]
+               ) -> NDArray[np.float64]:
+    """Return poses (n, 4, 4) with positions times a scale, then turned by a rotation (3, 3)."""
+    moved = poses.copy()
+    moved[:, :3, 3] *= scale
+    moved[:, :3] = rotation @ moved[:, :3]
+    return moved
+
+
 def rotation_angle_deg(rotation: NDArray[np.float64]) -> float:
     """Return the angle [deg] by which a rotation (3, 3) turns."""
     return float(np.degrees(Rotation.from_matrix(rotation).magnitude()))

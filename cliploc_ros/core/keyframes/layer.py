@@ -15,7 +15,7 @@ import hashlib
 import json
 import os
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -83,6 +83,17 @@ class KeyframeLayer:
     def __len__(self) -> int:
         """Return the number of keyframes."""
         return len(self.map_from_camera)
+
+    def select(self, chosen: NDArray[np.bool_]) -> 'KeyframeLayer':
+        """Return the keyframes of a mask (K,), without their small images."""
+        counts = np.diff(self.offsets)
+        rows = np.repeat(chosen, counts)
+        return replace(
+            self, map_from_camera=self.map_from_camera[chosen],
+            offsets=np.cumsum([0, *counts[chosen]]), images=None, image_offsets=None,
+            camera_rows=None if self.camera_rows is None else self.camera_rows[chosen],
+            **{name: getattr(self, name)[rows] for name in ('pixels', 'points', 'descriptors',
+                                                            'words')})
 
     def prepare(self) -> None:
         """Compute the indices now, so that the first request does not wait for them."""

@@ -11,9 +11,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.transforms import invert_transform, rotation_angle_deg
+from cliploc_ros.core.geometry.transforms import (
+    invert_transform,
+    move_poses,
+    rotation_angle_deg,
+)
 from cliploc_ros.core.keyframes.features import Features, extract, match, unit_rows
 from cliploc_ros.datasets.frames import ImageFile, read_color
 from cliploc_ros.datasets.poses import Poses
@@ -38,10 +41,6 @@ _FEATURES, _LONGEST_PX = 500, 480
 _LEAST_MATCHES = 25
 # Median epipolar errors at an image _LONGEST_PX wide [px]: a true choice has 0.3 to 2 of them.
 _GOOD_PX, _WRONG_PX, _BETTER = 3.0, 4.0, 0.35
-# Images look along the ground; a camera that only turns about its own x axis tells no vertical.
-_LEAST_SPREAD = np.sin(np.radians(8.0)) ** 2
-_MOST_SHARE = 0.25
-_LEAST_UPRIGHT = 0.5
 
 
 @dataclass(frozen=True)
@@ -64,9 +63,7 @@ class PlacedPoses:
         if stored is None:
             return None
         pose = np.array(AXES[self.axes](stored))
-        pose[:3, 3] *= self.scale
-        pose[:3] = self.map_from_stored @ pose[:3]
-        return pose
+        return move_poses(pose[None], self.scale, self.map_from_stored)[0]
 
     def all_of(self, files: Sequence[ImageFile]) -> list[tuple[ImageFile, _Pose]]:
         """Return the images that have a pose, each with it."""
@@ -92,40 +89,6 @@ def find_scale(posed: Sequence[tuple[ImageFile, _Pose]], first: str, second: str
         raise DatasetError(f'{where}: {first} and {second} were taken at one place; name two '
                            'images at a distance that you know')
     return metres / distance
-
-
-def find_vertical(poses: NDArray[np.float64]) -> _Pose | None:
-    """Return the direction (3,) that points up in the poses' coordinate frame.
-
-    People hold a camera level: its x axis is horizontal, so up is the direction with the least
-    share of the x axes, and the upper edge of the image points there on average.
-
-    Parameters
-    ----------
-    poses : ndarray (n, 4, 4)
-
-    Returns
-    -------
-    ndarray or None
-        None where the cameras do not tell: they never turn, or are held on their side.
-    """
-    level, image_up = poses[:, :3, 0], -poses[:, :3, 1]
-    shares, directions = np.linalg.eigh(level.T @ level / len(level))
-    up = directions[:, 0] * (np.sign(image_up.mean(axis=0) @ directions[:, 0]) or 1.0)
-    if (shares[1] < _LEAST_SPREAD or shares[0] > _MOST_SHARE * shares[1]
-            or np.mean(image_up @ up) < _LEAST_UPRIGHT):
-        return None
-    return np.asarray(up)
-
-
-def rotation_to_z(up: _Pose) -> tuple[_Pose, float]:
-    """Return the least rotation (3, 3) of a direction to the z axis, and its angle [deg]."""
-    angle = float(np.degrees(np.arccos(np.clip(up[2], -1.0, 1.0))))
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    if np.linalg.norm(axis) < 1e-9:
-        axis = np.array([1.0, 0.0, 0.0])
-    axis = axis / np.linalg.norm(axis)
-    return Rotation.from_rotvec(np.radians(angle) * axis).as_matrix(), angle
 
 
 def check_axes(files: Sequence[ImageFile], stored: Poses, axes: str, where: Path) -> str:

@@ -13,7 +13,13 @@ from typing import Any
 from cliploc_ros.files.storage import write_text
 from cliploc_ros.mapping.check.landmark_faults import LandmarkCheck
 from cliploc_ros.mapping.check.relocalization import Trial, count_verdicts
-from cliploc_ros.mapping.check.report import SERIOUS, CheckReport, RecordingCheck, share
+from cliploc_ros.mapping.check.report import (
+    SERIOUS,
+    CheckReport,
+    RecordingCheck,
+    count_by_objects,
+    share,
+)
 
 PAGE, DATA = 'check.html', 'check.json'
 ACCEPTED, REFUSED, MISLED = '#0072B2', '#E69F00', '#D55E00'
@@ -123,7 +129,12 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
              'was built from this recording)'),
             ('explained boxes, median IoU; held out',
              f'{one.held_out.explained:.1%}, {one.held_out.median_iou:.3f}'),
-            ('recorded frames, cross-validated', _verdicts(one.trials)),
+            ('recorded frames, cross-validated', _verdicts(one.judged) + (
+                '' if len(one.judged) == len(one.trials) else
+                f'; {len(one.trials) - len(one.judged)} more show what no other part of the '
+                'recording shows')),
+            *([('of these by objects alone', str(count_by_objects(one.judged)['accepted']))]
+              if any(trial.by_objects for trial in one.trials) else []),
             ('the same poses with simulated boxes', _verdicts(one.simulated)),
             ('noise of box edges', f'{one.edge_scale:.2f} times that assumed by build_map')]
     if report.queries:
@@ -132,6 +143,8 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
              ('grid positions near the recording with an accepted heading'
               if report.recording else 'grid positions with an accepted heading',
               f'{report.grid.accepted_positions:.0%} of {int(report.grid.is_near.sum())}')]
+    if report.accepted_positions != report.grid.accepted_positions:
+        rows.append(('these positions, with keyframes', f'{report.accepted_positions:.0%}'))
     if (layer := report.keyframes) is not None:
         rows.append(('keyframes', f'{layer.keyframes} with {layer.points} points'))
         if len(layer.recorded):

@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from cliploc_ros.core.geometry.tilt import tilt_note
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
@@ -21,7 +22,9 @@ from cliploc_ros.mapping.check.landmark_faults import (
 )
 from cliploc_ros.mapping.check.places import Grid, find_look_alikes, make_grid
 from cliploc_ros.mapping.check.relocalization import (
+    ImageOf,
     PosedObservation,
+    RecordedKeyframes,
     Trial,
     box_quality,
     make_folds,
@@ -59,7 +62,8 @@ _NO_RECORDING = (
 def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = None,
               queries: Sequence[PosedObservation] = (), options: CheckOptions | None = None,
               thresholds: Thresholds | None = None, progress: Progress | None = None,
-              layer: KeyframeLayer | None = None) -> CheckReport:
+              layer: KeyframeLayer | None = None, image_of: ImageOf | None = None
+              ) -> CheckReport:
     """Check a map.
 
     Parameters
@@ -72,6 +76,9 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         What the map has to reach.
     layer : KeyframeLayer, optional
         The keyframes next to the map.
+    image_of : callable, optional
+        Returns the undistorted image (h, w, 3) of a frame of the recording, red first; None where
+        it is missing. With a layer, frames are relocalized by keyframes, too.
 
     Raises
     ------
@@ -98,8 +105,12 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         if len(models) > 1:
             notes.append(f'the grid has one camera, {detections.camera_names[0]}, the first of '
                          f'{len(models)}')
-        recording = _check_recording(landmark_map, detections, views, witness, models, options,
-                                     tell)
+        recording = _check_recording(
+            landmark_map, detections, views, witness, models, options, tell,
+            None if layer is None or image_of is None else RecordedKeyframes(layer, image_of))
+        notes += _notes_on(recording)
+        if note := tilt_note(detections.map_from_camera):
+            notes.append(note)
     overlaps = find_map_overlaps(landmark_map, witness, views)
     places = make_grid(landmark_map, None if detections is None else detections.of_first_camera,
                        options)
@@ -136,17 +147,19 @@ def judge_grid(grid: Grid, model: DetectorModel, trials: Sequence[Trial], headin
 
 def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
                      witness: Witness, models: Sequence[DetectorModel], options: CheckOptions,
-                     tell: Progress) -> RecordingCheck:
+                     tell: Progress, keyframes: RecordedKeyframes | None) -> RecordingCheck:
     tell('cross-validating', 0.0)
     folds, blocks, held_out = [], [], []
     for fold in make_folds(views, witness, options):
-        ious = best_ious(views, fold.landmarks)[np.isin(views.frames, fold.frames)]
+        # a box whose landmark no other part of the recording shows says nothing of the map
+        is_known = (witness.shown < 0) | np.isin(witness.shown, fold.rows)
+        ious = best_ious(views, fold.landmarks)[np.isin(views.frames, fold.frames) & is_known]
         folds.append(fold)
         held_out.append(ious)
         blocks.append(BlockQuality(len(fold.frames), len(fold.rows), box_quality(ious)))
         tell('cross-validating', len(folds) / options.folds)
     trials = try_recording(landmark_map, detections, witness.shown, folds, options,
-                           partial(tell, 'relocalizing recorded frames'))
+                           partial(tell, 'relocalizing recorded frames'), keyframes)
     sampled = sample_frames(detections, options.frames)
     simulated = [trial for number, model in enumerate(models) for trial in try_poses(
         model, landmark_map,
@@ -162,6 +175,19 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
         trials=tuple(trials), simulated=tuple(simulated),
         corrections=tuple(find_corrections(detections, views, witness.fitted, witness.shown)),
         edge_scale=models[0].edge_scale)
+
+
+def _notes_on(recording: RecordingCheck) -> list[str]:
+    """Return why some figures of a recording do not count."""
+    notes = []
+    if not recording.can_judge_boxes:
+        notes.append(f'cross-validation cannot judge boxes: of {recording.as_given.boxes}, other '
+                     f'parts of the recording show the objects of {recording.held_out.boxes}')
+    if not recording.can_judge_frames:
+        notes.append(f'cross-validation cannot judge frames: other parts of the recording show '
+                     f'the objects of {len(recording.judged)} of {len(recording.trials)}; the '
+                     'verdict takes simulated boxes; pass each place twice to know better')
+    return notes
 
 
 def _unrelated(landmark_map: LandmarkMap, detections: PosedDetections) -> str:

@@ -8,13 +8,21 @@ recording. Simulated frames have the errors of the recording's detector.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.keyframes.localization import (
+    ImageRecognizer,
+    KeyframeLocalizer,
+    query_features,
+)
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -31,9 +39,15 @@ from cliploc_ros.simulation.labels import LabelModel
 
 _MAX_SAMPLED_FRAMES = 600
 _CLUTTER_IOU = 0.1
+# Half a block of cross-validation.
+_SAME_TIME_S = 0.5 * CheckOptions.block_s
+#: A pose needs this number of landmarks.
+LANDMARKS_FOR_A_POSE = 3
 
 Verdict = Literal['accepted', 'refused', 'misled']
 Tell = Callable[[float], None]
+#: Returns the undistorted image (h, w, 3) of a recorded frame, red first; None without one.
+ImageOf = Callable[[int], NDArray[np.uint8] | None]
 
 
 class Fold(NamedTuple):
@@ -43,6 +57,23 @@ class Fold(NamedTuple):
     #: (l,): the landmarks of the whole map that the other frames suffice for
     rows: NDArray[np.int64]
     landmarks: Landmarks  #: These landmarks, fitted to the other frames
+    training: NDArray[np.bool_]  #: (F,): these other frames
+
+
+class RecordedKeyframes(NamedTuple):
+    """The keyframes next to a map, and the images of the recording."""
+
+    layer: KeyframeLayer
+    image_of: ImageOf
+
+    def recognizer(self, detections: PosedDetections, frame: int) -> ImageRecognizer | None:
+        """Return the keyframe search of a frame, without keyframes of its time; None without."""
+        is_other = np.abs(detections.stamps_s[_frames_of(self.layer, detections)]
+                          - detections.stamps_s[frame]) > _SAME_TIME_S
+        image = self.image_of(frame) if is_other.any() else None
+        return None if image is None else ImageRecognizer(
+            KeyframeLocalizer(self.layer.select(is_other)), query_features(image),
+            detections.camera_of(frame))
 
 
 @dataclass(frozen=True)
@@ -87,7 +118,7 @@ def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterato
                 kept[row] = len(seen_from) >= mapping.min_viewpoints
             boxes.append(rows if kept[row] else rows[:0])
         yield Fold(judged, np.nonzero(kept)[0],
-                   fit_landmarks(views, witness.landmarks, boxes).select(kept))
+                   fit_landmarks(views, witness.landmarks, boxes).select(kept), training)
 
 
 def box_quality(ious: NDArray[np.float64]) -> BoxQuality:
@@ -162,11 +193,16 @@ class Trial:
     error_m: float | None
     reason: str  #: Of a refusal
     stamp_s: float | None = None  #: Of a recorded frame [s]
+    #: Of a recorded frame: the verdict without keyframes, where they were used; and whether the
+    #: other frames show enough of its objects, or of its place, to judge the map by it
+    by_objects: Verdict | None = None
+    is_judged: bool = True
 
     def as_dict(self) -> dict[str, Any]:
         """Return the trial as plain values, for JSON."""
         return {
-            'verdict': self.verdict, 'stamp_s': self.stamp_s,
+            'verdict': self.verdict, 'stamp_s': self.stamp_s, 'by_objects': self.by_objects,
+            'is_judged': self.is_judged,
             'position': self.position.round(4).tolist(),
             'forward': self.forward.round(4).tolist(), 'detections': self.detections,
             'landmarks': self.landmarks,
@@ -176,15 +212,16 @@ class Trial:
 
 def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
                   shown: NDArray[np.int64], folds: Sequence[Fold], options: CheckOptions,
-                  tell: Tell) -> list[Trial]:
+                  tell: Tell, keyframes: RecordedKeyframes | None = None) -> list[Trial]:
     """Relocalize recorded frames in the map that the other frames show, in the order of time.
 
-    Boxes and poses are the recording's, similarities are simulated; shown (n,) has the landmark
-    of each box, -1 for none. The callable tell is told the share that is done.
+    Boxes, poses and images are the recording's, similarities are simulated; shown (n,) has the
+    landmark of each box, -1 for none. The callable tell is told the share that is done.
     """
     labels = LabelModel.of(landmark_map)
     chosen = set(sample_frames(detections, options.frames).tolist())
-    trials, done = [], 0
+    taken_at = None if keyframes is None else _frames_of(keyframes.layer, detections)
+    trials: list[Trial] = []
     for fold in folds:
         frames = [frame for frame in fold.frames.tolist() if frame in chosen]
         if not frames:
@@ -195,24 +232,43 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
             relocalizer = _relocalizer(replace(
                 landmark_map.select(fold.rows.tolist()), centers=fold.landmarks.centers,
                 semi_axes=semi_axes, quats_xyzw=quats_xyzw), options)
+        localizer = None
+        if keyframes is not None and fold.training[taken_at].any():
+            localizer = KeyframeLocalizer(keyframes.layer.select(fold.training[taken_at]))
         for frame in frames:
             rows = slice(*detections.frame_offsets[frame:frame + 2])
             rng = np.random.default_rng([options.random_seed, frame])
             class_ids = tuple(detections.class_names[one] for one in detections.classes[rows])
             boxes, seen = detections.bboxes_xyxy[rows], shown[rows]
             pose, stamp_s = detections.map_from_camera[frame], float(detections.stamps_s[frame])
-            done += 1
-            tell(done / len(chosen))
+            tell((len(trials) + 1) / len(chosen))
+            known = int(np.isin(seen, fold.rows).sum())
+            is_judged = known >= min(LANDMARKS_FOR_A_POSE, int((seen >= 0).sum()))
             if relocalizer is None:
                 trials.append(Trial('refused', pose[:3, 3], pose[:3, 2], len(boxes), 0, None,
-                                    None, 'the other parts show no landmark', stamp_s))
+                                    None, 'the other parts show no landmark', stamp_s,
+                                    is_judged=is_judged))
                 continue
             similarities = labels.similarities(seen, class_ids, boxes, rng)[:, fold.rows]
-            trials.append(_try(
-                relocalizer, detections.camera_of(frame), Detections(boxes, class_ids,
-                                                                     detections.scores[rows]),
-                similarities, pose, int((seen >= 0).sum()), options, stamp_s))
+            camera = detections.camera_of(frame)
+            judge = partial(_try, relocalizer, camera, Detections(
+                boxes, class_ids, detections.scores[rows]), similarities, pose,
+                int((seen >= 0).sum()), options, stamp_s)
+            trial = replace(judge(), is_judged=is_judged)
+            if (localizer is not None and keyframes is not None
+                    and (image := keyframes.image_of(frame)) is not None):
+                both = judge(ImageRecognizer(localizer, query_features(image), camera))
+                trial = replace(both, by_objects=trial.verdict,
+                                is_judged=is_judged or both.verdict != 'refused')
+            trials.append(trial)
     return sorted(trials, key=lambda one: one.stamp_s or 0.0)
+
+
+def _frames_of(layer: KeyframeLayer, detections: PosedDetections) -> NDArray[np.int64]:
+    """Return the recorded frame (K,) that is nearest to each keyframe, in place and direction."""
+    places, queries = (np.column_stack([poses[:, :3, 3], poses[:, :3, 2], poses[:, :3, 0]])
+                       for poses in (detections.map_from_camera, layer.map_from_camera))
+    return np.asarray(cKDTree(places).query(queries)[1])
 
 
 def sample_frames(detections: PosedDetections, limit: int) -> NDArray[np.int64]:
@@ -269,10 +325,13 @@ def count_verdicts(trials: Sequence[Trial]) -> dict[str, int]:
 
 
 def refused_spans(trials: Sequence[Trial]) -> Iterator[list[Trial]]:
-    """Yield the runs of recorded frames without an accepted right pose, the longest first."""
+    """Yield the runs of recorded frames without an accepted right pose, the longest first.
+
+    Frames that do not tell are left out.
+    """
     runs: list[list[Trial]] = [[]]
     for one in trials:
-        if one.verdict == 'accepted':
+        if one.verdict == 'accepted' or not one.is_judged:
             runs.append([])
         else:
             runs[-1].append(one)
@@ -286,10 +345,11 @@ def _relocalizer(landmark_map: LandmarkMap, options: CheckOptions) -> Relocalize
 
 def _try(relocalizer: Relocalizer, camera: Camera, detections: Detections,
          similarities: NDArray[np.float32], map_from_camera: NDArray[np.float64], landmarks: int,
-         options: CheckOptions, stamp_s: float | None = None) -> Trial:
+         options: CheckOptions, stamp_s: float | None = None,
+         recognizer: ImageRecognizer | None = None) -> Trial:
     up = map_from_camera[2, :3] if options.use_vertical else None  # the map's z in the camera
     result = relocalizer.relocalize([Observation(camera, detections, similarities,
-                                                 up_in_camera=up)])
+                                                 up_in_camera=up)], recognizer)
     estimate, error_m = result.map_from_camera, None
     if estimate is not None:
         error_m = float(pose_error(estimate, map_from_camera)[0])

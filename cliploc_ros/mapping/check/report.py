@@ -3,7 +3,7 @@
 """The result of a check: figures, verdict and advice."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,14 +13,17 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import NEAR_DEG, NEAR_M
 from cliploc_ros.mapping.check.landmark_faults import LandmarkCheck, Overlap
 from cliploc_ros.mapping.check.places import LookAlike
-from cliploc_ros.mapping.check.relocalization import BoxQuality, Trial, count_verdicts
+from cliploc_ros.mapping.check.relocalization import (
+    LANDMARKS_FOR_A_POSE,
+    BoxQuality,
+    Trial,
+    count_verdicts,
+)
 from cliploc_ros.mapping.options import Thresholds
 from cliploc_ros.mapping.systematic import Correction
 
 #: A landmark of this severity has a serious fault.
 SERIOUS = 1.0
-#: A pose needs this number of landmarks.
-LANDMARKS_FOR_A_POSE = 3
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,21 @@ class RecordingCheck:
     corrections: tuple[Correction, ...]
     edge_scale: float  #: Deviation of box edges, in units of build_map's assumption
 
+    @property
+    def judged(self) -> tuple[Trial, ...]:
+        """Return the recorded frames by which the map can be judged."""
+        return tuple(one for one in self.trials if one.is_judged)
+
+    @property
+    def can_judge_frames(self) -> bool:
+        """Return whether cross-validation tells how many frames are accepted."""
+        return 2 * len(self.judged) >= len(self.trials)
+
+    @property
+    def can_judge_boxes(self) -> bool:
+        """Return whether the other parts of the recording show the landmarks of most boxes."""
+        return 2 * self.held_out.boxes >= self.as_given.boxes
+
     def as_dict(self) -> dict[str, Any]:
         """Return the check as plain values, for JSON."""
         return {
@@ -58,6 +76,8 @@ class RecordingCheck:
             'as_given': asdict(self.as_given), 'held_out': asdict(self.held_out),
             'folds': [asdict(one) for one in self.folds], 'edge_scale': self.edge_scale,
             'verdicts': count_verdicts(self.trials),
+            'verdicts_by_objects': count_by_objects(self.trials),
+            'judged_frames': len(self.judged),
             'verdicts_with_simulated_boxes': count_verdicts(self.simulated),
             'corrections': [asdict(one) for one in self.corrections],
             'trials': [one.as_dict() for one in self.trials]}
@@ -165,6 +185,22 @@ class CheckReport:
         return not self.failures
 
     @property
+    def accepted_positions(self) -> float:
+        """Return the share of the grid positions near the recording with an accepted heading.
+
+        A keyframe within reach counts where recorded images were relocalized by the keyframes of
+        other parts of the recording, by the share of them that was accepted.
+        """
+        by_images = [] if self.recording is None else [
+            one for one in self.recording.judged if one.by_objects is not None]
+        if self.keyframes is None or not by_images:
+            return self.grid.accepted_positions
+        near = self.grid.is_near
+        chance = share(by_images, 'accepted') * (self.keyframes.headings[near] > 0)
+        accepted = np.where(self.grid.accepted[near] > 0, 1.0, chance)
+        return float(accepted.mean()) if len(accepted) else 0.0
+
+    @property
     def duplicates(self) -> int:
         """Return the number of pairs of landmarks that are one object."""
         return sum(one.is_duplicate for one in self.overlaps)
@@ -215,16 +251,27 @@ def find_failures(report: CheckReport, limits: Thresholds) -> list[str]:
            True, str)
     if (recording := report.recording) is not None:
         views += recording.trials
-        demand('held-out boxes explained', recording.held_out.explained, limits.min_explained,
-               False)
-        demand('held-out median IoU', recording.held_out.median_iou, limits.min_iou, False,
-               '{:.4g}'.format)
-        demand('recorded frames accepted', share(recording.trials, 'accepted'),
-               limits.min_accepted, False)
-    demand('positions with an accepted heading', report.grid.accepted_positions,
+        if recording.can_judge_boxes:
+            demand('held-out boxes explained', recording.held_out.explained,
+                   limits.min_explained, False)
+            demand('held-out median IoU', recording.held_out.median_iou, limits.min_iou, False,
+                   '{:.4g}'.format)
+        if recording.can_judge_frames:
+            demand('recorded frames accepted', share(recording.judged, 'accepted'),
+                   limits.min_accepted, False)
+        else:  # a map of a walk that passes each object once
+            demand('recorded frames accepted with simulated boxes',
+                   share(recording.simulated, 'accepted'), limits.min_accepted, False)
+    demand('positions with an accepted heading', report.accepted_positions,
            limits.min_positions, False)
     demand('views that mislead a robot', share(views, 'misled'), limits.max_misled, True)
     return failures
+
+
+def count_by_objects(trials: Sequence[Trial]) -> dict[str, int]:
+    """Return how many trials are accepted, refused and misled without keyframes."""
+    return count_verdicts([replace(one, verdict=one.by_objects or one.verdict)
+                           for one in trials])
 
 
 def share(trials: Sequence[Trial], verdict: str) -> float:

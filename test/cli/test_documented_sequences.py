@@ -1,0 +1,173 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The commands of the pages, from a recorded bag to a pose, in their order."""
+
+import contextlib
+import importlib
+import io
+import json
+import signal
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from doc_commands import PROJECT, commands_of
+from rig_bag import TF, transform
+from test_doc_commands import program_of
+
+from cliploc_ros.cli.studio import make_parser, open_studio
+from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.keyframes.layer import layer_path
+from cliploc_ros.datasets import bag_messages
+from cliploc_ros.datasets.bags import BagWriter
+from cliploc_ros.datasets.folders import read_sequence
+from cliploc_ros.datasets.poses import mount_from_numbers
+from cliploc_ros.demo import ASSETS
+
+PAGES = [PROJECT / page for page in ('doc/from_a_bag.md', 'README.md', 'doc/your_robot.md',
+                                     'doc/mapping.md', 'doc/keyframes.md')]
+# Of another robot or recording.
+OTHER = {'--cameras', '--update', '--observations', '--colmap', '--queries'}
+MOUNT = mount_from_numbers([0.1, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5])
+FEW = ('--positions', '4', '--headings', '2', '--frames', '10')
+BOTH = pytest.mark.parametrize('drive', ['rendered', 'real'], indirect=True)
+TOPICS = {'/camera/image_raw': bag_messages.IMAGE,
+          '/camera/camera_info': bag_messages.CAMERA_INFO, '/tf': TF, '/tf_static': TF}
+
+
+def write_drive(path, folder, every):
+    """Write the bag that the pages record: images, camera_info, and the robot's tf."""
+    sequence, camera, _ = read_sequence(folder, None)
+    sequence = sequence.every(every)
+    image, info = list(TOPICS)[:2]
+    with BagWriter(path) as bag:
+        for topic, msgtype in TOPICS.items():
+            bag.add_topic(topic, msgtype)
+        first = sequence.stamps_ns[0]
+        bag.write('/tf_static', first, transform(first, 'base_footprint', 'camera_optical_frame',
+                                                 MOUNT))
+        for stamp, file in zip(sequence.stamps_ns, sequence.image_paths, strict=True):
+            pixels = np.ascontiguousarray(cv2.imread(str(file))[..., ::-1])
+            bag.write(image, stamp, bag_messages.image_message(stamp, 'camera_optical_frame',
+                                                               pixels))
+            bag.write(info, stamp, bag_messages.camera_info_message(
+                stamp, 'camera_optical_frame', camera))
+            pose = sequence.pose_at(stamp)
+            if pose is not None:
+                bag.write('/tf', stamp, transform(stamp, 'map', 'odom', np.eye(4)))
+                bag.write('/tf', stamp, transform(stamp, 'odom', 'base_footprint',
+                                                  pose @ invert_transform(MOUNT)))
+
+
+@pytest.fixture(scope='module')
+def drive(request, tmp_path_factory):
+    """Return a folder with the bag, and its networks as arguments and as parameters."""
+    folder = tmp_path_factory.mktemp(request.param)
+    if request.param == 'rendered':
+        write_drive(folder / 'drive', ASSETS / 'mapping', 1)
+        found, more = {'model': ASSETS / 'yolo.pt', 'clip_model': ASSETS / 'clip.json',
+                       'clip_pretrained': ASSETS / 'clip.safetensors'}, []
+    else:
+        shared = request.getfixturevalue('shared_data')
+        write_drive(folder / 'drive', shared / 'rooms/tum_fr1_rpy', 4)
+        found, more = {'model': shared / 'weights/yolov8n_coco.pt'}, ['--no-clip']
+    arguments = [word for name, file in found.items()
+                 for word in (f'--{name.replace("_", "-")}', str(file))]
+    return folder, [*arguments, *more], found
+
+
+@pytest.fixture(scope='module')
+def built(drive):
+    """Return the drive, and what the first command of the page printed."""
+    folder, networks, _ = drive
+    with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()) as printed:
+        assert main_of('build_map')(['--bag', 'drive', '--out', 'office.yaml', *networks]) == 0
+    return *drive, printed.getvalue()
+
+
+def main_of(name):
+    return importlib.import_module(f'cliploc_ros.cli.{name}').main
+
+
+def documented(pages):
+    """Return the commands that make, check or open the map of a drive, each once."""
+    found = []
+    for page in pages:
+        for one in commands_of(page):
+            module, arguments = program_of(one)
+            name = module.rpartition('.')[2]
+            if (name in ('build_map', 'check_map', 'studio') and not OTHER & {*arguments}
+                    and ('drive' in arguments or (name != 'build_map'
+                                                  and 'office.yaml' in arguments[:1]))):
+                found.append((name, *arguments))
+    return list(dict.fromkeys(found))
+
+
+FIRST, *ON_PAGE = documented(PAGES[:1])
+ELSEWHERE = [one for one in documented(PAGES) if one not in (FIRST, *ON_PAGE)]
+
+
+@BOTH
+def test_one_command_leads_from_a_bag_to_a_checked_map(built):
+    folder, _, _, printed = built
+    assert FIRST == ('build_map', '--bag', 'drive', '--out', 'office.yaml')
+    assert 'drive: /camera/image_raw and /camera/camera_info' in printed
+    assert printed.endswith('to correct it: studio office.yaml\n')
+    assert layer_path(folder / 'office.yaml').exists()
+    checked = json.loads((folder / 'office_check/check.json').read_text())
+    assert 'fails: ' in printed or checked['passed']
+    verdicts, alone = (checked['recording'][one] for one in ('verdicts', 'verdicts_by_objects'))
+    assert verdicts['accepted'] > alone['accepted'] and verdicts['misled'] == 0
+
+
+@pytest.mark.parametrize(('drive', 'words'), [
+    *(('real', one) for one in ON_PAGE), *(('rendered', one) for one in (*ON_PAGE, *ELSEWHERE))],
+    indirect=['drive'])
+def test_the_other_commands_run(built, monkeypatch, words):
+    folder, networks, _, _ = built
+    monkeypatch.chdir(folder)
+    name, *arguments = words
+    if name == 'studio':
+        studio = open_studio(make_parser().parse_args(arguments))
+        assert studio.views > 10 and studio.document.landmarks
+        assert 'pose by' in studio.relocalize_here()
+        studio.document.close()
+    elif name == 'check_map':
+        assert main_of(name)([*arguments, *FEW]) in (0, 1)
+    else:
+        arguments[arguments.index('office.yaml')] = 'other.yaml'
+        assert main_of(name)([*arguments, *networks, '--no-check']) == 0
+        assert layer_path('other.yaml').exists() != ('--no-keyframe-layer' in arguments)
+
+
+@BOTH
+def test_the_nodes_answer_as_the_page_says(built, monkeypatch):
+    folder, _, parameters, _ = built
+    monkeypatch.chdir(folder)
+    processes = []
+    try:
+        for one in commands_of(PAGES[0]):
+            module, arguments = program_of(one)
+            name = module.rpartition('.')[2]
+            words = [sys.executable, '-m', module, *arguments]
+            if name in ('detector', 'relocalizer'):
+                own = {key: value for key, value in parameters.items()
+                       if key.startswith('clip') == (name == 'relocalizer')}
+                if name == 'relocalizer' and not own:
+                    own = {'matching': 'class'}
+                words += [word for key, value in own.items()
+                          for word in ('-p', f'{key}:={value}')]
+            if name in ('replay', 'detector', 'relocalizer'):
+                processes.append(subprocess.Popen(words))
+            elif name == 'wake_up':
+                done = subprocess.run([*words, '--timeout', '150'], capture_output=True,
+                                      text=True, timeout=300)
+                assert done.returncode == 0, done.stdout + done.stderr
+                assert 'accepted' in done.stdout
+    finally:
+        for process in processes:
+            process.send_signal(signal.SIGINT)
+        for process in processes:
+            process.wait(60)
