@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
+from cliploc_ros.cli.sources import add_topic_options
 from cliploc_ros.command import (
     StageBar,
     positive,
@@ -20,12 +21,15 @@ from cliploc_ros.command import (
     within,
 )
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.errors import CliplocError
 from cliploc_ros.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
     from cliploc_ros.core.map.landmark_map import LandmarkMap
+    from cliploc_ros.evaluation.map_check.views import Views
     from cliploc_ros.mapping.check.relocalization import PosedObservation
+    from cliploc_ros.mapping.posed_detections import PosedDetections
 
 _ADVICE_SHOWN = 8
 EPILOG = """\
@@ -53,6 +57,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('map', type=Path, metavar='MAP', help='a map file')
     parser.add_argument('--observations', type=Path, metavar='NPZ',
                         help='boxes and poses of a recording of the place')
+    parser.add_argument('--images', type=Path, metavar='BAG|DIR',
+                        help='show these images beside the advice (the recording, where the '
+                        'observations lie next to it)')
     parser.add_argument('--queries', type=Path, metavar='NPZ',
                         help='a query file of this map: frames with similarities')
     parser.add_argument('--out', type=Path, required=True, metavar='DIR',
@@ -63,6 +70,7 @@ def make_parser() -> argparse.ArgumentParser:
     add_use_option(parser, 'report what the keyframes next to the map reach')
     _add_relocalizer_options(parser)
     _add_thresholds(parser)
+    add_topic_options(parser.add_argument_group('images of a bag'))
     return parser
 
 
@@ -134,7 +142,8 @@ def check(options: argparse.Namespace) -> int:
         report = check_map(landmark_map, detections, queries, check_options, thresholds, bar.show,
                            layer)
         write_report(options.out, options.map.name, report,
-                     draw_pictures(landmark_map, report))
+                     draw_pictures(landmark_map, report),
+                     _open_views(options, landmark_map, detections))
     print('\n'.join(summary_lines(report)))
     print('what to do:')
     print('\n'.join(f'  {printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
@@ -143,6 +152,28 @@ def check(options: argparse.Namespace) -> int:
     print(f'wrote {options.out / PAGE} in {time.monotonic() - begin:.1f} s: '
           f'{"passed" if report.passed else "failed"}')
     return 0 if report.passed else 1
+
+
+def _open_views(options: argparse.Namespace, landmark_map: 'LandmarkMap',
+                detections: 'PosedDetections | None') -> 'Views | None':
+    """Return the views of the recording; None where its images are not at hand."""
+    from cliploc_ros.datasets.bag_frames import BagTopics
+    from cliploc_ros.evaluation.map_check.views import Views
+    from cliploc_ros.recording.recorder import source_of
+    from cliploc_ros.studio.images import open_images
+
+    if detections is None or (path := options.images or source_of(options.observations)) is None:
+        return None
+    topics = BagTopics(options.image, options.camera_info, options.rectified)
+    try:
+        images = open_images(path, topics, detections.camera_names if options.cameras == ['']
+                             else options.cameras)
+    except CliplocError as error:
+        if options.images is not None:
+            raise
+        print(f'note: no images beside the advice: {error}')
+        return None
+    return Views(landmark_map, detections, images.near)
 
 
 def _read_queries(path: Path, landmark_map: 'LandmarkMap') -> list['PosedObservation']:

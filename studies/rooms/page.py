@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 
 from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.evaluation.figures import draw_map
-from cliploc_ros.evaluation.map_check.page import ACCEPTED, FAINT, MISLED, REFUSED
+from cliploc_ros.files.page import ACCEPTED, FAINT, MISLED, REFUSED
 from cliploc_ros.files.storage import write_text
 from studies.rooms.asking import BOTH, KEYFRAMES, KNOWN, NOTHING, OBJECTS, WAYS, Answers, Outcome
 from studies.rooms.rooms import Room
