@@ -127,6 +127,11 @@ def figure(image: bytes | str, caption: str, name: str = '') -> str:
             f'<figcaption>{escape(caption)}</figcaption></figure>')
 
 
+def side_by_side(parts: Iterable[str]) -> str:
+    """Return parts side by side, where there is room."""
+    return f'<div class="row">{"".join(parts)}</div>'
+
+
 def items(texts: Iterable[str]) -> str:
     """Return a list."""
     return '<ul>' + ''.join(f'<li>{escape(text)}</li>' for text in texts) + '</ul>'

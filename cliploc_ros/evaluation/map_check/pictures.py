@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pictures of a check: the map from above with landmarks, grid and recorded frames."""
 
-import io
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -16,11 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon, Rectangle
-from numpy.typing import NDArray
 
-from cliploc_ros.core.geometry.ellipsoid import outline_points
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.evaluation.figures import EDGED
+from cliploc_ros.evaluation.drawing import EDGED, draw_outline, png_of, write_name
 from cliploc_ros.evaluation.map_check.page import (
     FIRST_ADVICE,
     GRADE_COLORS,
@@ -42,8 +39,6 @@ INK = '#222222'
 _HEAT = LinearSegmentedColormap.from_list('accepted', ['#FBE9C6', '#56B4E9', '#003E6B'])
 _UNSEEN = '#DDDDDD'
 _MOST_NAMES = 30
-# Width and height of a name in shares of the picture.
-_NAME_ROOM = np.array([0.09, 0.035])
 _MOST_LOOK_ALIKES = 6
 
 
@@ -55,25 +50,19 @@ def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
            'the more of the headings with at least three detectable landmarks give an accepted, '
            'right pose. Ticks point where the camera looked when a wrong pose was accepted. '
            'Positions inside of a landmark, and beyond all objects, are left out. The numbers '
-           'are those of the advice.', _png(_grid_figure(canvas)))
+           'are those of the advice.', png_of(_grid_figure(canvas), _DPI))
     if report.recording is not None and report.recording.trials:
         yield ('frames', 'Recorded frames, each relocalized in a map that was fitted without '
                'frames of that time. The dot is the camera, the wedge where it looks. Times '
                'are those of the longest runs of refused frames.',
-               _png(_frames_figure(canvas, report.recording.trials)))
+               png_of(_frames_figure(canvas, report.recording.trials), _DPI))
         yield ('time', 'The same frames over time: how many landmarks of the map the detector '
-               'found, and the verdict.', _png(_time_figure(report.recording.trials)))
+               'found, and the verdict.', png_of(_time_figure(report.recording.trials), _DPI))
     yield ('landmarks', 'The landmarks from above. Names are those of landmarks with a fault; '
-           'where these are many, with a serious one.', _png(_landmarks_figure(canvas)))
+           'where these are many, with a serious one.', png_of(_landmarks_figure(canvas), _DPI))
     if report.look_alikes:
         yield ('look_alikes', 'Places that look alike, joined in pairs.',
-               _png(_look_alikes_figure(canvas)))
-
-
-def _png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format='png', dpi=_DPI)
-    return buffer.getvalue()
+               png_of(_look_alikes_figure(canvas), _DPI))
 
 
 class _Canvas:
@@ -113,16 +102,9 @@ class _Canvas:
         axes.set_axisbelow(True)
         faces = [face] * len(self.map) if isinstance(face, str) else face
         for center, shape, color in zip(self.map.centers, self.map.shapes, faces, strict=True):
-            outline = np.array([center[0], center[1], shape[0], shape[1], shape[3]])
-            axes.add_patch(Polygon(outline_points(outline), closed=True, facecolor=color,
-                                   edgecolor='#444444', linewidth=0.7, alpha=alpha, zorder=3,
-                                   path_effects=EDGED if color == 'none' else None))
+            draw_outline(axes, center, shape, facecolor=color, edgecolor='#444444', linewidth=0.7,
+                         alpha=alpha, zorder=3, path_effects=EDGED if color == 'none' else None)
         return figure, axes
-
-
-def _name(axes: Axes, xy: NDArray[np.float64], text: str) -> None:
-    axes.text(xy[0], xy[1], text, fontsize=8, color=INK, ha='center', va='center', zorder=9,
-              path_effects=EDGED, parse_math=False, clip_on=True)
 
 
 def _add_legend(figure: Figure, handles: Sequence[Line2D | Patch]) -> None:
@@ -202,7 +184,7 @@ def _frames_figure(canvas: _Canvas, trials: Sequence[Trial]) -> Figure:
     for run in [run for run in refused_spans(trials) if len(run) > 1][:8]:
         middle = run[len(run) // 2]
         behind = middle.position[:2] - 1.2 * size * middle.forward[:2]
-        _name(axes, behind, f'{(middle.stamp_s or 0.0) - first:.0f} s')
+        write_name(axes, behind, f'{(middle.stamp_s or 0.0) - first:.0f} s')
     counts = count_verdicts(trials)
     _add_legend(figure, [
         *(Line2D([], [], color=color, label=f'{verdict} ({counts[verdict]})', markersize=5,
@@ -245,19 +227,8 @@ def _landmarks_figure(canvas: _Canvas) -> Figure:
     named = [one for one in checks if one.faults]
     if len(named) > _MOST_NAMES:
         named = [one for one in named if grade(one) == 'faulty'][:_MOST_NAMES]
-    # names nearer than some room share one
-    stacks: list[tuple[NDArray[np.float64], list[str]]] = []
     for one in named:
-        place = np.array(one.center[:2])
-        for other, names in stacks:
-            if (np.abs(other - place) < _NAME_ROOM * canvas.size).all():
-                names.append(one.landmark_id)
-                break
-        else:
-            stacks.append((place, [one.landmark_id]))
-    for place, names in stacks:
-        shown = names if len(names) <= 3 else [*names[:2], f'and {len(names) - 2} more']
-        _name(axes, place, '\n'.join(shown))
+        write_name(axes, one.center[:2], one.landmark_id)
     if canvas.path is not None:
         axes.plot(*canvas.path.T, color=FAINT, linewidth=0.8, zorder=2)
     counts = Counter(grades.values())
