@@ -167,10 +167,11 @@ def _success_by_boxes(summaries: Sequence[Summary]) -> Figure:
         rates = [(one.errors_m[:, chosen] < _SUCCESS_M).mean() for _, _, chosen in bins]
         axes.plot(range(len(bins)), rates, color=color, linestyle=line, marker=marker,
                   markersize=4, linewidth=1.2, label=one.method)
-    names = [f'{low} to {high}' if high < _BOX_BINS[-1][1] else f'{low} and more'
+    names = [f'{low} to {high}' if high < _BOX_BINS[-1][1] else f'{low} or more'
              for low, high, _ in bins]
-    axes.set_xticks(range(len(bins)), [f'{name}\n({int(chosen.sum())} images)'
-                                       for name, (*_, chosen) in zip(names, bins, strict=True)])
+    axes.set_xticks(range(len(bins)), [f'{name}\n{int(chosen.sum())} images'
+                                       for name, (*_, chosen) in zip(names, bins, strict=True)],
+                    fontsize=8)
     axes.set_ylim(-0.02, 1.02)
     add_legend(figure)
     return figure
@@ -190,8 +191,7 @@ def _precision_over_recall(summaries: Sequence[Summary]) -> Figure:
             axes.plot(one.recall(), one.precision(), color=color, marker=marker, markersize=6,
                       markeredgecolor='black', linestyle='none')
     axes.set(xlim=(-0.02, 1.02))
-    axes.set_title('lines: all thresholds of the confidence; markers: the options as run',
-                   fontsize=9)
+    axes.set_title('lines: all least confidences; markers: as run', fontsize=9)
     add_legend(figure)
     return figure
 
@@ -268,8 +268,9 @@ def _time_by_stage(summaries: Sequence[Summary], observing_ms: Mapping[str, floa
     search = np.array([one.mean_search_ms for one in summaries])
     axes.barh(rows, search, left=start, color=[_style(one.method)[0] for one in summaries])
     for row, total, own in zip(rows, start + search, search, strict=True):
-        axes.annotate(f'search {own:,.1f}, all {total:,.1f}', (total, row), xytext=(3, 0),
-                      va='center', fontsize=8, textcoords='offset points')
+        axes.annotate(f'search {own:,.1f}' + (f', all {total:,.1f}' if total > own else ''),
+                      (total, row), xytext=(3, 0), va='center', fontsize=8,
+                      textcoords='offset points')
     axes.set_yticks(rows, [one.method for one in summaries])
     axes.invert_yaxis()
     has_stages = bool(observing_ms) or keyframes.any()

@@ -21,6 +21,8 @@ from cliploc_ros.files.storage import write_text
 
 PAGE = 'report.html'
 _TOP_VIEW = 'top_view'
+# Columns of the first screen: method, success, accepted, false accepts.
+_BRIEF = (0, 1, 2, 5, 7)
 _CAPTIONS = {
     _TOP_VIEW: 'The map from above. A line joins each estimate of the best method to its truth.',
     'success_over_threshold': 'Share of poses within a distance of the truth, accepted or not.',
@@ -42,14 +44,14 @@ def write_report(folder: Path, summaries: Sequence[Summary], rows: Sequence[Sequ
                    f'{len(best.queries)} images' if len(summaries) > 1 else
                    f'{best.method} on {len(best.queries)} images', not wrong)
     numbers = tiles([
-        (f'{best.success(1.0):.0%}', 'of the poses within 1 m of the truth', True),
+        (f'{100 * best.success(1.0):.0f} %', 'of the poses within 1 m of the truth', True),
         (f'{int(best.accepted.sum())} of {count}', 'accepted', bool(best.accepted.any())),
         (str(wrong), 'accepted, but wrong by more than 1 m', not wrong)])
     drawn = {one.stem: figure(one.read_bytes(), _CAPTIONS[one.stem], one.stem) for one in pictures}
+    head, *brief = [[row[column] for column in _BRIEF] for row in rows]
     top_view = drawn.pop(_TOP_VIEW, '')
     write_text(folder / PAGE, page(
         'Evaluation',
-        first_screen([said, numbers, table(rows[0][:4], [row[:4] for row in rows[1:]])],
-                     [top_view]),
+        first_screen([said, numbers, table(head, brief)], [top_view]),
         fold('The whole table', table(rows[0], rows[1:]), *map(note, remarks)),
         fold('Figures', side_by_side(drawn.values()), is_open=True)))

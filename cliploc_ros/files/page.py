@@ -50,9 +50,8 @@ td.faulty {{ border-left: 4px solid {MISLED} }} td.minor {{ border-left: 4px sol
 .good, .tiles .good {{ border-color: {GOOD} }} .bad, .tiles .bad {{ border-color: {BAD} }}
 .card {{ display: flex; gap: 1rem; align-items: flex-start; padding: .45rem 0;
   border-top: 1px solid #ddd }}
-.card figure {{ margin: 0; flex: 0 0 11rem }} .card img {{ width: 11rem }} .card p {{ margin: 0 }}
-.card figcaption {{ font-size: 12px; line-height: 1.3 }}
-.row {{ display: flex; flex-wrap: wrap; gap: 1rem }} .row figure {{ flex: 1 1 20rem }}
+.card img {{ width: 8.6rem }} .card p {{ margin: 0 }}
+.row {{ display: flex; flex-wrap: wrap; gap: 1rem }} .row figure {{ flex: 1 1 28rem }}
 details {{ margin: .5rem 0; border-top: 1px solid #ddd; padding-top: .4rem }}
 summary {{ font-weight: 600; cursor: pointer }}
 """
@@ -108,9 +107,10 @@ def _percent(share: float) -> str:
     return f'{100.0 * min(1.0, max(0.0, share)):.1f}%'
 
 
-def card(text: str, picture: str = '') -> str:
-    """Return a text beside a picture."""
-    return f'<div class="card">{picture}<p>{escape(text)}</p></div>'
+def card(text: str, image: bytes | None = None, caption: str = '') -> str:
+    """Return a text and a caption beside a picture, if there is one."""
+    picture = '' if image is None else f'<img alt="a view" src="{_embedded(image)}">'
+    return f'<div class="card">{picture}<div><p>{escape(text)}</p>{note(caption)}</div></div>'
 
 
 def fold(heading: str, *parts: str, is_open: bool = False) -> str:
@@ -121,10 +121,13 @@ def fold(heading: str, *parts: str, is_open: bool = False) -> str:
 
 def figure(image: bytes | str, caption: str, name: str = '') -> str:
     """Return a picture, embedded or by the name of a file beside the page; PNG or JPEG."""
-    source = image if isinstance(image, str) else (
-        f'data:image/{_TYPES[image[:4]]};base64,{b64encode(image).decode("ascii")}')
-    return (f'<figure><img alt="{escape(name)}" src="{escape(source)}" loading="lazy">'
+    source = escape(image) if isinstance(image, str) else _embedded(image)
+    return (f'<figure><img alt="{escape(name)}" src="{source}" loading="lazy">'
             f'<figcaption>{escape(caption)}</figcaption></figure>')
+
+
+def _embedded(image: bytes) -> str:
+    return f'data:image/{_TYPES[image[:4]]};base64,{b64encode(image).decode("ascii")}'
 
 
 def side_by_side(parts: Iterable[str]) -> str:

@@ -118,8 +118,8 @@ def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, byt
 
 def _card(number: int, advice: Advice, views: Views | None) -> str:
     view = None if views is None else views.of(advice)
-    return card(f'{number}. {advice.text}',
-                '' if view is None else figure(view.jpeg, view.caption, 'a view'))
+    text = f'{number}. {advice.text}'
+    return card(text) if view is None else card(text, view.jpeg, view.caption)
 
 
 def _bar(one: Measure) -> Bar:

@@ -79,7 +79,7 @@ class _Canvas:
             points.append(self.path)
             hull = cv2.convexHull(np.concatenate(points).astype(np.float32))
             self.shown = report.grid.is_near | np.array([
-                cv2.pointPolygonTest(hull, one, True) > -half for one in grid.tolist()])
+                cv2.pointPolygonTest(hull, one, False) > 0 for one in grid.tolist()])
         every = np.concatenate([*points, grid[self.shown] - half, grid[self.shown] + half])
         self._low = every.min(axis=0) - _MARGIN_M
         self._high = every.max(axis=0) + _MARGIN_M
