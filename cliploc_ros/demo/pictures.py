@@ -34,7 +34,7 @@ _COLUMNS = {'box': 0.0, 'landmark': 0.065, 'CLIP': 0.73, 'rank': 0.815, 'IoU': 0
 _LABEL_CHARS = 54
 _LINE_CHARS = 88
 _MOST_ROWS = 34
-_TOP_VIEW_DPI = 140
+_TOP_VIEW_DPI = 160
 _TRUTH = '#222222'
 _MARGIN_M = 0.45
 _HEADING_M = 0.28
@@ -166,7 +166,7 @@ def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
     points = np.concatenate([landmark_map.centers[:, :2], path_xyz[:, :2]])
     low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
     width, height = high - low
-    scale = min(11.0 / width, 9.0 / height)
+    scale = min(7.5 / width, 6.5 / height)
     figure = Figure(figsize=(width * scale + 3.2, height * scale + 0.9), dpi=_TOP_VIEW_DPI,
                     layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08))
     axes = figure.add_subplot()

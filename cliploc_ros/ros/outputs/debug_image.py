@@ -134,6 +134,7 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
                                       landmark_map.centers[rows], shape_matrices(
                                           landmark_map.semi_axes[rows],
                                           landmark_map.quats_xyzw[rows]))
+        taken: list[NDArray[np.int32]] = []
         for match, outline in zip(found.matches, outlines, strict=True):
             if np.isfinite(outline).all():
                 points = seen.observation.camera.project_normalized(outline_points(outline))
@@ -142,8 +143,8 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
                               cv2.LINE_AA)
             label = landmark_map.labels[match.landmark][:_LABEL_CHARS]
             similarity = _similarity(seen.observation, match.detection, match.landmark)
-            corner = _pixels(boxes[match.detection][:2])
-            _write(canvas, f'{label} {similarity}IoU {match.iou:.2f}', corner - (0, 4), _BOX)
+            _write_near(canvas, f'{label} {similarity}IoU {match.iou:.2f}',
+                        boxes[match.detection], taken)
     scale = _scale(canvas)
     lines = _lines(verdict, int(canvas.shape[1] / (_CHAR_PX * scale))) if verdict else []
     canvas[:int((len(lines) + 0.3 * bool(lines)) * _LINE_PX * scale)] = (
@@ -187,6 +188,19 @@ def _write(canvas: NDArray[np.uint8], text: str, at: NDArray[np.int32],
     thickness = max(1, round(2 * scale))
     cv2.putText(canvas, text, shadow, _FONT, scale, (0, 0, 0), thickness, cv2.LINE_AA)
     cv2.putText(canvas, text, place, _FONT, scale, color, thickness, cv2.LINE_AA)
+
+
+def _write_near(canvas: NDArray[np.uint8], text: str, box: NDArray[np.float64],
+                taken: list[NDArray[np.int32]]) -> None:
+    """Write a line above a box or below it, where it covers no other line; else leave it out."""
+    (width, height), _ = cv2.getTextSize(text, _FONT, _scale(canvas), 1)
+    for corner in (box[:2] - (0, 4), box[[0, 3]] + (0, height + 4)):
+        left, bottom = _pixels(corner).tolist()
+        place = np.array([left, bottom - height, left + width, bottom], dtype=np.int32)
+        if not any((place[:2] < one[2:]).all() and (one[:2] < place[2:]).all() for one in taken):
+            taken.append(place)
+            _write(canvas, text, _pixels(corner), _BOX)
+            return
 
 
 def _scale(canvas: NDArray[np.uint8]) -> float:
