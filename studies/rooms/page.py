@@ -102,7 +102,7 @@ def _top_views(answers: Sequence[Answers], room: Room) -> Figure:
             axes.autoscale_view()
     drawn.legend(handles=[Line2D([], [], color=color, marker='.', linestyle='none', label=name)
                            for name, color in _VERDICTS.items()],
-                  loc='outside lower center', ncols=4, frameon=False)
+                  loc='outside lower center', ncols=2, frameon=False)
     return drawn
 
 

@@ -29,6 +29,8 @@ _MOST_FRAMES = 600
 # A landmark that fills this share of the image is large enough.
 _LARGE = 0.04
 _OWN_IOU = 0.3
+# A picture of a landmark is this many times as large as it.
+_AROUND = 3.0
 # An angle that makes a view as different as a metre does [deg]; what is the same view, and a view
 # that is too different [m].
 _DEGREES_PER_M, _SAME, _MOST_DIFFERENT = 30.0, 0.1, 3.0
@@ -110,14 +112,25 @@ class Views:
                            self._detections.name_of(frame), camera)
         if image is None:
             return None
-        scale = _WIDTH_PX / image.shape[1]
-        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        for box in self._boxes(frame) * scale:
+        outlines = self._outlines(frame, rows)
+        corner, size = np.zeros(2), np.array([camera.width, camera.height], dtype=np.float64)
+        if rows:
+            # a part of the image, in which a small landmark is to be seen
+            left, top, right, bottom = ellipse_bboxes(outlines[:1])[0]
+            part = float(np.clip(_AROUND * max(right - left, bottom - top) / size[1], 0.3, 1.0))
+            corner = np.clip(np.array([left + right, top + bottom]) / 2 - part * size / 2, 0.0,
+                             (1.0 - part) * size).round()
+            size = part * size
+        scale = _WIDTH_PX / size[0]
+        (x, y), (width, height) = corner.astype(int).tolist(), size.astype(int).tolist()
+        small = cv2.resize(np.ascontiguousarray(image[y:y + height, x:x + width]), None, fx=scale,
+                           fy=scale, interpolation=cv2.INTER_AREA)
+        for box in (self._boxes(frame) - np.tile(corner, 2)) * scale:
             left, top, right, bottom = np.rint(box).astype(int).tolist()
             cv2.rectangle(small, (left, top), (right, bottom), _BOX_RGB, 1, cv2.LINE_AA)
-        for outline in self._outlines(frame, rows):
+        for outline in outlines:
             if np.isfinite(outline).all():
-                points = np.clip(np.rint(outline_points(outline) * scale), -9999, 9999)
-                cv2.polylines(small, [points.astype(np.int32)], True, _OUTLINE_RGB, 3, cv2.LINE_AA)
+                points = np.rint((outline_points(outline) - corner) * scale).clip(-9999, 9999)
+                cv2.polylines(small, [points.astype(np.int32)], True, _OUTLINE_RGB, 4, cv2.LINE_AA)
         return cv2.imencode('.jpg', small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
                             )[1].tobytes()
