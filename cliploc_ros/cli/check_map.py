@@ -8,10 +8,12 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
+from cliploc_ros.cli.sources import add_topic_options
 from cliploc_ros.command import (
     StageBar,
     positive,
@@ -21,14 +23,18 @@ from cliploc_ros.command import (
     within,
 )
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.errors import DatasetError
+from cliploc_ros.errors import CliplocError
 from cliploc_ros.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.mapping.check.relocalization import ImageOf, PosedObservation
+    from cliploc_ros.mapping.check.relocalization import PosedObservation
     from cliploc_ros.mapping.posed_detections import PosedDetections
+    from cliploc_ros.studio.images import Images
 
 _ADVICE_SHOWN = 8
 EPILOG = """\
@@ -57,6 +63,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--observations', type=Path, metavar='NPZ',
                         help='boxes and poses of a recording of the place (those that build_map '
                         'made the map from, if NAME.recording.json next to the map names them)')
+    parser.add_argument('--images', type=Path, metavar='BAG|DIR',
+                        help='the images of this recording (found where NAME.recording.json '
+                        'names them, or where the observations lie beside them)')
     parser.add_argument('--queries', type=Path, metavar='NPZ',
                         help='a query file of this map: frames with similarities')
     parser.add_argument('--out', type=Path, metavar='DIR',
@@ -67,6 +76,7 @@ def make_parser() -> argparse.ArgumentParser:
     add_use_option(parser, 'report what the keyframes next to the map reach')
     _add_relocalizer_options(parser)
     _add_thresholds(parser)
+    add_topic_options(parser.add_argument_group('images of a bag'))
     return parser
 
 
@@ -112,6 +122,7 @@ def check(options: argparse.Namespace) -> int:
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.evaluation.map_check.page import PAGE, summary_lines, write_report
     from cliploc_ros.evaluation.map_check.pictures import draw_pictures
+    from cliploc_ros.evaluation.map_check.views import Views
     from cliploc_ros.files.storage import make_folder
     from cliploc_ros.mapping.check.checking import check_map
 
@@ -125,7 +136,12 @@ def check(options: argparse.Namespace) -> int:
         random_seed=options.seed)
     thresholds = Thresholds(**{field.name: getattr(options, field.name)
                                for field in fields(Thresholds)})
-    detections, image_of = _read_recording(options)
+    detections, images = _read_recording(options) or (None, None)
+    image_of = views = None
+    if detections is not None and images is not None:
+        views = Views(landmark_map, detections, images.near)
+        if options.observations is None:  # the layer's own: judged by those of other times
+            image_of = partial(_image_of, detections, images)
     queries = _read_queries(options.queries, landmark_map) if options.queries else []
     layer = read_layer(options.map, landmark_map, options.keyframes)
     out = options.out or options.map.with_name(f'{options.map.stem}_check')
@@ -133,8 +149,7 @@ def check(options: argparse.Namespace) -> int:
     with StageBar() as bar:
         report = check_map(landmark_map, detections, queries, check_options, thresholds, bar.show,
                            layer, image_of)
-        write_report(out, options.map.name, report,
-                     draw_pictures(landmark_map, report))
+        write_report(out, options.map.name, report, draw_pictures(landmark_map, report), views)
     print('\n'.join(summary_lines(report)))
     print('what to do:')
     print('\n'.join(f'  {printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
@@ -145,32 +160,44 @@ def check(options: argparse.Namespace) -> int:
     return 0 if report.passed else 1
 
 
-def _read_recording(options: argparse.Namespace
-                    ) -> 'tuple[PosedDetections | None, ImageOf | None]':
+def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Images | None] | None':
     """Return the recording of the command line or of the map, and its images where they are."""
+    from cliploc_ros.datasets.bag_frames import BagTopics
     from cliploc_ros.datasets.map_recording import load_recording
     from cliploc_ros.datasets.observations import load_observations
-    from cliploc_ros.studio.images import images_of_recording
+    from cliploc_ros.recording.recorder import source_of
+    from cliploc_ros.studio.images import images_of_recording, open_images
 
-    recording, images = load_recording(options.map), None
+    recording = load_recording(options.map) if options.observations is None else None
     if options.observations is not None:
-        detections = load_observations(options.observations)
+        detections, source = load_observations(options.observations), source_of(
+            options.observations)
     elif recording is not None:
         print(f'observations: {os.path.relpath(recording.observations)}', flush=True)
-        detections = recording.load()
-        try:
-            images = images_of_recording(recording, detections.camera_names)
-        except DatasetError as error:
-            print(f'without images: {error}', flush=True)
+        detections, source = recording.load(), None
     else:
-        return None, None
+        return None
+    images = None
+    try:
+        if (path := options.images or source) is not None:
+            images = open_images(
+                path, BagTopics(options.image, options.camera_info, options.rectified),
+                detections.camera_names if options.cameras == [''] else options.cameras)
+        elif recording is not None:
+            images = images_of_recording(recording, detections.camera_names)
+    except CliplocError as error:
+        if options.images is not None:
+            raise
+        print(f'without images: {error}', flush=True)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
-    if images is None:
-        return detections, None
-    found = images
-    return detections, lambda frame: found.near(
-        float(detections.stamps_s[frame]), detections.name_of(frame), detections.camera_of(frame))
+    return detections, images
+
+
+def _image_of(detections: 'PosedDetections', images: 'Images', frame: int
+              ) -> 'NDArray[np.uint8] | None':
+    return images.near(float(detections.stamps_s[frame]), detections.name_of(frame),
+                       detections.camera_of(frame))
 
 
 def _read_queries(path: Path, landmark_map: 'LandmarkMap') -> list['PosedObservation']:

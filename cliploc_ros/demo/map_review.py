@@ -5,7 +5,6 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +19,10 @@ from scipy.optimize import linear_sum_assignment
 from cliploc_ros.core.geometry.ellipsoid import outline_points, shape_matrices
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.tum import parse_stamp_ns
-from cliploc_ros.demo.review import ACCEPTED, REFUSED
 from cliploc_ros.demo.truth import TrueFrame, TrueObject, true_ids
-from cliploc_ros.evaluation.figures import EDGED
+from cliploc_ros.evaluation.drawing import spread_names, write_name
 from cliploc_ros.evaluation.summary import LIMITS_M, Summary
+from cliploc_ros.files.page import ACCEPTED, BAD, figure, fold, table
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.units import NS_PER_S
 
@@ -189,42 +188,32 @@ def _success_rows(summaries: Mapping[str, Summary]) -> list[tuple[str, ...]]:
 def section(review: MapReview, summaries: Mapping[str, Summary], images: int) -> str:
     """Return the section of the page."""
     objects, landmark_map = review.objects, review.landmark_map
+    head, *rows = _success_rows(summaries)
     parts = [
-        '<h2>The map</h2>',
         f'<p><code>build_map</code> built it from {images} images of a mapping walk, with the '
         'poses of that walk. The wake-ups come later: objects have moved, and the light has '
-        'changed.</p>',
-        f'<p><b>{escape(review.summary())}.</b> An object is found if a landmark of its class '
-        f'lies within {NEAR_M * 100:.0f} cm of it. All other landmarks are false.</p>',
-        f'<figure><img src="{PICTURE}" alt="built map and true objects from three sides">'
-        '<figcaption>Found, missed and false objects. The dotted line is the mapping walk.'
-        '</figcaption></figure>',
+        f'changed. An object is found if a landmark of its class lies within {NEAR_M * 100:.0f} '
+        'cm of it. All other landmarks are false.</p>',
+        figure(PICTURE, 'Found, missed and false objects. The dotted line is the mapping walk.',
+               'built map and true objects from three sides'),
         '<p>One look at each image of the wake-ups, in the built map and in the true map:</p>',
-        _table(_success_rows(summaries))]
+        table(head, rows)]
     if review.missed:
-        parts += ['<h3>Missed objects</h3>', _table([('object', 'label', 'why'), *(
+        parts += ['<h2>Missed objects</h2>', table(('object', 'label', 'why'), (
             (objects[row].object_id, objects[row].label, reason)
-            for row, reason in review.missed.items())])]
+            for row, reason in review.missed.items()))]
     if review.false:
-        parts += ['<h3>False objects</h3>', _table([('landmark', 'label', 'what is there'), *(
+        parts += ['<h2>False objects</h2>', table(('landmark', 'label', 'what is there'), (
             (landmark_map.landmark_ids[landmark], landmark_map.labels[landmark], instead)
-            for landmark, instead in review.false.items())])]
-    found = _table([
-        ('object', "a person's label", 'landmark', "the map's label", 'off by', 'size'),
-        *((objects[one.object_row].object_id, objects[one.object_row].label,
-           landmark_map.landmark_ids[one.landmark], landmark_map.labels[one.landmark],
-           f'{one.offset_m * 100:.1f} cm', f'{one.size_ratio - 1:+.0%}')
-          for one in sorted(review.found, key=lambda one: -one.offset_m))])
-    return '\n'.join([
-        *parts, '<details><summary>All found objects, the least accurate first</summary>'
-        f'{found}</details>', '<h2>The wake-ups in this map</h2>'])
-
-
-def _table(rows: Sequence[Sequence[str]]) -> str:
-    """Return a table of HTML; the first row is its headings."""
-    lines = [''.join(f'<{tag}>{escape(cell)}</{tag}>' for cell in row)
-             for tag, row in zip(['th', *['td'] * (len(rows) - 1)], rows, strict=True)]
-    return '<table>' + ''.join(f'<tr>{line}</tr>' for line in lines) + '</table>'
+            for landmark, instead in review.false.items()))]
+    found = table(
+        ('object', "a person's label", 'landmark', "the map's label", '#off by', '#size'),
+        ((objects[one.object_row].object_id, objects[one.object_row].label,
+          landmark_map.landmark_ids[one.landmark], landmark_map.labels[one.landmark],
+          f'{one.offset_m * 100:.1f} cm', f'{one.size_ratio - 1:+.0%}')
+         for one in sorted(review.found, key=lambda one: -one.offset_m)))
+    return fold(f'The map that was built: {review.summary()}', *parts,
+                fold('All found objects, the least accurate first', found))
 
 
 def draw_map_review(review: MapReview, map_from_camera: NDArray[np.float64], path: Path) -> None:
@@ -233,13 +222,13 @@ def draw_map_review(review: MapReview, map_from_camera: NDArray[np.float64], pat
                              map_from_camera[:, :3, 3]])
     low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
     extents = high - low
-    figure = Figure(figsize=(13.0, 1.0 + 13.0 * (extents[1] + extents[2]) / extents[:2].sum()),
+    drawn = Figure(figsize=(13.0, 1.0 + 13.0 * (extents[1] + extents[2]) / extents[:2].sum()),
                     dpi=_DPI, layout='constrained')
-    grid = figure.add_gridspec(2, 2, height_ratios=(extents[1], extents[2]),
+    grid = drawn.add_gridspec(2, 2, height_ratios=(extents[1], extents[2]),
                                width_ratios=(extents[0], extents[1]))
     for place, (across, up, entries) in zip((grid[0, 0], grid[1, 0], grid[1, 1]), _PANELS,
                                             strict=True):
-        axes = figure.add_subplot(place)
+        axes = drawn.add_subplot(place)
         axes.set(xlim=(low[across], high[across]), ylim=(low[up], high[up]), aspect='equal',
                  xlabel=f'{_AXIS_NAMES[across]} [m]', ylabel=f'{_AXIS_NAMES[up]} [m]')
         axes.grid(color='#EEEEEE', zorder=0)
@@ -251,17 +240,18 @@ def draw_map_review(review: MapReview, map_from_camera: NDArray[np.float64], pat
             axes.plot(*positions.T, '.', color='#666666', markersize=5, zorder=2)
             for start, end in zip(positions, positions + _HEADING_M * forward, strict=True):
                 axes.plot(*zip(start, end, strict=True), color='#666666', linewidth=0.9, zorder=2)
-    legend = figure.add_subplot(grid[0, 1])
+    legend = drawn.add_subplot(grid[0, 1])
     legend.set_axis_off()
     legend.legend(loc='upper left', frameon=False, fontsize=11, handles=[
         Patch(facecolor=ACCEPTED, alpha=0.45, label=f'landmark of an object: {len(review.found)}'),
-        Patch(facecolor=REFUSED, alpha=0.45, label=f'false landmark: {len(review.false)}'),
+        Patch(facecolor=BAD, alpha=0.45, label=f'false landmark: {len(review.false)}'),
         Patch(facecolor='none', edgecolor=_MISSED, linewidth=2.0,
               label=f'missed object: {len(review.missed)}'),
         Patch(facecolor='none', edgecolor=_TRUTH, linewidth=0.6, label='true object'),
         Line2D([], [], color='#666666', marker='.', linestyle=':',
                label='mapping walk, with the direction of each view')])
-    figure.savefig(path)
+    spread_names(drawn)
+    drawn.savefig(path)
 
 
 def _draw_panel(axes: Axes, review: MapReview, plane: tuple[int, int],
@@ -269,7 +259,7 @@ def _draw_panel(axes: Axes, review: MapReview, plane: tuple[int, int],
     landmark_map = review.landmark_map
     for landmark, (center, shape) in enumerate(zip(landmark_map.centers, landmark_map.shapes,
                                                    strict=True)):
-        color = REFUSED if landmark in review.false else ACCEPTED
+        color = BAD if landmark in review.false else ACCEPTED
         outline = outline_points(np.array([*center[[*plane]], *shape[[*entries]]]))
         axes.add_patch(Polygon(outline, closed=True, facecolor=color, edgecolor='none', alpha=0.45,
                                zorder=4 if landmark in review.false else 3))
@@ -282,12 +272,8 @@ def _draw_panel(axes: Axes, review: MapReview, plane: tuple[int, int],
                                edgecolor=_MISSED if is_missed else _TRUTH,
                                linewidth=2.0 if is_missed else 0.6))
         if is_missed:
-            _name(axes, one.center[[*plane]] + (0.0, _NAME_OFFSET_M), one.object_id, '#8A5A00')
+            write_name(axes, one.center[[*plane]] + (0.0, _NAME_OFFSET_M), one.object_id,
+                       color='#8A5A00')
     for landmark in review.false:
-        _name(axes, landmark_map.centers[landmark, [*plane]] - (0.0, _NAME_OFFSET_M),
-              landmark_map.landmark_ids[landmark], REFUSED)
-
-
-def _name(axes: Axes, place: NDArray[np.float64], name: str, color: str) -> None:
-    axes.text(place[0], place[1], name, fontsize=8, ha='center', va='center', color=color,
-              zorder=8, fontweight='bold', path_effects=EDGED)
+        write_name(axes, landmark_map.centers[landmark, [*plane]] - (0.0, _NAME_OFFSET_M),
+                   landmark_map.landmark_ids[landmark], color=BAD)

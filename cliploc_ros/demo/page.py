@@ -8,46 +8,37 @@ from pathlib import Path
 
 import numpy as np
 
-from cliploc_ros.demo.review import ACCEPTED, REFUSED, WRONG_M, Judged, Review
+from cliploc_ros.demo.review import WRONG_M, Judged, Review
+from cliploc_ros.files.page import figure, first_screen, fold, page, table, tiles, verdict
+from cliploc_ros.files.storage import write_text
 
 TOP_VIEW = 'top_view.png'
 #: Pattern of the wake-ups' pictures.
 PICTURES = 'wake_up_??.png'
 
+# Columns of the first screen.
+_BRIEF_COLUMNS = (0, 2, 4, 6, 7)
 # Heading and width on the terminal.
 _COLUMNS = (('', 3), ('image at', 8), ('answer', 8), ('score', 6), ('inliers', 7),
             ('x y z [m]', 18), ('error', 15), ('answer time', 11), ('stages', 0))
-
-_STYLE = f"""\
-body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 2rem auto; max-width: 1280px;
-  padding: 0 1rem }}
-img {{ max-width: 100%; border: 1px solid #ddd }}
-table {{ border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums }}
-th, td {{ text-align: left; padding: .25rem .8rem; border-bottom: 1px solid #ddd }}
-.accepted {{ color: {ACCEPTED} }} .refused {{ color: {REFUSED} }}
-.note {{ background: #fff6e5; border-left: 4px solid #E69F00; padding: .6rem 1rem }}
-figure {{ margin: 2rem 0 }} details {{ margin: 1rem 0 }}
-figcaption {{ font-size: 14px; color: #555 }}
-"""
+_BRIEF = [_COLUMNS[column][0] for column in _BRIEF_COLUMNS]
 
 _SYNTHETIC = """\
 <p class="note"><b>This world is synthetic.</b> A program rendered room, objects and images;
-detector and CLIP are small networks trained on renders of other such rooms. The software is real:
-nodes, messages, inference and search are those that run on a robot. So this page shows that the
-whole system works. It does <em>not</em> show how well the system recognizes real objects, or how
-it copes with real light, lenses, dirt and motion, with labels written by people, or with a map
-made from real images. Nor does it show how large networks such as YOLOv8x and ViT-L/14 perform.
-To find out, run the nodes on your own recordings.</p>"""
+detector and CLIP are small networks trained on renders of other such rooms. Nodes, messages and
+search are those that run on a robot. So the page shows that the whole works, and <em>not</em> how
+well it recognizes real objects in real light. To find out, run the nodes on your own
+recordings.</p>"""
 
 _HOW = """\
-<p>The two nodes sent boxes, hypotheses and figures of the table over ROS. The errors compare
-with the recording's ground truth, which the nodes never see. No topic carries the matches of boxes
-and landmarks. For the pictures the demo therefore repeats the search on the same detections with
-the same code, networks, options and seed, and compares its pose with the one from ROS
-({repeated}).</p>"""
+<p class="note">The two nodes sent boxes, hypotheses and figures of the table over ROS. The errors
+compare with the recording's ground truth, which the nodes never see. No topic carries the matches
+of boxes and landmarks. For the pictures the demo therefore repeats the search on the same
+detections with the same code, networks, options and seed, and compares its pose with the one from
+ROS ({repeated}).</p>"""
 
 _LIST = """\
-<p>CLIP is the cosine similarity of crop and label, rank its place among all labels of
+<p class="note">CLIP is the cosine similarity of crop and label, rank its place among all labels of
 the map, IoU the overlap of box and projected landmark. ✓ and ✗ compare a match with what the
 renderer drew there. A ✗ can also mean that the object was moved after mapping, or is not in the
 map.</p>"""
@@ -94,31 +85,33 @@ def write_page(folder: Path, reviews: Sequence[Review], method: str, section: st
     The section is HTML to put before the wake-ups.
     """
     judged = [review.judged for review in reviews]
+    accepted = [one for one in judged if one.wake_up.accepted]
+    wrong = sum(one.is_wrong for one in accepted)
+    errors = [one.error[0] for one in accepted if one.error is not None]
     repeated = sum(review.repeated for review in reviews)
     how = _HOW.format(repeated=f'equal in {repeated} of {len(reviews)} cases')
-    rows = [''.join(f'<th>{escape(heading)}</th>' for heading, _ in _COLUMNS)]
-    for one in judged:
-        kind = 'accepted' if one.wake_up.accepted else 'refused'
-        rows.append(''.join(f'<td class="{kind}">{escape(cell)}</td>' if cell == kind
-                            else f'<td>{escape(cell)}</td>' for cell in _cells(one)))
-    table = '<table>' + ''.join(f'<tr>{row}</tr>' for row in rows) + '</table>'
-    figures = [f'<figure><img src="{picture_name(one)}" loading="lazy" '
-               f'alt="wake-up {one.number}: {escape(one.verdict)}">'
-               f'<figcaption>“{escape(one.wake_up.message)}”</figcaption></figure>'
-               for one in judged]
-    page = folder / 'index.html'
-    page.write_text('\n'.join([
-        '<!DOCTYPE html>', '<html lang="en">', '<meta charset="utf-8">',
-        '<title>cliploc_ros: where am I?</title>', f'<style>{_STYLE}</style>',
-        '<h1>A robot wakes up</h1>', f'<p><b>{escape(summary(judged))}.</b> Method: '
-        f'{escape(method)}.</p>', _SYNTHETIC, section, table,
-        f'<figure><img src="{TOP_VIEW}" alt="map from above with the estimated poses">'
-        '<figcaption>The map from above. A line joins each estimate to its ground truth. Refused '
-        'poses were not published.</figcaption></figure>', how,
+    rows = [[(cell, cell) if cell in ('accepted', 'refused') else cell for cell in _cells(one)]
+            for one in judged]
+    pictures = [figure(picture_name(one), f'“{one.wake_up.message}”',
+                       f'wake-up {one.number}: {one.verdict}') for one in judged]
+    numbers = [(f'{len(accepted)} of {len(judged)}', 'wake-ups accepted', bool(accepted)),
+               (str(wrong), f'wrong by more than {WRONG_M:g} m', not wrong)]
+    if errors:
+        numbers.append((f'{100 * np.median(errors):.1f} cm', 'off the truth (median)', not wrong))
+    page_file = folder / 'index.html'
+    write_text(page_file, page(
+        'cliploc_ros: a robot wakes up', first_screen(
+            [verdict(f'{summary(judged)}.', not wrong), tiles(numbers), _SYNTHETIC,
+             '<h2>Wake-ups</h2>', table(_BRIEF, ([row[column] for column in _BRIEF_COLUMNS]
+                                                 for row in rows))],
+            [figure(TOP_VIEW, 'The map from above. A line joins each estimate to its ground '
+                    'truth. Refused poses were not published.', 'map with the estimated poses')]),
+        section,
+        fold(f'All figures; method {method}', table([name for name, _ in _COLUMNS], rows)),
         # several cameras have pictures without a list of matches
-        '' if any(one.beside for one in reviews) else _LIST,
-        *figures, '</html>', '']), encoding='utf-8')
-    return page
+        fold('How to read the pictures', how, '' if any(one.beside for one in reviews)
+             else _LIST), *pictures))
+    return page_file
 
 
 def _cells(judged: Judged) -> list[str]:

@@ -22,8 +22,9 @@ from cliploc_ros.core.geometry.ellipsoid import outline_points, project_ellipsoi
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.demo.review import ACCEPTED, REFUSED, Judged, Review
-from cliploc_ros.evaluation.figures import EDGED, draw_map
+from cliploc_ros.demo.review import Judged, Review
+from cliploc_ros.evaluation.drawing import draw_map, spread_names, write_name
+from cliploc_ros.files.page import ACCEPTED, BAD
 
 _DPI = 110
 _BOX, _UNMATCHED, _ELLIPSE, _EXPECTED = '#56B4E9', '#FFFFFF', '#E69F00', '#F0E442'
@@ -33,7 +34,7 @@ _COLUMNS = {'box': 0.0, 'landmark': 0.065, 'CLIP': 0.73, 'rank': 0.815, 'IoU': 0
 _LABEL_CHARS = 54
 _LINE_CHARS = 88
 _MOST_ROWS = 34
-_TOP_VIEW_DPI = 140
+_TOP_VIEW_DPI = 160
 _TRUTH = '#222222'
 _MARGIN_M = 0.45
 _HEADING_M = 0.28
@@ -46,7 +47,7 @@ def draw_wake_up(review: Review, landmark_map: LandmarkMap, path: Path) -> None:
     figure = Figure(figsize=(14.0, 11.3 if review.beside else 6.9), dpi=_DPI)
     judged, wake_up, top = review.judged, review.judged.wake_up, 0.965 if review.beside else 0.945
     figure.text(0.008, top, f'Wake-up {judged.number}: {judged.verdict}', fontsize=15,
-                color=ACCEPTED if wake_up.accepted else REFUSED, fontweight='bold')
+                color=ACCEPTED if wake_up.accepted else BAD, fontweight='bold')
     figure.text(0.992, top, f'score {wake_up.score:.2f}, {wake_up.inliers} inliers',
                 fontsize=11, ha='right')
     numbers = _numbers(review)
@@ -123,7 +124,7 @@ def _list_matches(panel: Axes, review: Review, landmark_map: LandmarkMap, number
         if judged.pose is not None:
             lines.append('Matches of the best hypothesis, which was not published:')
         for text in lines:
-            panel.text(0, line, text, fontsize=9, va='top', color=REFUSED)
+            panel.text(0, line, text, fontsize=9, va='top', color=BAD)
             line += 1
         line += 0.3
     if not review.repeated:
@@ -149,7 +150,7 @@ def _list_matches(panel: Axes, review: Review, landmark_map: LandmarkMap, number
             is_true = (review.true_landmarks[match.detection]
                        == landmark_map.landmark_ids[match.landmark])
             panel.text(_COLUMNS[''], line, '✓' if is_true else '✗', fontsize=9, va='top',
-                       color=ACCEPTED if is_true else REFUSED, fontweight='bold')
+                       color=ACCEPTED if is_true else BAD, fontweight='bold')
         line += 1
     matched = {match.detection for match in review.matches}
     rest = [f'{number} {review.detections.class_ids[row]}' for row, number in numbers.items()
@@ -165,7 +166,7 @@ def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
     points = np.concatenate([landmark_map.centers[:, :2], path_xyz[:, :2]])
     low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
     width, height = high - low
-    scale = min(11.0 / width, 9.0 / height)
+    scale = min(7.5 / width, 6.5 / height)
     figure = Figure(figsize=(width * scale + 3.2, height * scale + 0.9), dpi=_TOP_VIEW_DPI,
                     layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08))
     axes = figure.add_subplot()
@@ -183,25 +184,25 @@ def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
                label='ground truth and view'),
         Line2D([], [], color=ACCEPTED, marker='o', markersize=5.5,
                label='accepted estimate,\njoined to its truth'),
-        Line2D([], [], color=REFUSED, marker='X', linestyle=(0, (4, 3)),
+        Line2D([], [], color=BAD, marker='X', linestyle=(0, (4, 3)),
                label='refused: best hypothesis,\nnot published'),
         Line2D([], [], color='#999999', linewidth=1.0, label='the walk')]
     handles += [Patch(facecolor=color, edgecolor='#333333', alpha=0.55, label=name)
                 for name, color in class_colors.items()]
     figure.legend(handles=handles, loc='outside right upper', frameon=False, fontsize=9)
+    spread_names(figure)
     figure.savefig(path)
 
 
 def _draw_wake_up(axes: Axes, judged: Judged) -> None:
     """Draw truth and estimate as arrows along the view, with a line between them."""
     accepted, truth, pose = judged.wake_up.accepted, judged.truth, judged.pose
-    color = ACCEPTED if accepted else REFUSED
+    color = ACCEPTED if accepted else BAD
     seen_from = pose if truth is None else truth
     if seen_from is not None:
         # the number lies behind the camera, to its left
         x, y = seen_from[:2, 3] - 0.11 * (seen_from[:2, 2] + seen_from[:2, 0])
-        axes.text(x, y, str(judged.number), fontsize=10, fontweight='bold', color=color,
-                  ha='center', va='center', zorder=8, path_effects=EDGED)
+        write_name(axes, (x, y), str(judged.number), 11, color)
     if truth is not None:
         _draw_camera(axes, truth, _TRUTH, 'o', hollow=True)
     if pose is None:
@@ -272,6 +273,7 @@ def draw_kidnapped(file: Path, camera: Camera, detections: Detections, landmark_
                  xlim=(0.0, times[-1] + 2.0))
     timeline.legend(handles=[Patch(color=color, label=state) for state, color in _STATES.items()],
                     loc='lower left', fontsize=9)
+    spread_names(figure)
     figure.savefig(path)
 
 
@@ -294,7 +296,7 @@ def _draw_expected(axes: Axes, file: Path, camera: Camera, detections: Detection
 def _draw_ways(axes: Axes, landmark_map: LandmarkMap, moments: Sequence[Moment]) -> None:
     """Draw the way of the robot, and that of its localizer's poses."""
     draw_map(axes, landmark_map)
-    for name, color, style in (('truth', _TRUTH, '-'), ('localized', REFUSED, '--')):
+    for name, color, style in (('truth', _TRUTH, '-'), ('localized', BAD, '--')):
         way = np.array([getattr(one, name)[:2, 3] for one in moments])
         jumps = np.nonzero(np.linalg.norm(np.diff(way, axis=0), axis=1) > 1.0)[0] + 1
         for number, part in enumerate(np.split(way, jumps)):

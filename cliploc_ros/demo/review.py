@@ -35,9 +35,6 @@ WRONG_M = 1.0
 # A repeated search that differs by more than this has found another pose [m, deg].
 _SAME_POSE = (1e-6, 1e-4)
 
-#: Okabe and Ito's blue and vermilion, which colour-blind readers can distinguish.
-ACCEPTED, REFUSED = '#0072B2', '#D55E00'
-
 
 @dataclass(frozen=True)
 class Judged:

@@ -8,27 +8,19 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
-from matplotlib import color_sequences
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.patches import Polygon
-from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from cliploc_ros.core.geometry.ellipsoid import outline_points
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.evaluation.drawing import draw_map, spread_names
 from cliploc_ros.evaluation.methods import PAPER_METHODS
 from cliploc_ros.evaluation.summary import Summary, find_best, wilson_interval
 from cliploc_ros.evaluation.trials import Query, Result
 from cliploc_ros.files.storage import write_file
 
-#: Outlines text, so that it is legible on any background.
-EDGED = (withStroke(linewidth=2.0, foreground='white'),)
-_MOST_NAMES = 100
-# Landmarks nearer than this share one place for their names.
-_SAME_PLACE_M = 0.14
 # The colours of Okabe and Ito, which the colour-blind can distinguish: one for each matching, the
 # others for other methods. Line style and marker show the algorithm.
 _COLORS = {'class': '#D55E00', 'clip': '#009E73', 'hybrid': '#0072B2'}
@@ -45,47 +37,6 @@ _BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.0)
 _FREEDOM = 6  # of a pose
 _JUDGED_COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 _MARKERS = 'osD^vP'
-
-
-def draw_map(axes: Axes, landmark_map: LandmarkMap) -> dict[str, tuple[float, ...]]:
-    """Draw each landmark from above, with its name if there are few.
-
-    Parameters
-    ----------
-    axes : Axes
-        x and y of the map [m], with equal scales.
-
-    Returns
-    -------
-    dict of str to tuple of float
-        Colour of each class.
-    """
-    classes = sorted(set(landmark_map.class_ids))
-    palette = color_sequences['tab20'][::2] + color_sequences['tab20'][1::2]
-    colors = {name: palette[i % len(palette)] for i, name in enumerate(classes)}
-    for center, shape, class_id in zip(landmark_map.centers, landmark_map.shapes,
-                                       landmark_map.class_ids, strict=True):
-        outline = np.array([center[0], center[1], shape[0], shape[1], shape[3]])
-        axes.add_patch(Polygon(outline_points(outline), closed=True, facecolor=colors[class_id],
-                               edgecolor='#333333', linewidth=0.5, alpha=0.55, zorder=3))
-    for place, names in _places(landmark_map) if len(landmark_map) <= _MOST_NAMES else ():
-        axes.text(place[0], place[1], '\n'.join(names), fontsize=5.4, ha='center', va='center',
-                  zorder=4, linespacing=0.95, path_effects=EDGED)
-    return colors
-
-
-def _places(landmark_map: LandmarkMap) -> list[tuple[NDArray[np.float64], list[str]]]:
-    """Return places and the names to write there; stacked landmarks share one."""
-    places: list[tuple[NDArray[np.float64], list[int]]] = []
-    for row in np.argsort(-landmark_map.centers[:, 2], kind='stable'):
-        center = landmark_map.centers[row, :2]
-        for place, rows in places:
-            if np.linalg.norm(place - center) < _SAME_PLACE_M:
-                rows.append(int(row))
-                break
-        else:
-            places.append((center, [int(row)]))
-    return [(place, [landmark_map.landmark_ids[row] for row in rows]) for place, rows in places]
 
 
 def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
@@ -132,6 +83,7 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
 
 def save_figure(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG and as SVG beside it; return the path."""
+    spread_names(figure)
     write_file(path, lambda partial: figure.savefig(partial, dpi=150))
     # without its date and with fixed ids, an SVG of the same results is the same file
     with matplotlib.rc_context({'svg.hashsalt': path.stem}):
@@ -215,10 +167,11 @@ def _success_by_boxes(summaries: Sequence[Summary]) -> Figure:
         rates = [(one.errors_m[:, chosen] < _SUCCESS_M).mean() for _, _, chosen in bins]
         axes.plot(range(len(bins)), rates, color=color, linestyle=line, marker=marker,
                   markersize=4, linewidth=1.2, label=one.method)
-    names = [f'{low} to {high}' if high < _BOX_BINS[-1][1] else f'{low} and more'
+    names = [f'{low} to {high}' if high < _BOX_BINS[-1][1] else f'{low} or more'
              for low, high, _ in bins]
-    axes.set_xticks(range(len(bins)), [f'{name}\n({int(chosen.sum())} images)'
-                                       for name, (*_, chosen) in zip(names, bins, strict=True)])
+    axes.set_xticks(range(len(bins)), [f'{name}\n{int(chosen.sum())} images'
+                                       for name, (*_, chosen) in zip(names, bins, strict=True)],
+                    fontsize=8)
     axes.set_ylim(-0.02, 1.02)
     add_legend(figure)
     return figure
@@ -238,8 +191,7 @@ def _precision_over_recall(summaries: Sequence[Summary]) -> Figure:
             axes.plot(one.recall(), one.precision(), color=color, marker=marker, markersize=6,
                       markeredgecolor='black', linestyle='none')
     axes.set(xlim=(-0.02, 1.02))
-    axes.set_title('lines: all thresholds of the confidence; markers: the options as run',
-                   fontsize=9)
+    axes.set_title('lines: all least confidences; markers: as run', fontsize=9)
     add_legend(figure)
     return figure
 
@@ -308,17 +260,24 @@ def _time_by_stage(summaries: Sequence[Summary], observing_ms: Mapping[str, floa
                                         strict=False):
         axes.barh(rows, duration, left=start, color=shade, label=stage)
         start += duration
+    keyframes = np.array([one.keyframes_ms.mean() if one.has_keyframes else 0.0
+                          for one in summaries])
+    if keyframes.any():
+        axes.barh(rows, keyframes, left=start, color='#56B4E9', label='keyframes')
+        start += keyframes
     search = np.array([one.mean_search_ms for one in summaries])
     axes.barh(rows, search, left=start, color=[_style(one.method)[0] for one in summaries])
     for row, total, own in zip(rows, start + search, search, strict=True):
-        axes.annotate(f'search {own:,.1f}', (total, row), xytext=(3, 0), va='center', fontsize=8,
+        axes.annotate(f'search {own:,.1f}' + (f', all {total:,.1f}' if total > own else ''),
+                      (total, row), xytext=(3, 0), va='center', fontsize=8,
                       textcoords='offset points')
     axes.set_yticks(rows, [one.method for one in summaries])
     axes.invert_yaxis()
-    if (start + search).max() > 50 * (start + search).min() and not observing_ms:
+    has_stages = bool(observing_ms) or keyframes.any()
+    if (start + search).max() > 50 * (start + search).min() and not has_stages:
         axes.set_xscale('log')
-    axes.margins(x=0.28)
-    if observing_ms:
+    axes.margins(x=0.4)
+    if has_stages:
         add_legend(figure)
     return figure
 

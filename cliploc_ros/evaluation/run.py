@@ -24,6 +24,7 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.queries import QueryFrame
 from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.evaluation.methods import Method
+from cliploc_ros.evaluation.report import PAGE, write_report
 from cliploc_ros.evaluation.summary import (
     Summary,
     as_csv,
@@ -200,11 +201,11 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[Query],
         write_text(out / 'table.md', '\n\n'.join([as_markdown(rows), *remarks]) + '\n')
         write_text(out / 'results.json', as_json(own))
         write_text(out / 'summary.csv', as_csv(summaries))
-        if figures:
-            _draw(out, parts_of(landmark_map)[0].landmark_map, queries, results, summaries,
-                  methods, frames)
+        pictures = _draw(out, parts_of(landmark_map)[0].landmark_map, queries, results,
+                         summaries, methods, frames) if figures else []
+        write_report(out, summaries, rows, remarks, pictures)
         log.remove()
-    print(f'results: {out.resolve()}', flush=True)
+    print(f'results: {out.resolve() / PAGE}', flush=True)
     return summaries
 
 
@@ -266,12 +267,12 @@ def describe(landmark_map: LandmarkMap, queries: Sequence[Query], methods: Seque
 
 def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
           results: Sequence[Result], summaries: Sequence[Summary], methods: Sequence[Method],
-          frames: Sequence[QueryFrame]) -> None:
+          frames: Sequence[QueryFrame]) -> list[Path]:
     try:
         from cliploc_ros.evaluation.figures import draw_all
     except ImportError as error:
         print(f'no figures: {error}; install matplotlib', flush=True)
-        return
+        return []
     # the summaries of each sampling method, by their number of iterations
     sweep: dict[str, dict[int, Summary]] = {}
     iterations = {one.name: one.options.iterations for one in methods if not one.draws_nothing}
@@ -281,11 +282,11 @@ def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
             sweep.setdefault(name, {})[int(count or iterations[name])] = one
     observing = {stage: np.array([getattr(frame, name) for frame in frames])
                  for stage, name in (('detector', 'detector_ms'), ('CLIP', 'clip_ms'))}
-    draw_all(out, landmark_map, queries, [one for one in results if _AT not in one.method],
-             summaries, {name: dict(sorted(found.items())) for name, found in sweep.items()
-                         if len(found) > 1},
-             {stage: float(np.nanmean(times)) for stage, times in observing.items()
-              if np.isfinite(times).any()})
+    return draw_all(
+        out, landmark_map, queries, [one for one in results if _AT not in one.method], summaries,
+        {name: dict(sorted(found.items())) for name, found in sweep.items() if len(found) > 1},
+        {stage: float(np.nanmean(times)) for stage, times in observing.items()
+         if np.isfinite(times).any()})
 
 
 def write_trajectories(folder: Path, queries: Sequence[Query], results: Sequence[Result]) -> None:

@@ -49,6 +49,8 @@ from cliploc_ros.units import NS_PER_S
 
 logger = logging.getLogger(__name__)
 # The unit of depth is judged by the boxes of this number of frames.
+# In the name of an observation file beside its source.
+_BESIDE = '.cliploc-'
 _FRAMES_FOR_UNIT = 10
 _UNKNOWN = np.full((4, 4), np.nan)
 
@@ -125,7 +127,14 @@ def observation_file(frames: Frames, options: RecordingOptions) -> Path:
     """Return the observation file beside a source, named after all that it depends on."""
     source = frames.source.resolve()
     digest = hashlib.sha256(describe(frames, options).encode()).hexdigest()[:12]
-    return source.with_name(f'{source.name}.cliploc-{digest}.npz')
+    return source.with_name(f'{source.name}{_BESIDE}{digest}.npz')
+
+
+def source_of(observations: Path) -> Path | None:
+    """Return the source that an observation file lies beside, see observation_file; else None."""
+    name, _, rest = observations.name.partition(_BESIDE)
+    source = observations.with_name(name or observations.name)
+    return source if rest and source.exists() else None
 
 
 def describe(frames: Frames, options: RecordingOptions) -> str:

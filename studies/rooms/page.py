@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of all rooms: tables, maps from above with what became of each image, and failures."""
 
-import io
-from base64 import b64encode
 from collections.abc import Iterator, Sequence
-from html import escape
 from pathlib import Path
 
 import cv2
@@ -15,78 +12,60 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from cliploc_ros.core.geometry.transforms import RIGHT_M
-from cliploc_ros.evaluation.figures import draw_map
-from cliploc_ros.evaluation.map_check.page import ACCEPTED, FAINT, MISLED, REFUSED
+from cliploc_ros.evaluation.drawing import draw_map, png_of
+from cliploc_ros.files.page import (
+    ACCEPTED,
+    FAINT,
+    MISLED,
+    REFUSED,
+    figure,
+    fold,
+    note,
+    page,
+    side_by_side,
+    table,
+)
 from cliploc_ros.files.storage import write_text
 from studies.rooms.asking import BOTH, KEYFRAMES, KNOWN, NOTHING, OBJECTS, WAYS, Answers, Outcome
 from studies.rooms.rooms import Room
 from studies.rooms.tables import grouped
 
-_STYLE = """\
-body { font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 2rem auto; max-width: 1200px;
-  padding: 0 1rem }
-img { max-width: 100% } figure { margin: 1.5rem 0 } figcaption { font-size: 14px; color: #555 }
-table { border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums }
-th, td { text-align: left; padding: .2rem .7rem; border-bottom: 1px solid #ddd }
-summary { font-weight: 600; cursor: pointer; margin: .8rem 0 } .row { display: flex; gap: 1rem }
-.row figure { flex: 1 }
-"""
 _VERDICTS = {'accepted, right': ACCEPTED, 'refused, right within 1 m': REFUSED,
              'refused, no right pose': FAINT, 'accepted, wrong': MISLED}
 _ERRORS_M = np.linspace(0.0, 1.5, 76)
 _COLORS = dict(zip(WAYS, ('#E69F00', '#56B4E9', '#0072B2', '#222222'), strict=True))
-_FAILURES, _IMAGE_PX, _JPEG_QUALITY = 3, 380, 70
+_FAILURES, _IMAGE_PX, _JPEG_QUALITY, _DPI = 3, 380, 70, 100
 
 
 def write_page(path: Path, answers: Sequence[Answers], rooms: Sequence[Room], text: str) -> None:
     """Write the page: pictures of each room, and the tables (Markdown) folded below."""
-    parts = ['<!DOCTYPE html>', '<html lang="en">', '<meta charset="utf-8">',
-             '<meta name="viewport" content="width=device-width">', '<title>Rooms</title>',
-             f'<style>{_STYLE}</style>', '<h1>Rooms</h1>']
     failures, *sections = text.split('## ')
-    parts += [f'<p>{escape(line)}</p>' for line in failures.splitlines() if line]
+    parts = [note(line) for line in failures.splitlines() if line]
     for section in sections:
         heading, _, lines = section.partition('\n')
-        is_open = ' open' if heading == 'Rooms' else ''
-        parts.append(f'<details{is_open}><summary>{escape(heading)}</summary>'
-                     f'{_html_table(lines)}</details>')
+        cells = [[cell.strip() for cell in line.strip().strip('|').split('|')]
+                 for line in lines.strip().splitlines()]
+        parts.append(fold(heading, table(cells[0], cells[2:]), is_open=heading == 'Rooms'))
     for room in rooms:
         its = [one for one in answers if one.task.room == room.name and one.outcomes]
         if its:
-            parts.append(f'<h2>{escape(room.name)}</h2>')
-            parts += [_picture(_curves(its), 'Share of images whose best pose is within a '
-                               'distance of the truth, over all splits.'),
-                      _picture(_top_views(its, room), 'Cameras from above, by what became of '
-                               'their image without vertical and depth; landmarks of the map of '
-                               'that part.'),
-                      *_failures(its, room)]
-    write_text(path, '\n'.join([*parts, '</html>', '']))
-
-
-def _html_table(markdown: str) -> str:
-    lines = [[cell.strip() for cell in line.strip().strip('|').split('|')]
-             for line in markdown.strip().splitlines()]
-    head, rows = lines[0], lines[2:]
-    return ('<table><tr>' + ''.join(f'<th>{escape(cell)}</th>' for cell in head) + '</tr>'
-            + ''.join('<tr>' + ''.join(f'<td>{escape(cell)}</td>' for cell in row) + '</tr>'
-                      for row in rows) + '</table>')
-
-
-def _picture(figure: Figure, caption: str) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format='png', dpi=100)
-    data = b64encode(buffer.getvalue()).decode('ascii')
-    return (f'<figure><img alt="" src="data:image/png;base64,{data}">'
-            f'<figcaption>{escape(caption)}</figcaption></figure>')
+            parts.append(fold(
+                room.name,
+                figure(png_of(_curves(its), _DPI), 'Share of images whose best pose is within a '
+                       'distance of the truth, over all splits.'),
+                figure(png_of(_top_views(its, room), _DPI), 'Cameras from above, by what became '
+                       'of their image without vertical and depth; landmarks of the map of that '
+                       'part.'), *_failures(its, room), is_open=True))
+    write_text(path, page('Rooms', *parts))
 
 
 def _curves(answers: Sequence[Answers]) -> Figure:
     """Draw the share of right poses over the limit of the error, for each split."""
     here = [one for answer in answers for one in answer.outcomes if one.is_here]
     kinds = list(dict.fromkeys(one.kind for one in here))
-    figure = Figure(figsize=(3.0 * len(kinds), 3.2), layout='constrained')
+    drawn = Figure(figsize=(3.0 * len(kinds), 3.2), layout='constrained')
     for column, kind in enumerate(kinds, start=1):
-        axes = figure.add_subplot(1, len(kinds), column)
+        axes = drawn.add_subplot(1, len(kinds), column)
         some = [one for one in here if one.kind == kind and one.known in (NOTHING, KNOWN[-1])]
         for (way, known), its in grouped(some, 'way', 'known'):
             errors = np.array([one.error_m for one in its])
@@ -95,9 +74,9 @@ def _curves(answers: Sequence[Answers]) -> Figure:
                       label=way if known == NOTHING else f'{way}, {known}')
         axes.set(title=kind, xlabel='error [m]', ylim=(0.0, 1.02), xlim=(0.0, 1.5))
         axes.grid(alpha=0.3)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside lower center', ncols=4, frameon=False, fontsize=9)
-    return figure
+    handles, labels = drawn.axes[0].get_legend_handles_labels()
+    drawn.legend(handles, labels, loc='outside lower center', ncols=4, frameon=False, fontsize=9)
+    return drawn
 
 
 def _verdict(one: Outcome) -> str:
@@ -108,11 +87,11 @@ def _verdict(one: Outcome) -> str:
 def _top_views(answers: Sequence[Answers], room: Room) -> Figure:
     """Draw one part of each split from above: by objects, and by keyframes."""
     kinds = list({one.task.kind: one for one in answers}.values())
-    figure = Figure(figsize=(3.4 * len(kinds), 7.4), layout='constrained')
+    drawn = Figure(figsize=(3.4 * len(kinds), 7.4), layout='constrained')
     poses = room.detections.map_from_camera[:, :3, 3]
     for row, way in enumerate((OBJECTS, KEYFRAMES)):
         for column, answer in enumerate(kinds):
-            axes: Axes = figure.add_subplot(2, len(kinds), 1 + row * len(kinds) + column)
+            axes: Axes = drawn.add_subplot(2, len(kinds), 1 + row * len(kinds) + column)
             if answer.landmark_map is not None:
                 draw_map(axes, answer.landmark_map)
             for one in answer.outcomes:
@@ -121,10 +100,10 @@ def _top_views(answers: Sequence[Answers], room: Room) -> Figure:
                               markersize=5, zorder=6)
             axes.set(aspect='equal', title=f'{answer.task.part}, {way}')
             axes.autoscale_view()
-    figure.legend(handles=[Line2D([], [], color=color, marker='.', linestyle='none', label=name)
+    drawn.legend(handles=[Line2D([], [], color=color, marker='.', linestyle='none', label=name)
                            for name, color in _VERDICTS.items()],
-                  loc='outside lower center', ncols=4, frameon=False)
-    return figure
+                  loc='outside lower center', ncols=2, frameon=False)
+    return drawn
 
 
 def _failures(answers: Sequence[Answers], room: Room) -> Iterator[str]:
@@ -138,12 +117,9 @@ def _failures(answers: Sequence[Answers], room: Room) -> Iterator[str]:
         image_rgb, _ = room.raws[one.number].color()
         scale = _IMAGE_PX / image_rgb.shape[1]
         small = cv2.resize(image_rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        data = b64encode(cv2.imencode('.jpg', small[..., ::-1], [
-            cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()).decode('ascii')
-        images.append(f'<figure><img alt="" src="data:image/jpeg;base64,{data}"><figcaption>'
-                      f'image {one.number}, {escape(one.part)}: '
-                      + escape(one.reason or f'accepted, {one.error_m:.1f} m off') +
-                      '</figcaption></figure>')
+        jpeg = cv2.imencode('.jpg', small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
+        images.append(figure(jpeg.tobytes(), f'image {one.number}, {one.part}: ' + (
+            one.reason or f'accepted, {one.error_m:.1f} m off')))
     if images:
-        yield ('<h3>Images without a right pose by both, the most confident first</h3>'
-               f'<div class="row">{"".join(images)}</div>')
+        yield '<h2>Images without a right pose by both, the most confident first</h2>'
+        yield side_by_side(images)

@@ -96,6 +96,9 @@ def test_the_papers_table_on_real_queries(shared_data, tmp_path):
             for matching, algorithm, rates in re.findall(
                 r'^(\w+) +([\w-]+) +(\S+ / \S+ / \S+)', done.stdout, re.MULTILINE)}
     assert tuple(rows) == PAPER_METHODS
+    page = (tmp_path / 'report.html').read_text()
+    assert page.count('src="data:image/png;base64,') == len(FIGURES)
+    assert 'methods on 52 images' in page
     for method, expected in table['success'].items():
         tolerance = table['tolerance']['bf' if method.endswith('_bf') else 'sampled']
         assert rows[method] == pytest.approx(expected, abs=tolerance + 0.005), method

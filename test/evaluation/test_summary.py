@@ -5,11 +5,17 @@
 import csv
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from cliploc_ros.evaluation.figures import new_axes, precision_recall, save_figure
+from cliploc_ros.evaluation.figures import (
+    _time_by_stage,
+    new_axes,
+    precision_recall,
+    save_figure,
+)
 from cliploc_ros.evaluation.summary import (
     Summary,
     as_csv,
@@ -143,6 +149,18 @@ def test_figures_of_the_same_results_are_the_same_files(tmp_path):
         path = save_figure(figure, tmp_path / 'figure.png')
         contents.append([one.read_bytes() for one in (path, path.with_suffix('.svg'))])
     assert contents[0] == contents[1]
+
+
+def test_the_time_by_stage_counts_keyframes():
+    plain = make_summary([[0.1, 0.2]])
+    with_keyframes = replace(plain, sources=np.array([['both', 'both']]),
+                             keyframes_ms=np.array([[700.0, 800.0]]))
+    (axes,) = _time_by_stage([plain, with_keyframes], {'detector': 50.0}).axes
+    ends = [max(bar.get_x() + bar.get_width() for bar in axes.patches if bar.get_y() < row < (
+        bar.get_y() + bar.get_height())) for row in range(2)]
+    assert ends == [52.0, 802.0]
+    assert [text.get_text() for text in axes.texts] == [
+        'search 2.0, all 52.0', 'search 2.0, all 802.0']
 
 
 def test_precision_falls_as_recall_rises():

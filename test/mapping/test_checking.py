@@ -4,6 +4,7 @@
 
 import json
 import re
+from collections import Counter
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -18,6 +19,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError, OptionsError
 from cliploc_ros.evaluation.map_check.page import DATA, PAGE, write_report
 from cliploc_ros.evaluation.map_check.pictures import draw_pictures
+from cliploc_ros.evaluation.map_check.views import Views
 from cliploc_ros.mapping.check.advice import give_advice
 from cliploc_ros.mapping.check.checking import check_map
 from cliploc_ros.mapping.check.landmark_faults import find_map_overlaps, hear_witness
@@ -131,7 +133,8 @@ def test_a_shifted_landmark_is_told_its_offset(detections):
     report = check_map(shifted, detections, options=QUICK)
     assert report.landmarks[0].landmark_id == 'thing_4'
     assert report.landmarks[0].offset_m == pytest.approx(0.12, abs=0.01)
-    assert 'away from where its boxes put it' in ' '.join(report.landmarks[0].faults)
+    assert 'is 12 cm away from where its boxes put it: delete it or map again' in report.landmarks[
+        0].faults
 
 
 @pytest.mark.parametrize('is_recorded', [False, True])
@@ -159,8 +162,8 @@ def test_neighbours_that_frames_show_apart_are_no_duplicates():
 def test_a_symmetric_place_is_one_place(report):
     pair = LookAlike((5.7, 3.5, 0.8), (5.8, 3.5, 0.8), (), 6, 1.0, 0, 180.0)
     advice = give_advice(replace(report, look_alikes=(pair,)))
-    assert any(text.startswith('the place around x 5.7, y 3.5 looks the same when turned by 180 '
-                               'degrees') for text in advice)
+    assert any(one.text.startswith('the place around x 5.7, y 3.5 looks the same when turned by '
+                                   '180 degrees') for one in advice)
 
 
 @pytest.mark.parametrize('turn_deg', [0.0, 35.0, -120.0])
@@ -196,8 +199,8 @@ def test_a_robot_that_is_misled_into_the_double_is_advice_on_the_double(rooms_re
 
     def misled_to(estimate):
         trial = replace(seen, verdict='misled', estimate=np.array(estimate), error_m=10.0)
-        return give_advice(replace(
-            rooms_report, grid=replace(grid, trials=(*grid.trials, trial))))
+        return [one.text for one in give_advice(replace(
+            rooms_report, grid=replace(grid, trials=(*grid.trials, trial))))]
 
     side = np.sign(5.0 - seen.position[0])  # to the other room
     into_double = misled_to(seen.position + np.array([10.0 * side, 0.2, 0.0]))
@@ -313,7 +316,7 @@ def test_stretches_without_landmarks_become_advice(detections):
     # from 4 to 8 s nothing is detected
     gap = detections.select_boxes(~np.isin(detections.frames, np.arange(20, 41)))
     report = check_map(TABLE, gap, options=QUICK)
-    assert any(re.match(r'record this side: \d frames at [45] s.* see no landmarks', text)
+    assert any(re.match(r'record this side: \d frames at [45] s.* show no landmarks', text)
                for text in report.advice), report.advice
 
 
@@ -388,10 +391,10 @@ def test_options_are_checked(change):
 class _Tags(HTMLParser):
     def __init__(self):
         super().__init__()
-        self.found, self.sources = set(), []
+        self.found, self.sources = Counter(), []
 
     def handle_starttag(self, tag, attrs):
-        self.found.add(tag)
+        self.found[tag] += 1
         self.sources += [value for name, value in attrs if name in ('src', 'href')]
 
 
@@ -401,14 +404,25 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
     named = replace(doubled, frame_id=hostile, labels=(hostile, *doubled.labels[1:]),
                     landmark_ids=(hostile, *doubled.landmark_ids[1:]))
     report = check_map(named, detections, options=QUICK)
-    write_report(tmp_path, hostile, report, draw_pictures(named, report))
+    shown = [0.0, 9.8]  # the images that are at hand
+
+    def read(stamp_s, camera, pinhole):
+        return np.full((480, 640, 3), 128, np.uint8) if min(
+            abs(stamp_s - one) for one in shown) < 1e-6 else None
+    write_report(tmp_path, hostile, report, draw_pictures(named, report),
+                 Views(named, detections, read))
     page = (tmp_path / PAGE).read_text()
     tags = _Tags()
     tags.feed(page)
     assert 'script' not in tags.found
     assert '&lt;script&gt;' in page
-    assert len(tags.sources) == 4
-    assert all(source.startswith('data:image/png;base64,') for source in tags.sources)
+    kinds = Counter(source[:16] for source in tags.sources)
+    assert kinds.keys() == {'data:image/png;b', 'data:image/jpeg;'}
+    assert kinds['data:image/png;b'] == 4
+    assert kinds['data:image/jpeg;'] >= 5, 'five duplicates are shown'
+    assert 'outlined: &lt;script&gt;' in page
+    assert page.index('What to do first') < page.index('<details>'), 'only the rest is folded'
+    assert tags.found['u'] == len(report.measures) == 8, 'each threshold has a bar'
     assert 'http' not in page
     assert json.loads((tmp_path / DATA).read_text())['landmarks'][0]['faults']
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([PAGE, DATA])

@@ -67,8 +67,8 @@ def test_places_without_a_keyframe_are_counted_and_named(report):
     assert len(nowhere.as_dict()['positions_without']) == len(grid.positions)
     assert nowhere.as_dict()['recorded_frames_in_reach'] == 0.5
     text = 'no keyframe is within reach of'
-    assert any(text in line for line in give_advice(replace(report, keyframes=nowhere)))
-    assert not any(text in line for line in give_advice(replace(report, keyframes=full)))
+    assert any(text in one.text for one in give_advice(replace(report, keyframes=nowhere)))
+    assert not any(text in one.text for one in give_advice(replace(report, keyframes=full)))
 
 
 def test_the_report_has_keyframes_only_where_there_are_some(tmp_path, capsys):

@@ -42,7 +42,7 @@ def pixels_of(canvas, color):
 
 def test_boxes_and_outlines_are_where_they_were_seen(room, found):
     seen = grey_image(room)
-    canvas = draw_debug_image(seen, found, room, 'accepted')
+    canvas = draw_debug_image(seen, found, room, '')
     assert (seen.image_rgb == 128).all(), 'the image itself stays'
     box = seen.observation.detections.bboxes_xyxy[0]
     middle = (box[:2] + box[2:]) / 2
@@ -78,7 +78,8 @@ def test_nothing_found_is_drawn_too(room, similarities):
     seen = grey_image(room, similarities=similarities)
     verdict = 'refused: ' + 50 * 'nothing at all ' + 'ellipsoïde'
     canvas = draw_debug_image(seen, Relocalization(False, 'nothing'), room, verdict)
-    assert len(pixels_of(canvas, (213, 94, 0))) > 500, 'the verdict is red'
+    assert (canvas[:40, -20:] == (176, 70, 0)).all(), 'the verdict has a band of its own'
+    assert len(pixels_of(canvas, (255, 255, 255))) > 500, 'on which it is white'
 
 
 def test_similarities_are_written(room, found):

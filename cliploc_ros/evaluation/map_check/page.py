@@ -1,54 +1,56 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The files of a check: figures as JSON; a page with pictures, no scripts, no requests."""
+"""The files of a check: figures as JSON; a page whose first screen says all, the rest folded."""
 
 import json
 import math
-from base64 import b64encode
 from collections.abc import Iterable, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
+from cliploc_ros.evaluation.map_check.views import Views
+from cliploc_ros.files.page import (
+    ACCEPTED,
+    MISLED,
+    REFUSED,
+    Bar,
+    bars,
+    card,
+    figure,
+    first_screen,
+    fold,
+    items,
+    note,
+    page,
+    table,
+    tiles,
+    verdict,
+)
 from cliploc_ros.files.storage import write_text
 from cliploc_ros.mapping.check.landmark_faults import LandmarkCheck
 from cliploc_ros.mapping.check.relocalization import Trial, count_verdicts
 from cliploc_ros.mapping.check.report import (
     SERIOUS,
+    Advice,
     CheckReport,
+    Measure,
     RecordingCheck,
     count_by_objects,
     share,
 )
 
 PAGE, DATA = 'check.html', 'check.json'
-ACCEPTED, REFUSED, MISLED = '#0072B2', '#E69F00', '#D55E00'
-SOUND, MINOR, FAULTY = '#009E73', '#E69F00', '#D55E00'
-LOOK_ALIKE, INK, FAINT = '#CC79A7', '#222222', '#999999'
+LOOK_ALIKE = '#CC79A7'
 VERDICT_COLORS = {'accepted': ACCEPTED, 'refused': REFUSED, 'misled': MISLED}
-GRADE_COLORS = {'faulty': FAULTY, 'minor': MINOR, 'sound': SOUND}
+GRADE_COLORS = {'faulty': MISLED, 'minor': REFUSED, 'sound': '#009E73'}
 GRADE_NAMES = {'faulty': 'serious fault', 'minor': 'minor fault', 'sound': 'sound'}
 _MOST_LANDMARKS = 300
 _MOST_MATCHED = 12
-_STYLE = f"""\
-body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 2rem auto; max-width: 1200px;
-  padding: 0 1rem }}
-img {{ max-width: 100%; border: 1px solid #ddd }}
-table {{ border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums;
-  margin: 1rem 0 }}
-th, td {{ text-align: left; vertical-align: top; padding: .25rem .7rem;
-  border-bottom: 1px solid #ddd; unicode-bidi: isolate }}
-td {{ min-width: 6rem; max-width: 24rem; overflow-wrap: anywhere }}
-td.text {{ min-width: 11rem }}
-td.number, th.number {{ text-align: right; min-width: 0 }} td.number {{ white-space: nowrap }}
-li, h1, figcaption {{ overflow-wrap: anywhere; unicode-bidi: isolate }}
-.scroll {{ overflow-x: auto }}
-.verdict {{ border-left: 6px solid; padding: .6rem 1rem; background: #f6f6f6 }}
-.passed {{ border-color: {ACCEPTED} }} .failed {{ border-color: {FAULTY} }}
-.faulty {{ border-left: 4px solid {FAULTY} }} .minor {{ border-left: 4px solid {MINOR} }}
-.note, figcaption {{ font-size: 14px; color: #555 }}
-figure {{ margin: 2rem 0 }} li {{ margin: .3rem 0 }}
-"""
+# Of the first screen.
+_NUMBERS, FIRST_ADVICE = 3, 3
+# Figures for large type, the most telling first.
+_TELLING = ('recorded frames accepted', 'positions with an accepted heading',
+            'views that mislead a robot', 'landmarks with a serious fault')
 
 
 def grade(landmark: LandmarkCheck) -> str:
@@ -59,15 +61,15 @@ def grade(landmark: LandmarkCheck) -> str:
 
 
 def write_report(folder: Path, name: str, report: CheckReport,
-                 pictures: Iterable[tuple[str, str, bytes]]) -> None:
+                 pictures: Iterable[tuple[str, str, bytes]], views: Views | None = None) -> None:
     """Write the page and the JSON file of a check of a named map, each in one step.
 
-    Pictures have a name, a caption and a PNG each. OptionsError: a file cannot be written; the old
-    one stays.
+    Pictures have a name, a caption and a PNG each; the first one is on the first screen. Views are
+    beside the advice. OptionsError: a file cannot be written; the old one stays.
     """
     data = _finite({'map': name, **report.as_dict()})
     write_text(folder / DATA, json.dumps(data, indent=1, allow_nan=False))
-    write_text(folder / PAGE, _page(name, report, pictures))
+    write_text(folder / PAGE, _page(name, report, pictures, views))
 
 
 def _finite(value: Any) -> Any:
@@ -79,35 +81,54 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, bytes]]) -> str:
-    title = escape(f'Check of {name}')
-    verdict = '<p class="verdict passed"><b>The map reaches all thresholds.</b></p>' \
-        if report.passed else ('<div class="verdict failed"><b>The map misses these thresholds:'
-                               f'</b>{_list(report.failures)}</div>')
-    parts = ['<!DOCTYPE html>', '<html lang="en">', '<meta charset="utf-8">',
-             '<meta name="viewport" content="width=device-width">',
-             f'<title>{title}</title>', f'<style>{_STYLE}</style>', f'<h1>{title}</h1>', verdict,
-             '<h2>What to do</h2>', _list(report.advice), '<h2>Figures</h2>',
-             _table(('', ''), _figures(report))]
-    for picture, caption, png in pictures:
-        data = b64encode(png).decode('ascii')
-        parts.append(f'<figure><img alt="{escape(picture)}" src="data:image/png;base64,{data}">'
-                     f'<figcaption>{escape(caption)}</figcaption></figure>')
-    parts += ['<h2>Landmarks, worst first</h2>', _landmarks(report.landmarks)]
+def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, bytes]],
+          views: Views | None) -> str:
+    missed = len(report.failures)
+    said = verdict('The map reaches all thresholds.' if report.passed else
+                   f'The map misses {missed} of {len(report.measures)} thresholds.', report.passed)
+    by_name = {one.name: one for one in report.measures}
+    told = [by_name[one] for one in _TELLING if one in by_name][:_NUMBERS]
+    first, *others = (figure(png, caption, picture) for picture, caption, png in pictures)
+    cards = [_card(number, one, views) for number, one in enumerate(report.to_do, start=1)]
+    parts = [first_screen(
+        [said, tiles((one.show(one.value), one.name, not one.is_missed) for one in told),
+         bars(_bar(one) for one in report.measures),
+         '<h2>What to do first</h2>', *cards[:FIRST_ADVICE]], [first])]
+    if rest := cards[FIRST_ADVICE:]:
+        parts.append(fold(f'{len(rest)} more to do', *rest))
+    faulty = sum(grade(one) == 'faulty' for one in report.landmarks)
+    parts += [fold('All figures', table(('', ''), _figures(report))),
+              fold('Pictures', *others),
+              fold(f'Landmarks, worst first: {faulty} of {len(report.landmarks)} with a serious '
+                   'fault', _landmarks(report.landmarks))]
     if report.look_alikes:
-        parts += ['<h2>Places that look alike</h2>', _look_alikes(report)]
+        parts.append(fold(f'{len(report.look_alikes)} pairs of places that look alike',
+                          _look_alikes(report)))
     if report.recording is not None:
         rows = [(str(number), str(one.frames), str(one.landmarks), str(one.boxes.boxes),
                  f'{one.boxes.explained:.1%}', f'{one.boxes.median_iou:.3f}')
                 for number, one in enumerate(report.recording.folds, start=1)]
-        parts += ['<h2>Held-out boxes</h2>',
-                  '<p>Blocks of time take turns in being judged; landmarks are fitted to the '
-                  'other blocks.</p>',
-                  _table(('#fold', '#frames', '#landmarks', '#boxes', '#explained',
-                          '#median IoU'), rows),
-                  '<h2>Systematic residuals</h2>', _corrections(report.recording)]
-    return '\n'.join([*parts, '<h2>What these figures rest on</h2>', _list(report.notes),
-                      '</html>', ''])
+        parts += [fold('Held-out boxes', note(
+            'Blocks of time take turns in being judged; landmarks are fitted to the other '
+            'blocks.'), table(('#fold', '#frames', '#landmarks', '#boxes', '#explained',
+                               '#median IoU'), rows)),
+                  fold('Systematic residuals', _corrections(report.recording))]
+    return page(f'Check of {name}', *parts,
+                fold('What these figures rest on', items(report.notes)))
+
+
+def _card(number: int, advice: Advice, views: Views | None) -> str:
+    view = None if views is None else views.of(advice)
+    text = f'{number}. {advice.text}'
+    return card(text) if view is None else card(text, view.jpeg, view.caption)
+
+
+def _bar(one: Measure) -> Bar:
+    """Return the bar of a figure; a count's bar has room for its limit and one more."""
+    scale = max(one.limit + 1.0, one.value) if one.unit == 'count' else 1.0
+    word = 'at most' if one.is_most else 'at least'
+    return Bar(one.name, f'{one.show(one.value)} ({word} {one.show(one.limit)})',
+               one.value / scale, one.limit / scale, not one.is_missed)
 
 
 def summary_lines(report: CheckReport) -> list[str]:
@@ -165,7 +186,7 @@ def _verdicts(trials: Sequence[Trial]) -> str:
 def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
     head = ('landmark', 'label', 'faults', '#frames', '#seen [%]', '#baseline [°]',
             '#deviation [cm]', '#offset [cm]', '#IoU', '#thinness', 'overlaps with')
-    rows = []
+    rows: list[list[str | tuple[str, str]]] = []
     for one in landmarks[:_MOST_LANDMARKS]:
         support = '' if one.support is None else (
             str(one.support) if one.expected is None else f'{one.support} of {one.expected}')
@@ -176,19 +197,16 @@ def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
         texts = [support, *('' if value is None else f'{value * factor:.{digits}f}'
                             for value, factor, digits in numbers)]
         faults = '; '.join(one.faults) if one.faults else GRADE_NAMES['sound']
-        rows.append('<tr>' + ''.join([
-            _cell(one.landmark_id, grade(one)), _cell(label, 'text'), _cell(faults, 'text'),
-            *(_cell(text, 'number') for text in texts),
-            _cell(', '.join(f'{name} ({distance:.2f})' for name, distance in one.overlaps))])
-            + '</tr>')
+        rows.append([
+            (one.landmark_id, grade(one)), (label, 'text'), (faults, 'text'), *texts,
+            ', '.join(f'{name} ({distance:.2f})' for name, distance in one.overlaps)])
     rest = len(landmarks) - _MOST_LANDMARKS
-    more = f'<p class="note">and {rest} more in the JSON file</p>' if rest > 0 else ''
-    return (f'<div class="scroll"><table>{_head(head)}{"".join(rows)}</table></div>{more}'
-            '<p class="note">frames: with the landmark, of those that should show it. seen: '
-            'their share. baseline: greatest angle between two views. deviation: of the centre '
-            'on its worst axis. offset: from the centre to where its boxes put it. IoU: median '
-            'of its boxes. thinness: least by greatest semi-axis. In brackets: the normalized '
-            'distance of an overlap.</p>')
+    return (table(head, rows) + (note(f'and {rest} more in the JSON file') if rest > 0 else '')
+            + note('frames: with the landmark, of those that should show it. seen: their share. '
+                   'baseline: greatest angle between two views. deviation: of the centre on its '
+                   'worst axis. offset: from the centre to where its boxes put it. IoU: median of '
+                   'its boxes. thinness: least by greatest semi-axis. In brackets: the normalized '
+                   'distance of an overlap.'))
 
 
 def _look_alikes(report: CheckReport) -> str:
@@ -200,42 +218,21 @@ def _look_alikes(report: CheckReport) -> str:
         rows.append((str(number), f'{one.first[0]:.1f}, {one.first[1]:.1f}',
                      f'{one.second[0]:.1f}, {one.second[1]:.1f}', f'{one.turn_deg:.0f}',
                      f'{len(one.matched)} of {one.landmarks}', str(one.same_labels), pairs))
-    return _table(('#pair', 'a: x, y [m]', 'b: x, y [m]', '#turn [deg]', '#landmarks alike',
-                   '#with equal labels', 'which'), rows)
+    return table(('#pair', 'a: x, y [m]', 'b: x, y [m]', '#turn [deg]', '#landmarks alike',
+                  '#with equal labels', 'which'), rows)
 
 
 def _corrections(recording: RecordingCheck) -> str:
     if not recording.corrections:
-        return '<p>Too few boxes to tell.</p>'
+        return note('Too few boxes to tell.')
     rows = [(one.cause, one.name, f'{one.value:+.2f} {one.unit}',
              f'{one.deviation:.2f} {one.unit}', f'{one.effect_px:.1f}',
              f'{one.explained:.1%}', '' if not one.is_significant else (
                  'may follow from the cause that explains most' if one.follows
                  else 'significant'))
             for one in recording.corrections]
-    return ('<p>The correction that fits the edges of the boxes best, each cause on its own. A '
-            'turned mount and a shifted principal point look much the same.</p>'
-            + _table(('cause', 'what', '#correction', '#deviation', '#effect [px]',
-                       '#cost that the cause explains', ''), rows))
+    return (note('The correction that fits the edges of the boxes best, each cause on its own. A '
+                 'turned mount and a shifted principal point look much the same.')
+            + table(('cause', 'what', '#correction', '#deviation', '#effect [px]',
+                     '#cost that the cause explains', ''), rows))
 
-
-def _list(texts: Iterable[str]) -> str:
-    return '<ul>' + ''.join(f'<li>{escape(text)}</li>' for text in texts) + '</ul>'
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table; a heading that begins with # aligns its column to the right."""
-    body = ''.join('<tr>' + ''.join(
-        _cell(text, 'number' if title.startswith('#') else '')
-        for title, text in zip(head, row, strict=True)) + '</tr>' for row in rows)
-    return f'<div class="scroll"><table>{_head(head) if any(head) else ""}{body}</table></div>'
-
-
-def _head(titles: Sequence[str]) -> str:
-    return '<tr>' + ''.join(
-        f'<th{" class=number" if title.startswith("#") else ""}>{escape(title.lstrip("#"))}</th>'
-        for title in titles) + '</tr>'
-
-
-def _cell(text: str, kind: str = '') -> str:
-    return f'<td{f" class={kind}" if kind else ""}>{escape(text)}</td>'

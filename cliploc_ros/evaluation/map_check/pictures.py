@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pictures of a check: the map from above with landmarks, grid and recorded frames."""
 
-import io
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -15,33 +15,30 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon, Rectangle
-from numpy.typing import NDArray
 
-from cliploc_ros.core.geometry.ellipsoid import outline_points
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.evaluation.figures import EDGED
+from cliploc_ros.evaluation.drawing import EDGED, draw_outline, png_of, write_name
 from cliploc_ros.evaluation.map_check.page import (
-    FAINT,
+    FIRST_ADVICE,
     GRADE_COLORS,
     GRADE_NAMES,
-    INK,
     LOOK_ALIKE,
     MISLED,
     VERDICT_COLORS,
     grade,
 )
+from cliploc_ros.files.page import FAINT
 from cliploc_ros.mapping.check.places import RADIUS_M
 from cliploc_ros.mapping.check.relocalization import Trial, count_verdicts, refused_spans
 from cliploc_ros.mapping.check.report import CheckReport
 
-_DPI = 110
+_DPI = 120
 _MARGIN_M = 0.4
-_LARGEST_IN = 9.0
+_LARGEST_IN = 6.4
+INK = '#222222'
 _HEAT = LinearSegmentedColormap.from_list('accepted', ['#FBE9C6', '#56B4E9', '#003E6B'])
 _UNSEEN = '#DDDDDD'
 _MOST_NAMES = 30
-# Width and height of a name in shares of the picture.
-_NAME_ROOM = np.array([0.09, 0.035])
 _MOST_LOOK_ALIKES = 6
 
 
@@ -52,25 +49,20 @@ def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
     yield ('grid', 'Expected relocalization from above. A cell is a camera position: the darker, '
            'the more of the headings with at least three detectable landmarks give an accepted, '
            'right pose. Ticks point where the camera looked when a wrong pose was accepted. '
-           'Positions inside of a landmark are left out.', _png(_grid_figure(canvas)))
+           'Positions inside of a landmark, and beyond all objects, are left out. The numbers '
+           'are those of the advice.', png_of(_grid_figure(canvas), _DPI))
     if report.recording is not None and report.recording.trials:
         yield ('frames', 'Recorded frames, each relocalized in a map that was fitted without '
                'frames of that time. The dot is the camera, the wedge where it looks. Times '
                'are those of the longest runs of refused frames.',
-               _png(_frames_figure(canvas, report.recording.trials)))
+               png_of(_frames_figure(canvas, report.recording.trials), _DPI))
         yield ('time', 'The same frames over time: how many landmarks of the map the detector '
-               'found, and the verdict.', _png(_time_figure(report.recording.trials)))
+               'found, and the verdict.', png_of(_time_figure(report.recording.trials), _DPI))
     yield ('landmarks', 'The landmarks from above. Names are those of landmarks with a fault; '
-           'where these are many, with a serious one.', _png(_landmarks_figure(canvas)))
+           'where these are many, with a serious one.', png_of(_landmarks_figure(canvas), _DPI))
     if report.look_alikes:
         yield ('look_alikes', 'Places that look alike, joined in pairs.',
-               _png(_look_alikes_figure(canvas)))
-
-
-def _png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format='png', dpi=_DPI)
-    return buffer.getvalue()
+               png_of(_look_alikes_figure(canvas), _DPI))
 
 
 class _Canvas:
@@ -79,9 +71,16 @@ class _Canvas:
     def __init__(self, landmark_map: LandmarkMap, report: CheckReport):
         self.map, self.report = landmark_map, report
         grid, half = report.grid.positions[:, :2], report.grid.spacing_m / 2
-        points = [landmark_map.centers[:, :2], grid - half, grid + half]
         self.path = None if report.recording is None else report.recording.path_xyz[:, :2]
-        every = np.concatenate(points if self.path is None else [*points, self.path])
+        #: (P,): the positions to draw. Beyond the objects and the path there may be walls.
+        self.shown = np.ones(len(grid), dtype=np.bool_)
+        points = [landmark_map.centers[:, :2]]
+        if self.path is not None:
+            points.append(self.path)
+            hull = cv2.convexHull(np.concatenate(points).astype(np.float32))
+            self.shown = report.grid.is_near | np.array([
+                cv2.pointPolygonTest(hull, one, False) > 0 for one in grid.tolist()])
+        every = np.concatenate([*points, grid[self.shown] - half, grid[self.shown] + half])
         self._low = every.min(axis=0) - _MARGIN_M
         self._high = every.max(axis=0) + _MARGIN_M
         #: The longer side [m]
@@ -103,31 +102,26 @@ class _Canvas:
         axes.set_axisbelow(True)
         faces = [face] * len(self.map) if isinstance(face, str) else face
         for center, shape, color in zip(self.map.centers, self.map.shapes, faces, strict=True):
-            outline = np.array([center[0], center[1], shape[0], shape[1], shape[3]])
-            axes.add_patch(Polygon(outline_points(outline), closed=True, facecolor=color,
-                                   edgecolor='#444444', linewidth=0.7, alpha=alpha, zorder=3,
-                                   path_effects=EDGED if color == 'none' else None))
+            draw_outline(axes, center, shape, facecolor=color, edgecolor='#444444', linewidth=0.7,
+                         alpha=alpha, zorder=3, path_effects=EDGED if color == 'none' else None)
         return figure, axes
 
 
-def _name(axes: Axes, xy: NDArray[np.float64], text: str) -> None:
-    axes.text(xy[0], xy[1], text, fontsize=8, color=INK, ha='center', va='center', zorder=9,
-              path_effects=EDGED, parse_math=False, clip_on=True)
-
-
 def _add_legend(figure: Figure, handles: Sequence[Line2D | Patch]) -> None:
-    figure.legend(handles=list(handles), loc='outside lower center', ncols=min(4, len(handles)),
+    figure.legend(handles=list(handles), loc='outside lower center', ncols=min(3, len(handles)),
                   frameon=False, fontsize=9)
 
 
 def _grid_figure(canvas: _Canvas) -> Figure:
     grid = canvas.report.grid
     height = grid.positions[0, 2] if len(grid.positions) else 0.0
-    figure, axes = canvas.figure(f'Expected relocalization, camera {height:.2f} m high', 'none',
+    figure, axes = canvas.figure(f'Where a robot is accepted, camera {height:.2f} m high', 'none',
                                  alpha=0.9)
+    shown = canvas.shown
     side, inset = grid.spacing_m, 0.06 * grid.spacing_m
-    for position, near, accepted, useful in zip(grid.positions, grid.is_near, grid.accepted,
-                                                grid.useful, strict=True):
+    for position, near, accepted, useful in zip(
+            grid.positions[shown], grid.is_near[shown], grid.accepted[shown],
+            grid.useful[shown], strict=True):
         x, y = position[:2] - side / 2
         is_dark = useful == 0 and accepted == 0
         axes.add_patch(Rectangle(
@@ -139,7 +133,7 @@ def _grid_figure(canvas: _Canvas) -> Figure:
     handles: list[Line2D | Patch] = [
         Line2D([], [], color='#444444', marker='o', markerfacecolor='none', linestyle='none',
                label='landmark'),
-        Patch(facecolor=_UNSEEN, label='fewer than 3 landmarks in every view')]
+        Patch(facecolor=_UNSEEN, label='fewer than 3 landmarks in view')]
     if canvas.path is not None:
         axes.plot(*canvas.path.T, color=INK, linewidth=1.0, zorder=4, linestyle=(0, (4, 2)),
                   path_effects=EDGED)
@@ -156,6 +150,14 @@ def _grid_figure(canvas: _Canvas) -> Figure:
         axes.plot(x, y, 'X', color=MISLED, markersize=9, markeredgecolor='white', zorder=8)
     handles.append(Line2D([], [], color=MISLED, marker='X', linewidth=2.5,
                           label=f'misled ({len(wrong)} of {len(grid.trials)} views)'))
+    rows = {name: row for row, name in enumerate(canvas.map.landmark_ids)}
+    for number, advice in enumerate(canvas.report.to_do[:FIRST_ADVICE], start=1):
+        place = (canvas.map.centers[rows[advice.landmarks[0]]] if advice.landmarks
+                 else None if advice.view is None else advice.view.position)
+        if place is not None:
+            axes.text(place[0], place[1], str(number), fontsize=10, fontweight='bold', zorder=10,
+                      color='white', ha='center', va='center',
+                      bbox={'boxstyle': 'circle,pad=0.25', 'facecolor': INK, 'edgecolor': 'white'})
     bar = figure.colorbar(ScalarMappable(Normalize(0, 100), _HEAT), ax=axes, shrink=0.7,
                           pad=0.02)
     bar.set_label('right pose accepted\n[% of headings that show 3 landmarks]', fontsize=9)
@@ -182,7 +184,7 @@ def _frames_figure(canvas: _Canvas, trials: Sequence[Trial]) -> Figure:
     for run in [run for run in refused_spans(trials) if len(run) > 1][:8]:
         middle = run[len(run) // 2]
         behind = middle.position[:2] - 1.2 * size * middle.forward[:2]
-        _name(axes, behind, f'{(middle.stamp_s or 0.0) - first:.0f} s')
+        write_name(axes, behind, f'{(middle.stamp_s or 0.0) - first:.0f} s')
     counts = count_verdicts(trials)
     _add_legend(figure, [
         *(Line2D([], [], color=color, label=f'{verdict} ({counts[verdict]})', markersize=5,
@@ -225,19 +227,8 @@ def _landmarks_figure(canvas: _Canvas) -> Figure:
     named = [one for one in checks if one.faults]
     if len(named) > _MOST_NAMES:
         named = [one for one in named if grade(one) == 'faulty'][:_MOST_NAMES]
-    # names nearer than some room share one
-    stacks: list[tuple[NDArray[np.float64], list[str]]] = []
     for one in named:
-        place = np.array(one.center[:2])
-        for other, names in stacks:
-            if (np.abs(other - place) < _NAME_ROOM * canvas.size).all():
-                names.append(one.landmark_id)
-                break
-        else:
-            stacks.append((place, [one.landmark_id]))
-    for place, names in stacks:
-        shown = names if len(names) <= 3 else [*names[:2], f'and {len(names) - 2} more']
-        _name(axes, place, '\n'.join(shown))
+        write_name(axes, one.center[:2], one.landmark_id)
     if canvas.path is not None:
         axes.plot(*canvas.path.T, color=FAINT, linewidth=0.8, zorder=2)
     counts = Counter(grades.values())

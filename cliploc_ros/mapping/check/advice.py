@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.mapping.check.places import RADIUS_M, LookAlike
 from cliploc_ros.mapping.check.relocalization import Trial, refused_spans
-from cliploc_ros.mapping.check.report import SERIOUS, CheckReport, GridCheck
+from cliploc_ros.mapping.check.report import SERIOUS, Advice, CheckReport, GridCheck
 
 _MOST_OF_A_KIND, _MOST_MISLED = 5, 3
 # A shorter run of refused frames is no side of a room.
@@ -31,20 +31,20 @@ _SIGHT_M = 2.0 * RADIUS_M
 _NUMBERS = ('no', 'one', 'two', 'three', 'four', 'five', 'six', 'seven', 'eight', 'nine', 'ten')
 
 
-def give_advice(report: CheckReport) -> list[str]:
+def give_advice(report: CheckReport) -> list[Advice]:
     """Return what to do, one sentence or two each."""
     advice = [*_on_look_alikes(report), *_on_landmarks(report), *_on_corrections(report),
               *_on_misled(report), *_on_spans(report), *_on_grid(report)]
-    return advice or ['nothing to do: the map reaches all thresholds that were checked']
+    return advice or [Advice('nothing to do: the map reaches all thresholds that were checked')]
 
 
-def _some(texts: Sequence[str], what: str) -> list[str]:
-    """Return the first texts, and how many more there are."""
-    more = [f'and {len(texts) - _MOST_OF_A_KIND} more {what}']
-    return [*texts[:_MOST_OF_A_KIND], *(more if len(texts) > _MOST_OF_A_KIND else [])]
+def _some(advice: Sequence[Advice], what: str) -> list[Advice]:
+    """Return the first ones, and how many more there are."""
+    more = [Advice(f'and {len(advice) - _MOST_OF_A_KIND} more {what}')]
+    return [*advice[:_MOST_OF_A_KIND], *(more if len(advice) > _MOST_OF_A_KIND else [])]
 
 
-def _on_look_alikes(report: CheckReport) -> list[str]:
+def _on_look_alikes(report: CheckReport) -> list[Advice]:
     texts = []
     for one in report.look_alikes:
         matched = len(one.matched)
@@ -57,64 +57,68 @@ def _on_look_alikes(report: CheckReport) -> list[str]:
         alike = (f'the place around {_place(one.first)} looks the same when turned by '
                  f'{abs(one.turn_deg):.0f} degrees') if distance_m < _SAME_POSE_M else (
             f'the places around {_place(one.first)} and {_place(one.second)} look alike')
-        texts.append(f'{alike} ({matched} of {one.landmarks} landmarks)'
-                     + (f', and {mistaken} of the checked views are accepted in the wrong one'
-                        if mistaken else '') + f': {told_apart}')
+        texts.append(Advice(
+            f'{alike} ({matched} of {one.landmarks} landmarks)'
+            + (f', and {mistaken} of the checked views are accepted in the wrong one'
+               if mistaken else '') + f': {told_apart}', one.matched[0] if one.matched else ()))
     return _some(texts, 'pairs of places that look alike')
 
 
-def _on_landmarks(report: CheckReport) -> Iterator[str]:
+def _on_landmarks(report: CheckReport) -> Iterator[Advice]:
     """Yield advice on duplicates, on too few views, and on faults of single landmarks."""
-    yield from _some([
-        f'{report.map_ids[one.first]} and {report.map_ids[one.second]} are the same object '
-        f'(normalized distance {one.distance:.2f}): delete one of them'
-        for one in report.overlaps if one.is_duplicate], 'pairs of duplicates')
+    pairs = [(report.map_ids[one.first], report.map_ids[one.second])
+             for one in report.overlaps if one.is_duplicate]
+    yield from _some([Advice(f'{" and ".join(pair)} are the same object: delete one of them', pair)
+                      for pair in pairs], 'pairs of duplicates')
     if report.recording is not None:
         frames = float(np.median([one.support or 0 for one in report.landmarks]))
         unexplained = 1.0 - report.recording.as_given.explained
         if frames < _FEW_FRAMES and unexplained > _MANY_UNEXPLAINED:
-            yield (f'record more views: of {report.recording.frames} frames, {frames:.0f} show a '
-                   f'landmark (median), and {unexplained:.0%} of the boxes belong to none; pass '
-                   f'all objects slowly, until {_FEW_FRAMES} frames or more show each of them')
+            yield Advice(
+                f'record more views: of {report.recording.frames} frames, {frames:.0f} show a '
+                f'landmark (median), and {unexplained:.0%} of the boxes belong to none; pass '
+                f'all objects slowly, until {_FEW_FRAMES} frames or more show each of them')
     yield from _some([
-        f'{one.landmark_id} {one.faults[0]}' for one in report.landmarks
+        Advice(f'{one.landmark_id} {one.faults[0]}', (one.landmark_id,))
+        for one in report.landmarks
         if one.severity >= SERIOUS and one.faults and 'same object as' not in one.faults[0]],
         'landmarks with a serious fault: record the place again, and update the map')
 
 
-def _on_corrections(report: CheckReport) -> Iterator[str]:
+def _on_corrections(report: CheckReport) -> Iterator[Advice]:
     found = [one for one in (report.recording.corrections if report.recording else ())
              if one.is_significant]
     if not found:
         return
-    what = {'intrinsics': 'calibrate the camera', 'mount': 'check the mount of the camera',
+    what = {'intrinsics': 'calibrate the camera',
+            'mount': 'measure how the camera is mounted on the robot',
             'stamps': 'check the clock and the delay of the images'}
     best = max(found, key=lambda one: one.explained)
     # those of one fit, of one camera: what is wrong with it makes others look wrong, too
     cause, of_best = best.cause, [one for one in found if (one.cause, one.explained) == (
         best.cause, best.explained)]
-    numbers = [f'{one.name} by {one.value:+.2f} {one.unit} (standard deviation '
-               f'{one.deviation:.2f})'
+    numbers = [f'{one.name} by {one.value:+.2f} {one.unit} (± {one.deviation:.2f})'
                for one in sorted(of_best, key=lambda one: -one.effect_px)]
     left = sorted({one.cause for one in found if not one.follows} - {cause})
     follow = sorted({one.cause for one in found if one.follows} - {cause, *left})
     then = f'; after that, {" and ".join(what[one] for one in left)}' if left else ''
     if follow:
         then += f'; only if that was right, look at the {" and the ".join(follow)}'
-    yield f'{what[cause]}: the boxes fit better with other {", ".join(numbers)}{then}'
+    yield Advice(f'{what[cause]}: the boxes fit better if you change {", ".join(numbers)}{then}')
 
 
-def _on_misled(report: CheckReport) -> Iterator[str]:
+def _on_misled(report: CheckReport) -> Iterator[Advice]:
     wrong = [one for one in _misled(report)
              if not any(_takes_for(one, pair) for pair in report.look_alikes)]
     for one in sorted(wrong, key=lambda one: -(one.error_m or 0.0))[:_MOST_MISLED]:
-        yield (f'a robot at {_place(one.position)} looking {_heading(one)} would be misled by '
-               f'{one.error_m:.1f} m: raise min_confidence, or map more distinct objects there')
+        yield Advice(f'a robot at {_place(one.position)} looking {_heading(one)} would be misled '
+                     f'by {one.error_m:.1f} m: raise min_confidence, or map more distinct objects '
+                     'there', view=one)
     if len(wrong) > _MOST_MISLED:
-        yield f'and {len(wrong) - _MOST_MISLED} more views that mislead'
+        yield Advice(f'and {len(wrong) - _MOST_MISLED} more views that mislead')
 
 
-def _on_spans(report: CheckReport) -> Iterator[str]:
+def _on_spans(report: CheckReport) -> Iterator[Advice]:
     if report.recording is None:
         return
     for run in list(refused_spans(report.recording.trials))[:_MOST_OF_A_KIND]:
@@ -127,23 +131,26 @@ def _on_spans(report: CheckReport) -> Iterator[str]:
         middle = 0.5 * (run[0].stamp_s + run[-1].stamp_s) - first
         center = np.mean([one.position for one in run], axis=0)
         what = 'record this side' if seen <= _FEW_LANDMARKS else (
-            'give these objects better labels, or record this side again')
-        yield (f'{what}: {len(run)} frames at {middle:.0f} s, around {_place(center)} looking '
-               f'{_heading(halfway)}, see {_landmarks(seen)} and none is accepted')
+            'describe these objects better in their labels, or record this side again')
+        yield Advice(f'{what}: {len(run)} frames at {middle:.0f} s, around {_place(center)} '
+                     f'looking {_heading(halfway)}, show {_landmarks(seen)} and none is accepted',
+                     view=halfway)
 
 
-def _on_grid(report: CheckReport) -> Iterator[str]:
+def _on_grid(report: CheckReport) -> Iterator[Advice]:
     """Yield advice on areas without an accepted heading, and on those without a keyframe."""
     grid = report.grid
     for rows in _areas(grid, np.nonzero(grid.is_near & (grid.accepted == 0))[0])[:_MOST_OF_A_KIND]:
         if np.mean([_sees_double(one, report) for one in grid.positions[rows]]) <= 0.5:
-            yield (f'no heading is accepted at {_area(grid, rows)}: at most '
-                   f'{_landmarks(int(grid.visible[rows].max()))} can be expected in one view; map '
-                   'more objects that can be seen from there')
+            best = int(grid.visible[rows].max())
+            fullest = int(rows[0] * grid.headings + grid.visible[rows[0]].argmax())
+            yield Advice(f'no heading is accepted at {_area(grid, rows)}: a view from there shows '
+                         f'{_landmarks(best)} at most; map more objects that can be seen from '
+                         'there', view=grid.trials[fullest])
     if report.keyframes is not None:
         yield from _some([
-            f'no keyframe is within reach of {_area(grid, rows)}: drive there when the layer is '
-            'made again, or rely on the landmarks'
+            Advice(f'no keyframe is within reach of {_area(grid, rows)}: drive there when the '
+                   'layer is made again, or rely on the landmarks')
             for rows in _areas(grid, report.keyframes.without)], 'areas that no keyframe reaches')
 
 

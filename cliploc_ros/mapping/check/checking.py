@@ -40,7 +40,7 @@ from cliploc_ros.mapping.check.report import (
     GridCheck,
     RecordingCheck,
     check_keyframes,
-    find_failures,
+    find_measures,
 )
 from cliploc_ros.mapping.evidence import best_ious
 from cliploc_ros.mapping.options import CheckOptions, Thresholds
@@ -126,8 +126,8 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         notes=tuple(notes), map_ids=landmark_map.landmark_ids,
         keyframes=None if layer is None else check_keyframes(layer, grid, recorded))
     tell('done', 1.0)
-    return replace(report, advice=tuple(give_advice(report)),
-                   failures=tuple(find_failures(report, thresholds or Thresholds())))
+    return replace(report, to_do=tuple(give_advice(report)),
+                   measures=tuple(find_measures(report, thresholds or Thresholds())))
 
 
 def judge_grid(grid: Grid, model: DetectorModel, trials: Sequence[Trial], headings: int

@@ -128,8 +128,7 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
             **_support(landmark_map, row, witness),
             thinness=float(semi_axes.min() / semi_axes.max()),
             overlaps=tuple((ids[other], one.distance) for other, one in others))
-        faults = [(1.5, f'is the same object as {ids[other]} (normalized distance '
-                        f'{one.distance:.2f}): delete one of them')
+        faults = [(1.5, f'is the same object as {ids[other]}: delete one of them')
                   for other, one in others if one.is_duplicate]
         if not faults:
             faults += _support_faults(check, float(np.linalg.norm(semi_axes)), options)
@@ -177,28 +176,27 @@ def _support_faults(check: LandmarkCheck, size_m: float, options: MappingOptions
     if support == 0:
         if expected is not None and expected < _MIN_EXPECTED:
             return [(0.5, f'was in view in {expected} frames: record this place')]
-        return [(1.4, f'is never detected, although {expected} frames should show it: moved, '
-                      'removed, or of a class that the detector does not find; delete it or '
-                      'update the map')]
+        return [(1.4, f'is never detected, although {expected} frames should show it: delete it '
+                      'if it is gone, or map again')]
     faults = []
     if support is not None and support < options.min_viewpoints:
         faults.append((1.1, f'was seen in {support} frames: record it from more sides'))
     if ratio is not None and ratio < options.min_seen_ratio:
         faults.append((1.2, f'is detected in {ratio:.1%} of the frames that should show it: '
-                            'moved, or hard to detect'))
+                            'delete it if it has moved, or is hard to detect'))
     iou, baseline, sigma = check.median_iou, check.baseline_deg, check.position_sigma_m
     if iou is not None and iou < options.min_median_iou:
-        faults.append((1.2, f'does not fit its boxes: median IoU {iou:.2f}; moved, or two objects '
-                            'in one; map it again'))
+        faults.append((1.2, f'does not fit its boxes (median IoU {iou:.2f}), as if it had moved '
+                            'or were two objects: delete it or map again'))
     if baseline is not None and baseline < options.min_baseline_deg:
-        faults.append((0.7, f'was seen from one side: {baseline:.0f} degrees; record it from '
-                            'another side'))
+        faults.append((0.7, f'was seen from one side only, {baseline:.0f} degrees wide: record it '
+                            'from another side'))
     if (offset := check.offset_m) is not None and offset > max(
             _MIN_OFFSET_M, _OFFSET_SHARE * size_m, _OFFSET_SIGMAS * (sigma or 0.0)):
-        faults.append((1.1, f'is {offset * 100:.0f} cm away from where its boxes put it: moved, '
-                            'or badly fitted; map it again'))
+        faults.append((1.1, f'is {offset * 100:.0f} cm away from where its boxes put it: delete '
+                            'it or map again'))
     if sigma is not None and sigma > max(options.max_position_sigma_m,
                                          options.max_position_sigma_share * size_m):
-        faults.append((0.7, f'has an uncertain position: {sigma * 100:.0f} cm; record it from '
-                            'more sides'))
+        faults.append((0.7, f'may be {sigma * 100:.0f} cm off (standard deviation): record it '
+                            'from more sides'))
     return faults

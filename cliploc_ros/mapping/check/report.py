@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of a check: figures, verdict and advice."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,33 @@ from cliploc_ros.mapping.systematic import Correction
 
 #: A landmark of this severity has a serious fault.
 SERIOUS = 1.0
+
+
+class Advice(NamedTuple):
+    """What to do, and where it is to be seen."""
+
+    text: str
+    landmarks: tuple[str, ...] = ()  #: Ids of the landmarks that it is about
+    view: Trial | None = None  #: The view that it is about
+
+
+class Measure(NamedTuple):
+    """A figure of the map, and its threshold."""
+
+    name: str
+    value: float
+    limit: float
+    is_most: bool  #: The value may be the limit at most; else it has to be the limit at least
+    unit: Literal['share', 'number', 'count'] = 'share'
+
+    @property
+    def is_missed(self) -> bool:
+        """Return whether the map misses the threshold."""
+        return self.value > self.limit if self.is_most else self.value < self.limit
+
+    def show(self, value: float) -> str:
+        """Return a value in words, with enough digits to show that it is below its limit."""
+        return f'{100.0 * value:.4g} %' if self.unit == 'share' else f'{value:.4g}'
 
 
 @dataclass(frozen=True)
@@ -172,12 +199,23 @@ class CheckReport:
     recording: RecordingCheck | None = None
     #: Recorded queries with recorded similarities; empty without any
     queries: tuple[Trial, ...] = ()
-    failures: tuple[str, ...] = ()  #: Thresholds that the map misses; empty if it is good enough
-    advice: tuple[str, ...] = ()  #: What to do, the most urgent first
+    measures: tuple[Measure, ...] = ()  #: What decides whether the map is good enough
+    to_do: tuple[Advice, ...] = ()  #: The most urgent first
     notes: tuple[str, ...] = ()  #: What the figures rest on
     #: What the keyframes next to the map reach; None without any
     keyframes: KeyframeCheck | None = None
     map_ids: tuple[str, ...] = ()  #: Ids in the map's order, which overlaps refer to
+
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """Return the thresholds that the map misses; empty if it is good enough."""
+        return tuple(f'{one.name}: {one.show(one.value)} {">" if one.is_most else "<"} '
+                     f'{one.show(one.limit)}' for one in self.measures if one.is_missed)
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """Return what to do, the most urgent first."""
+        return tuple(one.text for one in self.to_do)
 
     @property
     def passed(self) -> bool:
@@ -231,31 +269,25 @@ class CheckReport:
             'keyframes': None if self.keyframes is None else self.keyframes.as_dict()}
 
 
-def find_failures(report: CheckReport, limits: Thresholds) -> list[str]:
-    """Return the thresholds that a report misses."""
-    failures = []
+def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
+    """Return the figures of a report that have a threshold."""
+    measures: list[Measure] = []
 
-    def percent(value: float) -> str:
-        """Return a share with enough digits to show that it is below its limit."""
-        return f'{100.0 * value:.4g} %'
-
-    def demand(text: str, value: float, limit: float, is_most: bool,
-               show: Callable[[float], str] = percent) -> None:
-        if value > limit if is_most else value < limit:
-            failures.append(f'{text}: {show(value)} {">" if is_most else "<"} {show(limit)}')
+    def demand(*numbers: Any) -> None:
+        measures.append(Measure(*numbers))
 
     views = [*report.grid.trials, *report.queries]
     demand('landmarks with a serious fault', report.faulty, limits.max_faulty, True)
-    demand('pairs of duplicates', report.duplicates, limits.max_duplicates, True, str)
+    demand('pairs of duplicates', report.duplicates, limits.max_duplicates, True, 'count')
     demand('pairs of places that look alike', len(report.look_alikes), limits.max_look_alikes,
-           True, str)
+           True, 'count')
     if (recording := report.recording) is not None:
         views += recording.trials
         if recording.can_judge_boxes:
             demand('held-out boxes explained', recording.held_out.explained,
                    limits.min_explained, False)
             demand('held-out median IoU', recording.held_out.median_iou, limits.min_iou, False,
-                   '{:.4g}'.format)
+                   'number')
         if recording.can_judge_frames:
             demand('recorded frames accepted', share(recording.judged, 'accepted'),
                    limits.min_accepted, False)
@@ -265,7 +297,7 @@ def find_failures(report: CheckReport, limits: Thresholds) -> list[str]:
     demand('positions with an accepted heading', report.accepted_positions,
            limits.min_positions, False)
     demand('views that mislead a robot', share(views, 'misled'), limits.max_misled, True)
-    return failures
+    return measures
 
 
 def count_by_objects(trials: Sequence[Trial]) -> dict[str, int]:

@@ -22,11 +22,13 @@ _RADIUS_PX = 3
 # Lines between more points hide the images.
 _MOST_LINES = 20
 _UNMATCHED, _BOX, _ELLIPSE = (255, 255, 255), (86, 180, 233), (230, 159, 0)
-_ACCEPTED, _REFUSED = (0, 158, 115), (213, 94, 0)
+# White text on them has a contrast of 5 and more.
+_ACCEPTED, _REFUSED = (0, 114, 178), (176, 70, 0)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _LABEL_CHARS = 40
-# The width of a character, at most [px].
-_CHAR_PX = 9
+# The scale of text, by the width of the image [1/px]; the width of a character, at most, and the
+# height of a line of scale 1 [px].
+_LEAST_SCALE, _SCALE_PER_PX, _CHAR_PX, _LINE_PX = 0.45, 1 / 1400, 20, 44
 
 
 def beside_keyframe(canvas: NDArray[np.uint8], seen: RecognizedPlace, layer: KeyframeLayer
@@ -116,7 +118,7 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
     found : Relocalization
         Its matches refer to the detections of the image.
     verdict : str
-        Written at the top.
+        Written at the top, on a band of its own.
     """
     canvas = np.ascontiguousarray(seen.image_rgb).copy()
     boxes = seen.observation.detections.bboxes_xyxy
@@ -132,6 +134,7 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
                                       landmark_map.centers[rows], shape_matrices(
                                           landmark_map.semi_axes[rows],
                                           landmark_map.quats_xyzw[rows]))
+        taken: list[NDArray[np.int32]] = []
         for match, outline in zip(found.matches, outlines, strict=True):
             if np.isfinite(outline).all():
                 points = seen.observation.camera.project_normalized(outline_points(outline))
@@ -140,11 +143,14 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
                               cv2.LINE_AA)
             label = landmark_map.labels[match.landmark][:_LABEL_CHARS]
             similarity = _similarity(seen.observation, match.detection, match.landmark)
-            corner = _pixels(boxes[match.detection][:2])
-            _write(canvas, f'{label} {similarity}IoU {match.iou:.2f}', corner - (0, 4), _BOX)
-    for line, text in enumerate(_lines(verdict, canvas.shape[1] // _CHAR_PX)):
-        _write(canvas, text, np.array([6, 18 + 20 * line]),
-               _ACCEPTED if found.accepted else _REFUSED)
+            _write_near(canvas, f'{label} {similarity}IoU {match.iou:.2f}',
+                        boxes[match.detection], taken)
+    scale = _scale(canvas)
+    lines = _lines(verdict, int(canvas.shape[1] / (_CHAR_PX * scale))) if verdict else []
+    canvas[:int((len(lines) + 0.3 * bool(lines)) * _LINE_PX * scale)] = (
+        _ACCEPTED if found.accepted else _REFUSED)
+    for line, text in enumerate(lines):
+        _write(canvas, text, np.array([6, int((line + 0.85) * _LINE_PX * scale)]), _TEXT)
     if seen.layer is None or found.recognized is None:
         return canvas
     return beside_keyframe(canvas, found.recognized, seen.layer)
@@ -173,14 +179,32 @@ def _pixels(points: NDArray[np.float64]) -> NDArray[np.int32]:
 
 def _write(canvas: NDArray[np.uint8], text: str, at: NDArray[np.int32],
            color: tuple[int, int, int]) -> None:
-    """Write a line with a shadow, inside the image."""
+    """Write a line with a shadow, inside the image, larger on a larger one."""
     height, width = canvas.shape[:2]
     place = (int(np.clip(at[0], 0, max(0, width - 10))), int(np.clip(at[1], 12, height)))
     text = text.encode('ascii', 'replace').decode()  # OpenCV has no other characters
     # As thick as the text: OpenCV 5 writes thicker text wider.
-    shadow = (place[0] + 1, place[1] + 1)
-    cv2.putText(canvas, text, shadow, _FONT, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
-    cv2.putText(canvas, text, place, _FONT, 0.45, color, 1, cv2.LINE_AA)
+    shadow, scale = (place[0] + 1, place[1] + 1), _scale(canvas)
+    thickness = max(1, round(2 * scale))
+    cv2.putText(canvas, text, shadow, _FONT, scale, (0, 0, 0), thickness, cv2.LINE_AA)
+    cv2.putText(canvas, text, place, _FONT, scale, color, thickness, cv2.LINE_AA)
+
+
+def _write_near(canvas: NDArray[np.uint8], text: str, box: NDArray[np.float64],
+                taken: list[NDArray[np.int32]]) -> None:
+    """Write a line above a box or below it, where it covers no other line; else leave it out."""
+    (width, height), _ = cv2.getTextSize(text, _FONT, _scale(canvas), 1)
+    for corner in (box[:2] - (0, 4), box[[0, 3]] + (0, height + 4)):
+        left, bottom = _pixels(corner).tolist()
+        place = np.array([left, bottom - height, left + width, bottom], dtype=np.int32)
+        if not any((place[:2] < one[2:]).all() and (one[:2] < place[2:]).all() for one in taken):
+            taken.append(place)
+            _write(canvas, text, _pixels(corner), _BOX)
+            return
+
+
+def _scale(canvas: NDArray[np.uint8]) -> float:
+    return max(_LEAST_SCALE, canvas.shape[1] * _SCALE_PER_PX)
 
 
 def _lines(text: str, width: int) -> list[str]:

@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Pages of HTML: one style and the parts of all pages. They have no scripts and ask for nothing.
+
+A function that takes texts escapes them; one that takes parts takes HTML.
+"""
+
+from base64 import b64encode
+from collections.abc import Iterable, Sequence
+from html import escape
+from typing import NamedTuple
+
+#: Okabe and Ito's colours, which colour-blind readers can distinguish.
+ACCEPTED, REFUSED, MISLED = '#0072B2', '#E69F00', '#D55E00'
+GOOD, BAD, FAINT = ACCEPTED, MISLED, '#999999'
+_TYPES = {b'\x89PNG': 'png', b'\xff\xd8\xff\xe0': 'jpeg'}
+_STYLE = f"""\
+body {{ font: 15px/1.45 system-ui, sans-serif; color: #222; margin: 0 auto; max-width: 1480px;
+  padding: 1rem 1.5rem 3rem }}
+h1 {{ font-size: 1.5rem; margin: 0 0 .6rem }} h2 {{ font-size: 1.15rem; margin: 1rem 0 .4rem }}
+img {{ max-width: 100%; max-height: 92vh; display: block }}
+p {{ margin: .5rem 0; max-width: 62rem }}
+table {{ border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums;
+  margin: .6rem 0 }}
+th, td {{ text-align: left; vertical-align: top; padding: .2rem .7rem;
+  border-bottom: 1px solid #ddd; unicode-bidi: isolate }}
+td {{ max-width: 26rem; overflow-wrap: anywhere }} td.text {{ min-width: 11rem }}
+td.number, th.number {{ text-align: right; white-space: nowrap }}
+li, h1, figcaption, .card {{ overflow-wrap: anywhere; unicode-bidi: isolate }}
+li {{ margin: .25rem 0 }} .scroll {{ overflow-x: auto }}
+.note, figcaption {{ font-size: 13.5px; color: #555 }} figure {{ margin: .8rem 0 }}
+.verdict {{ font-size: 1.05rem; border-left: 6px solid; padding: .4rem .9rem; background: #f4f4f4;
+  margin-bottom: .8rem }}
+.accepted {{ color: {ACCEPTED} }} .refused, .misled {{ color: {MISLED} }}
+td.faulty {{ border-left: 4px solid {MISLED} }} td.minor {{ border-left: 4px solid {REFUSED} }}
+.first {{ display: grid; grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); gap: 0 2rem;
+  align-items: start }}
+.first figure {{ margin: 0 }} .first figure img {{ max-height: 72vh; margin: auto }}
+@media (max-width: 900px) {{ .first {{ grid-template-columns: minmax(0, 1fr) }} }}
+.tiles {{ display: flex; gap: .8rem }}
+.tiles div {{ flex: 1; border-top: 4px solid; background: #f4f4f4; padding: .3rem .8rem .5rem;
+  font-size: 13.5px; color: #444 }}
+.tiles b {{ display: block; font-size: 1.7rem; line-height: 1.3; color: #222 }}
+.bars {{ display: grid; grid-template-columns: auto minmax(6rem, 1fr) auto; gap: .2rem .8rem;
+  align-items: center; font-size: 13.5px; margin: .9rem 0 }}
+.bar {{ position: relative; height: .8rem; background: #eee }}
+.bar i {{ position: absolute; height: 100%; background: {GOOD} }}
+.bar i.over {{ background: {BAD} }}
+.bar u {{ position: absolute; top: -.2rem; height: 1.2rem; border-left: 2px solid #222 }}
+.good, .tiles .good {{ border-color: {GOOD} }} .bad, .tiles .bad {{ border-color: {BAD} }}
+.card {{ display: flex; gap: 1rem; align-items: flex-start; padding: .45rem 0;
+  border-top: 1px solid #ddd }}
+.card img {{ width: 8.6rem }} .card p {{ margin: 0 }}
+.row {{ display: flex; flex-wrap: wrap; gap: 1rem }} .row figure {{ flex: 1 1 28rem }}
+details {{ margin: .5rem 0; border-top: 1px solid #ddd; padding-top: .4rem }}
+summary {{ font-weight: 600; cursor: pointer }}
+"""
+
+
+class Bar(NamedTuple):
+    """A figure beside its threshold."""
+
+    name: str
+    shown: str  #: The value and its threshold, in words
+    #: Shares of the bar's length
+    value: float
+    limit: float
+    is_good: bool
+
+
+def page(title: str, *parts: str) -> str:
+    """Return a page."""
+    return '\n'.join([
+        '<!DOCTYPE html>', '<html lang="en">', '<meta charset="utf-8">',
+        '<meta name="viewport" content="width=device-width">', f'<title>{escape(title)}</title>',
+        f'<style>{_STYLE}</style>', f'<h1>{escape(title)}</h1>', *parts, '</html>', ''])
+
+
+def first_screen(left: Iterable[str], right: Iterable[str]) -> str:
+    """Return two columns, which fill a screen."""
+    return f'<div class="first"><div>{"".join(left)}</div><div>{"".join(right)}</div></div>'
+
+
+def verdict(text: str, is_good: bool) -> str:
+    """Return the verdict of a page."""
+    return f'<p class="verdict {"good" if is_good else "bad"}"><b>{escape(text)}</b></p>'
+
+
+def tiles(numbers: Iterable[tuple[str, str, bool]]) -> str:
+    """Return a few numbers in large type: each with its words, and whether it is good."""
+    return '<div class="tiles">' + ''.join(
+        f'<div class="{"good" if is_good else "bad"}"><b>{escape(number)}</b>{escape(words)}</div>'
+        for number, words, is_good in numbers) + '</div>'
+
+
+def bars(rows: Iterable[Bar]) -> str:
+    """Return bars with a mark at each threshold."""
+    return '<div class="bars">' + ''.join(
+        f'<span>{escape(one.name)}</span><span class="bar">'
+        f'<i{"" if one.is_good else " class=over"} style="width:{_percent(one.value)}"></i>'
+        f'<u style="left:{_percent(one.limit)}"></u></span>'
+        f'<span>{"✓" if one.is_good else "✗"} {escape(one.shown)}</span>'
+        for one in rows) + '</div>'
+
+
+def _percent(share: float) -> str:
+    return f'{100.0 * min(1.0, max(0.0, share)):.1f}%'
+
+
+def card(text: str, image: bytes | None = None, caption: str = '') -> str:
+    """Return a text and a caption beside a picture, if there is one."""
+    picture = '' if image is None else f'<img alt="a view" src="{_embedded(image)}">'
+    return f'<div class="card">{picture}<div><p>{escape(text)}</p>{note(caption)}</div></div>'
+
+
+def fold(heading: str, *parts: str, is_open: bool = False) -> str:
+    """Return parts that a click on their heading shows."""
+    return (f'<details{" open" if is_open else ""}><summary>{escape(heading)}</summary>'
+            f'{"".join(parts)}</details>')
+
+
+def figure(image: bytes | str, caption: str, name: str = '') -> str:
+    """Return a picture, embedded or by the name of a file beside the page; PNG or JPEG."""
+    source = escape(image) if isinstance(image, str) else _embedded(image)
+    return (f'<figure><img alt="{escape(name)}" src="{source}" loading="lazy">'
+            f'<figcaption>{escape(caption)}</figcaption></figure>')
+
+
+def _embedded(image: bytes) -> str:
+    return f'data:image/{_TYPES[image[:4]]};base64,{b64encode(image).decode("ascii")}'
+
+
+def side_by_side(parts: Iterable[str]) -> str:
+    """Return parts side by side, where there is room."""
+    return f'<div class="row">{"".join(parts)}</div>'
+
+
+def items(texts: Iterable[str]) -> str:
+    """Return a list."""
+    return '<ul>' + ''.join(f'<li>{escape(text)}</li>' for text in texts) + '</ul>'
+
+
+def note(text: str) -> str:
+    """Return a remark in small type."""
+    return f'<p class="note">{escape(text)}</p>'
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str | tuple[str, str]]]) -> str:
+    """Return a table; a cell may have a class, and # before a heading aligns to the right."""
+    kinds = ['number' if title.startswith('#') else '' for title in head]
+    lines = [(('th', title.lstrip('#'), kind) for title, kind in zip(head, kinds, strict=True))
+             ] if any(head) else []
+    lines += [(('td', *((one, kind) if isinstance(one, str) else one))
+               for one, kind in zip(row, kinds, strict=True)) for row in rows]
+    return '<div class="scroll"><table>' + ''.join(
+        '<tr>' + ''.join(f'<{tag}{f" class={kind}" if kind else ""}>{escape(text)}</{tag}>'
+                         for tag, text, kind in line) + '</tr>' for line in lines
+    ) + '</table></div>'
