@@ -59,6 +59,7 @@ setup(
             'assets/*/rgb/*.jpg', 'assets/rig/*/*.*', 'assets/rig/*/rgb/*.jpg',
         ],
         f'{PACKAGE}.core.acceptance': ['calibration.yaml'],
+        f'{PACKAGE}.studio': ['web/studio.*'],
         f'{PACKAGE}.vocabulary': ['*.yaml'],
     },
     data_files=[
