@@ -272,7 +272,7 @@ class Desk:
             'phrases': studio.phrases(), 'note': studio.phrase_note,
             'severity': known.get('severity', 0.0), 'faults': known.get('faults', ()),
             'is_checked': check is not None, 'decision': studio.review.decision(key),
-            'support': known.get('support'), 'expected': known.get('expected'),
+            'support': known.get('support'), 'ratio': known.get('seen_ratio'),
             'sightings': None if sightings is None else [
                 [one.view, *(round(float(value), 1) for value in one.bbox_xyxy), one.is_detected]
                 for one in sightings]}

@@ -96,6 +96,7 @@ class Page:
         camera.look_at = tuple(middle)
         camera.position = tuple(middle + np.array([-0.6, -0.6, 0.6]) * max(1.0, spread))
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._server.gui.main_panel.minimize()
 
     # ---- what a person does in the scene --------------------------------------------------------
 

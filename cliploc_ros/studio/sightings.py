@@ -19,11 +19,10 @@ from cliploc_ros.studio.recording import Recording
 _MARGIN_PX = 3.0
 # Images that are read for a landmark, at most: sharpness needs them.
 _LOOKED_AT = 12
-# Views with less than this share of the median sharpness are blurred; sides that differ [deg].
-_LEAST_SHARPNESS, _LEAST_ANGLE_DEG = 0.5, 12.0
+# Sides that differ [deg], and what is looked at around a box, as a share of its size.
+_LEAST_ANGLE_DEG, _MARGIN = 12.0, 0.25
 # Projections cost time: every n-th view of more than these is tried.
 _MAX_PROJECTED = 400
-_CROP_PX = 96
 _MOST_KEPT = 500
 
 
@@ -34,7 +33,7 @@ class Sighting(NamedTuple):
     bbox_xyxy: NDArray[np.float64]  #: (4,) [px]
     is_detected: bool  #: A box of the detector; else the landmark's projection
     is_whole: bool  #: Not cut off by the edge of the image
-    sharpness: float  #: Variance of the Laplacian; 1 without images
+    sharpness: float  #: Variance of the Laplacian over that of the image; 1 without images
 
 
 def find_sightings(recording: Recording, images: Images | None,
@@ -44,39 +43,50 @@ def find_sightings(recording: Recording, images: Images | None,
 
     The detector's boxes come first. Without three of them, views that should show it join.
     """
-    one, detections = landmarks[landmark_id], recording.detections
+    landmark, detections = landmarks[landmark_id], recording.detections
     found = []
     for row in recording.boxes_of(landmarks)[landmark_id]:
         view = int(np.searchsorted(detections.frame_offsets, row, side='right')) - 1
-        found.append(_sighting(recording, view, detections.bboxes_xyxy[row], True))
+        box = detections.bboxes_xyxy[row]
+        shown = _projection(recording, view, landmark)
+        is_whole = (shown is not None and _is_whole(recording, view, shown, 0.0)
+                    and _is_whole(recording, view, box, _MARGIN_PX))
+        found.append(Sighting(view, box, True, is_whole, 1.0))
     if len(found) < 3:
-        shown = {one.view for one in found}
+        known = {one.view for one in found}
         for view in range(0, len(detections), max(1, -(-len(detections) // _MAX_PROJECTED))):
-            for outline in outlines_of({'': one}, detections.camera_of(view),
-                                       detections.map_from_camera[view]):
-                half = np.sqrt(outline.ellipse[[2, 4]])
-                box = np.concatenate([outline.ellipse[:2] - half, outline.ellipse[:2] + half])
-                sighting = _sighting(recording, view, box, False)
-                if view not in shown and sighting.is_whole:
-                    found.append(sighting)
+            shown = _projection(recording, view, landmark)
+            if view not in known and shown is not None and _is_whole(recording, view, shown,
+                                                                     _MARGIN_PX):
+                found.append(Sighting(view, shown, False, True, 1.0))
     found.sort(key=lambda one: (not one.is_whole, not one.is_detected, -_size(one)))
-    rays = detections.map_from_camera[:, :3, 3] - one.center
+    rays = detections.map_from_camera[:, :3, 3] - landmark.center
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
     looked = _apart(found, rays, 0.5 * _LEAST_ANGLE_DEG, _LOOKED_AT)
     if images is not None:
         looked = [one._replace(sharpness=_sharpness(recording, images, one)) for one in looked]
         median = float(np.median([one.sharpness for one in looked])) if looked else 0.0
-        looked.sort(key=lambda one: (not one.is_whole, not one.is_detected,
-                                     one.sharpness < _LEAST_SHARPNESS * median, -_size(one)))
+        looked.sort(key=lambda one: (
+            not one.is_whole, not one.is_detected,
+            -_size(one) * min(1.0, one.sharpness / max(median, 1e-9)) ** 2))
     return _apart(looked, rays, _LEAST_ANGLE_DEG, limit)
 
 
-def _sighting(recording: Recording, view: int, box: NDArray[np.float64], is_detected: bool
-              ) -> Sighting:
+def _projection(recording: Recording, view: int, landmark: Landmark
+                ) -> NDArray[np.float64] | None:
+    """Return the box (4,) around a landmark's outline in a view [px]; None where it has none."""
+    detections = recording.detections
+    for outline in outlines_of({'': landmark}, detections.camera_of(view),
+                               detections.map_from_camera[view]):
+        half = np.sqrt(outline.ellipse[[2, 4]])
+        return np.concatenate([outline.ellipse[:2] - half, outline.ellipse[:2] + half])
+    return None
+
+
+def _is_whole(recording: Recording, view: int, box: NDArray[np.float64], margin: float) -> bool:
     camera = recording.detections.camera_of(view)
-    is_whole = box.min() >= _MARGIN_PX and bool(
-        (box[2:] <= np.array([camera.width, camera.height]) - _MARGIN_PX).all())
-    return Sighting(view, box, is_detected, bool(is_whole), 1.0)
+    return bool(box.min() >= margin
+                and (box[2:] <= np.array([camera.width, camera.height]) - margin).all())
 
 
 def _size(one: Sighting) -> float:
@@ -96,12 +106,12 @@ def _apart(sightings: list[Sighting], rays: NDArray[np.float64], least_deg: floa
 
 
 def _sharpness(recording: Recording, images: Images, one: Sighting) -> float:
-    crop = crop_of(recording, images, one.view, one.bbox_xyxy, 0.0)
+    """Return the share of fine detail in what the view shows around the landmark."""
+    crop = crop_of(recording, images, one.view, one.bbox_xyxy, _MARGIN)
     if crop is None:
         return 0.0
-    grey = cv2.cvtColor(cv2.resize(crop, (_CROP_PX, _CROP_PX), interpolation=cv2.INTER_AREA),
-                        cv2.COLOR_RGB2GRAY)
-    return float(cv2.Laplacian(grey, cv2.CV_64F).var())
+    grey = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
+    return float(cv2.Laplacian(grey, cv2.CV_64F).var() / max(1.0, float(grey.var())))
 
 
 def crop_of(recording: Recording, images: Images, view: int, box: NDArray[np.float64],

@@ -32,7 +32,8 @@ _FILES = Path(__file__).parent / 'web'
 _TYPES = {'.html': 'text/html; charset=utf-8', '.css': 'text/css; charset=utf-8',
           '.js': 'text/javascript; charset=utf-8', '.jpg': 'image/jpeg'}
 # Nothing but the page's own files runs in it, and no other page frames it.
-_POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; frame-ancestors 'self'"
+_POLICY = ("default-src 'self'; img-src 'self' data:; style-src 'self' 'unsafe-inline'; "
+           "frame-ancestors 'self'")
 
 
 class Answer(NamedTuple):

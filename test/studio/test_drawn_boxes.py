@@ -122,7 +122,7 @@ def test_refitting_takes_the_boxes_of_the_recording(office, used):
             **shape_fields(fit.center, fit.basis)})
         unseen[str(number)] = others[~np.isin(views.frames[others], half)]
     recording = Recording(detections.select_frames(half))
-    refitted = edits.take_fits(drawn, drawn, recording.refit(drawn, drawn).landmark_map)
+    refitted = recording.refitted(drawn, list(drawn))[0]
     before, after = ([np.median(ious_with(views, unseen[key], one.center, one.basis))
                       for key, one in landmarks.items()]
                      for landmarks in (drawn, refitted.apply(drawn)))

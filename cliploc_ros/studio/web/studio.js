@@ -18,7 +18,7 @@ const state = {file: {}, rows: [], selection: {ids: [], one: null}, review: {}, 
 let mode = 'review', socket = null, followed = null, step = 0.1, gesture = 0, wantsCheck = true;
 // What the image shows, in its pixels; null: all of it. A goal waits for its view.
 let zoom = null, goal = null, shownView = -1, drag = null, typedNew = {};
-const shares = {review: 0.58, edit: 0.45, create: 0.7, test: 0.45};
+const shares = {review: 0.6, edit: 0.5, create: 0.72, test: 0.5};
 
 // ---- to and from the server
 
@@ -124,11 +124,20 @@ function show(changed) {
 function setMode(name) {
   mode = name;
   document.body.className = name;
-  $('view').style.width = `${100 * shares[name]}%`;
+  resize();
   fill($('modes'), MODES.map((one, place) => el('button', {
     'aria-pressed': String(one === name), onclick: () => setMode(one),
     title: `${one} (${place + 1})`}, one[0].toUpperCase() + one.slice(1))));
   if (state.file.name) show(new Set(Object.keys(state)));
+}
+
+function resize() {
+  $('view').style.flex = shares[mode];
+  $('scene').style.flex = 1 - shares[mode];
+  // viser covers a scene that is narrower than this with its panel
+  const scale = Math.min(1, $('scene').clientWidth / 620);
+  Object.assign($('frame').style, {width: `${100 / scale}%`, height: `${100 / scale}%`,
+                                   transform: `scale(${scale})`});
 }
 
 function showFile() {
@@ -162,8 +171,11 @@ function follow() {
 }
 
 function lookAt([view, left, top, right, bottom]) {
-  const size = 3.2 * Math.max(right - left, bottom - top);
-  goal = {view, x: (left + right - size) / 2, y: (top + bottom - size) / 2, w: size, h: size};
+  const [width, height] = state.view.size, wide = $('stage').clientWidth / $('stage').clientHeight;
+  const h = Math.min(height, 3.2 * Math.max(bottom - top, (right - left) / wide)), w = h * wide;
+  const within = (middle, size, whole) => size > whole ? (whole - size) / 2
+    : Math.max(0, Math.min(whole - size, middle - size / 2));
+  goal = {view, x: within((left + right) / 2, w, width), y: within((top + bottom) / 2, h, height), w, h};
   send('view', {view});
   if (state.view.view === view) showView();
 }
@@ -178,7 +190,7 @@ function showCard() {
   }
   const set = name => value => send('edit', {field: name, value, gesture: ++gesture});
   const off = {isOff: one.is_locked};
-  const round = values => values.map(value => Number(value.toFixed(4)));
+  const round = values => values.map(value => Number(value.toFixed(3)));
   fill($('card'), [
     el('div', {className: 'head'}, el('span', {}, one.id),
        toggle(one.is_locked ? 'locked' : 'open', one.is_locked ? 'Unlock' : 'Lock', 'L',
@@ -217,8 +229,8 @@ const PANELS = {
       one && one.is_checked ? (one.faults.length
         ? el('ul', {className: 'faults'}, ...one.faults.map(text => el('li', {}, text)))
         : el('p', {className: 'note done'}, 'no fault found')) : null,
-      one && one.support !== null && one.expected !== null
-        ? note(`${one.support} of ${one.expected} frames that should show it do`) : null,
+      one?.support != null ? note(`in ${one.support} frames`
+        + (one.ratio === null ? '' : `, ${Math.round(100 * one.ratio)} % of those that should show it`)) : null,
       buttons(button('Accept', doing('accept'), {key: 'A', kind: 'main', off: !one}),
               button('Fix', doing('fix'), {key: 'F', off: !one || !state.file.has_boxes,
                                            hint: 'merge a duplicate, fit others to their boxes'}),
@@ -231,7 +243,7 @@ const PANELS = {
     const by = value => () => send('edit', {field: 'by', value, gesture: 'by'});
     if (!ids.length) return [note('Select a landmark: in the list, the image or the scene. Shift selects several.')];
     return [
-      one ? el('div', {className: 'buttons'}, ...['x', 'y', 'z'].flatMap((axis, place) =>
+      one ? el('div', {className: 'buttons nudge'}, ...['x', 'y', 'z'].flatMap((axis, place) =>
         [-1, 1].map(sign => button(`${axis}${sign < 0 ? '−' : '+'}`, by(axisStep(place, sign)),
                                    {off: one.is_locked, hint: 'move'}))),
         el('select', {title: 'Step of a move; arrow keys and page keys move, too',
@@ -255,7 +267,7 @@ const PANELS = {
       made.doubt ? el('p', {className: 'note', style: 'color:var(--bad)'}, made.doubt) : null,
       el('div', {className: 'chips'}, ...made.boxes.map(([view]) => button(
         `view ${view}`, doing('view', {view}), {hint: 'show it'}))),
-      input('label', 'New label'), input('class_id', 'New class', 'classes'),
+      input('label', 'Label'), input('class_id', 'Class', 'classes'),
       buttons(button('Create', create, {key: '↵', kind: 'main', off: count < 2}),
               button('Next view', doing('next_view'), {key: 'C', off: !count, hint: 'a view from another side'}),
               button('Forget box', doing('forget', {view: state.view.view}), {key: 'Del', off: !hasBox}),
@@ -382,7 +394,7 @@ const mine = () => state.new?.boxes.find(([view]) => view === state.view.view)?.
 
 function applyZoom() {
   const [width, height] = state.view.size;
-  const one = zoom && zoom.w < 1.2 * width ? zoom : {x: 0, y: 0, w: width, h: height};
+  const one = zoom || {x: 0, y: 0, w: width, h: height};
   $('image').setAttribute('viewBox', `${one.x} ${one.y} ${one.w} ${one.h}`);
 }
 
@@ -563,14 +575,21 @@ $('splitter').onpointermove = event => {
   if (!document.body.classList.contains('dragging')) return;
   const left = $('view').getBoundingClientRect().left, width = window.innerWidth - left;
   shares[mode] = Math.max(0.15, Math.min(0.85, (event.clientX - left) / width));
-  $('view').style.width = `${100 * shares[mode]}%`;
+  resize();
 };
 $('splitter').onpointerup = () => { document.body.classList.remove('dragging'); if (state.view) showView(); };
 document.addEventListener('click', event => { if (!$('menu').contains(event.target)) $('menu').open = false; });
-window.addEventListener('resize', () => showView());
+window.addEventListener('resize', () => { resize(); showView(); });
 window.addEventListener('keydown', keyDown, true);
 // keys work in the scene, too; there they come before viser's
-$('frame').onload = () => $('frame').contentWindow.addEventListener('keydown', keyDown, true);
+$('frame').onload = () => {
+  const scene = $('frame').contentWindow;
+  scene.addEventListener('keydown', keyDown, true);
+  // the log has what viser's notices would say, and they cover the scene
+  const style = scene.document.createElement('style');
+  style.textContent = '.mantine-Notifications-root { display: none }';
+  scene.document.head.append(style);
+};
 $('frame').src = `${base}scene/${person}/`;
 setMode('review');
 connect();
