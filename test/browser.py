@@ -35,13 +35,15 @@ def running_chromium():
 
 
 class Person:
-    """Who looks at the page."""
+    """Who looks at the page; without the scene, which takes seconds a frame, unless asked for."""
 
-    def __init__(self, chromium, url):
+    def __init__(self, chromium, url, has_scene=False):
         self.page = chromium.new_page(viewport={'width': 1000, 'height': 800})
         self.page.set_default_timeout(TIMEOUT_S * 1000)
         self.foreign = []
         self.page.on('request', self.note)
+        if not has_scene:
+            self.page.route('**/scene/**', lambda route: route.abort())
         self.page.goto(url)
         self.page.get_by_text('landmarks in ').first.wait_for()
 

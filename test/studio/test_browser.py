@@ -135,8 +135,9 @@ def test_hide_and_lock_by_the_rows(person, studio):
     assert document.is_saved, 'the file holds neither'
 
 
-def test_the_gizmo_is_dragged(person, studio):
+def test_the_gizmo_is_dragged(chromium, studio):
     """The landmark follows, along the axis that was grabbed; one undo takes all of it back."""
+    person = Person(chromium, studio.url, has_scene=True)
     document, server = studio.document, studio.server
     person.mode('Edit')
     person.select(document, 'mug_2')
@@ -161,6 +162,7 @@ def test_the_gizmo_is_dragged(person, studio):
     person.page.keyboard.press('Control+z')
     wait_for(lambda: document.landmarks['mug_2'] == before, 'undo')
     assert document.to_undo is None
+    person.page.close()
 
 
 def test_the_exported_page_opens_without_a_server(chromium, person, studio, path):

@@ -69,7 +69,7 @@ def nodes_of(server):
 
 def test_keyframes_are_shown_and_hidden(chromium, path):
     studio = studio_with_keyframes(path)
-    with person_at(chromium, studio) as (person, server):
+    with person_at(chromium, studio, has_scene=True) as (person, server):
         assert not nodes_of(server), 'nothing is sent before it is wanted'
         scene = person.page.frame_locator('iframe')
         scene.get_by_text('Connected').click()

@@ -12,7 +12,6 @@ from cliploc_ros.mapping.association import associate, ious_with
 from cliploc_ros.mapping.landmarks import group_boxes, landmarks_of_map, project_box
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import camera_centers, make_views
-from cliploc_ros.studio import edits
 from cliploc_ros.studio.edits import EditError
 from cliploc_ros.studio.landmark import Landmark, shape_fields
 from cliploc_ros.studio.recording import Recording, fit_boxes

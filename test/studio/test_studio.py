@@ -70,7 +70,7 @@ def test_sightings_are_sharp_whole_and_from_several_sides(studio):
 
     assert find_sightings(recording, Blurred(), landmarks, 'mug_1')[0].view != best
     document = studio.document
-    document.apply(edits.move(landmarks, 'mug_1', [90.0, 0.0, 0.0]))
+    document.apply(edits.move(landmarks, 'mug_1', [0.0, 0.0, 90.0]))
     assert find_sightings(recording, studio.images, document.landmarks, 'mug_1') == []
 
 
@@ -108,22 +108,21 @@ def test_merging_with_boxes_fits_the_boxes_of_both(office):
 def test_the_review_goes_from_the_worst_to_the_end(office):
     """A moved landmark is fixed, a duplicate merged; each decision leads to the next one."""
     document, review = office.document, office.review
-    twin = document.landmarks['tv_1']
-    document.apply(edits.create(document.landmarks, 'a twin', 'tv', twin.center + 0.01,
+    twin, moved = (document.landmarks[key] for key in ('book_2', 'tv_1'))
+    document.apply(edits.create(document.landmarks, 'a twin', 'book', twin.center + 0.01,
                                 twin.basis))
-    moved = document.landmarks['keyboard_1']
-    document.apply(edits.move(document.landmarks, 'keyboard_1', moved.center + 0.4
-                              * moved.semi_axes.max()))
+    document.apply(edits.move(document.landmarks, 'tv_1',
+                              moved.center + 0.4 * moved.semi_axes.max()))
     assert 'serious' in review.check()
     severities = [row.severity for row in office.rows()]
     assert severities == sorted(severities, reverse=True) and severities[0] > 1.0
     total = len(document.landmarks)
-    document.select(['keyboard_1'])
-    assert any('away from where' in text for text in review.check_of('keyboard_1').faults)
-    office.review.fix()
-    assert review.decision('keyboard_1') == 'fixed'
-    assert np.linalg.norm(document.landmarks['keyboard_1'].center - moved.center) < 0.1
     document.select(['tv_1'])
+    assert any('away from where' in text for text in review.check_of('tv_1').faults)
+    review.fix()
+    assert review.decision('tv_1') == 'fixed'
+    assert np.linalg.norm(document.landmarks['tv_1'].center - moved.center) < 0.1
+    document.select(['book_2'])
     assert 'merged' in review.fix() and len(document.landmarks) == total - 1
     while 'complete' not in review.accept():
         assert len(document.selection) == 1
@@ -189,7 +188,7 @@ def test_a_large_map_with_many_views(tmp_path):
             here = studio.document.landmarks['id_7'].center
             studio.document.apply(edits.move(studio.document.landmarks, 'id_7', here + 0.01),
                                   gesture='drag')
-            assert studio.image(step).any()
+            assert studio.outlines() is not None, step
         times.append(time.process_time())
     opened_s, dragged_s = np.diff(times)
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -72,12 +72,15 @@ const doing = (name, values) => () => send(name, values);
 const buttons = (...children) => el('div', {className: 'buttons'}, ...children);
 const note = text => text ? el('p', {className: 'note'}, text) : null;
 
-// A text or numbers; what a person types is left alone until it is sent.
+// A text or numbers; what a person types is left alone until it is sent. Numbers are shown rounded,
+// and those that are not typed stay as exact as they were.
 function field(name, values, apply, {isText = false, isOff = false, list = ''} = {}) {
+  const shown = values.map(value => isText ? value : String(Number(value.toFixed(3))));
   const inputs = values.map((value, place) => el('input', {
-    type: isText ? 'text' : 'number', step: 'any', value, disabled: isOff,
+    type: isText ? 'text' : 'number', step: 'any', value: shown[place], disabled: isOff,
     'aria-label': name + (values.length > 1 ? ` ${'xyz'[place]}` : ''),
-    onchange: () => apply(isText ? inputs[0].value : inputs.map(one => Number(one.value))),
+    onchange: () => apply(isText ? inputs[0].value : inputs.map(
+      (one, row) => one.value === shown[row] ? values[row] : Number(one.value))),
     onkeydown: event => { if (event.key === 'Enter') event.target.blur(); }}));
   if (list) inputs[0].setAttribute('list', list);
   return el('label', {className: `field${values.length > 1 ? ' three' : ''}`},
@@ -190,7 +193,6 @@ function showCard() {
   }
   const set = name => value => send('edit', {field: name, value, gesture: ++gesture});
   const off = {isOff: one.is_locked};
-  const round = values => values.map(value => Number(value.toFixed(3)));
   fill($('card'), [
     el('div', {className: 'head'}, el('span', {}, one.id),
        toggle(one.is_locked ? 'locked' : 'open', one.is_locked ? 'Unlock' : 'Lock', 'L',
@@ -202,9 +204,9 @@ function showCard() {
     note(one.note),
     field('Class', [one.class_id], set('class_id'), {isText: true, list: 'classes', ...off}),
     ...(mode !== 'edit' ? [] : [
-      field('Position', round(one.center), set('center'), off),
-      field('Angles', round(one.angles), set('angles'), off),
-      field('Semi-axes', round(one.semi_axes), set('semi_axes'), off)])]);
+      field('Position', one.center, set('center'), off),
+      field('Angles', one.angles, set('angles'), off),
+      field('Semi-axes', one.semi_axes, set('semi_axes'), off)])]);
 }
 
 function toggle(name, text, key, action) {
