@@ -71,7 +71,7 @@ def test_boxes_merge_and_a_second_browser(chromium, person, studio, path):
         person.draw_box(studio, view, [*ellipse[:2] - half, *ellipse[:2] + half])
     person.name_new('a green mug', 'mug')
     person.picture('boxes')
-    person.click('Create ↵')
+    person.click('Create↵')
     wait_for(lambda: document.selection == ('mug_2',), 'the new landmark')
     made = document.landmarks['mug_2']
     assert np.linalg.norm(made.center - truth.center) < 0.05
@@ -121,7 +121,6 @@ def test_boxes_are_drawn_dragged_and_linked(person, studio):
     person.page.mouse.wheel(0, -600)
     wait_for(lambda: person.page.evaluate('$("image").viewBox.baseVal.width') < 0.7 * before,
              'the zoom')
-    assert not studio.document.selection
 
 
 def test_hide_and_lock_by_the_rows(person, studio):

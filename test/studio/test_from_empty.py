@@ -151,7 +151,7 @@ def test_the_robot_wakes_up_in_a_map_made_in_the_browser(chromium, tmp_path):
             for view, box in boxes.items():
                 person.draw_box(studio, view, box)
             person.name_new(one.label, one.class_id)
-            person.click('Create ↵')
+            person.click('Create↵')
             wait_for(lambda count=count: len(studio.document.landmarks) == count, 'the landmark')
         person.picture('from_empty')
         person.click('Save')
