@@ -72,6 +72,7 @@ setup(
             'assets/openvino/*/*.*',
         ],
         f'{PACKAGE}.core.acceptance': ['calibration.yaml'],
+        f'{PACKAGE}.studio': ['web/studio.*'],
         f'{PACKAGE}.vocabulary': ['*.yaml'],
     },
     data_files=[

@@ -35,15 +35,17 @@ def running_chromium():
 
 
 class Person:
-    """Who looks at the page."""
+    """Who looks at the page; without the scene, which takes seconds a frame, unless asked for."""
 
-    def __init__(self, chromium, url):
+    def __init__(self, chromium, url, has_scene=False):
         self.page = chromium.new_page(viewport={'width': 1000, 'height': 800})
         self.page.set_default_timeout(TIMEOUT_S * 1000)
         self.foreign = []
         self.page.on('request', self.note)
+        if not has_scene:
+            self.page.route('**/scene/**', lambda route: route.abort())
         self.page.goto(url)
-        self.page.get_by_text('landmarks in map').wait_for()
+        self.page.get_by_text('landmarks in ').first.wait_for()
 
     def note(self, request):
         if not re.match(r'(http|ws)://127\.0\.0\.1:|data:|blob:', request.url):
@@ -52,51 +54,61 @@ class Person:
     def click(self, name):
         self.page.get_by_role('button', name=name).first.click()
 
-    def field(self, label, number=0):
-        """Return an input of the row with a label."""
-        row = self.page.get_by_text(label, exact=True).locator('xpath=../../..')
-        return row.locator('input:not([type=hidden])').nth(number)
+    def mode(self, name):
+        self.page.get_by_role('button', name=name, exact=True).first.click()
 
-    def type(self, label, text, number=0):
-        field = self.field(label, number)
+    def field(self, label):
+        return self.page.get_by_label(label, exact=True).first
+
+    def type(self, label, text):
+        field = self.field(label)
         field.fill(text)
         field.press('Enter')
 
     def find(self, text):
-        self.field('Find').fill(text)
+        self.page.get_by_label('Find').fill(text)
+
+    def row(self, text):
+        return self.page.get_by_role('option').filter(has_text=text).first
 
     def select(self, document, landmark_id):
-        """Find a landmark in the table, and click it."""
+        """Find a landmark in the list, and click it."""
         self.find(landmark_id)
-        self.click(re.compile(f'^{landmark_id} '))
+        self.page.get_by_role('option').filter(has_text=re.compile(f'^{landmark_id} ')).click()
         wait_for(lambda: document.selection == (landmark_id,), 'the selection')
 
-    def draw_box(self, studio, server, view, box):
-        """Type the corners of a box (4,) [px] in a view."""
-        self.type('View', str(view))
+    def show_view(self, studio, view):
+        self.page.evaluate(f"send('view', {{view: {view}}})")
         wait_for(lambda: studio.view == view, 'the view')
-        for place, pixel in enumerate(round(float(edge)) for edge in box):
-            label, number = ('Left, top [px]', 'Right, bottom [px]')[place // 2], place % 2
-            self.type(label, str(pixel), number)
-            # viser's page loses a value if another one follows within milliseconds
-            wait_for(lambda label=label, number=number, pixel=pixel: value_of(
-                server, label)[number] == pixel, 'the corner')
-        self.click('Draw this box')
-        wait_for(lambda: view in studio.drawn, 'the box')
+        self.page.get_by_text(re.compile(f'^view {view}\\b')).first.wait_for()
 
-    def name_new(self, server, label, class_id):
+    def on_image(self, pixel):
+        """Return where a pixel (2,) of the image is on the page."""
+        return self.page.evaluate("""([x, y]) => {
+            const at = new DOMPoint(x, y).matrixTransform($('image').getScreenCTM());
+            return [at.x, at.y];}""", [float(value) for value in pixel])
+
+    def drag(self, start, end):
+        """Drag from one point of the page to another; the button stays down."""
+        self.page.mouse.move(*start)
+        self.page.mouse.down()
+        self.page.mouse.move(*[0.5 * (one + other) for one, other in zip(start, end, strict=True)],
+                             steps=4)
+        self.page.mouse.move(*end, steps=4)
+
+    def draw_box(self, studio, view, box):
+        """Draw a box (4,) [px] in a view."""
+        self.show_view(studio, view)
+        self.drag(self.on_image(box[:2]), self.on_image(box[2:]))
+        self.page.mouse.up()
+        wait_for(lambda: view in studio.new.boxes, 'the box')
+
+    def name_new(self, label, class_id):
         """Type label and class of the landmark that is to be created."""
-        for field, text in (('New label', label), ('New class', class_id)):
-            self.type(field, text)
-            wait_for(lambda field=field, text=text: value_of(server, field) == text, field)
+        self.type('Label', label)
+        self.type('Class', class_id)
 
     def picture(self, name):
         """Keep a picture of the page where the environment names a folder for it."""
         if folder := os.environ.get('CLIPLOC_SCREENSHOTS'):
             self.page.screenshot(path=Path(folder) / f'{name}.png', timeout=TIMEOUT_S * 1000)
-
-
-def value_of(server, label):
-    """Return what the studio knows of a field."""
-    return next(handle.value for handle in server.gui._gui_input_handle_from_uuid.values()
-                if getattr(handle, 'label', '') == label)

@@ -117,6 +117,11 @@ class Document:
         """The edit that the next redo does again."""
         return self._undone[-1].what if self._undone else None
 
+    @property
+    def is_in_gesture(self) -> bool:
+        """Whether the last edit may go on, as a drag does."""
+        return self._gesture is not None
+
     def to_map(self) -> LandmarkMap:
         """Return the map as the relocalizer knows it; MapError where it has no landmarks."""
         return map_of(self.landmarks, self.frame_id, self.path.name)

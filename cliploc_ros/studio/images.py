@@ -1,20 +1,19 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The images of a recording, and the picture of a view: its image with boxes and landmarks."""
+"""The images of a recording, and where landmarks lie in its views."""
 
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipses_in_pixels,
-    outline_points,
     project_ellipsoids,
     shape_matrices,
 )
@@ -28,18 +27,9 @@ from cliploc_ros.mapping.posed_detections import PosedDetections, group_cameras,
 from cliploc_ros.studio.landmark import Landmark
 from cliploc_ros.units import NS_PER_S
 
-SELECTED_RGB = (255, 220, 0)
-_DRAWN_RGB = (255, 0, 220)
-_DETECTED_RGB = (255, 255, 255)
-_BLANK = 70
 # A view and its image have the same stamp; files hold it to a microsecond or so.
 _MAX_DELAY_NS = 20_000_000
 _IMAGES_KEPT = 32
-# More outlines hide the image, and a drag would wait for them.
-_MAX_OUTLINES = 200
-# Subpixel bits of OpenCV's drawing functions; larger coordinates overflow its integers.
-_SHIFT = 4
-_MAX_PIXEL = 20_000.0
 _NO_OPTIONS = FolderOptions()
 
 #: x and y [px].
@@ -58,6 +48,7 @@ class Images:
                  cameras: Sequence[str] = ()):
         self._stamps_ns = stamps_ns
         self._cameras = np.array(cameras, dtype=np.str_)
+        self._lock = threading.Lock()  # readers of recordings are for one thread at a time
         self._read: Callable[[int, Camera | None], NDArray[np.uint8]] = lru_cache(_IMAGES_KEPT)(
             lambda place, pinhole: undistorted(*read(place), pinhole))
 
@@ -73,8 +64,9 @@ class Images:
             return None
         offsets = np.abs(self._stamps_ns[places] - round(stamp_s * NS_PER_S))
         nearest = int(np.argmin(offsets))
-        return (self._read(int(places[nearest]), pinhole)
-                if offsets[nearest] <= _MAX_DELAY_NS else None)
+        with self._lock:
+            return (self._read(int(places[nearest]), pinhole)
+                    if offsets[nearest] <= _MAX_DELAY_NS else None)
 
 
 def images_of_recording(recording: MapRecording, cameras: Sequence[str]) -> Images | None:
@@ -177,38 +169,3 @@ def box_at(boxes_xyxy: NDArray[np.float64], pixel: Pixel) -> int | None:
     rows = np.nonzero((left <= x) & (x <= right) & (top <= y) & (y <= bottom))[0]
     areas = (right - left) * (bottom - top)
     return int(rows[np.argmin(areas[rows])]) if len(rows) else None
-
-
-def draw(camera: Camera, image: NDArray[np.uint8] | None, boxes_xyxy: NDArray[np.float64],
-         drawn_xyxy: Sequence[float] | None, outlines: Sequence[Outline],
-         colors: Mapping[str, tuple[int, int, int]], selection: Sequence[str]
-         ) -> NDArray[np.uint8]:
-    """Return the picture (h, w, 3) of a view, red first; grey without an image.
-
-    It shows the detector's boxes (n, 4), the box that a person drew (4,) [px], and the outlines
-    in the colours of their landmarks, or in the selection's.
-    """
-    picture = np.full((camera.height, camera.width, 3), _BLANK, dtype=np.uint8)
-    if image is not None and image.shape == picture.shape:
-        picture = image.copy()
-    for box in boxes_xyxy:
-        _rectangle(picture, box, _DETECTED_RGB, 1)
-    # the farthest first, so that the nearest lie on top
-    shown = [one for number, one in enumerate(outlines)
-             if number < _MAX_OUTLINES or one.landmark_id in selection]
-    for one in reversed(shown):
-        is_selected = one.landmark_id in selection
-        points = outline_points(one.ellipse)
-        if np.abs(points).max() < _MAX_PIXEL:
-            cv2.polylines(picture, [np.round(points * 2**_SHIFT).astype(np.int32)], True,
-                          SELECTED_RGB if is_selected else colors[one.landmark_id],
-                          3 if is_selected else 2, cv2.LINE_AA, _SHIFT)
-    if drawn_xyxy is not None:
-        _rectangle(picture, np.array(drawn_xyxy), _DRAWN_RGB, 2)
-    return picture
-
-
-def _rectangle(picture: NDArray[np.uint8], box: NDArray[np.float64], rgb: tuple[int, int, int],
-               width: int) -> None:
-    left, top, right, bottom = (int(value) for value in np.clip(box, -_MAX_PIXEL, _MAX_PIXEL))
-    cv2.rectangle(picture, (left, top), (right, bottom), rgb, width, cv2.LINE_AA)

@@ -1,42 +1,33 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page: the scene and the panels, the one loop that redraws them, and who may open it.
+"""The page: the scene in three dimensions, and the one loop that redraws it and the desk.
 
-viser calls back from many threads. Each callback holds the document's lock for its action. One
-thread redraws, at most 20 times a second, and reads the studio under the same lock. So all
-browsers show the same state, and a slow one delays no edit.
-
-viser 1.1 lets everyone in who reaches its port. On the loopback interface these include every
-page that this machine's browsers show, since a browser opens WebSockets to any host. So a request
-needs a loopback name as its host, a WebSocket needs the studio's own page as its origin, and
-beyond the loopback interface each request needs the token that the studio prints.
+viser shows the scene, in a frame of our own page: its widgets have no image to zoom and draw on,
+no rows with buttons, and no place for them but one column. The pages send messages, viser calls
+back from many threads. Each holds the document's lock for its action. One thread redraws, at most
+20 times a second, and reads the studio under the same lock. So all browsers show the same state,
+and a slow one delays no edit.
 """
 
-import hmac
-import http
 import io
-import secrets
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
 
 import numpy as np
 import viser
-import websockets.asyncio.server
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from websockets.datastructures import Headers
-from websockets.http11 import Request, Response
 
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.studio import edits
-from cliploc_ros.studio.images import SELECTED_RGB
-from cliploc_ros.studio.panels import Actions, LandmarkPanel, MapPanel, TablePanel, ViewPanel
-from cliploc_ros.studio.recording import MIN_BOX_PX
+from cliploc_ros.studio.desk import Desk
+from cliploc_ros.studio.panels import Actions
 from cliploc_ros.studio.scene import Answers, Ellipsoids, Labels, ViewImage, draw_recording
-from cliploc_ros.studio.studio import Studio
-from cliploc_ros.studio.tool_panels import LivePanel, PlacesPanel, add_keyframes
+from cliploc_ros.studio.studio import SELECTED_RGB, Studio
+from cliploc_ros.studio.tool_panels import add_keyframes
+from cliploc_ros.studio.web import Answer, Board, Gate
 
 if TYPE_CHECKING:
     from cliploc_ros.studio.live import LiveRelocalizer
@@ -44,7 +35,7 @@ if TYPE_CHECKING:
 _REDRAW_INTERVAL_S = 0.05
 _GRID_M = 20.0
 _GIZMO = 0.4
-_LOOPBACK_NAMES = ('127.0.0.1', 'localhost', '::1')
+_BLANK = 70
 
 
 class Page:
@@ -56,19 +47,32 @@ class Page:
         self._actions = Actions(studio, server)
         self._stopped = threading.Event()
         self._drag = 0
-        self._shown_picture: object = None
+        self._shown_view = -1
         self._build_scene()
-        self._build_panels(live)
+        self.board = Board()
+        self.desk = Desk(self._actions, self._client_of, live)
+        if studio.layer is not None:
+            add_keyframes(self._actions, studio.layer)
         self._redrawer = threading.Thread(target=self._redraw_always, daemon=True)
         self._redrawer.start()
         self._actions.changed.set()
 
     def stop(self) -> None:
-        """Stop the search of places, and redrawing."""
-        self._places.search.stop()
+        """Stop the searches, and redrawing."""
+        self.desk.stop()
         self._stopped.set()
         self._actions.changed.set()
         self._redrawer.join()
+
+    def _client_of(self, person: str) -> viser.ClientHandle | None:
+        """Return the scene's client of a person, whom the path of its connection names."""
+        connections = self._server._websock_server._live_connections
+        for number, client in self._server.get_clients().items():
+            one = connections.get(number)
+            if one is not None and one.request is not None and one.request.path.strip(
+                    '/') == f'scene/{person}':
+                return client
+        return None
 
     # ---- building -------------------------------------------------------------------------------
 
@@ -82,64 +86,25 @@ class Page:
         self._gizmo.on_update(self._dragged_gizmo)
         if recording is not None:
             draw_recording(scene, recording.detections, lambda event, view: self._actions.act(
-                event, lambda: self._studio.show_view(view)))
+                lambda: self._studio.show_view(view)))
             self._answers = Answers(scene, recording.detections)
-            self._image = ViewImage(scene, self._clicked_image, self._dragged_image)
+            self._image = ViewImage(scene)
         centers = np.array([one.center for one in self._studio.document.landmarks.values()])
         middle = np.median(centers, axis=0) if len(centers) else np.zeros(3)
         spread = float(np.abs(centers - middle).max()) if len(centers) else 2.0
         camera = self._server.initial_camera
         camera.look_at = tuple(middle)
         camera.position = tuple(middle + np.array([-0.6, -0.6, 0.6]) * max(1.0, spread))
-
-    def _build_panels(self, live: 'LiveRelocalizer | None') -> None:
-        gui, actions = self._server.gui, self._actions
-        gui.configure_theme(show_logo=False, show_share_button=False, control_width='large')
-        gui.main_panel.dock_right()
-        self._panels: list[Any] = [MapPanel(actions), LandmarkPanel(actions)]
-        self._table = TablePanel(actions)
-        self._panels.append(self._table)
-        tools = gui.add_panel()
-        if self._studio.recording is not None:
-            with tools.add_tab('View'):
-                self._view = ViewPanel(actions)
-        with tools.add_tab('Places'):
-            self._places = PlacesPanel(actions)
-            self._panels.append(self._places)
-            if self._studio.layer is not None:
-                add_keyframes(actions, self._studio.layer)
-        if live is not None:
-            with tools.add_tab('Robot'):
-                self._panels.append(LivePanel(actions, live))
-        tools.dock_left()
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._server.gui.main_panel.minimize()
 
     # ---- what a person does in the scene --------------------------------------------------------
 
     def _clicked_landmark(self, event: Any, landmark_id: str) -> None:
-        self._actions.select(event, landmark_id,
-                             event.modifier == 'shift' or self._table.selects_several)
-
-    def _clicked_image(self, event: Any) -> None:
-        origin = np.array(event.ray_origin)
-        pixel = self._image.pixel(origin, origin + np.array(event.ray_direction))
-        action = self._studio.take_box if self._view.is_drawing else self._studio.select_at
-        self._actions.act(event, lambda: action(pixel))
-
-    def _dragged_image(self, event: Any) -> None:
-        if not self._view.is_drawing or event.phase == 'start':
-            return
-        eye = event.client.camera.position
-        corner = self._image.pixel(eye, event.start_position)
-        other = self._image.pixel(eye, event.end_position)
-
-        is_end = event.phase == 'end'
-
-        def draw() -> str | None:
-            message = self._studio.draw_box(corner, other)
-            return message if is_end else None
-
-        if is_end or np.abs(other - corner).min() >= MIN_BOX_PX:
-            self._actions.act(event if is_end else None, draw)
+        if event.modifier == 'shift':
+            self._actions.act(lambda: self._studio.toggle(landmark_id))
+        else:
+            self._actions.act(lambda: self._studio.document.select([landmark_id]))
 
     def _dragged_gizmo(self, event: Any) -> None:
         # Callbacks may overtake one another: each takes the gizmo's present pose, not its own.
@@ -156,7 +121,7 @@ class Page:
                                            np.roll(self._gizmo.wxyz, -1)),
                                gesture=('gizmo', self._drag, landmark_id))
 
-        self._actions.act(event, take_pose)
+        self._actions.act(take_pose)
 
     # ---- redrawing ------------------------------------------------------------------------------
 
@@ -171,13 +136,15 @@ class Page:
     def _redraw(self) -> None:
         document = self._studio.document
         chosen = set(document.selection)
-        pairs = tuple(document.landmarks.items())
+        pairs = tuple(self._studio.shown().items())
         self._rest.show([pair for pair in pairs if pair[0] not in chosen], None)
         self._selected.show([pair for pair in pairs if pair[0] in chosen], SELECTED_RGB)
-        self._labels.show(document.landmarks, document.selection)
+        self._labels.show(dict(pairs), [key for key in document.selection if key in dict(pairs)])
         self._show_gizmo()
-        for panel in self._panels:
-            panel.show()
+        self.desk.places.show()
+        if self.desk.robot is not None:
+            self.desk.robot.show()
+        self.board.show(self.desk.parts())
         if self._studio.recording is not None:
             self._answers.show(self._studio.answers)
             self._show_view()
@@ -199,73 +166,17 @@ class Page:
 
     def _show_view(self) -> None:
         studio = self._studio
-        key = studio.document.revision, studio.view, studio.drawn.get(studio.view)
-        if key == self._shown_picture:
+        if studio.view == self._shown_view:
             return
-        self._shown_picture = key
+        self._shown_view = studio.view
+        image: NDArray[np.uint8] | None = None
         try:
-            picture = studio.picture()
+            image = studio.image(studio.view)
         except CliplocError as error:
-            self._actions.notify(None, 'No image', str(error), 'red')
-            return
-        self._image.show(picture, studio.camera, studio.map_from_camera)
-        self._view.show(picture)
-
-
-# ---- who may open it ----------------------------------------------------------------------------
-
-class Gate:
-    """The check of a server that listens at an address."""
-
-    def __init__(self, host: str):
-        self.is_local = host in _LOOPBACK_NAMES
-        self.token = '' if self.is_local else secrets.token_urlsafe(24)
-
-    @property
-    def path(self) -> str:
-        """The path of the page: the token, if one is needed."""
-        return f'/{self.token}/' if self.token else '/'
-
-    def admit(self, request: Request) -> str | None:
-        """Return the path that viser shall see; None where the request is refused."""
-        host = request.headers.get('Host', '')
-        origin = request.headers.get('Origin')
-        if self.is_local and urlsplit(f'//{host}').hostname not in _LOOPBACK_NAMES:
-            return None
-        if origin is not None and urlsplit(origin).netloc != host:
-            return None
-        if request.headers.get('Upgrade', '').lower() == 'websocket' and origin is None:
-            return None
-        if not self.token:
-            return request.path
-        first, _, rest = request.path.partition('?')[0].lstrip('/').partition('/')
-        is_known = hmac.compare_digest(first.encode(), self.token.encode())
-        return f'/{rest}' if is_known else None
-
-    @contextmanager
-    def guard(self) -> Iterator[None]:
-        """Let servers that start inside of the block ask this gate first.
-
-        viser 1.1.1 has no option for it. It looks up ``websockets.asyncio.server.serve`` when it
-        starts, so that name leads to the check for as long as the block lasts.
-        """
-        serve = websockets.asyncio.server.serve
-
-        def guarded(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
-            def process(connection: Any, request: Request) -> Any:
-                path = self.admit(request)
-                if path is None:
-                    return Response(http.HTTPStatus.FORBIDDEN, 'Forbidden', Headers(),
-                                    b'refused: use the address that the studio printed\n')
-                request.path = path
-                return process_request(connection, request)
-            return serve(*args, process_request=process, **options)
-
-        websockets.asyncio.server.serve = guarded  # type: ignore[misc, assignment]
-        try:
-            yield
-        finally:
-            websockets.asyncio.server.serve = serve  # type: ignore[misc]
+            self._actions.log('refused', str(error))
+        camera = studio.camera
+        self._image.show(np.full((camera.height, camera.width, 3), _BLANK, dtype=np.uint8)
+                         if image is None else image, camera, studio.map_from_camera)
 
 
 @contextmanager
@@ -276,12 +187,21 @@ def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | 
     The port is the next free one from this on; 0: any. Beyond the loopback interface, the URL
     holds a token. ``live`` is the running relocalizer, to show it, too.
     """
-    gate = Gate(host)
-    with gate.guard(), redirect_stdout(io.StringIO()):  # viser prints a URL without the token
+    gate, pages = Gate(host), list[Page]()
+
+    def answer(path: str) -> Answer | None:
+        return pages[0].desk.picture(path) if pages else None
+
+    async def talk(connection: Any, person: str) -> None:
+        if pages:
+            await pages[0].board.serve(
+                connection, lambda message: pages[0].desk.do(person, message))
+
+    with gate.guard(answer, talk), redirect_stdout(io.StringIO()):  # viser prints another URL
         server = viser.ViserServer(host, port, verbose=False)
     # viser would open a tunnel to a server on the Internet for any browser that asks
     server.request_share_url = lambda *args, **options: None  # type: ignore[method-assign]
-    page = Page(studio, server, live)
+    pages.append(page := Page(studio, server, live))
     try:
         shown_host = f'[{host}]' if ':' in host else host
         yield f'http://{shown_host}:{server.get_port()}{gate.path}', server

@@ -23,6 +23,7 @@ from cliploc_ros.models.phrase_embeddings import phrases_of_classes
 from cliploc_ros.studio.images import Images
 from cliploc_ros.studio.landmark import Landmark
 from cliploc_ros.studio.recording import Recording
+from cliploc_ros.studio.sightings import find_sightings
 from cliploc_ros.vocabulary.vocabulary import Vocabulary, shipped_phrases
 
 _PHRASES = 5
@@ -159,14 +160,15 @@ class PhraseFinder:
         if self._recording is None or self._images is None:
             return None
         embeddings = []
-        for view, box in self._recording.best_views(question.landmark)[:_CROPS]:
+        for one in find_sightings(self._recording, self._images, question.landmarks,
+                                  question.landmark_id, _CROPS):
             detections = self._recording.detections
-            image = self._images.near(float(detections.stamps_s[view]), detections.name_of(view),
-                                      detections.camera_of(view))
-            if image is not None:
+            image = self._images.near(float(detections.stamps_s[one.view]),
+                                      detections.name_of(one.view), detections.camera_of(one.view))
+            if image is not None and one.is_whole:
                 if self._encoder is None:
                     self._encoder = ClipEncoder(weights, self._clip)
-                embeddings.append(self._encoder.encode_crops(image, box[None])[0])
+                embeddings.append(self._encoder.encode_crops(image, one.bbox_xyxy[None])[0])
         mean = np.sum(embeddings, axis=0)
         length = float(np.linalg.norm(mean))
         return np.asarray(mean / length, dtype=np.float32) if length > 0.0 else None

@@ -7,7 +7,7 @@ it. The views are not held out: a landmark that was fitted to them fits them bet
 images.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -25,6 +25,7 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.mapping.association import associate
 from cliploc_ros.mapping.check.landmark_faults import (
     LandmarkCheck,
+    Overlap,
     check_landmarks,
     find_map_overlaps,
     hear_witness,
@@ -37,12 +38,12 @@ from cliploc_ros.mapping.landmarks import Landmarks as Ellipsoids
 from cliploc_ros.mapping.landmarks import group_boxes
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.refit import RefitMap, refit_map
+from cliploc_ros.mapping.refit import refit_map
 from cliploc_ros.mapping.views import Views, camera_centers, make_views
 from cliploc_ros.simulation.labels import LabelModel
-from cliploc_ros.studio.edits import EditError, Landmarks
-from cliploc_ros.studio.images import outlines_of
-from cliploc_ros.studio.landmark import Landmark, Look, looks_of, map_of
+from cliploc_ros.studio import edits
+from cliploc_ros.studio.edits import Change, EditError, Landmarks
+from cliploc_ros.studio.landmark import Look, looks_of, map_of
 
 #: Fewer boxes leave an ellipsoid open.
 LEAST_BOXES = 3
@@ -104,6 +105,11 @@ class Recording:
         shown = associate(self.views, ellipsoids, self.options.association_iou)
         return dict(zip(landmarks, group_boxes(shown, len(landmarks)), strict=True))
 
+    def boxes_in_view(self, view: int) -> NDArray[np.float64]:
+        """Return the detector's boxes (n, 4) in a view [px]."""
+        first, last = self.detections.frame_offsets[view:view + 2]
+        return self.detections.bboxes_xyxy[first:last]
+
     def look_of(self, rows: NDArray[np.int64], encoder_key: str) -> Look | None:
         """Return the look that an encoder has of some boxes; None where it saw none of them."""
         detections = self.detections
@@ -113,28 +119,7 @@ class Recording:
         shown[rows] = 0
         return looks_of(embed_landmarks([''], detections, shown)).get('')
 
-    def best_views(self, landmark: Landmark) -> list[tuple[int, NDArray[np.float64]]]:
-        """Return the views that show all of a landmark, and the box (4,) there; largest first."""
-        found = []
-        for view, pose in enumerate(self.detections.map_from_camera):
-            camera = self.detections.camera_of(view)
-            for one in outlines_of({'': landmark}, camera, pose):
-                half = np.sqrt(one.ellipse[[2, 4]])
-                box = np.concatenate([one.ellipse[:2] - half, one.ellipse[:2] + half])
-                if box.min() >= 0.0 and (box[2:] <= (camera.width, camera.height)).all():
-                    found.append((view, box))
-        return sorted(found, key=lambda pair: -float((pair[1][2:] - pair[1][:2]).prod()))
-
-    def refit(self, landmarks: Landmarks, landmark_ids: Iterable[str]) -> RefitMap:
-        """Fit some of the landmarks to their boxes; MappingError where none can be fitted.
-
-        The others keep their boxes, so that none takes those of its neighbour.
-        """
-        chosen = set(landmark_ids)
-        return refit_map(self.detections, map_of(landmarks, 'map', 'studio'),
-                         np.array([key in chosen for key in landmarks]), self.options)
-
-    def fit_together(self, landmarks: Landmarks, landmark_ids: Iterable[str],
+    def fit_together(self, landmarks: Landmarks, landmark_ids: Sequence[str],
                      center: NDArray[np.float64], basis: NDArray[np.float64]) -> Fit | None:
         """Return one ellipsoid fitted to the boxes of several landmarks, from a start.
 
@@ -144,13 +129,40 @@ class Recording:
         rows = np.unique(np.concatenate([boxes[key] for key in landmark_ids]))
         return fit_ellipsoid(self.views, rows, center, basis) if len(rows) >= LEAST_BOXES else None
 
-    def check(self, landmarks: Landmarks) -> list[LandmarkCheck]:
-        """Return the check of each landmark, the worst first."""
+    def refitted(self, landmarks: Landmarks, landmark_ids: Sequence[str]
+                 ) -> tuple[Change, dict[str, str]]:
+        """Return the change that fits landmarks to their boxes, and why others are left out.
+
+        EditError: one is locked. MappingError: none can be fitted.
+        """
+        if locked := [key for key in landmark_ids if landmarks[key].is_locked]:
+            raise EditError(f"landmark '{locked[0]}' is locked: unlock it first")
+        chosen = np.array([key in set(landmark_ids) for key in landmarks])
+        # the others keep their boxes, so that none takes those of its neighbour
+        refit = refit_map(self.detections, map_of(landmarks, 'map', 'studio'), chosen,
+                          self.options)
+        reasons = {key: reason for key, reason in zip(landmarks, refit.reasons, strict=True)
+                   if reason is not None and key in landmark_ids}
+        fitted = [key for key in landmark_ids if key not in reasons]
+        return edits.take_fits(landmarks, fitted, refit.landmark_map), reasons
+
+    def merged(self, landmarks: Landmarks, landmark_ids: Sequence[str]) -> tuple[Change, str]:
+        """Return the change that merges landmarks, and how: by boxes, or else by volume."""
+        change = edits.merge(landmarks, landmark_ids)
+        merged = change.after[landmark_ids[0]]
+        assert merged is not None
+        fit = self.fit_together(landmarks, landmark_ids, merged.center, merged.basis)
+        if fit is None:
+            return change, 'by volume'
+        return edits.merge(landmarks, landmark_ids, (fit.center, fit.basis)), 'by boxes'
+
+    def check(self, landmarks: Landmarks) -> tuple[list[LandmarkCheck], list[Overlap]]:
+        """Return the check of each landmark, the worst first, and the overlaps."""
         landmark_map = map_of(landmarks, 'map', 'studio')
         witness = hear_witness(self.views, landmark_map, self.detections.class_names,
                                self.options)
         overlaps = find_map_overlaps(landmark_map, witness, self.views)
-        return check_landmarks(landmark_map, witness, overlaps, self.options)
+        return check_landmarks(landmark_map, witness, overlaps, self.options), overlaps
 
     def relocalize(self, landmarks: Landmarks, views: Sequence[int],
                    keyframes: RecordedKeyframes | None = None) -> list[Answer]:

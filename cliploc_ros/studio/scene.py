@@ -111,14 +111,10 @@ class Labels:
 
 
 class ViewImage:
-    """The picture of the selected view, in the scene in front of its camera.
+    """The image of the selected view, in the scene in front of its camera."""
 
-    A click and a drag call functions with their events.
-    """
-
-    def __init__(self, scene: viser.SceneApi, on_click: Callable[[Any], None],
-                 on_drag: Callable[[Any], None]):
-        self._scene, self._on_click, self._on_drag = scene, on_click, on_drag
+    def __init__(self, scene: viser.SceneApi):
+        self._scene = scene
         self._camera: Camera | None = None
         self.handle: Any = None
         self.pose = np.eye(4)
@@ -133,8 +129,6 @@ class ViewImage:
             '/view/image', picture, camera.width / camera.fx * _IMAGE_DEPTH_M,
             camera.height / camera.fy * _IMAGE_DEPTH_M, format='jpeg', cast_shadow=False,
             receive_shadow=False)
-        self.handle.on_click(self._on_click)
-        self.handle.on_drag('left')(self._on_drag)
 
     def show(self, picture: NDArray[np.uint8], camera: Camera,
              map_from_camera: NDArray[np.float64]) -> None:
@@ -146,18 +140,6 @@ class ViewImage:
             self.pose = map_from_camera
             self.handle.wxyz = wxyz_of(map_from_camera)
             self.handle.position = map_from_camera[:3, :3] @ self._middle + map_from_camera[:3, 3]
-
-    def pixel(self, origin: Sequence[float] | NDArray[np.float64],
-              through: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pixel (2,) where a ray from one point (3,) through another meets it."""
-        first, second = ((np.asarray(point) - self.pose[:3, 3]) @ self.pose[:3, :3]
-                         for point in (origin, through))
-        step = second - first
-        along = (_IMAGE_DEPTH_M - first[2]) / step[2] if abs(step[2]) > 1e-9 else 0.0
-        x, y, _ = (first + along * step) / _IMAGE_DEPTH_M
-        camera = self._camera
-        assert camera is not None  # nobody clicks before the first picture
-        return np.array([x * camera.fx + camera.cx, y * camera.fy + camera.cy])
 
 
 class Answers:

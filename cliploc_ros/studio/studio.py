@@ -6,7 +6,7 @@ Every action returns a line that says what it did, or raises a CliplocError.
 """
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,25 +14,19 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.mapping.check.landmark_faults import LandmarkCheck
 from cliploc_ros.mapping.check.relocalization import RecordedKeyframes, sample_frames
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.edits import EditError
-from cliploc_ros.studio.images import (
-    Images,
-    Outline,
-    Pixel,
-    box_at,
-    draw,
-    landmark_at,
-    outlines_of,
-)
+from cliploc_ros.studio.images import Images, Outline, Pixel, landmark_at, outlines_of
 from cliploc_ros.studio.landmark import Landmark
+from cliploc_ros.studio.new_landmark import NewLandmark
 from cliploc_ros.studio.phrases import FoundPhrases, PhraseFinder, Question
-from cliploc_ros.studio.recording import LEAST_BOXES, MIN_BOX_PX, Answer, Recording, fit_boxes
+from cliploc_ros.studio.recording import Answer, Recording
+from cliploc_ros.studio.review import Review
 
 Rgb = tuple[int, int, int]
+SELECTED_RGB: Rgb = (255, 220, 0)
 # Views of the whole recording in which the relocalizer is tried.
 _MAX_TRIALS = 100
 # Distinct on grey and on photographs; yellow and magenta are the selection's and drawn boxes'.
@@ -42,11 +36,14 @@ _PALETTE: tuple[Rgb, ...] = (
 
 
 class Row(NamedTuple):
-    """A line of the table of landmarks."""
+    """A line of the list of landmarks."""
 
     landmark_id: str
-    text: str
+    label: str
+    class_id: str
+    is_locked: bool
     severity: float
+    decision: str
 
 
 class Studio:
@@ -63,13 +60,12 @@ class Studio:
         self.layer = layer
         self.finder = finder
         self.recording = recording
+        self.images = images
+        self.review = Review(document, recording)
+        self.new = None if recording is None else NewLandmark(document, recording)
         self.view = 0
-        self.drawn: dict[int, tuple[float, float, float, float]] = {}
-        self.accepted: set[str] = set()
-        self._images = images
-        self._checks: dict[str, LandmarkCheck] = {}
-        # the row of the table that was selected last by walking through it
-        self._row = 0
+        #: Landmarks that the scene and the views leave out; the map file does not hold it.
+        self.hidden: frozenset[str] = frozenset()
         #: The relocalizer's answers that are shown; an edit leaves them as they are.
         self.answers: tuple[Answer, ...] = ()
         # of the last run over the whole recording, by verdict
@@ -104,36 +100,17 @@ class Studio:
         """Select a view; a number beyond the last one selects the last one."""
         self.view = max(0, min(int(view), self.views - 1))
 
-    def best_view(self) -> str:
-        """Select the view that shows the selected landmark largest, wholly in the image."""
-        landmark_id, landmark = self._one_selected()
-        views = self._recording().best_views(landmark)
-        if not views:
-            raise EditError(f'{landmark_id}: no view shows all of it')
-        self.view = views[0][0]
-        of = f' of {self.camera_name}' if self.camera_name else ''
-        return f'view {self.view}{of} shows {landmark_id} largest'
-
-    def boxes_in_view(self) -> NDArray[np.float64]:
-        """Return the detector's boxes (n, 4) in the selected view [px]."""
-        detections = self._recording().detections
-        first, last = detections.frame_offsets[self.view:self.view + 2]
-        return detections.bboxes_xyxy[first:last]
-
     def outlines(self) -> list[Outline]:
-        """Return the landmarks' outlines in the selected view, the nearest first."""
-        return outlines_of(self.document.landmarks, self.camera, self.map_from_camera)
+        """Return the shown landmarks' outlines in the selected view, the nearest first."""
+        return outlines_of(self.shown(), self.camera, self.map_from_camera)
 
-    def picture(self) -> NDArray[np.uint8]:
-        """Return the selected view with boxes and outlines (h, w, 3), red first."""
+    def image(self, view: int) -> NDArray[np.uint8] | None:
+        """Return the undistorted image (h, w, 3) of a view, red first; None without one."""
         detections = self._recording().detections
-        image = None
-        if self._images is not None:
-            image = self._images.near(float(detections.stamps_s[self.view]), self.camera_name,
-                                      self.camera)
-        colors = {key: color_of(one.class_id) for key, one in self.document.landmarks.items()}
-        return draw(self.camera, image, self.boxes_in_view(), self.drawn.get(self.view),
-                    self.outlines(), colors, self.document.selection)
+        if self.images is None or not 0 <= view < self.views:
+            return None
+        return self.images.near(float(detections.stamps_s[view]), detections.name_of(view),
+                                detections.camera_of(view))
 
     def _recording(self) -> Recording:
         if self.recording is None:
@@ -142,6 +119,15 @@ class Studio:
         return self.recording
 
     # ---- selection ------------------------------------------------------------------------------
+
+    def shown(self) -> dict[str, Landmark]:
+        """Return the landmarks that are not hidden."""
+        return {key: one for key, one in self.document.landmarks.items()
+                if key not in self.hidden}
+
+    def hide(self, landmark_ids: Iterable[str]) -> None:
+        """Hide landmarks, and show those among them that are hidden."""
+        self.hidden = self.hidden ^ frozenset(landmark_ids)
 
     def select_at(self, pixel: Pixel) -> str:
         """Select the landmark whose outline in the view is around a pixel."""
@@ -165,14 +151,6 @@ class Studio:
             raise EditError('select exactly one landmark first')
         return self.document.selected
 
-    def undo(self) -> None:
-        """Undo the last edit, if there is one."""
-        self.document.undo()
-
-    def redo(self) -> None:
-        """Do again what was undone last, if anything was."""
-        self.document.redo()
-
     # ---- edits of the selection -----------------------------------------------------------------
 
     def delete(self) -> str:
@@ -181,9 +159,9 @@ class Studio:
         self.document.apply(edits.delete(self.document.landmarks, ids))
         return f'deleted {", ".join(ids)}'
 
-    def toggle_lock(self) -> str:
-        """Lock the selection; unlock it if all of it is locked."""
-        ids, landmarks = self._selected(), self.document.landmarks
+    def toggle_lock(self, landmark_ids: Sequence[str] = ()) -> str:
+        """Lock landmarks, by default the selection; unlock them if all are locked."""
+        ids, landmarks = tuple(landmark_ids) or self._selected(), self.document.landmarks
         are_locked = all(landmarks[key].is_locked for key in ids)
         self.document.apply((edits.unlock if are_locked else edits.lock)(landmarks, ids))
         return f'{"unlocked" if are_locked else "locked"} {", ".join(ids)}'
@@ -199,14 +177,8 @@ class Studio:
     def merge(self) -> str:
         """Merge the selection; its boxes decide the shape, or else the volumes."""
         ids, landmarks = self._selected(), self.document.landmarks
-        change = edits.merge(landmarks, ids)
-        how = 'by volume'
-        if self.recording is not None:
-            merged = change.after[ids[0]]
-            assert merged is not None
-            fit = self.recording.fit_together(landmarks, ids, merged.center, merged.basis)
-            if fit is not None:
-                change, how = edits.merge(landmarks, ids, (fit.center, fit.basis)), 'by boxes'
+        change, how = ((edits.merge(landmarks, ids), 'by volume') if self.recording is None
+                       else self.recording.merged(landmarks, ids))
         self.document.apply(change)
         self.document.select([ids[0]])
         return f'merged {", ".join(ids)} {how}'
@@ -221,121 +193,25 @@ class Studio:
                             if not one.is_locked])
 
     def _refit(self, landmark_ids: Sequence[str]) -> str:
-        landmarks = self.document.landmarks
-        if locked := [key for key in landmark_ids if landmarks[key].is_locked]:
-            raise EditError(f"landmark '{locked[0]}' is locked: unlock it first")
-        refit = self._recording().refit(landmarks, landmark_ids)
-        reasons = {key: reason for key, reason in zip(landmarks, refit.reasons, strict=True)
-                   if reason is not None}
-        fitted = [key for key in landmark_ids if key not in reasons]
-        self.document.apply(edits.take_fits(landmarks, fitted, refit.landmark_map))
+        change, reasons = self._recording().refitted(self.document.landmarks, landmark_ids)
+        self.document.apply(change)
         left_out = ''.join(f'; {key} {reason}' for key, reason in list(reasons.items())[:3])
-        return f'refitted {len(fitted)} of {len(landmark_ids)} landmarks{left_out}'
+        return (f'refitted {len(landmark_ids) - len(reasons)} of {len(landmark_ids)} landmarks'
+                f'{left_out}')
 
-    # ---- a landmark from boxes ------------------------------------------------------------------
-
-    def draw_box(self, corner: Pixel, other: Pixel) -> str:
-        """Draw a box in the selected view between two opposite corners (2,) [px]."""
-        size = np.array([self.camera.width, self.camera.height], dtype=np.float64)
-        low, high = (np.clip(select(np.asarray(corner), np.asarray(other)), 0.0, size)
-                     for select in (np.minimum, np.maximum))
-        if (high - low).min() < MIN_BOX_PX:
-            raise EditError(f'the box is smaller than {MIN_BOX_PX:g} pixels; drag from corner to '
-                            'corner')
-        self.drawn[self.view] = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-        return f'{len(self.drawn)} boxes drawn'
-
-    def take_box(self, pixel: Pixel) -> str:
-        """Take the detector's smallest box around a pixel (2,) as a drawn one."""
-        boxes = self.boxes_in_view()
-        row = box_at(boxes, pixel)
-        if row is None:
-            raise EditError('no box of the detector there; drag to draw one')
-        left, top, right, bottom = (float(value) for value in boxes[row])
-        self.drawn[self.view] = (left, top, right, bottom)
-        return f'{len(self.drawn)} boxes drawn'
-
-    def clear_boxes(self) -> str:
-        """Forget all drawn boxes."""
-        self.drawn.clear()
-        return 'no boxes drawn'
-
-    def create(self, label: str, class_id: str) -> str:
-        """Create a landmark from the drawn boxes, and select it."""
-        recording, landmarks = self._recording(), self.document.landmarks
-        detections = recording.detections
-        views = sorted(self.drawn)
-        fit, warning = fit_boxes([detections.camera_of(view) for view in views],
-                                 detections.map_from_camera[views],
-                                 np.array([self.drawn[view] for view in views]))
-        change = edits.create(landmarks, label, class_id, fit.center, fit.basis)
-        (landmark_id,) = change.after
-        rows = recording.boxes_of(change.apply(landmarks))[landmark_id]
-        look = recording.look_of(rows, self.document.encoder_key)
-        self.document.apply(edits.create(landmarks, label, class_id, fit.center, fit.basis, look))
-        self.document.select([landmark_id])
-        self.drawn.clear()
-        hint = (f'{len(rows)} boxes of the recording show it: Refit fits it to them'
-                if len(rows) >= LEAST_BOXES else '')
-        return '; '.join(filter(None, [f'created {landmark_id}', warning, hint]))
-
-    # ---- the table ------------------------------------------------------------------------------
-
-    def check(self) -> str:
-        """Judge all landmarks by the recording; the table then has the worst first."""
-        found = self._recording().check(self.document.landmarks)
-        self._checks = {one.landmark_id: one for one in found}
-        self._row = 0
-        serious = sum(one.severity >= 1.0 for one in found)
-        return f'checked {len(found)} landmarks: {serious} with a serious fault'
-
-    def faults(self, landmark_id: str) -> tuple[str, ...]:
-        """Return the faults of a landmark that the last check found."""
-        return self._checks[landmark_id].faults if landmark_id in self._checks else ()
-
-    def rows(self, search: str = '') -> list[Row]:
-        """Return the table of landmarks whose id, label or class has a text, the worst first."""
-        wanted = search.casefold().split()
-        rows = []
-        for key, one in self.document.landmarks.items():
-            text = f'{key} · {one.label} · {one.class_id}'
-            if not wanted or all(word in text.casefold() for word in wanted):
-                is_open = key in self._checks and key not in self.accepted
-                severity = self._checks[key].severity if is_open else 0.0
-                rows.append(Row(key, ('🔒 ' if one.is_locked else '') + text, severity))
-        return sorted(rows, key=lambda row: -row.severity)
-
-    def accept(self) -> str:
-        """Accept the selection as it is, whatever the check says, and go on."""
-        ids = self._selected()
-        following = self._following()  # acceptance changes the order of the table
-        self.accepted.update(ids)
-        return f'accepted {", ".join(ids)}; {self._select_row(following)}'
-
-    def select_next(self) -> str:
-        """Select the next landmark of the table; after a deletion, the one that moved up."""
-        return self._select_row(self._following())
-
-    def _following(self) -> str:
-        ids, selection = [row.landmark_id for row in self.rows()], self.document.selection
-        if not ids:
-            raise EditError('there are no landmarks')
-        return ids[(ids.index(selection[0]) + 1 if selection else self._row) % len(ids)]
-
-    def _select_row(self, landmark_id: str) -> str:
-        self.document.select([landmark_id])
-        self._row = [row.landmark_id for row in self.rows()].index(landmark_id)
-        return f'selected {landmark_id}'
+    def rows(self) -> list[Row]:
+        """Return the list of landmarks, in the order of the review."""
+        review, places = self.review, {key: at for at, key in enumerate(self.review.order)}
+        rows = [Row(key, one.label, one.class_id, one.is_locked, review.severity(key),
+                    review.decision(key) or '') for key, one in self.document.landmarks.items()]
+        return sorted(rows, key=lambda row: places.get(row.landmark_id, len(places)))
 
     # ---- the relocalizer ------------------------------------------------------------------------
 
     def _keyframes(self) -> RecordedKeyframes | None:
         """Return the keyframes and the images of the views; None without them."""
-        images, detections = self._images, self._recording().detections
-        return None if self.layer is None or images is None else RecordedKeyframes(
-            self.layer, lambda view: images.near(float(detections.stamps_s[view]),
-                                                 detections.name_of(view),
-                                                 detections.camera_of(view)))
+        return None if self.layer is None or self.images is None else RecordedKeyframes(
+            self.layer, self.image)
 
     def relocalize_here(self) -> str:
         """Relocalize in the selected view."""

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The panels of the tools: coverage and look-alike places, keyframes, the running relocalizer.
+"""The layers of the tools: coverage and look-alike places, keyframes, the running relocalizer.
 
 No ROS here: the relocalizer comes as an object that ``live`` makes.
 """
 
-import html
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,7 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.evaluation.map_check.page import LOOK_ALIKE, MISLED
 from cliploc_ros.mapping.check.places import RADIUS_M
 from cliploc_ros.mapping.check.report import GridCheck
-from cliploc_ros.studio.panels import Actions, paragraph, show_props
+from cliploc_ros.studio.panels import Actions
 from cliploc_ros.studio.places import Places, PlacesSearch
 from cliploc_ros.studio.scene import Ellipsoids, some_cameras, wxyz_of
 
@@ -39,11 +38,11 @@ _LIFT_M = 0.005
 _STOREY_M = 2.5
 _MAX_LOOK_ALIKES = 20
 _CIRCLE_POINTS = 48
-_LEGEND = tuple(f'<span style="color:{color}">■</span> {text}' for color, text in (
+_LEGEND = (
     ('#003E6B', 'all headings with three landmarks are accepted'), ('#A0D2F0', 'few of them'),
     ('#E69F00', 'none'), ('#787878', 'no heading shows three landmarks'),
     (MISLED, 'a heading is misled; the line leads to the wrong pose'),
-    (LOOK_ALIKE, 'places that look alike')))
+    (LOOK_ALIKE, 'places that look alike'))
 
 _KEYFRAME_RGB = (0, 150, 136)
 _KEYFRAME_FRUSTUM_M, _POINT_M = 0.12, 0.015
@@ -65,7 +64,7 @@ _MAX_TEXT = 600
 
 
 class PlacesPanel:
-    """The search of places, and its layers in the scene."""
+    """The search of places, its figures for the page, and its layers in the scene."""
 
     def __init__(self, actions: Actions):
         self._actions = actions
@@ -73,35 +72,30 @@ class PlacesPanel:
         self._shown: Places | None = None
         self._coverage: list[Any] = []
         self._links: list[Any] = []
-        gui = actions.server.gui
-        self._start = gui.add_button(
-            'Find coverage and look-alikes', hint='relocalizes in simulated views all over the '
-            'map, up to a minute')
-        self._bar = gui.add_progress_bar(0.0, visible=False)
-        self._stop = gui.add_button('Stop', visible=False, color='red')
-        self._text = gui.add_html('')
-        self._shows_coverage = gui.add_checkbox('Show coverage', True)
-        self._shows_links = gui.add_checkbox('Show look-alikes', True)
-        self._start.on_click(lambda event: actions.ask(event, self.search.start))
-        self._stop.on_click(lambda event: actions.ask(event, self.search.stop))
-        for box in (self._shows_coverage, self._shows_links):
-            box.on_update(lambda event: self._set_visible())
+        self.shows_coverage = self.shows_links = True
+
+    def toggle_coverage(self) -> None:
+        """Show or hide the tiles of coverage."""
+        self.shows_coverage = not self.shows_coverage
+        self._set_visible()
+
+    def toggle_links(self) -> None:
+        """Show or hide the places that look alike."""
+        self.shows_links = not self.shows_links
+        self._set_visible()
+
+    def part(self) -> dict[str, Any]:
+        """Return the search as the page shows it."""
+        places, search = self.search.last, self.search
+        return {'share': round(search.share, 2), 'is_searching': search.is_running,
+                'failure': search.failure, 'is_stale': search.is_stale(),
+                'lines': [] if places is None else places.lines(search.before),
+                'legend': [] if places is None else _LEGEND,
+                'coverage': self.shows_coverage, 'links': self.shows_links}
 
     def show(self) -> None:
-        """Show progress, figures and layers."""
-        places, is_running = self.search.last, self.search.is_running
-        lines = []
-        if self.search.failure:
-            lines.append(f'<b>{html.escape(self.search.failure)}</b>')
-        if places is not None:
-            if self.search.is_stale():
-                lines.append('<b>of the map before the last edits: find again</b>')
-            lines += [*map(html.escape, places.lines(self.search.before)), *_LEGEND]
-        show_props(self._start, disabled=is_running)
-        show_props(self._stop, visible=is_running)
-        show_props(self._bar, visible=is_running, value=round(100.0 * self.search.share))
-        show_props(self._text, content=paragraph(
-            lines, 'padding:0.3em 1em;overflow-wrap:anywhere') if lines else '')
+        """Draw the layers of a new result."""
+        places = self.search.last
         if places is not None and places is not self._shown:
             self._shown = places
             for handle in self._coverage + self._links:
@@ -111,10 +105,10 @@ class PlacesPanel:
             self._set_visible()
 
     def _set_visible(self) -> None:
-        for handles, box in ((self._coverage, self._shows_coverage),
-                             (self._links, self._shows_links)):
+        for handles, is_shown in ((self._coverage, self.shows_coverage),
+                                  (self._links, self.shows_links)):
             for handle in handles:
-                handle.visible = box.value
+                handle.visible = is_shown
 
     def _draw_coverage(self, places: Places) -> list[Any]:
         scene, check = self._actions.server.scene, places.check
@@ -138,8 +132,7 @@ class PlacesPanel:
                     f'{check.useful[row]} show 3 landmarks, {check.accepted[row]} are accepted, '
                     f'{check.misled[row]} misled')
 
-        tiles.on_click(lambda event: self._actions.ask(
-            event, lambda: figures(event.instance_index)))
+        tiles.on_click(lambda event: self._actions.ask(lambda: figures(event.instance_index)))
         wrong = [one for one in check.trials if one.verdict == 'misled']
         points = np.array([[one.position, one.estimate] for one in wrong]).reshape(-1, 2, 3)
         lines = scene.add_line_segments('/coverage/misled', points, _rgb(MISLED), thickness=3.0,
@@ -223,36 +216,33 @@ class LivePanel:
         self._missing = Ellipsoids(
             self._scene, '/live/missing', lambda _, key: self._document.select([key]), 0.5,
             _MISSING_SCALE)
-        gui = actions.server.gui
-        self._status = gui.add_html('')
-        self._relocalize = gui.add_button('Relocalize the robot')
-        self._reload = gui.add_button('Let it reload its map')
-        look = gui.add_button('Look at its pose')
-        self._relocalize.on_click(lambda event: actions.ask(event, live.relocalize))
-        self._reload.on_click(lambda event: actions.ask(event, self._reload_map))
-        look.on_click(self._look)
+        self.relocalize = live.relocalize
         live.subscribe(actions.changed.set)
 
-    def _reload_map(self) -> str:
+    @property
+    def position(self) -> NDArray[np.float64] | None:
+        """The position (3,) of the last pose in the map."""
+        pose = self._live.state.pose
+        return None if pose is None else pose.map_from_body[:3, 3]
+
+    def reload_map(self) -> str:
+        """Let the relocalizer read its map again."""
         message = self._live.reload_map()
         return message if self._document.is_saved else (
             f'{message}; without the edits not saved here')
 
-    def _look(self, event: Any) -> None:
-        pose = self._live.state.pose
-        if event.client is not None and pose is not None:
-            event.client.camera.look_at = pose.map_from_body[:3, 3]
+    def part(self) -> dict[str, Any]:
+        """Return the relocalizer's state as the page shows it."""
+        state = self._live.state
+        return {'lines': [line[:_MAX_TEXT] for line in self._lines(state)],
+                'is_busy': state.is_busy}
 
     def show(self) -> None:
-        """Show the relocalizer's state."""
+        """Draw the relocalizer's state."""
         state = self._live.state
         if state is self._shown:
             return
         self._shown = state
-        self._status.content = paragraph([html.escape(line[:_MAX_TEXT])
-                                          for line in self._lines(state)],
-                                         'padding:0 1em;overflow-wrap:anywhere')
-        self._relocalize.disabled = self._reload.disabled = state.is_busy
         for handle in self._handles:
             handle.remove()
         self._handles = []

@@ -86,6 +86,7 @@ def test_the_robot_relocalizes_and_the_map_shows_where(person, live, tmp_path, s
         'clip_model': ASSETS / 'clip.json', 'clip_pretrained': ASSETS / 'clip.safetensors',
         'cache_dir': tmp_path}).wait_for_output('ready after')
     start('cli.replay', walk, '--loop', '--rate', '0.5')
+    person.mode('Test')
     person.page.get_by_text('landmarks in frame').wait_for()
     person.page.get_by_text('which is not the map of this studio').wait_for()
     while not live.state.is_current:  # single frames are refused
@@ -114,6 +115,7 @@ def test_the_watch_and_what_is_missing_are_shown(person, live, tester):
         values=[KeyValue(key=key, value=value) for key, value in values.items()])])
     tester.wait(publisher.get_subscription_count, 'discovery')
     publisher.publish(msg)
+    person.mode('Test')
     person.page.get_by_text('watch: uncertain: the map may be out of date here').wait_for()
     person.page.get_by_text('missing, red in the map: mug_2, bowl_4, unknown').wait_for()
     assert live.state.missing == ('mug_2', 'bowl_4', 'unknown')
@@ -123,6 +125,7 @@ def test_the_watch_and_what_is_missing_are_shown(person, live, tester):
 
 @in_a_browser
 def test_the_page_without_a_relocalizer_and_with_one_that_dies(person, own_relocalizer):
+    person.mode('Test')
     person.click('Relocalize the robot')
     person.page.get_by_text('no relocalizer found at /relocalizer').wait_for()
     process = own_relocalizer(timeout_s=60.0)

@@ -86,10 +86,10 @@ def open_page(studio, host='127.0.0.1'):
 
 
 @contextmanager
-def person_at(chromium, studio):
+def person_at(chromium, studio, has_scene=False):
     """Serve the page of a studio, and open it; yield the person at it and the server."""
     with open_page(studio) as (url, server):
-        person = Person(chromium, url)
+        person = Person(chromium, url, has_scene)
         yield person, server
         person.page.close()
         assert person.foreign == [], 'no request leaves the machine'

@@ -12,7 +12,6 @@ from cliploc_ros.mapping.association import associate, ious_with
 from cliploc_ros.mapping.landmarks import group_boxes, landmarks_of_map, project_box
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import camera_centers, make_views
-from cliploc_ros.studio import edits
 from cliploc_ros.studio.edits import EditError
 from cliploc_ros.studio.landmark import Landmark, shape_fields
 from cliploc_ros.studio.recording import Recording, fit_boxes
@@ -122,7 +121,7 @@ def test_refitting_takes_the_boxes_of_the_recording(office, used):
             **shape_fields(fit.center, fit.basis)})
         unseen[str(number)] = others[~np.isin(views.frames[others], half)]
     recording = Recording(detections.select_frames(half))
-    refitted = edits.take_fits(drawn, drawn, recording.refit(drawn, drawn).landmark_map)
+    refitted = recording.refitted(drawn, list(drawn))[0]
     before, after = ([np.median(ious_with(views, unseen[key], one.center, one.basis))
                       for key, one in landmarks.items()]
                      for landmarks in (drawn, refitted.apply(drawn)))

@@ -6,7 +6,6 @@ The boxes are simulated: those of the visible part of each object, which the gen
 demo's world recorded, with each edge off by 3 % of the box. The labels are that generator's, too.
 """
 
-import re
 from collections import defaultdict
 from itertools import combinations
 
@@ -145,13 +144,14 @@ def test_the_robot_wakes_up_in_a_map_made_in_the_browser(chromium, tmp_path):
     drawn = more[:OBJECTS]
     objects = [one for one, _ in drawn]
     studio = Studio(Document(path), Recording(views), open_images(walk, None))
-    with person_at(chromium, studio) as (person, server):
-        person.page.set_viewport_size({'width': 800, 'height': 240})  # less to render
+    with person_at(chromium, studio) as (person, _):
+        person.page.set_viewport_size({'width': 900, 'height': 560})
+        person.mode('Create')
         for count, (one, boxes) in enumerate(drawn, start=1):
             for view, box in boxes.items():
-                person.draw_box(studio, server, view, box)
-            person.name_new(server, one.label, one.class_id)
-            person.click(re.compile('^Create landmark from'))
+                person.draw_box(studio, view, box)
+            person.name_new(one.label, one.class_id)
+            person.click('Create↵')
             wait_for(lambda count=count: len(studio.document.landmarks) == count, 'the landmark')
         person.picture('from_empty')
         person.click('Save')

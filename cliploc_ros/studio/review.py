@@ -1,0 +1,179 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The review: each landmark of the map once, the worst first, until a person has decided on all.
+
+The order is that of the last check, so that a decision moves no landmark below the person's hand.
+"""
+
+from collections.abc import Iterable
+from typing import Literal
+
+from cliploc_ros.mapping.check.landmark_faults import (
+    LandmarkCheck,
+    check_landmarks,
+    find_map_overlaps,
+)
+from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.studio import edits
+from cliploc_ros.studio.document import Document
+from cliploc_ros.studio.edits import EditError
+from cliploc_ros.studio.landmark import map_of
+from cliploc_ros.studio.recording import Recording
+
+Decision = Literal['accepted', 'fixed', 'deleted']
+#: Faults from here on are serious.
+SERIOUS = 1.0
+
+
+class Review:
+    """The queue of landmarks, and the decisions on them.
+
+    Attributes
+    ----------
+    order : tuple of str
+        The landmarks of the last check, the worst first; empty before it.
+    """
+
+    def __init__(self, document: Document, recording: Recording | None):
+        self._document, self._recording = document, recording
+        self._decisions: dict[str, Decision] = {}
+        self._checks: dict[str, LandmarkCheck] = {}
+        self._duplicates: list[tuple[str, str]] = []
+        self.order: tuple[str, ...] = ()
+
+    # ---- what is known --------------------------------------------------------------------------
+
+    @property
+    def has_boxes(self) -> bool:
+        """Whether a recording's boxes judge the landmarks; else the map's own figures do."""
+        return self._recording is not None and len(self._recording.detections.classes) > 0
+
+    def check_of(self, landmark_id: str) -> LandmarkCheck | None:
+        """Return the last check of a landmark."""
+        return self._checks.get(landmark_id)
+
+    def decision(self, landmark_id: str) -> Decision | None:
+        """Return the decision on a landmark; an undone deletion is none."""
+        if landmark_id not in self._document.landmarks:
+            return 'deleted'
+        return self._decisions.get(landmark_id)
+
+    def severity(self, landmark_id: str) -> float:
+        """Return how bad the faults of a landmark are; 0 once a person has decided on it."""
+        check = self._checks.get(landmark_id)
+        return 0.0 if check is None or self.decision(landmark_id) else check.severity
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of landmarks in the queue, and of each decision."""
+        found = [self.decision(key) for key in self.order]
+        return {'total': len(found), **{name: found.count(name)
+                                        for name in ('accepted', 'fixed', 'deleted')}}
+
+    # ---- what a person does ---------------------------------------------------------------------
+
+    def check(self) -> str:
+        """Judge all landmarks; a new queue begins, and its worst landmark is selected."""
+        self._judge()
+        self.order, self._decisions = tuple(self._checks), {}
+        serious = sum(one.severity >= SERIOUS for one in self._checks.values())
+        if self.order:
+            self._document.select([self.order[0]])
+        source = '' if self.has_boxes else ' by the map alone: there are no boxes of a recording'
+        return f'checked {len(self.order)} landmarks{source}: {serious} with a serious fault'
+
+    def accept(self) -> str:
+        """Accept the selection as it is, whatever the check says, and go on."""
+        ids = self._selected()
+        return self._decide(ids, 'accepted', f'accepted {", ".join(ids)}')
+
+    def delete(self) -> str:
+        """Delete the selection, and go on."""
+        ids = self._selected()
+        self._document.apply(edits.delete(self._document.landmarks, ids))
+        return self._go_on(ids[-1], f'deleted {", ".join(ids)}')
+
+    def fix(self) -> str:
+        """Do what the check advises: merge a duplicate, fit any other landmark to its boxes.
+
+        The landmark is checked once more; the review goes on if no serious fault is left. The
+        boxes of a moved object may still lie where it was: look at the result.
+        """
+        landmark_id = self._selected()[0]
+        if self._recording is None or not self.has_boxes:
+            raise EditError(f'{landmark_id}: there are no boxes to fit it to: edit, accept or '
+                            'delete it')
+        landmarks, partner = self._document.landmarks, self._partner(landmark_id)
+        if partner is not None:
+            change, how = self._recording.merged(landmarks, [landmark_id, partner])
+            what = f'merged {landmark_id} with {partner} {how}'
+        else:
+            change, left_out = self._recording.refitted(landmarks, [landmark_id])
+            if left_out:
+                raise EditError(f'{landmark_id} {left_out[landmark_id]}: edit, accept or delete '
+                                'it')
+            what = f'fitted {landmark_id} to its boxes'
+        self._document.apply(change)
+        self._judge()
+        left = self._checks[landmark_id]
+        if left.severity >= SERIOUS:
+            self._document.select([landmark_id])
+            return f'{what}; it still {left.faults[0]}'
+        return self._decide([landmark_id], 'fixed', what)
+
+    def step(self, count: int) -> str | None:
+        """Select the landmark that lies some places farther in the queue."""
+        ids, selection = self._ids(), self._document.selection
+        place = ids.index(selection[0]) + count if selection and selection[0] in ids else 0
+        self._document.select([ids[place % len(ids)]])
+        return None
+
+    # ---------------------------------------------------------------------------------------------
+
+    def _ids(self) -> list[str]:
+        """Return the landmarks in the order of the queue; those that it lacks come last."""
+        landmarks = self._document.landmarks
+        if not landmarks:
+            raise EditError('there are no landmarks')
+        return list(dict.fromkeys([key for key in self.order if key in landmarks]
+                                  + list(landmarks)))
+
+    def _selected(self) -> tuple[str, ...]:
+        if not self._document.selection:
+            raise EditError('select a landmark first')
+        return self._document.selection
+
+    def _decide(self, ids: Iterable[str], decision: Decision, what: str) -> str:
+        """Keep a decision, and select the next landmark without one."""
+        self._decisions |= dict.fromkeys(ids, decision)
+        return self._go_on(list(ids)[-1], what)
+
+    def _go_on(self, last: str, what: str) -> str:
+        places = {key: place for place, key in enumerate(self.order)}
+        start = places.get(last, -1)
+        rest = [key for key in self.order if self.decision(key) is None]
+        if not rest:
+            return f'{what}; the review is complete' if self.order else what
+        self._document.select([min(
+            rest, key=lambda key: (places[key] <= start, places[key]))])
+        return what
+
+    def _partner(self, landmark_id: str) -> str | None:
+        """Return the nearest landmark of which this one is a duplicate."""
+        pairs = [pair for pair in self._duplicates if landmark_id in pair
+                 and all(key in self._document.landmarks for key in pair)]
+        return None if not pairs else pairs[0][pairs[0][0] == landmark_id]
+
+    def _judge(self) -> None:
+        landmarks = self._document.landmarks
+        if not landmarks:
+            raise EditError('there are no landmarks to review: create one first')
+        if self._recording is not None and self.has_boxes:
+            found, overlaps = self._recording.check(landmarks)
+        else:
+            landmark_map = map_of(landmarks, 'map', 'studio')
+            overlaps = find_map_overlaps(landmark_map, None, None)
+            found = check_landmarks(landmark_map, None, overlaps, MappingOptions())
+        ids = list(landmarks)
+        self._checks = {one.landmark_id: one for one in found}
+        self._duplicates = [(ids[one.first], ids[one.second]) for one in overlaps
+                            if one.is_duplicate]

@@ -1,0 +1,185 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Who may open the page, and what its port answers: our page, its images, and viser's scene.
+
+viser 1.1 lets everyone in who reaches its port. On the loopback interface these include every
+page that this machine's browsers show, since a browser opens WebSockets to any host. So a request
+needs a loopback name as its host, a WebSocket needs the studio's own page as its origin, and
+beyond the loopback interface each request needs the token that the studio prints.
+
+Below the token, ``/`` is the page, ``/scene/PERSON`` is viser's, ``/socket/PERSON`` is the page's
+WebSocket, and ``/image`` and ``/crop`` are pictures. PERSON is a word that each page makes up.
+"""
+
+import asyncio
+import hmac
+import http
+import json
+import secrets
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import urlsplit
+
+import websockets.asyncio.server
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+LOOPBACK_NAMES = ('127.0.0.1', 'localhost', '::1')
+_FILES = Path(__file__).parent / 'web'
+_TYPES = {'.html': 'text/html; charset=utf-8', '.css': 'text/css; charset=utf-8',
+          '.js': 'text/javascript; charset=utf-8', '.jpg': 'image/jpeg'}
+# Nothing but the page's own files runs in it, and no other page frames it.
+_POLICY = ("default-src 'self'; img-src 'self' data:; style-src 'self' 'unsafe-inline'; "
+           "frame-ancestors 'self'")
+
+
+class Answer(NamedTuple):
+    """What a path has: a file's content, and the ending of its name."""
+
+    content: bytes
+    suffix: str
+    is_kept: bool  #: The browser may keep it
+
+
+class Board:
+    """What all open pages show: parts by name, as JSON. A page gets those that changed."""
+
+    def __init__(self) -> None:
+        self._parts: dict[str, str] = {}
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._pages: set[asyncio.Event] = set()
+
+    def show(self, parts: dict[str, Any]) -> None:
+        """Show these parts, from any thread."""
+        texts = {name: json.dumps([name, value]) for name, value in parts.items()}
+        # a part that is equal stays the same object
+        self._parts = {name: self._parts[name] if self._parts.get(name) == text else text
+                       for name, text in texts.items()}
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self._wake)
+
+    def _wake(self) -> None:
+        for event in self._pages:
+            event.set()
+
+    async def serve(self, connection: Any, do: Callable[[dict[str, Any]], None]) -> None:
+        """Send parts to one page until it closes, and do what it says, one by one."""
+        self._loop, event, sent = asyncio.get_running_loop(), asyncio.Event(), dict[str, str]()
+        self._pages.add(event)
+        event.set()
+
+        async def send() -> None:
+            while True:
+                await event.wait()
+                event.clear()
+                parts = self._parts
+                news = [text for name, text in parts.items() if sent.get(name) is not text]
+                sent.update(parts)
+                if news:
+                    await connection.send(f'[{",".join(news)}]')
+
+        sender = asyncio.create_task(send())
+        try:
+            async for text in connection:
+                message = json.loads(text)
+                if isinstance(message, dict):
+                    await asyncio.to_thread(do, message)
+        except (ConnectionClosed, ValueError):
+            pass
+        finally:
+            self._pages.discard(event)
+            sender.cancel()
+
+
+class Gate:
+    """The check of a server that listens at an address."""
+
+    def __init__(self, host: str):
+        self.is_local = host in LOOPBACK_NAMES
+        self.token = '' if self.is_local else secrets.token_urlsafe(24)
+
+    @property
+    def path(self) -> str:
+        """The path of the page: the token, if one is needed."""
+        return f'/{self.token}/' if self.token else '/'
+
+    def admit(self, request: Request) -> str | None:
+        """Return the path below the token; None where the request is refused."""
+        host = request.headers.get('Host', '')
+        origin = request.headers.get('Origin')
+        if self.is_local and urlsplit(f'//{host}').hostname not in LOOPBACK_NAMES:
+            return None
+        if origin is not None and urlsplit(origin).netloc != host:
+            return None
+        if request.headers.get('Upgrade', '').lower() == 'websocket' and origin is None:
+            return None
+        path = request.path.partition('?')[0]
+        if not self.token:
+            return path
+        first, _, rest = path.lstrip('/').partition('/')
+        is_known = hmac.compare_digest(first.encode(), self.token.encode())
+        return f'/{rest}' if is_known else None
+
+    @contextmanager
+    def guard(self, answer: Callable[[str], Answer | None],
+              talk: Callable[[Any, str], Any]) -> Iterator[None]:
+        """Let a viser server that starts inside of the block ask this gate first.
+
+        ``answer`` returns the picture of a path, ``talk`` talks with the page of a person.
+        viser 1.1.1 has no option for either. It looks up ``websockets.asyncio.server.serve`` when
+        it starts, so that name leads here for as long as the block lasts.
+        """
+        serve = websockets.asyncio.server.serve
+
+        def guarded(handler: Callable[[Any], Any], *args: Any,
+                    process_request: Callable[..., Any], **options: Any) -> Any:
+            async def handle(connection: Any) -> None:
+                kind, _, person = connection.request.path.lstrip('/').partition('/')
+                await (talk(connection, person) if kind == 'socket' else handler(connection))
+
+            async def process(connection: Any, request: Request) -> Any:
+                path = self.admit(request)
+                if path is None:
+                    return _response(http.HTTPStatus.FORBIDDEN, Answer(
+                        b'refused: use the address that the studio printed\n', '', False))
+                request.path = path
+                if request.headers.get('Upgrade', '').lower() == 'websocket':
+                    return None
+                if path.startswith('/scene/'):
+                    request.path = '/'
+                    return process_request(connection, request)
+                # a page of another site may not even learn which pictures there are
+                is_foreign = request.headers.get('Sec-Fetch-Site') == 'cross-site'
+                found = _file(path) or (None if is_foreign else
+                                        await asyncio.to_thread(answer, path))
+                if found is None:
+                    return _response(http.HTTPStatus.NOT_FOUND, Answer(b'not found\n', '', False))
+                return _response(http.HTTPStatus.OK, found)
+
+            return serve(handle, *args, process_request=process, **options)
+
+        websockets.asyncio.server.serve = guarded  # type: ignore[misc, assignment]
+        try:
+            yield
+        finally:
+            websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+def _file(path: str) -> Answer | None:
+    """Return one of the page's own files."""
+    name = path.lstrip('/') or 'studio.html'
+    if name not in ('studio.html', 'studio.css', 'studio.js'):
+        return None
+    return Answer((_FILES / name).read_bytes(), Path(name).suffix, False)
+
+
+def _response(status: http.HTTPStatus, answer: Answer) -> Response:
+    headers = Headers({
+        'Content-Type': _TYPES.get(answer.suffix, 'text/plain'),
+        'Content-Length': str(len(answer.content)), 'Content-Security-Policy': _POLICY,
+        'X-Content-Type-Options': 'nosniff',
+        'Cache-Control': 'private, max-age=3600' if answer.is_kept else 'no-store'})
+    return Response(status, status.phrase, headers, answer.content)
