@@ -30,20 +30,21 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.studio import edits
+from cliploc_ros.studio import edits, viewpoint
+from cliploc_ros.studio.context import draw_lines
 from cliploc_ros.studio.images import SELECTED_RGB
 from cliploc_ros.studio.panels import Actions, LandmarkPanel, MapPanel, TablePanel, ViewPanel
 from cliploc_ros.studio.recording import MIN_BOX_PX
 from cliploc_ros.studio.scene import Answers, Ellipsoids, Labels, ViewImage, draw_recording
+from cliploc_ros.studio.scene_panel import ScenePanel
 from cliploc_ros.studio.studio import Studio
-from cliploc_ros.studio.tool_panels import LivePanel, PlacesPanel, add_keyframes
+from cliploc_ros.studio.tool_panels import LivePanel, PlacesPanel
 
 if TYPE_CHECKING:
     from cliploc_ros.studio.live import LiveRelocalizer
 
 _REDRAW_INTERVAL_S = 0.05
-_GRID_M = 20.0
-_GIZMO = 0.4
+_GIZMO_PX = 90.0
 _LOOPBACK_NAMES = ('127.0.0.1', 'localhost', '::1')
 
 
@@ -57,6 +58,7 @@ class Page:
         self._stopped = threading.Event()
         self._drag = 0
         self._shown_picture: object = None
+        self._recorded: list[Any] = []
         self._build_scene()
         self._build_panels(live)
         self._redrawer = threading.Thread(target=self._redraw_always, daemon=True)
@@ -74,23 +76,27 @@ class Page:
 
     def _build_scene(self) -> None:
         scene, recording = self._server.scene, self._studio.recording
-        scene.add_grid('/floor', width=_GRID_M, height=_GRID_M, cell_size=0.5)
-        self._rest = Ellipsoids(scene, '/landmarks', self._clicked_landmark)
+        extent = self._studio.extent()
+        scene.set_up_direction(extent.up)
+        draw_lines(scene, extent)
+        self._rest = Ellipsoids(scene, '/landmarks', self._clicked_landmark, 0.2,
+                                has_outlines=True)
         self._selected = Ellipsoids(scene, '/selection', self._clicked_landmark, 0.7)
-        self._labels = Labels(scene)
-        self._gizmo = scene.add_transform_controls('/gizmo', scale=_GIZMO, visible=False)
+        self._labels = Labels(self._server, extent.up)
+        # of the same size at any distance, and visible inside large landmarks
+        self._gizmo = scene.add_transform_controls('/gizmo', scale=_GIZMO_PX, fixed=True,
+                                                   depth_test=False, visible=False)
         self._gizmo.on_update(self._dragged_gizmo)
         if recording is not None:
-            draw_recording(scene, recording.detections, lambda event, view: self._actions.act(
-                event, lambda: self._studio.show_view(view)))
+            self._recorded = draw_recording(
+                scene, recording.detections, lambda event, view: self._actions.act(
+                    event, lambda: self._studio.show_view(view)))
             self._answers = Answers(scene, recording.detections)
             self._image = ViewImage(scene, self._clicked_image, self._dragged_image)
-        centers = np.array([one.center for one in self._studio.document.landmarks.values()])
-        middle = np.median(centers, axis=0) if len(centers) else np.zeros(3)
-        spread = float(np.abs(centers - middle).max()) if len(centers) else 2.0
         camera = self._server.initial_camera
-        camera.look_at = tuple(middle)
-        camera.position = tuple(middle + np.array([-0.6, -0.6, 0.6]) * max(1.0, spread))
+        camera.fov, camera.up = viewpoint.FOV_RAD, tuple(extent.up)
+        camera.look_at = tuple(extent.middle)
+        camera.position = tuple(viewpoint.overview(extent))
 
     def _build_panels(self, live: 'LiveRelocalizer | None') -> None:
         gui, actions = self._server.gui, self._actions
@@ -103,11 +109,12 @@ class Page:
         if self._studio.recording is not None:
             with tools.add_tab('View'):
                 self._view = ViewPanel(actions)
+        with tools.add_tab('Scene'):
+            self._scene_panel = ScenePanel(actions, self._labels, self._recorded)
+            self._panels.append(self._scene_panel)
         with tools.add_tab('Places'):
             self._places = PlacesPanel(actions)
             self._panels.append(self._places)
-            if self._studio.layer is not None:
-                add_keyframes(actions, self._studio.layer)
         if live is not None:
             with tools.add_tab('Robot'):
                 self._panels.append(LivePanel(actions, live))
@@ -116,6 +123,9 @@ class Page:
     # ---- what a person does in the scene --------------------------------------------------------
 
     def _clicked_landmark(self, event: Any, landmark_id: str) -> None:
+        if self._scene_panel.is_double(event, landmark_id):
+            self._actions.look_at_selection(event)
+            return
         self._actions.select(event, landmark_id,
                              event.modifier == 'shift' or self._table.selects_several)
 
@@ -172,8 +182,10 @@ class Page:
         document = self._studio.document
         chosen = set(document.selection)
         pairs = tuple(document.landmarks.items())
-        self._rest.show([pair for pair in pairs if pair[0] not in chosen], None)
-        self._selected.show([pair for pair in pairs if pair[0] in chosen], SELECTED_RGB)
+        self._rest.show([pair for pair in pairs if pair[0] not in chosen],
+                        self._studio.color_of)
+        self._selected.show([pair for pair in pairs if pair[0] in chosen],
+                            lambda class_id: SELECTED_RGB)
         self._labels.show(document.landmarks, document.selection)
         self._show_gizmo()
         for panel in self._panels:

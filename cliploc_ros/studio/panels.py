@@ -20,10 +20,9 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.files.storage import replace_file
-from cliploc_ros.studio import edits
+from cliploc_ros.studio import edits, viewpoint
 from cliploc_ros.studio.landmark import LEAST_SEMI_AXIS_M
 from cliploc_ros.studio.map_file import ChangedOnDiskError
-from cliploc_ros.studio.scene import wxyz_of
 from cliploc_ros.studio.studio import Studio
 
 _ROWS = 8
@@ -98,14 +97,13 @@ class Actions:
             self.act(event, lambda: self.studio.toggle(landmark_id))
         else:
             self.act(event, lambda: self.studio.document.select([landmark_id]))
-        self.look_at_selection(event)
 
     def look_at_selection(self, event: Any) -> None:
-        """Let the camera of the person who selected orbit the selection."""
+        """Let the camera of the person who selected fly to the selected landmark."""
         with self.studio.document.lock:
-            selected = self.studio.document.selected
+            selected, up = self.studio.document.selected, self.studio.extent().up
         if event.client is not None and selected is not None:
-            event.client.camera.look_at = selected[1].center
+            viewpoint.fly_to(event.client, selected[1].center, selected[1].semi_axes.max(), up)
 
 
 def show_props(handle: Any, **props: Any) -> None:
@@ -332,6 +330,7 @@ class TablePanel:
     def _clicked(self, number: int, event: Any) -> None:
         if number < len(self._ids):
             self._actions.select(event, self._ids[number], self.selects_several)
+            self._actions.look_at_selection(event)
 
     def _turn_to(self, first: int) -> None:
         self._first = max(0, first)
@@ -400,16 +399,7 @@ class ViewPanel:
             return
         with self._studio.document.lock:
             pose, intrinsics = self._studio.map_from_camera, self._studio.camera
-        camera = event.client.camera
-        with event.client.atomic():
-            camera.position = pose[:3, 3]
-            camera.look_at = pose[:3, 3] + pose[:3, 2]
-            camera.up_direction = -pose[:3, 1]
-            camera.wxyz = wxyz_of(pose)
-            # the whole image, also where the panels leave a narrow gap
-            half = max(intrinsics.height / intrinsics.fy,
-                       intrinsics.width / intrinsics.fx / max(camera.aspect, 0.1)) / 2.0
-            camera.fov = 2.0 * float(np.arctan(1.1 * half))
+        viewpoint.look_through(event.client, pose, intrinsics)
 
     def show(self, picture: NDArray[np.uint8]) -> None:
         """Show the picture of the selected view."""
