@@ -109,7 +109,7 @@ def _thinned(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> Cloud:
 def draw_cloud(scene: viser.SceneApi, cloud: Cloud) -> viser.PointCloudHandle:
     """Draw the points, so large that they nearly touch."""
     return scene.add_point_cloud('/cloud', cloud.points, cloud.colors, precision='float32',
-                                 point_size=0.3 * cloud.side_m, point_shading='flat',
+                                 point_size=0.25 * cloud.side_m, point_shading='flat',
                                  point_shape='square')
 
 

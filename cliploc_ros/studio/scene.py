@@ -25,7 +25,7 @@ _MAX_LABELS = 60
 _MAX_LABEL_LENGTH, _SHORT_LABEL_LENGTH = 60, 24
 # Size of a letter and of a line with its margins, in a label of scale 1 [px].
 _LETTER_PX, _LINE_PX = 6.5, 22.0
-_MAX_CAMERAS = 1000
+_MAX_CAMERAS = 300
 _FRUSTUM_M = 0.08
 _KEYFRAME_RGB = (0, 150, 136)
 _VERDICT_RGB = {'accepted': (30, 170, 60), 'refused': (150, 150, 150), 'wrong': (220, 0, 0)}
@@ -81,23 +81,30 @@ class Ellipsoids:
                                       dtype=np.float32),
             'batched_positions': np.array([one.center for _, one in landmarks], dtype=np.float32),
             'batched_scales': np.array([self._scale * one.semi_axes for _, one in landmarks],
-                                       dtype=np.float32),
-            'batched_colors': linear([rgb_of(one.class_id) for _, one in landmarks])}
-        if self._handles:
+                                       dtype=np.float32)}
+        colors = np.array([rgb_of(one.class_id) for _, one in landmarks], dtype=np.uint8)
+        if not self._handles:
+            self._add(arrays, colors)
+        else:
             for handle in self._handles:
                 for key, value in arrays.items():
                     setattr(handle, key, value)
-            return
+            self._handles[0].batched_colors = linear(colors)
+            if self._has_outlines:
+                self._handles[1].batched_colors = colors
+
+    def _add(self, arrays: dict[str, Any], colors: NDArray[np.uint8]) -> None:
         add: Any = partial(self._scene.add_batched_meshes_simple, cast_shadow=False,
                            receive_shadow=False, **arrays)
-        body = add(self._name, _SPHERE.vertices, _SPHERE.faces, opacity=self._opacity)
+        body = add(self._name, _SPHERE.vertices, _SPHERE.faces, opacity=self._opacity,
+                   batched_colors=linear(colors))
         for modifier in (None, 'shift'):
             body.on_click(modifier=modifier)(self._clicked)
         self._handles = [body]
         if self._has_outlines:
-            # edges of empty triangles: a mesh of lines, one pixel wide at any scale
+            # edges of empty triangles: a mesh of lines, one pixel wide at any scale, and dark
             self._handles.append(add(f'{self._name}_outlines', *_RINGS, wireframe=True,
-                                     lod='off'))
+                                     lod='off', batched_colors=colors))
 
     def _clicked(self, event: Any) -> None:
         shown = self._shown
@@ -124,6 +131,7 @@ class Labels:
         @server.on_client_connect
         def _(client: viser.ClientHandle) -> None:
             client.camera.on_update(self._moved)
+            self._moved(client.camera)
 
     def show(self, landmarks: Landmarks, selection: Sequence[str]) -> None:
         """Show the labels of these landmarks; those of the selection come first."""
@@ -157,7 +165,7 @@ class Labels:
         order = np.lexsort([depths, np.array([key not in self._selection for key in keys])])
         taken = np.empty((0, 4))
         for row in order[depths[order] > 0.05]:
-            scale = round(float(np.clip(orbit_m / depths[row], 0.7, 1.0)), 1)
+            scale = round(float(np.clip(orbit_m / depths[row], 0.8, 1.1)), 1)
             half = 0.5 * scale * _LETTER_PX * (len(self._text(keys[row])) + 2)
             x, y = pixels[row]
             box = np.array([x - half, y - scale * _LINE_PX, x + half, y])
