@@ -96,7 +96,7 @@ class Page:
         camera = self._server.initial_camera
         camera.fov, camera.up = viewpoint.FOV_RAD, tuple(extent.up)
         camera.look_at = tuple(extent.middle)
-        camera.position = tuple(viewpoint.overview(extent))
+        camera.position = tuple(viewpoint.overview(extent, viewpoint.USUAL_ASPECT))
 
     def _build_panels(self, live: 'LiveRelocalizer | None') -> None:
         gui, actions = self._server.gui, self._actions

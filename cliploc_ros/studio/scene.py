@@ -24,7 +24,7 @@ from cliploc_ros.studio.viewpoint import pixels_of, wxyz_of
 _MAX_LABELS = 60
 _MAX_LABEL_LENGTH, _SHORT_LABEL_LENGTH = 60, 24
 # Size of a letter and of a line with its margins, in a label of scale 1 [px].
-_LETTER_PX, _LINE_PX = 6.5, 22.0
+_LETTER_PX, _LINE_PX = 6.5, 28.0
 _MAX_CAMERAS = 300
 _FRUSTUM_M = 0.08
 _KEYFRAME_RGB = (0, 150, 136)
@@ -169,8 +169,7 @@ class Labels:
             half = 0.5 * scale * _LETTER_PX * (len(self._text(keys[row])) + 2)
             x, y = pixels[row]
             box = np.array([x - half, y - scale * _LINE_PX, x + half, y])
-            is_inside = box[2] > 0 and box[3] > 0 and box[0] < camera.image_width and (
-                box[1] < camera.image_height)
+            is_inside = 0 < x < camera.image_width and 0 < y < camera.image_height
             if is_inside and not ((taken[:, :2] < box[2:]) & (taken[:, 2:] > box[:2])).all(
                     axis=1).any():
                 taken = np.concatenate([taken, box[None]])

@@ -28,6 +28,7 @@ class ScenePanel:
 
     def __init__(self, actions: Actions, labels: Labels, recording: Sequence[Any]):
         self._actions, self._studio, self._labels = actions, actions.studio, labels
+        self._recording = recording
         self._followed: int | None = None
         self._stops: threading.Event | None = None
         self._clicked: tuple[object, float] = None, 0.0
@@ -44,7 +45,7 @@ class ScenePanel:
             self._layer('Walls', [draw_walls(scene, studio.grid)])
         self._layer('Labels', [self])
         if recording:
-            self._layer('Cameras', recording)
+            self._cameras = self._layer('Cameras', recording)
         if studio.layer is not None:
             self._layer('Keyframes', draw_keyframes(scene, studio.layer), False)
         self._cloud_box.visible = False
@@ -106,7 +107,7 @@ class ScenePanel:
         elif event.client is not None:
             with self._studio.document.lock:
                 extent = self._studio.extent()
-            position = (viewpoint.from_above if to == _ABOVE else viewpoint.overview)(extent)
+            position = viewpoint.overview(extent, event.client.camera.aspect, to == _ABOVE)
             viewpoint.fly(event.client, position, extent.middle, extent.up)
 
     def _project(self, event: Any) -> None:
@@ -127,6 +128,9 @@ class ScenePanel:
         if studio.recording is None:
             return
         view = studio.view if self._follows.value else None
+        if (view is None) != (self._followed is None):  # the cameras nearby would be in the way
+            for handle in self._recording:
+                handle.visible = view is None and self._cameras.value
         if view is not None and view != self._followed:
             for client in self._actions.server.get_clients().values():
                 viewpoint.look_through(client, studio.map_from_camera, studio.camera)

@@ -27,7 +27,9 @@ _EXTENT_SHARE = 0.95
 _FLIGHT_STEPS, _STEP_S = 10, 0.03
 # A landmark that is looked at fills about a third of the page's height, unless it is small.
 _LEAST_RADIUS_M, _AROUND = 0.2, 2.5
-_LEAST_RISE, _PANELS = 0.35, 1.3
+_LEAST_RISE = 0.35
+#: Of a page between its panels, before it tells.
+USUAL_ASPECT = 0.8
 
 
 class Extent(NamedTuple):
@@ -63,7 +65,8 @@ def extent_of(centers: NDArray[np.float64], poses: NDArray[np.float64]) -> Exten
     points = np.concatenate([centers, poses[:, :3, 3]])
     if not len(points):
         points = np.zeros((1, 3))
-    middle = np.median(centers if len(centers) else points, axis=0)
+    share = np.array([1.0 - _EXTENT_SHARE, _EXTENT_SHARE])
+    middle = np.quantile(centers if len(centers) else points, share, axis=0).mean(axis=0)
     distances = np.linalg.norm(points - middle, axis=1)
     # the floor of a map with z up is its z = 0; of another one nothing is known but its points
     floor_m = 0.0 if up[2] == 1.0 else float(np.quantile(points @ up, 0.02)) - 0.3
@@ -75,18 +78,16 @@ def extent_of(centers: NDArray[np.float64], poses: NDArray[np.float64]) -> Exten
                   float((points @ up).max()), aside / np.linalg.norm(aside))
 
 
-def overview(extent: Extent) -> NDArray[np.float64]:
-    """Return the position (3,) that sees all of a map, from the side of its cameras."""
-    direction = extent.aside + 0.8 * extent.up
-    distance = _PANELS * extent.radius_m / np.tan(FOV_RAD / 2.0)
+def overview(extent: Extent, aspect: float, is_from_above: bool = False) -> NDArray[np.float64]:
+    """Return the position (3,) that sees all of a map, from the side of its cameras or from above.
+
+    ``aspect`` is the width of the page by its height. From above, y is up on the page.
+    """
+    # the camera orbits about the vertical, so that it may look along it almost only
+    direction = (extent.upright @ [0.0, -1e-3, 1.0] if is_from_above
+                 else extent.aside + 0.8 * extent.up)
+    distance = extent.radius_m / np.tan(FOV_RAD / 2.0) / min(1.0, max(aspect, 0.1))
     return np.asarray(extent.middle + distance * direction / np.linalg.norm(direction))
-
-
-def from_above(extent: Extent) -> NDArray[np.float64]:
-    """Return the position (3,) that sees all of a map from above, y up on the page."""
-    # the camera orbits about the vertical, so that it looks along it almost only
-    away = extent.upright @ [0.0, -1e-3, 1.0]
-    return np.asarray(extent.middle + _PANELS * extent.radius_m / np.tan(FOV_RAD / 2.0) * away)
 
 
 def fly_to(client: Any, center: NDArray[np.float64], radius_m: float, up: NDArray[np.float64]
