@@ -86,7 +86,7 @@ def overview(extent: Extent, aspect: float, is_from_above: bool = False) -> NDAr
     # the camera orbits about the vertical, so that it may look along it almost only
     direction = (extent.upright @ [0.0, -1e-3, 1.0] if is_from_above
                  else extent.aside + 0.8 * extent.up)
-    distance = extent.radius_m / np.tan(FOV_RAD / 2.0) / min(1.0, max(aspect, 0.1))
+    distance = 1.15 * extent.radius_m / np.tan(FOV_RAD / 2.0) / min(1.0, max(aspect, 0.1))
     return np.asarray(extent.middle + distance * direction / np.linalg.norm(direction))
 
 

@@ -130,7 +130,7 @@ def test_the_gizmo_is_dragged(person, studio):
     person.select(document, 'mug_2')
     before = document.landmarks['mug_2']
     camera = next(iter(server.get_clients().values())).camera
-    wait_for(lambda: np.allclose(camera.look_at, before.center, atol=1e-2), 'looking at it')
+    wait_for(lambda: np.allclose(camera.look_at, before.center, atol=1e-2), 'flying to it')
     near = before.center + np.array([-0.9, -0.9, 0.7])
     camera.position, camera.look_at = near, before.center
     # the camera reports where it is: another report shows that the browser moved it
@@ -138,7 +138,8 @@ def test_the_gizmo_is_dragged(person, studio):
     wait_for(lambda: np.linalg.norm(camera.position - near) < 0.2, 'coming near')
     person.picture('gizmo')
     up = np.array([0.0, 0.0, 1.0])
-    grip, goal = (on_screen(person, server, before.center + height * up) for height in (0.3, 0.5))
+    # the gizmo has the same size on the page at any distance: its arrow begins at the centre
+    grip, goal = (on_screen(person, server, before.center + height * up) for height in (0.1, 0.3))
     drag(person, grip, goal)
     wait_for(lambda: document.landmarks['mug_2'].center[2] > before.center[2] + 0.1, 'the drag')
     person.page.mouse.up()
@@ -148,6 +149,19 @@ def test_the_gizmo_is_dragged(person, studio):
     person.click(re.compile('^Undo'))
     wait_for(lambda: document.landmarks['mug_2'] == before, 'undo')
     assert document.to_undo is None
+
+
+def test_a_double_click_flies_to_a_landmark(person, studio):
+    """A click selects and moves nothing; the second one flies, though the gizmo is there now."""
+    document, server = studio.document, studio.server
+    one = document.landmarks['mug_2']
+    camera = next(iter(server.get_clients().values())).camera
+    start = camera.position
+    person.page.mouse.dblclick(*on_screen(person, server, one.center))
+    wait_for(lambda: document.selection == ('mug_2',), 'the selection')
+    wait_for(lambda: np.allclose(camera.look_at, one.center, atol=1e-3), 'flying to it')
+    assert np.linalg.norm(camera.position - one.center) < 0.5 * np.linalg.norm(
+        start - one.center)
 
 
 def test_the_exported_page_opens_without_a_server(chromium, person, studio, path):
