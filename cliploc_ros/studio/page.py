@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 
 _REDRAW_INTERVAL_S = 0.05
 _GIZMO_PX = 90.0
+# The selection is drawn around its landmarks, so much larger.
+_AROUND = 1.03
 _LOOPBACK_NAMES = ('127.0.0.1', 'localhost', '::1')
 
 
@@ -79,9 +81,9 @@ class Page:
         extent = self._studio.extent()
         scene.set_up_direction(extent.up)
         draw_lines(scene, extent)
-        self._rest = Ellipsoids(scene, '/landmarks', self._clicked_landmark, 0.2,
-                                has_outlines=True)
-        self._selected = Ellipsoids(scene, '/selection', self._clicked_landmark, 0.7)
+        self._all = Ellipsoids(scene, '/landmarks', self._clicked_landmark, 0.2,
+                               has_outlines=True)
+        self._selected = Ellipsoids(scene, '/selection', self._clicked_landmark, 0.6, _AROUND)
         self._labels = Labels(self._server, extent.up)
         # of the same size at any distance, and visible inside large landmarks
         self._gizmo = scene.add_transform_controls('/gizmo', scale=_GIZMO_PX, fixed=True,
@@ -180,11 +182,9 @@ class Page:
 
     def _redraw(self) -> None:
         document = self._studio.document
-        chosen = set(document.selection)
-        pairs = tuple(document.landmarks.items())
-        self._rest.show([pair for pair in pairs if pair[0] not in chosen],
-                        self._studio.color_of)
-        self._selected.show([pair for pair in pairs if pair[0] in chosen],
+        # all of them: a second click comes with the number that the first one's picture has
+        self._all.show(list(document.landmarks.items()), self._studio.color_of)
+        self._selected.show([(key, document.landmarks[key]) for key in document.selection],
                             lambda class_id: SELECTED_RGB)
         self._labels.show(document.landmarks, document.selection)
         self._show_gizmo()

@@ -18,7 +18,7 @@ from cliploc_ros.studio.panels import Actions
 from cliploc_ros.studio.scene import Labels, draw_keyframes
 
 # Between the pictures of the film, and between the clicks of a double click [s].
-_PICTURE_S, DOUBLE_CLICK_S = 0.2, 0.5
+_PICTURE_S, _DOUBLE_CLICK_S = 0.2, 0.6
 _ALL, _ABOVE, _SELECTION = 'everything', 'from above', 'selection'
 _PERSPECTIVE, _ORTHOGRAPHIC = 'perspective', 'orthographic'
 
@@ -118,7 +118,7 @@ class ScenePanel:
         """Return whether this click on a landmark is the second one of a double click."""
         key, now = (event.client_id, landmark_id), time.monotonic()
         before, self._clicked = self._clicked, (key, now)
-        return before[0] == key and now - before[1] < DOUBLE_CLICK_S
+        return before[0] == key and now - before[1] < _DOUBLE_CLICK_S
 
     # ---- the recording as a film ----------------------------------------------------------------
 

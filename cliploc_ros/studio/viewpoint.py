@@ -29,7 +29,7 @@ _FLIGHT_STEPS, _STEP_S = 10, 0.03
 _LEAST_RADIUS_M, _AROUND = 0.2, 2.5
 _LEAST_RISE = 0.35
 #: Of a page between its panels, before it tells.
-USUAL_ASPECT = 0.8
+USUAL_ASPECT = 0.6
 
 
 class Extent(NamedTuple):

@@ -15,6 +15,7 @@ from studio_map import ASSETS
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.studio.images import outlines_of
+from cliploc_ros.studio.viewpoint import overview
 
 # Software rendering needs an idle machine.
 pytestmark = [pytest.mark.clock, pytest.mark.needs('viser', 'playwright', 'chromium')]
@@ -152,16 +153,17 @@ def test_the_gizmo_is_dragged(person, studio):
 
 
 def test_a_double_click_flies_to_a_landmark(person, studio):
-    """A click selects and moves nothing; the second one flies, though the gizmo is there now."""
+    """A click selects and moves nothing; the second one flies, whatever the first one changed."""
     document, server = studio.document, studio.server
     one = document.landmarks['mug_2']
     camera = next(iter(server.get_clients().values())).camera
-    start = camera.position
+    person.page.keyboard.press('h')
+    start = overview(studio.extent(), camera.aspect)
+    wait_for(lambda: np.allclose(camera.position, start, atol=0.05), 'flying to see everything')
     person.page.mouse.dblclick(*on_screen(person, server, one.center))
     wait_for(lambda: document.selection == ('mug_2',), 'the selection')
     wait_for(lambda: np.allclose(camera.look_at, one.center, atol=1e-3), 'flying to it')
-    assert np.linalg.norm(camera.position - one.center) < 0.5 * np.linalg.norm(
-        start - one.center)
+    assert np.linalg.norm(camera.position - one.center) < 2.0
 
 
 def test_the_exported_page_opens_without_a_server(chromium, person, studio, path):
