@@ -217,7 +217,7 @@ def check_depth_unit(depths_m: NDArray[np.float32], where: str) -> None:
 
 
 def points_in_color(depth: DepthImage, camera: Camera, step: int
-                     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+                    ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Return the colour pixels (2, p) of the depth pixels that have a value, and the values."""
     height, width = depth.depths_m.shape
     v, u = np.mgrid[0:height:step, 0:width:step]

@@ -68,8 +68,9 @@ class Page:
         self._actions.changed.set()
 
     def stop(self) -> None:
-        """Stop the search of places, and redrawing."""
+        """Stop the search of places, the film, and redrawing."""
         self._places.search.stop()
+        self._scene_panel.stop()
         self._stopped.set()
         self._actions.changed.set()
         self._redrawer.join()

@@ -122,8 +122,7 @@ class Labels:
         self._server, self._up = server, up
         self._handles: dict[str, tuple[Landmark, Any]] = {}
         self._count = 0
-        self._landmarks: Landmarks = {}
-        self._selection: Sequence[str] = ()
+        self._shown: tuple[Landmarks, Sequence[str]] = {}, ()
         self._camera: Any = None
         self._lock, self._is_stale = threading.Lock(), False
         self.is_shown = True
@@ -135,7 +134,7 @@ class Labels:
 
     def show(self, landmarks: Landmarks, selection: Sequence[str]) -> None:
         """Show the labels of these landmarks; those of the selection come first."""
-        self._landmarks, self._selection = landmarks, selection
+        self._shown = landmarks, selection
         self._lay_out()
 
     def _moved(self, camera: Any) -> None:
@@ -148,25 +147,30 @@ class Labels:
         while self._is_stale and self._lock.acquire(blocking=False):
             try:
                 self._is_stale = False
+                landmarks, selection = self._shown
+                texts = {key: _shortened(one.label, key in selection)
+                         for key, one in landmarks.items()}
                 if self._camera is not None:
+                    scales = dict(self._with_room(landmarks, texts, selection))
                     with self._server.atomic():
-                        self._set(dict(self._with_room()))
+                        self._set(landmarks, texts, scales)
             finally:
                 self._lock.release()
 
-    def _with_room(self) -> Iterator[tuple[str, float]]:
+    def _with_room(self, landmarks: Landmarks, texts: dict[str, str], selection: Sequence[str]
+                   ) -> Iterator[tuple[str, float]]:
         """Yield the landmarks whose labels do not overlap, and the labels' sizes."""
-        landmarks, camera = self._landmarks, self._camera
+        camera = self._camera
         if not (self.is_shown and landmarks):
             return
         keys = list(landmarks)
         pixels, depths = pixels_of(camera, [self._place(landmarks[key]) for key in keys])
         orbit_m = float(np.linalg.norm(camera.look_at - camera.position))
-        order = np.lexsort([depths, np.array([key not in self._selection for key in keys])])
+        order = np.lexsort([depths, np.array([key not in selection for key in keys])])
         taken = np.empty((0, 4))
         for row in order[depths[order] > 0.05]:
             scale = round(float(np.clip(orbit_m / depths[row], 0.8, 1.1)), 1)
-            half = 0.5 * scale * _LETTER_PX * (len(self._text(keys[row])) + 2)
+            half = 0.5 * scale * _LETTER_PX * (len(texts[keys[row]]) + 2)
             x, y = pixels[row]
             box = np.array([x - half, y - scale * _LINE_PX, x + half, y])
             is_inside = 0 < x < camera.image_width and 0 < y < camera.image_height
@@ -177,14 +181,15 @@ class Labels:
             if len(taken) >= _MAX_LABELS:
                 return
 
-    def _set(self, scales: dict[str, float]) -> None:
-        for key in self._handles.keys() - self._landmarks.keys():
+    def _set(self, landmarks: Landmarks, texts: dict[str, str], scales: dict[str, float]
+             ) -> None:
+        for key in self._handles.keys() - landmarks.keys():
             self._handles.pop(key)[1].remove()
         for key in self._handles.keys() - scales.keys():
             if self._handles[key][1].visible:
                 self._handles[key][1].visible = False
         for key, scale in scales.items():
-            one, text = self._landmarks[key], self._text(key)
+            one, text = landmarks[key], texts[key]
             old, handle = self._handles.get(key, (None, None))
             if handle is None:
                 # ids may hold any characters, names of nodes not
@@ -202,10 +207,10 @@ class Labels:
         """Return where its label begins: at its top."""
         return one.center + float(np.linalg.norm(one.basis.T @ self._up)) * self._up
 
-    def _text(self, key: str) -> str:
-        label = self._landmarks[key].label
-        length = _MAX_LABEL_LENGTH if key in self._selection else _SHORT_LABEL_LENGTH
-        return label if len(label) <= length else f'{label[:length - 1]}…'
+
+def _shortened(label: str, is_selected: bool) -> str:
+    length = _MAX_LABEL_LENGTH if is_selected else _SHORT_LABEL_LENGTH
+    return label if len(label) <= length else f'{label[:length - 1]}…'
 
 
 class ViewImage:

@@ -85,11 +85,14 @@ class ScenePanel:
     def _load(self) -> None:
         """Read the cloud, which takes seconds, while people use the page."""
         studio = self._studio
+        with studio.document.lock:
+            extent = studio.extent()
         try:
             cloud = find_cloud(None if studio.recording is None else studio.recording.detections,
-                               studio.images, studio.layer, studio.extent())
+                               studio.images, studio.layer, extent)
         except CliplocError as error:
-            self._actions.notify(None, 'No surfaces', str(error), 'red')
+            self._cloud_box.label, self._cloud_box.hint = 'No surfaces', str(error)
+            self._cloud_box.visible = self._cloud_box.disabled = True
             return
         if cloud is not None:
             self._cloud.append(draw_cloud(self._actions.server.scene, cloud))
@@ -121,6 +124,11 @@ class ScenePanel:
         return before[0] == key and now - before[1] < _DOUBLE_CLICK_S
 
     # ---- the recording as a film ----------------------------------------------------------------
+
+    def stop(self) -> None:
+        """Stop the film."""
+        if self._stops is not None:
+            self._stops.set()
 
     def show(self) -> None:
         """Let all browsers look from the selected view, if they follow it."""
