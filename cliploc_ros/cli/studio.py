@@ -64,6 +64,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--device', default='auto', help='of CLIP (%(default)s)')
     parser.add_argument('--vocabulary', type=Path, metavar='FILE',
                         help='phrases by class (YAML), besides the shipped ones')
+    parser.add_argument('--occupancy-grid', type=Path, metavar='FILE',
+                        help="show the walls: the YAML file of nav2_map_server, in the map's "
+                        'coordinate frame')
     parser.add_argument('--port', type=within(0, 65535), default=8080, metavar='N',
                         help='the next free one from this on (%(default)s)')
     parser.add_argument('--host', default=_LOOPBACK, metavar='ADDRESS',
@@ -116,6 +119,7 @@ def follow(options: argparse.Namespace) -> 'AbstractContextManager[LiveRelocaliz
 
 def open_studio(options: argparse.Namespace) -> 'Studio':
     """Return the studio that the command line asks for."""
+    from cliploc_ros.core.map.occupancy_grid import read_occupancy_grid
     from cliploc_ros.datasets.bag_frames import BagTopics
     from cliploc_ros.datasets.folders import find_layout
     from cliploc_ros.datasets.map_recording import load_recording
@@ -146,7 +150,9 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     document = Document(options.map or next(
         path for path in map(Path, names) if not path.exists()))
     layer = read_layer(document.path, document.to_map(), None) if document.landmarks else None
-    return Studio(document, recording, images, finder, layer)
+    grid = (None if options.occupancy_grid is None
+            else read_occupancy_grid(options.occupancy_grid, document.frame_id))
+    return Studio(document, recording, images, finder, layer, grid)
 
 
 def _cameras(options: argparse.Namespace, detections: 'PosedDetections | None') -> list[str]:

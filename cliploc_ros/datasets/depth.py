@@ -152,7 +152,7 @@ def depths_of_boxes(depth: DepthImage, camera: Camera, bboxes_xyxy: NDArray[np.f
     spreads_m : ndarray (n,) float32
         Half the distance between the 16th and 84th percentile there [m].
     """
-    pixels, values = _points_in_color(depth, camera, _STEP)
+    pixels, values = points_in_color(depth, camera, _STEP)
     depths = np.full(len(bboxes_xyxy), np.nan, dtype=np.float32)
     spreads = depths.copy()
     density = depth.depths_m.size / (camera.width * camera.height) / _STEP**2
@@ -186,7 +186,7 @@ def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float
         nothing was measured, and at edges, where a neighbour is much further away.
     """
     height, width = depth.depths_m.shape
-    seen, values = _points_in_color(depth, camera, 1)
+    seen, values = points_in_color(depth, camera, 1)
     places = np.round(seen * [[width / camera.width], [height / camera.height]]).astype(np.int64)
     inside = ((places >= 0) & (places < [[width], [height]])).all(axis=0)
     near = np.full((height, width), np.inf, dtype=np.float32)
@@ -216,8 +216,8 @@ def check_depth_unit(depths_m: NDArray[np.float32], where: str) -> None:
             f'{greatest:.0f} m: wrong unit? give --depth-unit (0.001 for mm, 0.0002 for TUM)')
 
 
-def _points_in_color(depth: DepthImage, camera: Camera, step: int
-                     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+def points_in_color(depth: DepthImage, camera: Camera, step: int
+                    ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Return the colour pixels (2, p) of the depth pixels that have a value, and the values."""
     height, width = depth.depths_m.shape
     v, u = np.mgrid[0:height:step, 0:width:step]

@@ -170,7 +170,7 @@ def folder_frames(folder: Path, files: Sequence[ImageFile], poses: Poses,
             pose = poses.pose_at(file.stamp_ns)
             if is_wanted(place, file.stamp_ns, pose):
                 yield RawFrame(place, file.stamp_ns, pose, partial(read_color, file),
-                               None if file.depth is None else partial(_read_depth, file, form))
+                               None if file.depth is None else partial(read_depth, file, form))
     return Frames(folder, len(files), read_raw,
                   varies=any(file.camera != files[0].camera for file in files))
 
@@ -224,7 +224,8 @@ class _Video:
 _open_video = lru_cache(1)(_Video)
 
 
-def _read_depth(file: ImageFile, form: DepthFormat) -> DepthImage:
+def read_depth(file: ImageFile, form: DepthFormat) -> DepthImage:
+    """Return the depth image of a file that has one; DatasetError: it cannot be read."""
     counts = cv2.imread(str(file.depth), cv2.IMREAD_UNCHANGED)
     if counts is None:
         raise DatasetError(f'{file.depth} cannot be read as a depth image')

@@ -19,15 +19,13 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.files.storage import replace_file
-from cliploc_ros.studio import edits
+from cliploc_ros.studio import edits, viewpoint
 from cliploc_ros.studio.edits import EditError
 from cliploc_ros.studio.images import Outline, outlines_of
 from cliploc_ros.studio.landmark import Landmark, shape_fields
 from cliploc_ros.studio.map_file import ChangedOnDiskError
-from cliploc_ros.studio.panels import Actions, fly_to
-from cliploc_ros.studio.scene import wxyz_of
+from cliploc_ros.studio.panels import Actions
 from cliploc_ros.studio.sightings import SightingFinder, crop_of
-from cliploc_ros.studio.studio import color_of
 from cliploc_ros.studio.tool_panels import LivePanel, PlacesPanel
 from cliploc_ros.studio.web import Answer
 
@@ -78,9 +76,9 @@ class Desk:
             self._actions.act(lambda: self._commands[name](message))
             if name in ('next', 'previous', 'accept', 'review_delete', 'create') or (
                     name in ('select', 'select_at') and not message.get('joins')):
-                self._fly(person)
-        elif name in ('fly', 'look_through', 'look_at_robot'):
-            self._actions.act(lambda: getattr(self, f'_{name}')(person))
+                self._look(person, 'fly')
+        elif isinstance(name, str):
+            self._look(person, name)
 
     def _do_slowly(self, name: str) -> None:
         with self._actions.busy(name):
@@ -199,31 +197,25 @@ class Desk:
 
     # ---- the camera of a person -----------------------------------------------------------------
 
-    def _fly(self, person: str) -> None:
-        if (selected := self._studio.document.selected) is not None:
-            fly_to(self._find_client(person), selected[1])
+    def _look(self, person: str, name: str) -> None:
+        """Move a person's camera, which takes part of a second, while the next message is done."""
+        client, actions, studio = self._find_client(person), self._actions, self._studio
 
-    def _look_at_robot(self, person: str) -> None:
-        client = self._find_client(person)
-        if client is not None and self.robot is not None and self.robot.position is not None:
-            client.camera.look_at = self.robot.position
+        def look_through() -> None:
+            if studio.recording is not None:
+                viewpoint.look_through(client, studio.map_from_camera, studio.camera)
 
-    def _look_through(self, person: str) -> None:
-        """Put a person's camera where the selected view was taken."""
-        client = self._find_client(person)
-        if client is None or self._studio.recording is None:
-            return
-        pose, intrinsics, camera = (self._studio.map_from_camera, self._studio.camera,
-                                    client.camera)
-        with client.atomic():
-            camera.position = pose[:3, 3]
-            camera.look_at = pose[:3, 3] + pose[:3, 2]
-            camera.up_direction = -pose[:3, 1]
-            camera.wxyz = wxyz_of(pose)
-            # the whole image, also in a narrow scene
-            half = max(intrinsics.height / intrinsics.fy,
-                       intrinsics.width / intrinsics.fx / max(camera.aspect, 0.1)) / 2.0
-            camera.fov = 2.0 * float(np.arctan(1.1 * half))
+        def look_at_robot() -> None:
+            if client is not None and self.robot is not None and self.robot.position is not None:
+                client.camera.look_at = self.robot.position
+
+        looks: dict[str, Callable[[], None]] = {
+            'fly': lambda: actions.look_at_selection(client),
+            'overview': lambda: actions.look_at_all(client, False),
+            'from_above': lambda: actions.look_at_all(client, True),
+            'look_through': look_through, 'look_at_robot': look_at_robot}
+        if client is not None and name in looks:
+            threading.Thread(target=looks[name], daemon=True).start()
 
     # ---- what the page shows --------------------------------------------------------------------
 
@@ -232,7 +224,7 @@ class Desk:
         studio = self._studio
         found = {
             'file': self._file_part(),
-            'rows': [[*row, '#{:02x}{:02x}{:02x}'.format(*color_of(row.class_id)),
+            'rows': [[*row, '#{:02x}{:02x}{:02x}'.format(*studio.color_of(row.class_id)),
                       row.landmark_id in studio.hidden] for row in studio.rows()],
             'selection': self._selection_part(),
             'review': {**studio.review.counts(), 'running': self._actions.running},

@@ -19,8 +19,9 @@ from cliploc_ros.core.geometry.ellipsoid import (
 )
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.datasets.bag_frames import BagTopics, bag_images
+from cliploc_ros.datasets.depth import DepthImage
 from cliploc_ros.datasets.folders import FolderOptions, find_layout, read_folder
-from cliploc_ros.datasets.frames import read_color, undistorted
+from cliploc_ros.datasets.frames import read_color, read_depth, undistorted
 from cliploc_ros.datasets.map_recording import MapRecording
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.mapping.posed_detections import PosedDetections, group_cameras, names_of_group
@@ -40,13 +41,16 @@ class Images:
     """The images of a folder or a recording, taken at stamps (F,) [ns].
 
     ``read`` returns image and camera of a place, 0 to F - 1; ``cameras`` are the names (F,) of
-    several cameras; of a folder, whose stamps differ, the stamp is enough.
+    several cameras; of a folder, whose stamps differ, the stamp is enough. ``read_depth`` returns
+    the depth image of a place, or None.
     """
 
     def __init__(self, stamps_ns: NDArray[np.int64],
                  read: Callable[[int], tuple[NDArray[np.uint8], Camera]],
-                 cameras: Sequence[str] = ()):
+                 cameras: Sequence[str] = (),
+                 read_depth: Callable[[int], DepthImage | None] = lambda place: None):
         self._stamps_ns = stamps_ns
+        self._read_raw, self._read_depth = read, read_depth
         self._cameras = np.array(cameras, dtype=np.str_)
         self._lock = threading.Lock()  # readers of recordings are for one thread at a time
         self._read: Callable[[int, Camera | None], NDArray[np.uint8]] = lru_cache(_IMAGES_KEPT)(
@@ -58,15 +62,26 @@ class Images:
 
         It is as a pinhole shows it, such as that of the boxes. None without one.
         """
+        place = self._place(stamp_s, camera)
+        with self._lock:
+            return None if place is None else self._read(place, pinhole)
+
+    def depth_near(self, stamp_s: float, camera: str = ''
+                   ) -> tuple[NDArray[np.uint8], Camera, DepthImage] | None:
+        """Return a camera's image at a time [s], distorted as it is, with its depth image."""
+        place = self._place(stamp_s, camera)
+        with self._lock:
+            depth = None if place is None else self._read_depth(place)
+            return None if place is None or depth is None else (*self._read_raw(place), depth)
+
+    def _place(self, stamp_s: float, camera: str) -> int | None:
         places = (np.nonzero(self._cameras == camera)[0] if len(self._cameras)
                   else np.arange(len(self._stamps_ns)))
         if not len(places):
             return None
         offsets = np.abs(self._stamps_ns[places] - round(stamp_s * NS_PER_S))
         nearest = int(np.argmin(offsets))
-        with self._lock:
-            return (self._read(int(places[nearest]), pinhole)
-                    if offsets[nearest] <= _MAX_DELAY_NS else None)
+        return int(places[nearest]) if offsets[nearest] <= _MAX_DELAY_NS else None
 
 
 def images_of_recording(recording: MapRecording, cameras: Sequence[str]) -> Images | None:
@@ -87,9 +102,12 @@ def open_images(path: Path, topics: BagTopics, cameras: Sequence[str] = ('',),
     if not path.exists():
         raise DatasetError(f'{path}: no such folder or recording')
     if (layout := find_layout(path, folder.layout)) is not None:
-        files = layout.read(path, folder).files
+        capture = layout.read(path, folder)
+        files = capture.files
         return Images(np.array([one.stamp_ns for one in files], dtype=np.int64),
-                      lambda place: read_color(files[place]))
+                      lambda place: read_color(files[place]), (),
+                      lambda place: (None if files[place].depth is None
+                                     else read_depth(files[place], capture.depth)))
     of_cameras = [bag_images(path, topics.of_camera(name)) for name in cameras]
     places = [(one, place) for one in of_cameras for place in range(len(one.times_ns))]
     names = np.repeat(np.array(cameras), [len(one.times_ns) for one in of_cameras])

@@ -21,21 +21,23 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.studio import edits
+from cliploc_ros.studio import edits, viewpoint
+from cliploc_ros.studio.context import draw_lines
 from cliploc_ros.studio.desk import Desk
 from cliploc_ros.studio.panels import Actions
 from cliploc_ros.studio.scene import Answers, Ellipsoids, Labels, ViewImage, draw_recording
+from cliploc_ros.studio.scene_panel import ScenePanel
 from cliploc_ros.studio.studio import SELECTED_RGB, Studio
-from cliploc_ros.studio.tool_panels import add_keyframes
 from cliploc_ros.studio.web import Answer, Board, Gate
 
 if TYPE_CHECKING:
     from cliploc_ros.studio.live import LiveRelocalizer
 
 _REDRAW_INTERVAL_S = 0.05
-_GRID_M = 20.0
-_GIZMO = 0.4
 _BLANK = 70
+_GIZMO_PX = 90.0
+# The selection is drawn around its landmarks, so much larger.
+_AROUND = 1.03
 
 
 class Page:
@@ -48,18 +50,18 @@ class Page:
         self._stopped = threading.Event()
         self._drag = 0
         self._shown_view = -1
+        self._recorded: list[Any] = []
         self._build_scene()
         self.board = Board()
         self.desk = Desk(self._actions, self._client_of, live)
-        if studio.layer is not None:
-            add_keyframes(self._actions, studio.layer)
         self._redrawer = threading.Thread(target=self._redraw_always, daemon=True)
         self._redrawer.start()
         self._actions.changed.set()
 
     def stop(self) -> None:
-        """Stop the searches, and redrawing."""
+        """Stop the searches, the film, and redrawing."""
         self.desk.stop()
+        self._scene_panel.stop()
         self._stopped.set()
         self._actions.changed.set()
         self._redrawer.join()
@@ -78,30 +80,37 @@ class Page:
 
     def _build_scene(self) -> None:
         scene, recording = self._server.scene, self._studio.recording
-        scene.add_grid('/floor', width=_GRID_M, height=_GRID_M, cell_size=0.5)
-        self._rest = Ellipsoids(scene, '/landmarks', self._clicked_landmark)
-        self._selected = Ellipsoids(scene, '/selection', self._clicked_landmark, 0.7)
-        self._labels = Labels(scene)
-        self._gizmo = scene.add_transform_controls('/gizmo', scale=_GIZMO, visible=False)
+        extent = self._studio.extent()
+        scene.set_up_direction(extent.up)
+        draw_lines(scene, extent)
+        self._all = Ellipsoids(scene, '/landmarks', self._clicked_landmark, 0.2,
+                               has_outlines=True)
+        self._selected = Ellipsoids(scene, '/selection', self._clicked_landmark, 0.6, _AROUND)
+        self._labels = Labels(self._server, extent.up)
+        # of the same size at any distance, and visible inside large landmarks
+        self._gizmo = scene.add_transform_controls('/gizmo', scale=_GIZMO_PX, fixed=True,
+                                                   depth_test=False, visible=False)
         self._gizmo.on_update(self._dragged_gizmo)
         if recording is not None:
-            draw_recording(scene, recording.detections, lambda event, view: self._actions.act(
-                lambda: self._studio.show_view(view)))
+            self._recorded = draw_recording(
+                scene, recording.detections,
+                lambda event, view: self._actions.act(lambda: self._studio.show_view(view)))
             self._answers = Answers(scene, recording.detections)
             self._image = ViewImage(scene)
-        centers = np.array([one.center for one in self._studio.document.landmarks.values()])
-        middle = np.median(centers, axis=0) if len(centers) else np.zeros(3)
-        spread = float(np.abs(centers - middle).max()) if len(centers) else 2.0
         camera = self._server.initial_camera
-        camera.look_at = tuple(middle)
-        camera.position = tuple(middle + np.array([-0.6, -0.6, 0.6]) * max(1.0, spread))
+        camera.fov, camera.up = viewpoint.FOV_RAD, tuple(extent.up)
+        camera.look_at = tuple(extent.middle)
+        camera.position = tuple(viewpoint.overview(extent, viewpoint.USUAL_ASPECT))
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._server.gui.main_panel.minimize()
+        self._scene_panel = ScenePanel(self._actions, self._labels, self._recorded)
 
     # ---- what a person does in the scene --------------------------------------------------------
 
     def _clicked_landmark(self, event: Any, landmark_id: str) -> None:
-        if event.modifier == 'shift':
+        if self._scene_panel.is_double(event, landmark_id):
+            self._actions.look_at_selection(event.client)
+        elif event.modifier == 'shift':
             self._actions.act(lambda: self._studio.toggle(landmark_id))
         else:
             self._actions.act(lambda: self._studio.document.select([landmark_id]))
@@ -135,12 +144,14 @@ class Page:
 
     def _redraw(self) -> None:
         document = self._studio.document
-        chosen = set(document.selection)
-        pairs = tuple(self._studio.shown().items())
-        self._rest.show([pair for pair in pairs if pair[0] not in chosen], None)
-        self._selected.show([pair for pair in pairs if pair[0] in chosen], SELECTED_RGB)
-        self._labels.show(dict(pairs), [key for key in document.selection if key in dict(pairs)])
+        shown = self._studio.shown()
+        chosen = [key for key in document.selection if key in shown]
+        # all of them: a second click comes with the number that the first one's picture has
+        self._all.show(list(shown.items()), self._studio.color_of)
+        self._selected.show([(key, shown[key]) for key in chosen], lambda class_id: SELECTED_RGB)
+        self._labels.show(shown, chosen)
         self._show_gizmo()
+        self._scene_panel.show()
         self.desk.places.show()
         if self.desk.robot is not None:
             self.desk.robot.show()

@@ -8,16 +8,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-import numpy as np
 import viser
 
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.studio.landmark import Landmark
+from cliploc_ros.studio import viewpoint
 from cliploc_ros.studio.studio import Studio
 
 _MAX_LINES = 200
-# The camera flies to this number of semi-axes from a landmark, and not nearer than this [m].
-_AXES_AWAY, _LEAST_AWAY_M = 5.0, 0.9
 
 logger = logging.getLogger(__name__)
 
@@ -99,19 +96,20 @@ class Actions:
                 self.running = tuple(rest)
             self.changed.set()
 
+    def look_at_selection(self, client: viser.ClientHandle | None) -> None:
+        """Let a person's camera fly to the selected landmark."""
+        with self.studio.document.lock:
+            selected, up = self.studio.document.selected, self.studio.extent().up
+        if client is not None and selected is not None:
+            viewpoint.fly_to(client, selected[1].center, selected[1].semi_axes.max(), up)
 
-def fly_to(client: viser.ClientHandle | None, landmark: Landmark) -> None:
-    """Let a person's camera look at a landmark from near by, in the direction that it has."""
-    if client is None:
-        return
-    camera = client.camera
-    offset = camera.position - camera.look_at
-    length = float(np.linalg.norm(offset))
-    way = offset / length if length > 1e-6 else np.array([-0.6, -0.6, 0.5])
-    away = max(_LEAST_AWAY_M, _AXES_AWAY * float(landmark.semi_axes.max()))
-    with client.atomic():
-        camera.look_at = landmark.center
-        camera.position = landmark.center + away * way
+    def look_at_all(self, client: viser.ClientHandle | None, is_from_above: bool) -> None:
+        """Let a person's camera fly to where it sees the whole map."""
+        with self.studio.document.lock:
+            extent = self.studio.extent()
+        if client is not None:
+            position = viewpoint.overview(extent, client.camera.aspect, is_from_above)
+            viewpoint.fly(client, position, extent.middle, extent.up)
 
 
 def show_props(handle: Any, **props: Any) -> None:

@@ -2,77 +2,109 @@
 # SPDX-License-Identifier: Apache-2.0
 """The three-dimensional view: ellipsoids, labels, cameras, the selected image and the gizmo."""
 
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 import trimesh.creation
 import viser
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera, frusta
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.studio.edits import Landmarks
 from cliploc_ros.studio.landmark import Landmark
 from cliploc_ros.studio.recording import Answer
-from cliploc_ros.studio.studio import color_of
+from cliploc_ros.studio.viewpoint import pixels_of, wxyz_of
 
-# More labels than these hide the map, and slow the browser down.
-_MAX_LABELS = 150
-_MAX_LABEL_LENGTH = 60
-_LABEL_M = 0.035
-_MAX_CAMERAS = 1000
+# More labels than these hide the map.
+_MAX_LABELS = 60
+_MAX_LABEL_LENGTH, _SHORT_LABEL_LENGTH = 60, 24
+# Size of a letter and of a line with its margins, in a label of scale 1 [px].
+_LETTER_PX, _LINE_PX = 6.5, 28.0
+_MAX_CAMERAS = 300
 _FRUSTUM_M = 0.08
+_KEYFRAME_RGB = (0, 150, 136)
 _VERDICT_RGB = {'accepted': (30, 170, 60), 'refused': (150, 150, 150), 'wrong': (220, 0, 0)}
 # The image of the selected view lies this far in front of its camera [m].
 _IMAGE_DEPTH_M = 0.3
 _SPHERE = trimesh.creation.icosphere(subdivisions=2)
+_RING_POINTS = 40
+
+
+def _make_rings() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return three unit circles as vertices (v, 3) and triangles without area (f, 3)."""
+    angles = np.linspace(0.0, 2.0 * np.pi, _RING_POINTS, endpoint=False)
+    circle = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(_RING_POINTS)])
+    rows = np.arange(3 * _RING_POINTS)
+    after = rows // _RING_POINTS * _RING_POINTS + (rows + 1) % _RING_POINTS
+    return (np.concatenate([np.roll(circle, axis, axis=1) for axis in range(3)]),
+            np.column_stack([rows, after, after]))
+
+
+_RINGS = _make_rings()
 
 
 class Ellipsoids:
     """Landmarks as one node of many equal spheres, each with its own scale.
 
-    A click calls a function with the event and the landmark's id.
+    A click calls a function with the event and the landmark's id. With outlines, each is a
+    shade with three rings along its axes, which hides nothing behind it.
     """
 
     def __init__(self, scene: viser.SceneApi, name: str, on_click: Callable[[Any, str], None],
-                 opacity: float | None = None, scale: float = 1.0):
+                 opacity: float | None = None, scale: float = 1.0, has_outlines: bool = False):
         self._scene, self._name, self._on_click = scene, name, on_click
-        self._opacity, self._scale = opacity, scale
+        self._opacity, self._scale, self._has_outlines = opacity, scale, has_outlines
         self._shown: tuple[tuple[str, Landmark], ...] = ()
-        self._handle: Any = None
+        self._handles: list[Any] = []
 
-    def show(self, landmarks: Sequence[tuple[str, Landmark]], rgb: tuple[int, int, int] | None
-             ) -> None:
-        """Show these landmarks, in the colours of their classes unless one is given."""
+    def show(self, landmarks: Sequence[tuple[str, Landmark]],
+             rgb_of: Callable[[str], tuple[int, int, int]]) -> None:
+        """Show these landmarks, in the colours of their classes."""
         landmarks = tuple(landmarks)
         if landmarks == self._shown:
             return
         count_changed = len(landmarks) != len(self._shown)
         self._shown = landmarks
+        if count_changed:
+            for handle in self._handles:
+                handle.remove()
+            self._handles = []
         if not landmarks:
-            if self._handle is not None:
-                self._handle.remove()
-                self._handle = None
             return
         arrays: dict[str, Any] = {
             'batched_wxyzs': np.array([np.roll(one.quat_xyzw, 1) for _, one in landmarks],
                                       dtype=np.float32),
             'batched_positions': np.array([one.center for _, one in landmarks], dtype=np.float32),
             'batched_scales': np.array([self._scale * one.semi_axes for _, one in landmarks],
-                                       dtype=np.float32),
-            'batched_colors': np.array([rgb or color_of(one.class_id) for _, one in landmarks],
-                                       dtype=np.uint8)}
-        if count_changed or self._handle is None:
-            self._handle = self._scene.add_batched_meshes_simple(
-                self._name, _SPHERE.vertices, _SPHERE.faces, cast_shadow=False,
-                receive_shadow=False, opacity=self._opacity, **arrays)
-            for modifier in (None, 'shift'):
-                self._handle.on_click(modifier=modifier)(self._clicked)
+                                       dtype=np.float32)}
+        colors = np.array([rgb_of(one.class_id) for _, one in landmarks], dtype=np.uint8)
+        if not self._handles:
+            self._add(arrays, colors)
         else:
-            for key, value in arrays.items():
-                setattr(self._handle, key, value)
+            for handle in self._handles:
+                for key, value in arrays.items():
+                    setattr(handle, key, value)
+            self._handles[0].batched_colors = linear(colors)
+            if self._has_outlines:
+                self._handles[1].batched_colors = colors
+
+    def _add(self, arrays: dict[str, Any], colors: NDArray[np.uint8]) -> None:
+        add: Any = partial(self._scene.add_batched_meshes_simple, cast_shadow=False,
+                           receive_shadow=False, **arrays)
+        body = add(self._name, _SPHERE.vertices, _SPHERE.faces, opacity=self._opacity,
+                   batched_colors=linear(colors))
+        for modifier in (None, 'shift'):
+            body.on_click(modifier=modifier)(self._clicked)
+        self._handles = [body]
+        if self._has_outlines:
+            # edges of empty triangles: a mesh of lines, one pixel wide at any scale, and dark
+            self._handles.append(add(f'{self._name}_outlines', *_RINGS, wireframe=True,
+                                     lod='off', batched_colors=colors))
 
     def _clicked(self, event: Any) -> None:
         shown = self._shown
@@ -81,33 +113,104 @@ class Ellipsoids:
 
 
 class Labels:
-    """The landmarks' labels in the scene."""
+    """The landmarks' labels in the scene, as many as have room there, the nearest first.
 
-    def __init__(self, scene: viser.SceneApi):
-        self._scene = scene
+    The room is that of the browser whose camera moved last.
+    """
+
+    def __init__(self, server: viser.ViserServer, up: NDArray[np.float64]):
+        self._server, self._up = server, up
         self._handles: dict[str, tuple[Landmark, Any]] = {}
         self._count = 0
+        self._shown: tuple[Landmarks, Sequence[str]] = {}, ()
+        self._camera: Any = None
+        self._lock, self._is_stale = threading.Lock(), False
+        self.is_shown = True
+
+        @server.on_client_connect
+        def _(client: viser.ClientHandle) -> None:
+            client.camera.on_update(self._moved)
+            self._moved(client.camera)
 
     def show(self, landmarks: Landmarks, selection: Sequence[str]) -> None:
-        """Show the labels of all landmarks, or of the selection if there are too many."""
-        keys = list(landmarks) if len(landmarks) <= _MAX_LABELS else selection
-        for key in self._handles.keys() - set(keys):
+        """Show the labels of these landmarks; those of the selection come first."""
+        self._shown = landmarks, selection
+        self._lay_out()
+
+    def _moved(self, camera: Any) -> None:
+        self._camera = camera
+        self._lay_out()
+
+    def _lay_out(self) -> None:
+        """Lay out the labels; a call during another one has that one do it once more."""
+        self._is_stale = True
+        while self._is_stale and self._lock.acquire(blocking=False):
+            try:
+                self._is_stale = False
+                landmarks, selection = self._shown
+                texts = {key: _shortened(one.label, key in selection)
+                         for key, one in landmarks.items()}
+                if self._camera is not None:
+                    scales = dict(self._with_room(landmarks, texts, selection))
+                    with self._server.atomic():
+                        self._set(landmarks, texts, scales)
+            finally:
+                self._lock.release()
+
+    def _with_room(self, landmarks: Landmarks, texts: dict[str, str], selection: Sequence[str]
+                   ) -> Iterator[tuple[str, float]]:
+        """Yield the landmarks whose labels do not overlap, and the labels' sizes."""
+        camera = self._camera
+        if not (self.is_shown and landmarks):
+            return
+        keys = list(landmarks)
+        pixels, depths = pixels_of(camera, [self._place(landmarks[key]) for key in keys])
+        orbit_m = float(np.linalg.norm(camera.look_at - camera.position))
+        order = np.lexsort([depths, np.array([key not in selection for key in keys])])
+        taken = np.empty((0, 4))
+        for row in order[depths[order] > 0.05]:
+            scale = round(float(np.clip(orbit_m / depths[row], 0.8, 1.1)), 1)
+            half = 0.5 * scale * _LETTER_PX * (len(texts[keys[row]]) + 2)
+            x, y = pixels[row]
+            box = np.array([x - half, y - scale * _LINE_PX, x + half, y])
+            is_inside = 0 < x < camera.image_width and 0 < y < camera.image_height
+            if is_inside and not ((taken[:, :2] < box[2:]) & (taken[:, 2:] > box[:2])).all(
+                    axis=1).any():
+                taken = np.concatenate([taken, box[None]])
+                yield keys[row], scale
+            if len(taken) >= _MAX_LABELS:
+                return
+
+    def _set(self, landmarks: Landmarks, texts: dict[str, str], scales: dict[str, float]
+             ) -> None:
+        for key in self._handles.keys() - landmarks.keys():
             self._handles.pop(key)[1].remove()
-        for key in keys:
-            one = landmarks[key]
+        for key in self._handles.keys() - scales.keys():
+            if self._handles[key][1].visible:
+                self._handles[key][1].visible = False
+        for key, scale in scales.items():
+            one, text = landmarks[key], texts[key]
             old, handle = self._handles.get(key, (None, None))
-            if old is one:
-                continue
-            text = one.label[:_MAX_LABEL_LENGTH]
-            position = one.center + np.array([0.0, 0.0, one.semi_axes.max()])
             if handle is None:
                 # ids may hold any characters, names of nodes not
-                handle = self._scene.add_label(
-                    f'/labels/{self._count}', text, position=position, anchor='bottom-center',
-                    font_size_mode='scene', font_scene_height=_LABEL_M)
+                handle = self._server.scene.add_label(f'/labels/{self._count}', text,
+                                                      anchor='bottom-center')
                 self._count += 1
-            handle.text, handle.position = text, position
+            if old is not one:
+                handle.position = self._place(one)
+            for name, value in (('text', text), ('font_screen_scale', scale), ('visible', True)):
+                if getattr(handle, name) != value:
+                    setattr(handle, name, value)
             self._handles[key] = (one, handle)
+
+    def _place(self, one: Landmark) -> NDArray[np.float64]:
+        """Return where its label begins: at its top."""
+        return one.center + float(np.linalg.norm(one.basis.T @ self._up)) * self._up
+
+
+def _shortened(label: str, is_selected: bool) -> str:
+    length = _MAX_LABEL_LENGTH if is_selected else _SHORT_LABEL_LENGTH
+    return label if len(label) <= length else f'{label[:length - 1]}…'
 
 
 class ViewImage:
@@ -158,7 +261,7 @@ class Answers:
         colors = np.array([_VERDICT_RGB[one.verdict] for one in answers], dtype=np.uint8)
         self._scene.add_batched_meshes_simple(
             '/answers', _SPHERE.vertices * 0.03, _SPHERE.faces,
-            np.tile([1.0, 0.0, 0.0, 0.0], (len(answers), 1)), asked, batched_colors=colors,
+            np.tile([1.0, 0.0, 0.0, 0.0], (len(answers), 1)), asked, batched_colors=linear(colors),
             cast_shadow=False, receive_shadow=False)
         pairs = [(asked[row], one.result.map_from_camera[:3, 3], colors[row])
                  for row, one in enumerate(answers) if one.result.map_from_camera is not None]
@@ -168,9 +271,9 @@ class Answers:
                                       thickness=2.0, thickness_units='screen')
 
 
-def wxyz_of(map_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a pose's rotation as viser wants it: w first."""
-    return np.asarray(np.roll(Rotation.from_matrix(map_from_camera[:3, :3]).as_quat(), 1))
+def linear(rgb: Any) -> NDArray[np.uint8]:
+    """Return colours (n, 3) as viser takes those of instances: for linear light."""
+    return np.asarray(255.0 * (np.asarray(rgb) / 255.0) ** 2.2, dtype=np.uint8)
 
 
 def some_cameras(count: int) -> NDArray[np.int64]:
@@ -179,25 +282,38 @@ def some_cameras(count: int) -> NDArray[np.int64]:
 
 
 def draw_recording(scene: viser.SceneApi, detections: PosedDetections,
-                   on_click: Callable[[Any, int], None]) -> None:
+                   on_click: Callable[[Any, int], None]) -> list[Any]:
     """Draw the trajectory and the cameras, all of them or every n-th; a click chooses a view."""
+    handles: list[Any] = []
     poses, order = detections.map_from_camera, detections.by_camera
     is_way = np.diff(detections.frame_cameras[order]) == 0
     if is_way.any():
         path = np.stack([poses[order[:-1][is_way], :3, 3], poses[order[1:][is_way], :3, 3]],
                         axis=1)
-        scene.add_line_segments('/trajectory', path, (90, 90, 90), thickness=1.5,
-                                thickness_units='screen')
+        handles.append(scene.add_line_segments('/trajectory', path, (90, 90, 90), thickness=1.5,
+                                               thickness_units='screen'))
     shown = order[some_cameras(len(poses))]
-    scene.add_line_segments('/cameras', frusta([detections.camera_of(row) for row in shown],
-                                               poses[shown], _FRUSTUM_M),
-                            (120, 120, 200), thickness=1.0, thickness_units='screen')
+    handles.append(scene.add_line_segments(
+        '/cameras', frusta([detections.camera_of(row) for row in shown], poses[shown],
+                           _FRUSTUM_M),
+        (120, 120, 200), thickness=1.0, thickness_units='screen'))
     handle = scene.add_batched_meshes_simple(
         '/camera_centers', _SPHERE.vertices * 0.012, _SPHERE.faces,
         np.tile([1.0, 0.0, 0.0, 0.0], (len(shown), 1)), poses[shown, :3, 3],
-        batched_colors=(120, 120, 200), cast_shadow=False, receive_shadow=False)
+        batched_colors=linear((120, 120, 200)), cast_shadow=False, receive_shadow=False)
 
     @handle.on_click
     def _(event: Any) -> None:
         if event.instance_index is not None:
             on_click(event, int(shown[event.instance_index]))
+
+    return [*handles, handle]
+
+
+def draw_keyframes(scene: viser.SceneApi, layer: KeyframeLayer) -> list[Any]:
+    """Draw the cameras of the keyframes, all of them or every n-th."""
+    shown = some_cameras(len(layer))
+    return [scene.add_line_segments(
+        '/keyframes', frusta([layer.camera_of(row) for row in shown],
+                             layer.map_from_camera[shown], 1.5 * _FRUSTUM_M),
+        _KEYFRAME_RGB, thickness=1.5, thickness_units='screen')]

@@ -5,7 +5,6 @@
 Every action returns a line that says what it did, or raises a CliplocError.
 """
 
-import zlib
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.map.occupancy_grid import OccupancyGrid
 from cliploc_ros.mapping.check.relocalization import RecordedKeyframes, sample_frames
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
@@ -24,6 +24,7 @@ from cliploc_ros.studio.new_landmark import NewLandmark
 from cliploc_ros.studio.phrases import FoundPhrases, PhraseFinder, Question
 from cliploc_ros.studio.recording import Answer, Recording
 from cliploc_ros.studio.review import Review
+from cliploc_ros.studio.viewpoint import Extent, extent_of
 
 Rgb = tuple[int, int, int]
 SELECTED_RGB: Rgb = (255, 220, 0)
@@ -32,7 +33,9 @@ _MAX_TRIALS = 100
 # Distinct on grey and on photographs; yellow and magenta are the selection's and drawn boxes'.
 _PALETTE: tuple[Rgb, ...] = (
     (31, 119, 180), (255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (140, 86, 75),
-    (0, 190, 190), (120, 190, 32), (70, 110, 255), (255, 110, 130))
+    (0, 190, 190), (255, 110, 130), (120, 190, 32), (70, 90, 255), (0, 105, 92), (128, 0, 40),
+    (190, 140, 255), (90, 70, 0), (120, 200, 255), (20, 40, 110), (255, 170, 120), (0, 220, 130),
+    (110, 110, 110), (180, 70, 0))
 
 
 class Row(NamedTuple):
@@ -50,13 +53,14 @@ class Studio:
     """The document and its surroundings.
 
     ``recording`` has views with boxes and poses, ``images`` the images of these views, ``layer``
-    the keyframes next to the map, to be shown.
+    the keyframes next to the map, ``grid`` its walls, to be shown.
     """
 
     def __init__(self, document: Document, recording: Recording | None = None,
                  images: Images | None = None, finder: PhraseFinder | None = None,
-                 layer: KeyframeLayer | None = None):
+                 layer: KeyframeLayer | None = None, grid: OccupancyGrid | None = None):
         self.document = document
+        self.grid = grid
         self.layer = layer
         self.finder = finder
         self.recording = recording
@@ -70,8 +74,19 @@ class Studio:
         self.answers: tuple[Answer, ...] = ()
         # of the last run over the whole recording, by verdict
         self._counts: dict[str, int] = {}
+        self._colors: dict[str, Rgb] = {}
+        for class_id in sorted({one.class_id for one in document.landmarks.values()}):
+            self.color_of(class_id)
         if recording is not None and recording.detections.encoder_key:
             document.take_encoder(recording.detections.encoder_key)
+
+    def extent(self) -> Extent:
+        """Return where the map is, by its landmarks and by the cameras that saw it."""
+        poses = (self.recording.detections.map_from_camera if self.recording is not None
+                 else self.layer.map_from_camera if self.layer is not None
+                 else np.empty((0, 4, 4)))
+        return extent_of(np.reshape([one.center for one in self.document.landmarks.values()],
+                                    (-1, 3)), poses)
 
     # ---- views ----------------------------------------------------------------------------------
 
@@ -111,6 +126,10 @@ class Studio:
             return None
         return self.images.near(float(detections.stamps_s[view]), detections.name_of(view),
                                 detections.camera_of(view))
+
+    def color_of(self, class_id: str) -> Rgb:
+        """Return the colour of a class; the first twenty classes of a map differ."""
+        return self._colors.setdefault(class_id, _PALETTE[len(self._colors) % len(_PALETTE)])
 
     def _recording(self) -> Recording:
         if self.recording is None:
@@ -253,8 +272,3 @@ class Studio:
         if self.finder is None or self.document.selected is None:
             return FoundPhrases((), '')
         return self.finder.answer(Question(self.document.selected[0], self.document.landmarks))
-
-
-def color_of(class_id: str) -> Rgb:
-    """Return the colour of a class; equal in every session."""
-    return _PALETTE[zlib.crc32(class_id.encode()) % len(_PALETTE)]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The layers of the tools: coverage and look-alike places, keyframes, the running relocalizer.
+"""The layers of the tools: coverage and look-alike places, the running relocalizer.
 
 No ROS here: the relocalizer comes as an object that ``live`` makes.
 """
@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from cliploc_ros.core.geometry.camera import frusta
-from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.evaluation.map_check.page import LOOK_ALIKE, MISLED
 from cliploc_ros.mapping.check.places import RADIUS_M
 from cliploc_ros.mapping.check.report import GridCheck
 from cliploc_ros.studio.panels import Actions
 from cliploc_ros.studio.places import Places, PlacesSearch
-from cliploc_ros.studio.scene import Ellipsoids, some_cameras, wxyz_of
+from cliploc_ros.studio.scene import Ellipsoids, linear
+from cliploc_ros.studio.viewpoint import wxyz_of
 
 if TYPE_CHECKING:
     from cliploc_ros.studio.live import LivePose, LiveRelocalizer, LiveState
@@ -43,11 +42,6 @@ _LEGEND = (
     ('#E69F00', 'none'), ('#787878', 'no heading shows three landmarks'),
     (MISLED, 'a heading is misled; the line leads to the wrong pose'),
     (LOOK_ALIKE, 'places that look alike'))
-
-_KEYFRAME_RGB = (0, 150, 136)
-_KEYFRAME_FRUSTUM_M, _POINT_M = 0.12, 0.015
-# More points slow the browser down.
-_MAX_POINTS = 30_000
 
 # Larger than the landmark itself, which shines through.
 _MISSING_RGB, _MISSING_SCALE = (220, 0, 0), 1.3
@@ -119,8 +113,7 @@ class PlacesPanel:
         tiles = scene.add_batched_meshes_simple(
             '/coverage/tiles', _TILE * check.spacing_m * _GAP, _TILE_FACES,
             np.tile([1.0, 0.0, 0.0, 0.0], (len(positions), 1)), positions,
-            # the page takes colours of instances for linear light
-            batched_colors=(255.0 * (tile_colors(check) / 255.0) ** 2.2).astype(np.uint8),
+            batched_colors=linear(tile_colors(check)),
             opacity=0.9, material='toon5', side='double', lod='off',
             cast_shadow=False, receive_shadow=False)
 
@@ -179,32 +172,6 @@ def _rgb(color: str) -> tuple[int, int, int]:
     return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
 
 
-def add_keyframes(actions: Actions, layer: KeyframeLayer) -> None:
-    """Add a switch for the layer of keyframes, which is drawn when it is first shown."""
-    scene, handles = actions.server.scene, list[Any]()
-    images = 'no images' if layer.images is None else 'small images'
-    box = actions.server.gui.add_checkbox(
-        'Show keyframes', False,
-        hint=f'{len(layer)} keyframes with {layer.offsets[-1]} points, {images}')
-
-    @box.on_update
-    def _(event: Any) -> None:
-        if box.value and not handles:
-            shown, step = some_cameras(len(layer)), -(-int(layer.offsets[-1]) // _MAX_POINTS)
-            points = np.concatenate([layer.points_in_map(row)[::max(1, step)]
-                                     for row in range(len(layer))])
-            handles.append(scene.add_line_segments(
-                '/keyframes/cameras',
-                frusta([layer.camera_of(row) for row in shown], layer.map_from_camera[shown],
-                       _KEYFRAME_FRUSTUM_M),
-                _KEYFRAME_RGB, thickness=2.0, thickness_units='screen'))
-            handles.append(scene.add_point_cloud(
-                '/keyframes/points', points.astype(np.float32), _KEYFRAME_RGB,
-                point_size=_POINT_M, point_shape='circle'))
-        for handle in handles:
-            handle.visible = box.value
-
-
 class LivePanel:
     """The last answer of the running relocalizer, and requests to it."""
 
@@ -248,7 +215,7 @@ class LivePanel:
         self._handles = []
         landmarks = self._document.landmarks
         self._missing.show([(key, landmarks[key]) for key in state.missing if key in landmarks],
-                           _MISSING_RGB)
+                           lambda class_id: _MISSING_RGB)
         if state.pose is not None and state.pose.frame_id == self._document.frame_id:
             self._handles = self._draw(state.pose, state)
 

@@ -14,6 +14,7 @@ from studio_map import ASSETS
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.studio.images import outlines_of
+from cliploc_ros.studio.viewpoint import overview
 
 # Software rendering needs an idle machine.
 pytestmark = [pytest.mark.clock, pytest.mark.needs('viser', 'playwright', 'chromium')]
@@ -142,7 +143,7 @@ def test_the_gizmo_is_dragged(chromium, studio):
     person.select(document, 'mug_2')
     before = document.landmarks['mug_2']
     camera = next(iter(server.get_clients().values())).camera
-    wait_for(lambda: np.allclose(camera.look_at, before.center, atol=1e-2), 'looking at it')
+    wait_for(lambda: np.allclose(camera.look_at, before.center, atol=1e-2), 'flying to it')
     near = before.center + np.array([-0.9, -0.9, 0.7])
     camera.position, camera.look_at = near, before.center
     # the camera reports where it is: another report shows that the browser moved it
@@ -151,7 +152,8 @@ def test_the_gizmo_is_dragged(chromium, studio):
     wait_for(lambda: np.linalg.norm(camera.position - near) < 0.2, 'coming near')
     person.picture('gizmo')
     up = np.array([0.0, 0.0, 1.0])
-    grip, goal = (on_screen(person, server, before.center + height * up) for height in (0.3, 0.5))
+    # the gizmo has the same size on the page at any distance: its arrow begins at the centre
+    grip, goal = (on_screen(person, server, before.center + height * up) for height in (0.1, 0.3))
     person.drag(grip, goal)
     wait_for(lambda: document.landmarks['mug_2'].center[2] > before.center[2] + 0.1, 'the drag')
     person.page.mouse.up()
@@ -162,6 +164,20 @@ def test_the_gizmo_is_dragged(chromium, studio):
     wait_for(lambda: document.landmarks['mug_2'] == before, 'undo')
     assert document.to_undo is None
     person.page.close()
+
+
+def test_a_double_click_flies_to_a_landmark(person, studio):
+    """A click selects and moves nothing; the second one flies, whatever the first one changed."""
+    document, server = studio.document, studio.server
+    one = document.landmarks['mug_2']
+    camera = next(iter(server.get_clients().values())).camera
+    person.page.keyboard.press('h')
+    start = overview(studio.extent(), camera.aspect)
+    wait_for(lambda: np.allclose(camera.position, start, atol=0.05), 'flying to see everything')
+    person.page.mouse.dblclick(*on_screen(person, server, one.center))
+    wait_for(lambda: document.selection == ('mug_2',), 'the selection')
+    wait_for(lambda: np.allclose(camera.look_at, one.center, atol=1e-3), 'flying to it')
+    assert np.linalg.norm(camera.position - one.center) < 2.0
 
 
 def test_the_exported_page_opens_without_a_server(chromium, person, studio, path):

@@ -1,0 +1,181 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where a person looks from: the whole map, from above, one landmark, a view of the recording."""
+
+import time
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.tilt import find_tilt, rotation_to_z
+
+#: The vertical angle of view [rad].
+FOV_RAD = 0.9
+# viser has no orthographic camera: this angle of view, from afar, is nearly one [rad].
+_FLAT_RAD = 0.08
+# The near plane, as a share of the distance: depth has too few digits for both near and far.
+_FLAT_NEAR, _NEAR_M = 0.3, 0.01
+# A vertical by hand-held cameras that is so near z confirms z [deg].
+_SAME_UP_DEG = 20.0
+# Of landmarks and cameras, so many lie within the extent.
+_EXTENT_SHARE = 0.95
+# Steps of a flight, and seconds of one.
+_FLIGHT_STEPS, _STEP_S = 10, 0.03
+# A landmark that is looked at fills about a third of the page's height, unless it is small.
+_LEAST_RADIUS_M, _AROUND = 0.2, 2.5
+_LEAST_RISE = 0.35
+#: Of a page between its panels, before it tells.
+USUAL_ASPECT = 0.6
+# The latest flight of each browser: a flight ends when another one begins.
+_FLIGHTS: WeakKeyDictionary[Any, object] = WeakKeyDictionary()
+
+
+class Extent(NamedTuple):
+    """Where the map is."""
+
+    middle: NDArray[np.float64]  #: (3,) [m]
+    radius_m: float  #: Of a sphere around almost all of it
+    up: NDArray[np.float64]  #: (3,): the unit vector that points up
+    floor_m: float  #: Height of the floor along ``up``
+    top_m: float  #: Height of the highest landmark or camera
+    aside: NDArray[np.float64]  #: (3,): from the middle towards the cameras, level
+
+    @property
+    def upright(self) -> NDArray[np.float64]:
+        """The rotation (3, 3) from a coordinate frame with z up to the map's."""
+        return rotation_to_z(self.up)[0].T
+
+
+def up_direction(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the direction (3,) that points up in a map, by cameras (n, 4, 4) that saw it.
+
+    It is z, unless the cameras' tilt clearly says something else: the map is in a camera's
+    coordinate frame.
+    """
+    z, found = np.array([0.0, 0.0, 1.0]), find_tilt(poses)
+    return z if found is None or found[1] < _SAME_UP_DEG else np.asarray(found[0].T @ z)
+
+
+def extent_of(centers: NDArray[np.float64], poses: NDArray[np.float64]) -> Extent:
+    """Return the extent of landmarks (n, 3) and the cameras (m, 4, 4) that saw them [m]."""
+    up = up_direction(poses)
+    points = np.concatenate([centers, poses[:, :3, 3]])
+    if not len(points):
+        points = np.zeros((1, 3))
+    share = np.array([1.0 - _EXTENT_SHARE, _EXTENT_SHARE])
+    middle = np.quantile(centers if len(centers) else points, share, axis=0).mean(axis=0)
+    distances = np.linalg.norm(points - middle, axis=1)
+    # the floor of a map with z up is its z = 0; of another one nothing is known but its points
+    floor_m = 0.0 if up[2] == 1.0 else float(np.quantile(points @ up, 0.02)) - 0.3
+    aside = poses[:, :3, 3].mean(axis=0) - middle if len(poses) else np.zeros(3)
+    aside = aside - (aside @ up) * up
+    if np.linalg.norm(aside) < 0.3:
+        aside = rotation_to_z(up)[0].T @ [-1.0, -1.0, 0.0]
+    return Extent(middle, max(1.0, float(np.quantile(distances, _EXTENT_SHARE))), up, floor_m,
+                  float((points @ up).max()), aside / np.linalg.norm(aside))
+
+
+def overview(extent: Extent, aspect: float, is_from_above: bool = False) -> NDArray[np.float64]:
+    """Return the position (3,) that sees all of a map, from the side of its cameras or from above.
+
+    ``aspect`` is the width of the page by its height. From above, y is up on the page.
+    """
+    # the camera orbits about the vertical, so that it may look along it almost only
+    direction = (extent.upright @ [0.0, -1e-3, 1.0] if is_from_above
+                 else extent.aside + 0.8 * extent.up)
+    distance = 1.15 * extent.radius_m / np.tan(FOV_RAD / 2.0) / min(1.0, max(aspect, 0.1))
+    return np.asarray(extent.middle + distance * direction / np.linalg.norm(direction))
+
+
+def fly_to(client: Any, center: NDArray[np.float64], radius_m: float, up: NDArray[np.float64]
+           ) -> None:
+    """Move the camera of a browser to an object, to the side where it looks from now."""
+    camera = client.camera
+    direction = camera.position - camera.look_at
+    direction = direction / max(float(np.linalg.norm(direction)), 1e-9)
+    direction = direction + max(0.0, _LEAST_RISE - float(direction @ up)) * up
+    distance = _AROUND * max(radius_m, _LEAST_RADIUS_M) / np.tan(FOV_RAD / 2.0)
+    fly(client, center + distance * direction / np.linalg.norm(direction), center, up)
+
+
+def fly(client: Any, position: NDArray[np.float64], look_at: NDArray[np.float64],
+        up: NDArray[np.float64]) -> None:
+    """Move the camera of a browser to a position (3,), so that it looks at a point (3,).
+
+    It orbits that point from then on. A flat view is from so far away that it shows as much.
+    """
+    camera = client.camera
+    is_flat = camera.fov < 2.0 * _FLAT_RAD
+    start, pivot = _unflattened(camera.position, camera.look_at, camera.fov), camera.look_at
+    camera.up_direction = up
+    flight = _FLIGHTS[client] = object()
+    for share in np.linspace(0.0, 1.0, _FLIGHT_STEPS + 1)[1:]:
+        share = share * share * (3.0 - 2.0 * share)
+        if _FLIGHTS.get(client) is not flight:
+            return
+        at = pivot + share * (look_at - pivot)
+        _put(client, start + share * (position - start), at, is_flat)
+        time.sleep(_STEP_S)
+
+
+def set_flat(client: Any, is_flat: bool) -> None:
+    """Let a browser show the map without perspective, or with it, as large as before."""
+    camera = client.camera
+    _put(client, _unflattened(camera.position, camera.look_at, camera.fov), camera.look_at,
+         is_flat)
+
+
+def _put(client: Any, position: NDArray[np.float64], look_at: NDArray[np.float64],
+         is_flat: bool) -> None:
+    camera, fov = client.camera, _FLAT_RAD if is_flat else FOV_RAD
+    away = (position - look_at) * np.tan(FOV_RAD / 2.0) / np.tan(fov / 2.0)
+    with client.atomic():
+        camera.position = look_at + away
+        camera.look_at = look_at
+        camera.fov = fov
+        distance = float(np.linalg.norm(away))
+        camera.near = _FLAT_NEAR * distance if is_flat else _NEAR_M
+        camera.far = max(1000.0, 3.0 * distance)
+
+
+def _unflattened(position: NDArray[np.float64], look_at: NDArray[np.float64], fov: float
+                 ) -> NDArray[np.float64]:
+    """Return the position (3,) that shows as much with FOV_RAD."""
+    return np.asarray(look_at + (position - look_at) * np.tan(fov / 2.0) / np.tan(FOV_RAD / 2.0))
+
+
+def look_through(client: Any, pose: NDArray[np.float64], intrinsics: Camera) -> None:
+    """Put the camera of a browser where an image was taken, so that it shows all of it."""
+    camera = client.camera
+    _FLIGHTS.pop(client, None)
+    with client.atomic():
+        camera.near = _NEAR_M
+        camera.position = pose[:3, 3]
+        camera.look_at = pose[:3, 3] + pose[:3, 2]
+        camera.up_direction = -pose[:3, 1]
+        camera.wxyz = wxyz_of(pose)
+        # the whole image, also where the panels leave a narrow gap
+        half = max(intrinsics.height / intrinsics.fy,
+                   intrinsics.width / intrinsics.fx / max(camera.aspect, 0.1)) / 2.0
+        camera.fov = 2.0 * float(np.arctan(1.1 * half))
+
+
+def pixels_of(camera: Any, points: Sequence[NDArray[np.float64]]
+              ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the pixels (n, 2) of points (n, 3) in a browser, and how far away they are (n,)."""
+    rotation = Rotation.from_quat(np.roll(camera.wxyz, -1)).as_matrix()
+    seen = (np.reshape(points, (-1, 3)) - camera.position) @ rotation
+    focal = camera.image_height / 2.0 / np.tan(camera.fov / 2.0)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        return seen[:, :2] / seen[:, 2:] * focal + (
+            camera.image_width / 2.0, camera.image_height / 2.0), seen[:, 2]
+
+
+def wxyz_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation of a pose (4, 4), or a rotation (3, 3), as viser wants it: w first."""
+    return np.asarray(np.roll(Rotation.from_matrix(rotation[:3, :3]).as_quat(), 1))

@@ -1,0 +1,152 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The studio's scene: surfaces, walls, labels, colours, and where a person looks from."""
+
+import io
+import itertools
+from contextlib import redirect_stdout
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import viser
+from scipy.spatial.transform import Rotation
+from studio_map import demo_studio, write_hall
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.core.map.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
+from cliploc_ros.datasets.depth import DepthImage
+from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.studio import viewpoint
+from cliploc_ros.studio.context import MAX_POINTS, draw_walls, find_cloud
+from cliploc_ros.studio.document import Document
+from cliploc_ros.studio.images import Images, open_images, views_of_folder
+from cliploc_ros.studio.scene import Labels
+from cliploc_ros.studio.studio import Studio
+
+CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
+UPRIGHT = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # looks along x
+
+
+@pytest.fixture
+def server():
+    with redirect_stdout(io.StringIO()):
+        server = viser.ViserServer('127.0.0.1', 0, verbose=False)
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def studio(tmp_path):
+    studio = demo_studio(tmp_path / 'map.yaml')
+    yield studio
+    studio.document.close()
+
+
+def page_camera(position, look_at, up, size=(900, 700)):
+    """Return a browser's camera as viser tells it."""
+    forward = (look_at - position) / np.linalg.norm(look_at - position)
+    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
+    turn = np.column_stack([right, np.cross(forward, right), forward])
+    return SimpleNamespace(position=position, look_at=look_at, fov=viewpoint.FOV_RAD,
+                           wxyz=viewpoint.wxyz_of(turn), image_width=size[0], image_height=size[1])
+
+
+def test_depth_becomes_a_cloud_below_the_ceiling():
+    """A wall 2 m ahead, red at its left, of a camera 1 m above the floor at x = 3."""
+    image = np.zeros((48, 64, 3), dtype=np.uint8)
+    image[:, :32, 0] = 200
+    depth = DepthImage(np.full((48, 64), 2.0, dtype=np.float32))
+    images = Images(np.array([0]), lambda place: (image, CAMERA), (), lambda place: depth)
+    poses = make_transform(UPRIGHT, np.array([3.0, 0.0, 1.0]))[None]
+    views = PosedDetections((CAMERA,), poses, np.zeros(1), np.zeros(2, dtype=np.int64),
+                            np.empty((0, 4)), (), np.empty(0, dtype=np.int64), np.empty(0))
+    extent = viewpoint.extent_of(np.array([[4.0, 0.0, 0.5]]), poses)
+    points, colors, _ = find_cloud(views, images, None, extent)
+    assert len(points) > 50 and np.allclose(points[:, 0], 5.0, atol=1e-5)
+    assert 1.0 < points[:, 2].max() < 1.3 < 1.8, 'no camera or landmark is higher than 1 m'
+    is_red = colors[:, 0].astype(int) > colors[:, 1].astype(int)
+    assert (points[is_red, 1] > -0.02).all() and (points[~is_red, 1] < 0.02).all()
+    assert find_cloud(views, None, None, extent) is None
+
+
+def test_the_cloud_of_a_room_is_thin_and_quick(shared_data):
+    folder = shared_data / 'seven_scenes_kitchen'
+    views = views_of_folder(folder)
+    extent = viewpoint.extent_of(np.empty((0, 3)), views.map_from_camera)
+    cloud = find_cloud(views, open_images(folder, None), None, extent)
+    assert 20_000 < len(cloud.points) <= MAX_POINTS and np.isfinite(cloud.points).all()
+    # 7-Scenes lies in its first camera's coordinate frame, where y points down
+    assert extent.up[1] < -0.8
+    assert len(np.unique(cloud.colors, axis=0)) > 1000
+
+
+@pytest.mark.parametrize('yaw', (0.0, 0.4))
+def test_walls_lie_where_the_grid_has_them(server, yaw):
+    cells = np.full((30, 40), UNKNOWN, dtype=np.int8)
+    cells[4, 33] = cells[20, 7] = OCCUPIED
+    grid = OccupancyGrid('map', cells, 0.1, (-1.0, 2.0, yaw))
+    handle = draw_walls(server.scene, grid)
+    rows, columns = np.nonzero(handle.image[..., 3])
+    height, width = handle.image.shape[:2]
+    across = np.column_stack([((columns + 0.5) / width - 0.5) * handle.render_width,
+                              ((rows + 0.5) / height - 0.5) * handle.render_height,
+                              np.zeros(len(rows))])
+    turn = Rotation.from_quat(np.roll(handle.wxyz, -1))
+    points = turn.apply(across) + handle.position
+    assert len(points) and (grid.at(points[:, :2]) == OCCUPIED).all()
+    assert turn.apply([0.0, 0.0, 1.0])[2] == pytest.approx(-1.0), 'its face is up'
+
+
+def test_up_is_found_where_the_map_is_in_a_cameras_frame():
+    turns = Rotation.from_euler('z', np.linspace(0.0, 3.0, 20)[:, None]).as_matrix() @ UPRIGHT
+    poses = np.array([make_transform(turn, np.zeros(3)) for turn in turns])
+    assert viewpoint.up_direction(poses).tolist() == [0.0, 0.0, 1.0]
+    into_first = np.linalg.inv(poses[0]) @ poses
+    assert np.allclose(viewpoint.up_direction(into_first), [0.0, -1.0, 0.0], atol=1e-6)
+    assert viewpoint.up_direction(np.empty((0, 4, 4))).tolist() == [0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize('is_from_above', (False, True))
+@pytest.mark.parametrize('size', ((900, 700), (400, 700)))
+def test_the_page_opens_with_all_landmarks_in_sight(studio, is_from_above, size):
+    extent = studio.extent()
+    position = viewpoint.overview(extent, size[0] / size[1], is_from_above)
+    pixels, depths = viewpoint.pixels_of(
+        page_camera(position, extent.middle, extent.up, size),
+        [one.center for one in studio.document.landmarks.values()])
+    assert (depths > 0.5).all(), 'outside of the objects'
+    assert ((pixels > 0) & (pixels < size)).all(axis=1).mean() > 0.9
+
+
+def test_labels_do_not_overlap_and_the_selected_one_is_there(server, studio):
+    landmarks = studio.document.landmarks
+    extent = studio.extent()
+    labels = Labels(server, extent.up)
+    camera = page_camera(viewpoint.overview(extent, 1.0), extent.middle, extent.up)
+    labels._camera = camera
+    labels.show(landmarks, ('mug_2',))
+    shown = {key: handle for key, (_, handle) in labels._handles.items() if handle.visible}
+    assert 5 < len(shown) < len(landmarks)
+    assert shown['mug_2'].text == landmarks['mug_2'].label
+    pixels, _ = viewpoint.pixels_of(camera, [handle.position for handle in shown.values()])
+    widths = [len(one.text) * 5.0 * one.font_screen_scale for one in shown.values()]
+    for (first, left), (second, right) in itertools.combinations(
+            zip(pixels, widths, strict=True), 2):
+        assert abs(first[1] - second[1]) > 12.0 or abs(first[0] - second[0]) > (left + right) / 2
+    labels.is_shown = False
+    labels.show(landmarks, ('mug_2',))
+    assert not any(handle.visible for _, handle in labels._handles.values())
+
+
+def test_classes_differ_in_colour(tmp_path):
+    path = tmp_path / 'map.yaml'
+    names = ('book', 'chair', 'cup', 'tv', *(f'class {number}' for number in range(16)))
+    write_hall(path, names, names)
+    studio = Studio(Document(path))
+    before = {name: studio.color_of(name) for name in names}
+    assert len(set(before.values())) == 20
+    studio.color_of('a new one')
+    assert {name: studio.color_of(name) for name in names} == before
+    studio.document.close()
