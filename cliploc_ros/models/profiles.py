@@ -8,7 +8,6 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.devices import resolve_device
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
-from cliploc_ros.models.transformers_detector import TransformersDetector, is_of_transformers
 
 
 @dataclass(frozen=True)
@@ -72,6 +71,8 @@ def load_detector(options: DetectorOptions) -> ObjectDetector:
     OptionsError
         The device or the inference engine is missing.
     """
+    from cliploc_ros.models.transformers_detector import TransformersDetector, is_of_transformers
+
     if is_of_transformers(options.model):
         return TransformersDetector(options)
     from cliploc_ros.models.yolo_detector import YoloDetector

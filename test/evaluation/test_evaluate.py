@@ -112,13 +112,14 @@ def test_the_papers_table_on_real_queries(shared_data, tmp_path):
 
 
 def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_here):
-    """Twelve views of one place: some are refused alone, all are accepted together."""
-    recorded = changed(files, tmp_path, query_group=np.zeros(12, dtype=np.int64),
-                       is_main=np.arange(12) == 1)
+    """Six views of each of two places: some are refused alone, all are accepted together."""
+    recorded = changed(files, tmp_path, query_group=np.arange(12) // 6,
+                       is_main=np.arange(12) % 6 == 1)
     given = ('--queries', recorded, '--map', files / 'map.yaml', '--methods', 'auto',
-             '--no-figures', '--frames', 'all', '--fuse', '--trials', 2)
-    for name, more in (('exact', ()), ('noisy', ('--odometry-noise', 0.02, 0.5)),
-                       ('other', ('--odometry-noise', 0.02, 0.5, '--seed', 1))):
+             '--no-figures', '--frames', 'all', '--fuse')
+    noise = ('--odometry-noise', 0.02, 0.5)
+    for name, more in (('exact', ('--trials', 2)), ('noisy', (*noise, '--trials', 2)),
+                       ('other', (*noise, '--trials', 1, '--seed', 1))):
         done = evaluate(*given, *more, '--out', tmp_path / name)
         assert done.returncode == 0, done.stderr
     exact, noisy, other = (results_of(tmp_path / name) for name in ('exact', 'noisy', 'other'))
@@ -127,10 +128,10 @@ def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_
     errors = [np.median([row['error_m'] for row in rows]) for rows in (exact, noisy)]
     assert errors[0] < errors[1] < 0.2
     # each trial has noise of its own, that of the run which begins with its seed
-    assert len(noisy) == len(other) == 2 * len(exact)
-    poses = [[[row['map_from_camera'] for row in rows if row['trial'] == trial]
-              for trial in range(2)] for rows in (noisy, other)]
-    assert poses[0][0] != poses[0][1] == poses[1][0]
+    assert len(noisy) == 2 * len(other) == 2 * len(exact)
+    first, second = ([row['map_from_camera'] for row in noisy if row['trial'] == trial]
+                     for trial in range(2))
+    assert first != second == [row['map_from_camera'] for row in other]
     table = (tmp_path / 'noisy/table.md').read_text()
     assert '12 queries, trials: 2; ±' in table and ' ± ' in table.splitlines()[2]
     assert '12 queries, trials: 1.' in (tmp_path / 'exact/table.md').read_text()
@@ -269,13 +270,13 @@ def test_detector_and_clip_run_once(walk, evaluated_bag):
     cache, = walk.glob('bag.cliploc-*.npz')
     before = cache.stat().st_mtime_ns
     done = evaluate('--bag', walk / 'bag', *NETWORKS, '--methods', 'clip_b-prosac', '--sweep',
-                    '--out', walk / 'again', '--no-figures')
+                    '--trials', 1, '--out', walk / 'again', '--no-figures')
     assert done.returncode == 0, done.stderr
     assert str(cache) in done.stderr
     assert cache.stat().st_mtime_ns == before
     cache.write_bytes(b'rubbish')
     done = evaluate('--bag', walk / 'bag', *NETWORKS, '--methods', 'clip_b-prosac', '--sweep',
-                    '--out', walk / 'once_more', '--no-figures')
+                    '--trials', 1, '--out', walk / 'once_more', '--no-figures')
     assert done.returncode == 0
     assert 'recording again' in done.stderr
     assert results_of(walk / 'again') == results_of(walk / 'once_more')
