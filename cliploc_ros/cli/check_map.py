@@ -109,6 +109,7 @@ def _add_thresholds(parser: argparse.ArgumentParser) -> None:
 def check(options: argparse.Namespace) -> int:
     """Check as the command line asks; return the exit code."""
     # Late, so that --help is fast.
+    from cliploc_ros.core.geometry.tilt import tilt_note
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.evaluation.map_check.page import PAGE, summary_lines, write_report
     from cliploc_ros.evaluation.map_check.pictures import draw_pictures
@@ -126,6 +127,8 @@ def check(options: argparse.Namespace) -> int:
     thresholds = Thresholds(**{field.name: getattr(options, field.name)
                                for field in fields(Thresholds)})
     detections, image_of = _read_recording(options)
+    if detections is not None and (note := tilt_note(detections.map_from_camera)):
+        print(f'note: {note}', flush=True)
     queries = _read_queries(options.queries, landmark_map) if options.queries else []
     layer = read_layer(options.map, landmark_map, options.keyframes)
     out = options.out or options.map.with_name(f'{options.map.stem}_check')
