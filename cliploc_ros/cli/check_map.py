@@ -119,6 +119,7 @@ def _add_thresholds(parser: argparse.ArgumentParser) -> None:
 def check(options: argparse.Namespace) -> int:
     """Check as the command line asks; return the exit code."""
     # Late, so that --help is fast.
+    from cliploc_ros.core.geometry.tilt import tilt_note
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.evaluation.map_check.page import PAGE, summary_lines, write_report
     from cliploc_ros.evaluation.map_check.pictures import draw_pictures
@@ -142,6 +143,8 @@ def check(options: argparse.Namespace) -> int:
         views = Views(landmark_map, detections, images.near)
         if options.observations is None:  # the layer's own: judged by those of other times
             image_of = partial(_image_of, detections, images)
+    if detections is not None and (note := tilt_note(detections.map_from_camera)):
+        print(f'note: {note}', flush=True)
     queries = _read_queries(options.queries, landmark_map) if options.queries else []
     layer = read_layer(options.map, landmark_map, options.keyframes)
     out = options.out or options.map.with_name(f'{options.map.stem}_check')

@@ -83,6 +83,8 @@ def make_parser() -> argparse.ArgumentParser:
 def serve(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C; return the exit code."""
     # Late, so that --help is fast.
+    from cliploc_ros.core.geometry.tilt import tilt_note
+
     try:
         from cliploc_ros.studio.page import serve_studio
     except ModuleNotFoundError as error:
@@ -94,7 +96,9 @@ def serve(options: argparse.Namespace) -> int:
               serve_studio(studio, options.host, options.port, live) as (url, _)):
             print(f'{studio.document.path}: {len(studio.document.landmarks)} landmarks, '
                   f'{studio.views} views')
-            for note in studio.document.notes:
+            tilt = '' if studio.recording is None else tilt_note(
+                studio.recording.detections.map_from_camera)
+            for note in filter(None, (*studio.document.notes, tilt)):
                 print(f'note: {note}')
             print(f'studio: {url}', flush=True)
             if not options.no_browser:

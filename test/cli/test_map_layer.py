@@ -30,7 +30,7 @@ def test_options_that_do_not_go_together_are_refused_at_once(tmp_path, capsys, o
 
 def test_images_without_a_layer_are_refused(tmp_path, capsys):
     out = tmp_path / 'map.yaml'
-    assert main([*WALK, '--keyframe-images', '--out', str(out)]) == 1
+    assert main([*WALK, '--no-keyframe-layer', '--keyframe-images', '--out', str(out)]) == 1
     assert '--keyframe-images is for --keyframe-layer' in capsys.readouterr().err
 
 

@@ -244,7 +244,7 @@ def test_a_type_that_is_not_installed_is_left_out_with_a_note(tmp_path):
     with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         for name, msgtype, definition in (('/odd', 'my_msgs/msg/Odd', 'int32 x'),
                                           ('/number', 'std_msgs/msg/Int32', 'int32 data')):
-            connection = bag.add_connection(name, msgtype, msgdef=definition, rihs01='',
+            connection = bag.add_connection(name, msgtype, msgdef=definition, rihs01='unknown',
                                             offered_qos_profiles=[RECORDED_QOS])
             bag.write(connection, START_NS, b'\x00\x01\x00\x00\x01\x00\x00\x00')
     done = run('replay', tmp_path / 'bag')

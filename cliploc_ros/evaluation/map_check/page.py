@@ -152,8 +152,8 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
              f'{one.held_out.explained:.1%}, {one.held_out.median_iou:.3f}'),
             ('recorded frames, cross-validated', _verdicts(one.judged) + (
                 '' if len(one.judged) == len(one.trials) else
-                f'; {len(one.trials) - len(one.judged)} more show what no other part of the '
-                'recording shows')),
+                f'; of all {_verdicts(one.trials)}: no other part of the recording shows the '
+                'objects of the rest')),
             *([('of these by objects alone', str(count_by_objects(one.judged)['accepted']))]
               if any(trial.by_objects for trial in one.trials) else []),
             ('the same poses with simulated boxes', _verdicts(one.simulated)),

@@ -194,7 +194,7 @@ class Trial:
     reason: str  #: Of a refusal
     stamp_s: float | None = None  #: Of a recorded frame [s]
     #: Of a recorded frame: the verdict without keyframes, where they were used; and whether the
-    #: other frames show enough of its objects, or of its place, to judge the map by it
+    #: other frames show enough of its objects to judge the map by it, whatever the verdict
     by_objects: Verdict | None = None
     is_judged: bool = True
 
@@ -258,8 +258,7 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
             if (localizer is not None and keyframes is not None
                     and (image := keyframes.image_of(frame)) is not None):
                 both = judge(ImageRecognizer(localizer, query_features(image), camera))
-                trial = replace(both, by_objects=trial.verdict,
-                                is_judged=is_judged or both.verdict != 'refused')
+                trial = replace(both, by_objects=trial.verdict, is_judged=is_judged)
             trials.append(trial)
     return sorted(trials, key=lambda one: one.stamp_s or 0.0)
 
