@@ -57,7 +57,7 @@ def test_extras_are_what_the_tests_run_with(extras):
 
 
 def test_all_has_all(extras):
-    parts = {'evaluate', 'build_map', 'studio', 'models', 'cluster'}
+    parts = {'runtime', 'models', 'evaluate', 'studio', 'cluster'}
     assert extras.keys() == parts | {'all', 'test', 'docs'}
     assert set(extras['all']) == {one for name in parts for one in extras[name]}
 

@@ -158,7 +158,7 @@ def test_images_need_the_extra_with_the_networks(programs, tmp_path):
     done = run(programs / 'cliploc_build_map', '--tum',
                PROJECT / 'cliploc_ros/demo/assets/mapping', '--out', 'map.yaml', cwd=tmp_path)
     assert done.returncode == 1
-    assert "is not installed" in done.stderr and "extra 'models'" in done.stderr
+    assert 'is not installed' in done.stderr and "extra 'models'" in done.stderr
     assert done.stderr.count('\n') == 1
 
 
