@@ -150,13 +150,14 @@ def test_build_map_runs_and_says_what_it_lacks(programs, tmp_path):
     done = run(programs / 'cliploc_build_map', '--observations', ROOM / 'after.npz', '--every',
                '5', '--no-joint', '--out', 'map.yaml', cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert 'labels are class names: open_clip is not installed' in done.stdout
+    assert 'labels are class names: ' in done.stdout
     assert len(LandmarkMap.from_file(tmp_path / 'map.yaml')) > 5
 
 
 def test_images_need_the_extra_with_the_networks(programs, tmp_path):
     done = run(programs / 'cliploc_build_map', '--tum',
-               PROJECT / 'cliploc_ros/demo/assets/mapping', '--out', 'map.yaml', cwd=tmp_path)
+               PROJECT / 'cliploc_ros/demo/assets/mapping', '--record-to', 'o.npz', '--out',
+               'map.yaml', cwd=tmp_path)
     assert done.returncode == 1
     assert 'is not installed' in done.stderr and "extra 'models'" in done.stderr
     assert done.stderr.count('\n') == 1

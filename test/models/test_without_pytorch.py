@@ -4,6 +4,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -60,6 +61,12 @@ def hidden(tmp_path_factory) -> dict[str, str]:
     return hide_pytorch(tmp_path_factory.mktemp('hidden'))
 
 
+@pytest.fixture
+def walk(tmp_path) -> Path:
+    """A copy: evaluate keeps what it records beside its folder."""
+    return Path(shutil.copytree(ASSETS / 'rig/front', tmp_path / 'walk'))
+
+
 def run(code: list[object], environment: dict[str, str]) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, *map(str, code)], cwd=PROJECT, env=environment,
                           capture_output=True, text=True, timeout=300, check=False)
@@ -81,7 +88,7 @@ def test_poses_equal_those_with_pytorch(hidden, tmp_path):
     assert len(off) >= WAKE_UPS // 2 and max(off) < 0.01
 
 
-def test_a_map_is_built_and_evaluated(hidden, tmp_path):
+def test_a_map_is_built_and_evaluated(hidden, walk, tmp_path):
     networks = ['--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
                 '--clip-pretrained', ASSETS / 'clip.safetensors']
     done = run(['-m', 'cliploc_ros.cli.build_map', '--tum', ASSETS / 'mapping', *networks,
@@ -91,17 +98,17 @@ def test_a_map_is_built_and_evaluated(hidden, tmp_path):
     assert 'labels are class names' not in done.stdout
     assert len(LandmarkMap.from_file(tmp_path / 'map.yaml')) > 20
     # no CLIP at all: its weights are not even named
-    done = run(['-m', 'cliploc_ros.cli.evaluate', '--tum', ASSETS / 'rig/front', *networks[:2],
+    done = run(['-m', 'cliploc_ros.cli.evaluate', '--tum', walk, *networks[:2],
                 '--map', ASSETS / 'map.yaml', '--methods', 'class_bf', '--trials', 1, '--sweep',
                 '--no-figures', '--out', tmp_path / 'out'], hidden)
     assert done.returncode == 0, done.stderr
 
 
-def test_networks_that_are_not_converted_are_named_with_the_remedies(hidden, tmp_path):
+def test_networks_that_are_not_converted_are_named_with_the_remedies(hidden, walk, tmp_path):
     (tmp_path / 'yolo.pt').symlink_to(ASSETS / 'yolo.pt')
     for file in ('clip.json', 'clip.safetensors'):
         (tmp_path / file).symlink_to(ASSETS / file)
-    sources = ['-m', 'cliploc_ros.cli.evaluate', '--tum', ASSETS / 'rig/front', '--map',
+    sources = ['-m', 'cliploc_ros.cli.evaluate', '--tum', walk, '--map',
                ASSETS / 'map.yaml', '--methods', 'auto', '--out', tmp_path / 'out']
     environment = hidden | {'XDG_CACHE_HOME': str(tmp_path / 'cache')}
     for networks, named in (
@@ -114,8 +121,8 @@ def test_networks_that_are_not_converted_are_named_with_the_remedies(hidden, tmp
         assert named in done.stderr
 
 
-def test_no_clip_is_refused_where_crops_are_compared(tmp_path):
-    done = run(['-m', 'cliploc_ros.cli.evaluate', '--tum', ASSETS / 'rig/front', '--map',
+def test_no_clip_is_refused_where_crops_are_compared(walk):
+    done = run(['-m', 'cliploc_ros.cli.evaluate', '--tum', walk, '--map',
                 ASSETS / 'map.yaml', '--methods', 'hybrid_bf', '--no-clip'], dict(os.environ))
     assert done.returncode == 1
     assert "method 'hybrid_bf' compares crops" in done.stderr and 'matching: class' in done.stderr
