@@ -21,11 +21,15 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.errors import ImageError, OptionsError
+from cliploc_ros.models.clip_towers import keep_text_tower
+from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.models.devices import import_openvino
+from cliploc_ros.models.openvino_networks import ConversionError
 from cliploc_ros.models.protocols import ObjectDetector
 from cliploc_ros.nodes.detector import DetectorNode
 from cliploc_ros.nodes.relocalizer import RelocalizerNode
 from cliploc_ros.ros.conversions import detections_to_msg
-from cliploc_ros.ros.frame_localizer import FrameLocalizer, load_localizer
+from cliploc_ros.ros.frame_localizer import FrameLocalizer, clip_options_of, load_localizer
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.map_parameters import map_files
@@ -83,12 +87,23 @@ def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bo
         parameters = node.settings.snapshot()
         used.append(parameters)
         localizer = load_localizer(node, parameters)
+    if (parameters.options().needs_similarities and localizer.device == 'cpu'
+            and parameters.inference != 'pytorch' and import_openvino() is not None):
+        with _step("CLIP's text tower, for the labels of other maps"):
+            _convert_text_tower(clip_options_of(parameters))
     with _step(f'{_REQUESTS} requests for {picture or "a picture of the demo"}'):
         requests = [answer(image_rgb, detector, localizer, parameters) for _ in range(_REQUESTS)]
     print(cost_table(requests), flush=True)
     print('ready: with these parameters, start and requests need neither network nor compiler')
     if cache_dir is not None:
         print('\n'.join(carrying(cache_dir, used)))
+
+
+def _convert_text_tower(options: ClipOptions) -> None:
+    try:
+        keep_text_tower(resolve_clip_weights(options), options)
+    except ConversionError as error:
+        print(f'    {error}: without PyTorch, a robot knows the labels of this map only')
 
 
 def answer(image_rgb: NDArray[np.uint8], detector: ObjectDetector | None,
@@ -159,6 +174,7 @@ def carrying(cache_dir: Path, used: list[CommonParameters]) -> list[str]:
             for name in map_files(one)}
     names |= maps | {str(embeddings_path(name)) for name in maps}
     files = sorted({Path(name).expanduser().absolute() for name in names})
+    files += sorted({file.parent / 'openvino' for file in files})  # networks beside their weights
     return lines + [f'carry as well, for a parameter names it: {file}' for file in files
                     if file.exists()]
 

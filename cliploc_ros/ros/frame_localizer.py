@@ -221,7 +221,7 @@ class FrameLocalizer:
         if observer is not None:
             from cliploc_ros.models.map_rows import embed_map
             observer = observer.with_labels(embed_map(
-                _clip_options(parameters), landmark_map, files, parameters.landmark_embeddings))
+                clip_options_of(parameters), landmark_map, files, parameters.landmark_embeddings))
         return FrameLocalizer(landmark_map, observer, relocalizer, options, self.device, map_hash,
                               load_keyframes(parameters, landmark_map),
                               load_grid(parameters, landmark_map))
@@ -416,7 +416,7 @@ def load_localizer(node: Node, parameters: RelocalizerParameters) -> FrameLocali
     if options.needs_similarities:
         from cliploc_ros.models.map_rows import load_encoder_for_map
         encoder, embeddings = load_encoder_for_map(
-            _clip_options(parameters), landmark_map, files, parameters.landmark_embeddings)
+            clip_options_of(parameters), landmark_map, files, parameters.landmark_embeddings)
         observer, device = Observer(encoder, embeddings), encoder.device
         observer.measure()
     return FrameLocalizer(landmark_map, observer, relocalizer, options, device, map_hash,
@@ -436,7 +436,8 @@ def _in_its_map(found: Relocalization, landmark_map: LandmarkMap, seen: Observat
     return found, own.landmark_map, replace(seen, similarities=pieces[which])
 
 
-def _clip_options(parameters: RelocalizerParameters) -> ClipOptions:
+def clip_options_of(parameters: RelocalizerParameters) -> ClipOptions:
+    """Return the CLIP that parameters name: that of the profile where they name none."""
     named = ClipOptions(
         model=parameters.clip_model, pretrained=parameters.clip_pretrained,
         checkpoint_path=parameters.clip_checkpoint_path, device=parameters.device,

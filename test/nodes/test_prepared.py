@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What `prepare` makes is all that the nodes need on a machine without a network."""
+"""What `prepare` makes is all that nodes need on a machine without a network and PyTorch."""
 
 import os
 import shutil
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from processes import PROJECT
+from without_pytorch import hide_pytorch
 
 from cliploc_ros.demo import ASSETS
 
@@ -19,6 +20,7 @@ OFFLINE = ('unshare', '--map-root-user', '--net', 'sh', '-c', 'ip link set lo up
 # Mounts a folder on itself, read-only, as a robot of a fleet mounts the cache of all.
 READ_ONLY = ('unshare', '--mount', 'sh', '-c',
              'mount --bind "$0" "$0" && mount -o remount,bind,ro "$0" && exec "$@"')
+WEIGHTS = ('yolo.pt', 'clip.json', 'clip.safetensors')
 ROBOT = f"""\
 detector:
   ros__parameters:
@@ -43,9 +45,13 @@ def offline():
 
 @pytest.fixture(scope='module')
 def robot(tmp_path_factory):
-    file = tmp_path_factory.mktemp('robot') / 'robot.yaml'
-    file.write_text(ROBOT)
-    return file
+    folder = tmp_path_factory.mktemp('robot')
+    text = ROBOT
+    for name in WEIGHTS:  # without the converted networks beside them
+        (folder / name).symlink_to(ASSETS / name)
+        text = text.replace(f'{ASSETS}/{name}', f'{folder}/{name}')
+    (folder / 'robot.yaml').write_text(text)
+    return folder / 'robot.yaml'
 
 
 def prepare(*arguments, within=(), **environment):
@@ -68,7 +74,7 @@ def content(folder):
     return sorted(str(file.relative_to(folder)) for file in folder.rglob('*'))
 
 
-def test_prepare_shows_progress_and_costs(prepared):
+def test_prepare_shows_progress_and_costs(prepared, robot):
     folder, output = prepared
     for text in ('==> detector: weights and network', '==> relocalizer: map', 'done after',
                  'what a request costs here', 'the verdict on this picture: accepted',
@@ -76,8 +82,9 @@ def test_prepare_shows_progress_and_costs(prepared):
         assert text in output
     stages = [line.split()[0] for line in output.splitlines() if len(line.split()) == 3]
     assert set(stages[-4:]) == {'detection', 'decoding', 'CLIP', 'search'}
-    for name in ('yolo.pt', 'clip.json', 'clip.safetensors', 'map.yaml'):
-        assert f'carry as well, for a parameter names it: {Path(ASSETS) / name}' in output
+    for file in (*map(robot.with_name, WEIGHTS), Path(ASSETS) / 'map.yaml'):
+        assert f'carry as well, for a parameter names it: {file}' in output
+    assert len(list((folder / 'openvino').iterdir())) == 3
 
 
 def test_the_folder_is_all_that_the_nodes_need_without_a_network_and_read_only(
@@ -92,8 +99,8 @@ def test_the_folder_is_all_that_the_nodes_need_without_a_network_and_read_only(
         [*offline, *READ_ONLY, str(carried), sys.executable,
          str(Path(__file__).with_name('offline.py')), str(tmp_path),
          '--ros-args', '--params-file', str(robot), '-p', f'cache_dir:={carried}'],
-        env=variables | {'PYTHONPATH': str(PROJECT), 'HOME': str(tmp_path / 'home'),
-                         'ROS_LOG_DIR': str(tmp_path)},
+        env=variables | {'PYTHONPATH': hide_pytorch(tmp_path)['PYTHONPATH'],
+                         'HOME': str(tmp_path / 'home'), 'ROS_LOG_DIR': str(tmp_path)},
         capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith('True accepted: x '), done.stdout

@@ -1,0 +1,137 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Converted networks run where PyTorch cannot be imported, and give the same poses."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import open_clip
+import pytest
+from without_pytorch import hide_pytorch
+
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.demo import ASSETS
+from cliploc_ros.models.tokenizer import ClipTokenizer
+
+PROJECT = Path(__file__).resolve().parents[2]
+WAKE_UPS = 10
+#: Prints the demo's poses (4, 4), null for a refusal, and how far the robot is from each [m].
+POSES = """
+import json, sys
+import cv2, numpy as np
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.datasets.intrinsics import find_camera
+from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.demo import ASSETS
+from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.models.map_rows import load_encoder_for_map
+from cliploc_ros.models.observer import Observer
+from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.protocols import DetectorOptions
+
+inference, cache, wake_ups = sys.argv[1], sys.argv[2], int(sys.argv[3])
+landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
+detector = load_detector(DetectorOptions(str(ASSETS / 'yolo.pt'), inference=inference,
+                                         cache_dir=cache, device='cpu'))
+observer = Observer(*load_encoder_for_map(ClipOptions(
+    str(ASSETS / 'clip.json'), str(ASSETS / 'clip.safetensors'), inference=inference,
+    cache_dir=cache, device='cpu', precision='fp32'), landmark_map, [], 'text'))
+relocalizer = Relocalizer(landmark_map, RelocalizerOptions(time_budget_s=60.0))
+camera, _ = find_camera(None, ASSETS / 'sequence')
+found = []
+for file in read_tum(ASSETS / 'sequence').image_paths[::5][:wake_ups]:
+    image = np.ascontiguousarray(cv2.imread(str(file))[..., ::-1])
+    boxes = detector.detect(image).usable(camera.width, camera.height, 50)
+    pose = relocalizer.relocalize([observer.observe(image, camera, boxes, 0)])
+    found.append(np.asarray(pose.map_from_camera).tolist() if pose.accepted else None)
+print(json.dumps({'poses': found, 'engines': [detector.inference, observer._encoder.inference],
+                  'loaded': sorted({'torch', 'ultralytics', 'open_clip'} & set(sys.modules))}))
+"""
+
+
+@pytest.fixture(scope='module')
+def hidden(tmp_path_factory) -> dict[str, str]:
+    return hide_pytorch(tmp_path_factory.mktemp('hidden'))
+
+
+@pytest.fixture
+def walk(tmp_path) -> Path:
+    """A copy: evaluate keeps what it records beside its folder."""
+    return Path(shutil.copytree(ASSETS / 'rig/front', tmp_path / 'walk'))
+
+
+def run(code: list[object], environment: dict[str, str]) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, *map(str, code)], cwd=PROJECT, env=environment,
+                          capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_poses_equal_those_with_pytorch(hidden, tmp_path):
+    found = {}
+    for inference, environment in (('openvino', hidden), ('pytorch', dict(os.environ))):
+        done = run(['-c', POSES, inference, tmp_path / inference, WAKE_UPS], environment)
+        assert done.returncode == 0, done.stderr
+        found[inference] = json.loads(done.stdout)
+        assert found[inference]['engines'] == [inference] * 2
+    assert found['openvino']['loaded'] == []
+    first, second = (found[name]['poses'] for name in ('openvino', 'pytorch'))
+    assert [pose is None for pose in first] == [pose is None for pose in second]
+    off = [np.linalg.norm(np.subtract(one, other)[:3, 3]) for one, other in
+           zip(first, second, strict=True) if one is not None]
+    print(f'\n{len(off)} of {WAKE_UPS} poses accepted, at most {1e3 * max(off):.2f} mm apart')
+    assert len(off) >= WAKE_UPS // 2 and max(off) < 0.01
+
+
+def test_a_map_is_built_and_evaluated(hidden, walk, tmp_path):
+    networks = ['--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
+                '--clip-pretrained', ASSETS / 'clip.safetensors']
+    done = run(['-m', 'cliploc_ros.cli.build_map', '--tum', ASSETS / 'mapping', *networks,
+                '--record-to', tmp_path / 'o.npz', '--no-joint', '--out', tmp_path / 'map.yaml'],
+               hidden)
+    assert done.returncode == 0, done.stderr
+    assert 'labels are class names' not in done.stdout
+    assert len(LandmarkMap.from_file(tmp_path / 'map.yaml')) > 20
+    # no CLIP at all: its weights are not even named
+    done = run(['-m', 'cliploc_ros.cli.evaluate', '--tum', walk, *networks[:2],
+                '--map', ASSETS / 'map.yaml', '--methods', 'class_bf', '--trials', 1, '--sweep',
+                '--no-figures', '--out', tmp_path / 'out'], hidden)
+    assert done.returncode == 0, done.stderr
+
+
+def test_networks_that_are_not_converted_are_named_with_the_remedies(hidden, walk, tmp_path):
+    (tmp_path / 'yolo.pt').symlink_to(ASSETS / 'yolo.pt')
+    for file in ('clip.json', 'clip.safetensors'):
+        (tmp_path / file).symlink_to(ASSETS / file)
+    sources = ['-m', 'cliploc_ros.cli.evaluate', '--tum', walk, '--map',
+               ASSETS / 'map.yaml', '--methods', 'auto', '--out', tmp_path / 'out']
+    environment = hidden | {'XDG_CACHE_HOME': str(tmp_path / 'cache')}
+    for networks, named in (
+            (['--model', tmp_path / 'yolo.pt', '--no-clip'], 'yolo.pt'),
+            (['--model', ASSETS / 'yolo.pt', '--clip-model', tmp_path / 'clip.json',
+              '--clip-pretrained', tmp_path / 'clip.safetensors'], '--no-clip')):
+        done = run([*sources, *networks], environment)
+        assert done.returncode == 1 and 'Traceback' not in done.stderr
+        assert 'is not installed' in done.stderr and 'prepare --cache-dir' in done.stderr
+        assert named in done.stderr
+
+
+def test_no_clip_is_refused_where_crops_are_compared(walk):
+    done = run(['-m', 'cliploc_ros.cli.evaluate', '--tum', walk, '--map',
+                ASSETS / 'map.yaml', '--methods', 'hybrid_bf', '--no-clip'], dict(os.environ))
+    assert done.returncode == 1
+    assert "method 'hybrid_bf' compares crops" in done.stderr and 'matching: class' in done.stderr
+
+
+def test_tokens_equal_those_of_open_clip():
+    merges = Path(open_clip.tokenizer.default_bpe()).read_bytes()
+    texts = ['a photo of a red mug', 'Dining-table, 2.5m wide!!', "the dog's bowls, don't", 'Büro',
+             'cafe\u0301', '椅子 一二', '½ pint ²', '', 'very ' * 90 + 'long', 'a  b\tc\n',
+             '&amp; &lt;b&gt;', '‘quoted’ “x”', 'aaaaaaa aaaa', '🙂', '_under_score_', "''s"]
+    assert np.array_equal(ClipTokenizer(merges, 77)(texts),
+                          open_clip.get_tokenizer('ViT-B-32')(texts).numpy())
