@@ -110,8 +110,8 @@ def fly_to(client: viser.ClientHandle | None, landmark: Landmark) -> None:
     way = offset / length if length > 1e-6 else np.array([-0.6, -0.6, 0.5])
     away = max(_LEAST_AWAY_M, _AXES_AWAY * float(landmark.semi_axes.max()))
     with client.atomic():
-        camera.look_at = landmark.center
         camera.position = landmark.center + away * way
+        camera.look_at = landmark.center  # after the position, which takes it along
 
 
 def show_props(handle: Any, **props: Any) -> None:
