@@ -172,6 +172,8 @@ def test_studio_serves_its_page(programs, tmp_path):
             url = next(line.split()[1] for line in lines if line.startswith('studio: http'))
             with urllib.request.urlopen(url, timeout=60.0) as page:
                 assert b'<!doctype html>' in page.read(200).lower()
+            with urllib.request.urlopen(url + 'studio.js', timeout=60.0) as script:
+                assert script.status == 200, 'the wheel has the files of the page'
         finally:
             studio.send_signal(signal.SIGINT)
             rest, _ = studio.communicate(timeout=60.0)

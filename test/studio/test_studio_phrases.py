@@ -75,6 +75,7 @@ def test_a_person_chooses_a_phrase(chromium, path):
     document, truth = studio.document, studio.document.landmarks['bowl_1'].label
     document.apply(edits.relabel(document.landmarks, ['bowl_1'], 'something'))
     with person_at(chromium, studio) as (person, _):
+        person.mode('Edit')
         person.select(document, 'bowl_1')
         wait_for(lambda: truth in studio.phrases(), 'the phrases of CLIP')
         person.picture('phrases')

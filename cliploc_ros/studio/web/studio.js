@@ -199,7 +199,7 @@ function showCard() {
               doing('lock', {ids})),
        toggle('fly', 'Fly to it', 'G', doing('fly'))),
     field('Label', [one.label], set('label'), {isText: true, ...off}),
-    one.phrases.length ? el('div', {className: 'chips'}, ...one.phrases.map(
+    mode === 'edit' && one.phrases.length ? el('div', {className: 'chips'}, ...one.phrases.map(
       text => button(text, () => set('label')(text), {off: one.is_locked, hint: text}))) : null,
     note(one.note),
     field('Class', [one.class_id], set('class_id'), {isText: true, list: 'classes', ...off}),
@@ -227,17 +227,17 @@ const PANELS = {
     return [
       el('progress', {max: total, value: done}),
       note(`${done} of ${total}: ${accepted} accepted, ${fixed} fixed, ${deleted} deleted`),
+      buttons(button('Accept', doing('accept'), {key: 'A', kind: 'main', off: !one}),
+              button('Fix', doing('fix'), {key: 'F', off: !one || !state.file.has_boxes,
+                                           hint: 'merge a duplicate, fit others to their boxes'}),
+              button('Delete', doing('review_delete'), {key: 'D', kind: 'danger', off: !one}),
+              button('Skip', doing('next'), {key: 'N'})),
       one && one.decision ? el('p', {className: 'note done'}, one.decision) : null,
       one && one.is_checked ? (one.faults.length
         ? el('ul', {className: 'faults'}, ...one.faults.map(text => el('li', {}, text)))
         : el('p', {className: 'note done'}, 'no fault found')) : null,
       one?.support != null ? note(`in ${one.support} frames`
         + (one.ratio === null ? '' : `, ${Math.round(100 * one.ratio)} % of those that should show it`)) : null,
-      buttons(button('Accept', doing('accept'), {key: 'A', kind: 'main', off: !one}),
-              button('Fix', doing('fix'), {key: 'F', off: !one || !state.file.has_boxes,
-                                           hint: 'merge a duplicate, fit others to their boxes'}),
-              button('Delete', doing('review_delete'), {key: 'D', kind: 'danger', off: !one}),
-              button('Skip', doing('next'), {key: 'N'})),
       done === total ? buttons(button('Check again', doing('check'))) : null];
   },
   edit() {
