@@ -42,7 +42,7 @@ def office(tmp_path, shared_data):
 
 def test_the_picture_shows_the_image_with_its_landmarks(studio):
     studio.show_view(3)
-    plain = studio._images.near(float(studio.recording.detections.stamps_s[3]))
+    plain = studio.images.near(float(studio.recording.detections.stamps_s[3]))
     outlines = studio.outlines()
     assert outlines and studio.picture().shape == plain.shape
     assert (studio.picture() != plain).any() and (studio.picture() == plain).mean() > 0.8
