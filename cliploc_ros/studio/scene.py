@@ -122,7 +122,9 @@ class Labels:
         self._server, self._up = server, up
         self._handles: dict[str, tuple[Landmark, Any]] = {}
         self._count = 0
-        self._shown: tuple[Landmarks, Sequence[str]] = {}, ()
+        # landmarks, selection, where the labels begin, their texts
+        self._shown: tuple[Landmarks, Sequence[str], NDArray[np.float64], list[str]] = (
+            {}, (), np.empty((0, 3)), [])
         self._camera: Any = None
         self._lock, self._is_stale = threading.Lock(), False
         self.is_shown = True
@@ -134,7 +136,10 @@ class Labels:
 
     def show(self, landmarks: Landmarks, selection: Sequence[str]) -> None:
         """Show the labels of these landmarks; those of the selection come first."""
-        self._shown = landmarks, selection
+        tops = np.array([one.center + float(np.linalg.norm(one.basis.T @ self._up)) * self._up
+                         for one in landmarks.values()]).reshape(-1, 3)
+        self._shown = landmarks, selection, tops, [
+            _shortened(one.label, key in selection) for key, one in landmarks.items()]
         self._lay_out()
 
     def _moved(self, camera: Any) -> None:
@@ -147,49 +152,48 @@ class Labels:
         while self._is_stale and self._lock.acquire(blocking=False):
             try:
                 self._is_stale = False
-                landmarks, selection = self._shown
-                texts = {key: _shortened(one.label, key in selection)
-                         for key, one in landmarks.items()}
                 if self._camera is not None:
-                    scales = dict(self._with_room(landmarks, texts, selection))
                     with self._server.atomic():
-                        self._set(landmarks, texts, scales)
+                        self._set(*self._shown)
             finally:
                 self._lock.release()
 
-    def _with_room(self, landmarks: Landmarks, texts: dict[str, str], selection: Sequence[str]
-                   ) -> Iterator[tuple[str, float]]:
-        """Yield the landmarks whose labels do not overlap, and the labels' sizes."""
+    def _with_room(self, tops: NDArray[np.float64], texts: Sequence[str],
+                   is_selected: NDArray[np.bool_]) -> Iterator[tuple[int, float]]:
+        """Yield the rows of the labels that do not overlap, and their sizes."""
         camera = self._camera
-        if not (self.is_shown and landmarks):
-            return
-        keys = list(landmarks)
-        pixels, depths = pixels_of(camera, [self._place(landmarks[key]) for key in keys])
+        pixels, depths = pixels_of(camera, tops)
         orbit_m = float(np.linalg.norm(camera.look_at - camera.position))
-        order = np.lexsort([depths, np.array([key not in selection for key in keys])])
-        taken = np.empty((0, 4))
-        for row in order[depths[order] > 0.05]:
-            scale = round(float(np.clip(orbit_m / depths[row], 0.8, 1.1)), 1)
-            half = 0.5 * scale * _LETTER_PX * (len(texts[keys[row]]) + 2)
-            x, y = pixels[row]
-            box = np.array([x - half, y - scale * _LINE_PX, x + half, y])
-            is_inside = 0 < x < camera.image_width and 0 < y < camera.image_height
-            if is_inside and not ((taken[:, :2] < box[2:]) & (taken[:, 2:] > box[:2])).all(
-                    axis=1).any():
-                taken = np.concatenate([taken, box[None]])
-                yield keys[row], scale
+        with np.errstate(invalid='ignore'):
+            is_inside = (depths > 0.05) & (pixels > 0.0).all(axis=1) & (
+                pixels < (camera.image_width, camera.image_height)).all(axis=1)
+        order = np.lexsort([depths, ~is_selected])
+        taken: list[tuple[float, float, float, float]] = []
+        for row in order[is_inside[order]].tolist():
+            scale = round(min(max(orbit_m / float(depths[row]), 0.8), 1.1), 1)
+            half = 0.5 * scale * _LETTER_PX * (len(texts[row]) + 2)
+            x, bottom = pixels[row].tolist()
+            left, top, right = x - half, bottom - scale * _LINE_PX, x + half
+            if not any(left < one[2] and right > one[0] and top < one[3] and bottom > one[1]
+                       for one in taken):
+                taken.append((left, top, right, bottom))
+                yield row, scale
             if len(taken) >= _MAX_LABELS:
                 return
 
-    def _set(self, landmarks: Landmarks, texts: dict[str, str], scales: dict[str, float]
-             ) -> None:
+    def _set(self, landmarks: Landmarks, selection: Sequence[str], tops: NDArray[np.float64],
+             texts: Sequence[str]) -> None:
+        keys = list(landmarks)
+        rows = dict(self._with_room(tops, texts, np.isin(keys, selection))
+                    if self.is_shown and keys else ())
         for key in self._handles.keys() - landmarks.keys():
             self._handles.pop(key)[1].remove()
-        for key in self._handles.keys() - scales.keys():
+        for key in self._handles.keys() - {keys[row] for row in rows}:
             if self._handles[key][1].visible:
                 self._handles[key][1].visible = False
-        for key, scale in scales.items():
-            one, text = landmarks[key], texts[key]
+        for row, scale in rows.items():
+            key, text = keys[row], texts[row]
+            one = landmarks[key]
             old, handle = self._handles.get(key, (None, None))
             if handle is None:
                 # ids may hold any characters, names of nodes not
@@ -197,15 +201,11 @@ class Labels:
                                                       anchor='bottom-center')
                 self._count += 1
             if old is not one:
-                handle.position = self._place(one)
+                handle.position = tops[row]
             for name, value in (('text', text), ('font_screen_scale', scale), ('visible', True)):
                 if getattr(handle, name) != value:
                     setattr(handle, name, value)
             self._handles[key] = (one, handle)
-
-    def _place(self, one: Landmark) -> NDArray[np.float64]:
-        """Return where its label begins: at its top."""
-        return one.center + float(np.linalg.norm(one.basis.T @ self._up)) * self._up
 
 
 def _shortened(label: str, is_selected: bool) -> str:

@@ -165,7 +165,7 @@ def look_through(client: Any, pose: NDArray[np.float64], intrinsics: Camera) -> 
         camera.fov = 2.0 * float(np.arctan(1.1 * half))
 
 
-def pixels_of(camera: Any, points: Sequence[NDArray[np.float64]]
+def pixels_of(camera: Any, points: Sequence[NDArray[np.float64]] | NDArray[np.float64]
               ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the pixels (n, 2) of points (n, 3) in a browser, and how far away they are (n,)."""
     rotation = Rotation.from_quat(np.roll(camera.wxyz, -1)).as_matrix()
