@@ -45,7 +45,7 @@ def with_simulated_boxes(detections, landmark_map):
 
 
 def test_the_worst_landmarks_by_keys(chromium, path):
-    """One key each accepts, deletes, skips, and says what it cannot fix; a person who types presses them, too."""
+    """One key each accepts, deletes, skips; one that fixes says what it cannot; typing does not."""
     studio = demo_studio(path)
     document = studio.document
     studio = Studio(document, Recording(with_simulated_boxes(studio.recording.detections,
