@@ -49,6 +49,8 @@ class Page:
         self._drag = 0
         self._shown_view = -1
         self._build_scene()
+        for note in studio.document.notes:
+            self._actions.log('done', note)
         self.board = Board()
         self.desk = Desk(self._actions, self._client_of, live)
         if studio.layer is not None:

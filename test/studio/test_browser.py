@@ -165,7 +165,7 @@ def test_the_gizmo_is_dragged(chromium, studio):
 
 
 def test_the_exported_page_opens_without_a_server(chromium, person, studio, path):
-    person.page.get_by_title('More').click()
+    person.page.get_by_title('More', exact=True).click()
     person.click('Export the scene as one page')
     exported = path.with_suffix('.html')
     wait_for(exported.is_file, 'the export')
