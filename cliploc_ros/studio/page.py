@@ -52,6 +52,8 @@ class Page:
         self._shown_view = -1
         self._recorded: list[Any] = []
         self._build_scene()
+        for note in studio.document.notes:
+            self._actions.log('done', note)
         self.board = Board()
         self.desk = Desk(self._actions, self._client_of, live)
         self._redrawer = threading.Thread(target=self._redraw_always, daemon=True)

@@ -181,7 +181,7 @@ def test_a_double_click_flies_to_a_landmark(person, studio):
 
 
 def test_the_exported_page_opens_without_a_server(chromium, person, studio, path):
-    person.page.get_by_title('More').click()
+    person.page.get_by_title('More', exact=True).click()
     person.click('Export the scene as one page')
     exported = path.with_suffix('.html')
     wait_for(exported.is_file, 'the export')
