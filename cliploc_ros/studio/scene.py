@@ -30,7 +30,7 @@ _FRUSTUM_M = 0.08
 _KEYFRAME_RGB = (0, 150, 136)
 _VERDICT_RGB = {'accepted': (30, 170, 60), 'refused': (150, 150, 150), 'wrong': (220, 0, 0)}
 # The image of the selected view lies this far in front of its camera [m].
-_IMAGE_DEPTH_M = 0.3
+_IMAGE_DEPTH_M = 0.1
 _SPHERE = trimesh.creation.icosphere(subdivisions=2)
 _RING_POINTS = 40
 
