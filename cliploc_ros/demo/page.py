@@ -19,7 +19,7 @@ PICTURES = 'wake_up_??.png'
 # Columns of the first screen.
 _BRIEF_COLUMNS = (0, 2, 4, 6, 7)
 # Heading and width on the terminal.
-_COLUMNS = (('', 3), ('image at', 8), ('answer', 8), ('score', 6), ('inliers', 7),
+_COLUMNS = (('', 3), ('image at', 8), ('answer', 8), ('score', 6), ('landmarks', 9),
             ('x y z [m]', 18), ('error', 15), ('answer time', 11), ('stages', 0))
 _BRIEF = [_COLUMNS[column][0] for column in _BRIEF_COLUMNS]
 
@@ -126,7 +126,7 @@ def _cells(judged: Judged) -> list[str]:
     stages = ', '.join(f'{stage} {ms} ms' for stage, ms in wake_up.stage_ms.items())
     return [str(judged.number), f'{judged.time_s:.1f} s',
             'accepted' if wake_up.accepted else 'refused', f'{wake_up.score:.2f}',
-            str(wake_up.inliers), position, error, f'{wake_up.answer_s:.2f} s', stages]
+            str(wake_up.landmarks), position, error, f'{wake_up.answer_s:.2f} s', stages]
 
 
 def _line(cells: Sequence[str]) -> str:

@@ -48,7 +48,7 @@ def draw_wake_up(review: Review, landmark_map: LandmarkMap, path: Path) -> None:
     judged, wake_up, top = review.judged, review.judged.wake_up, 0.965 if review.beside else 0.945
     figure.text(0.008, top, f'Wake-up {judged.number}: {judged.verdict}', fontsize=15,
                 color=ACCEPTED if wake_up.accepted else BAD, fontweight='bold')
-    figure.text(0.992, top, f'score {wake_up.score:.2f}, {wake_up.inliers} inliers',
+    figure.text(0.992, top, f'score {wake_up.score:.2f}, {wake_up.landmarks} landmarks',
                 fontsize=11, ha='right')
     numbers = _numbers(review)
     if review.beside:

@@ -56,7 +56,7 @@ class WakeUp:
         return float(self._stated(r'score ([0-9.]+)'))
 
     @property
-    def inliers(self) -> int:
+    def landmarks(self) -> int:
         """Return the number of landmarks matched in the message."""
         return int(self._stated(r'(\d+) landmarks'))
 
