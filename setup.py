@@ -67,8 +67,8 @@ setup(
         # By name: evaluate and build_map put files of their own beside a recording. A wheel has no
         # command that shows the demo.
         f'{PACKAGE}.demo': [] if BUILDS_WHEEL else [
-            'assets/clip.*', 'assets/NOTICE.txt', 'assets/map.yaml', 'assets/yolo.pt', 'assets/*/*.*',
-            'assets/*/rgb/*.jpg', 'assets/rig/*/*.*', 'assets/rig/*/rgb/*.jpg',
+            'assets/clip.*', 'assets/NOTICE.txt', 'assets/map.yaml', 'assets/yolo.pt',
+            'assets/*/*.*', 'assets/*/rgb/*.jpg', 'assets/rig/*/*.*', 'assets/rig/*/rgb/*.jpg',
             'assets/openvino/*/*.*',
         ],
         f'{PACKAGE}.core.acceptance': ['calibration.yaml'],
