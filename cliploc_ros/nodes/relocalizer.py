@@ -5,6 +5,7 @@
 import math
 import time
 import traceback
+from contextlib import suppress
 from dataclasses import replace
 from typing import NoReturn
 
@@ -54,9 +55,11 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         linger_s = math.inf if continuous else LINGER_S
         on_frame = self._newest.offer if continuous else lambda frame: None
         self._frames = frames_of(self, parameters, linger_s, on_frame)
-        self.facts['topics'] = ' '.join(
-            f'{name}:={self.resolve_topic_name(name)}' for name in (
-                *self._frames.topics, *_OTHER_TOPICS, parameters.localizer_pose) if name)
+        with suppress(CliplocError):  # a bad name: it will not be configured
+            self.settings.snapshot()
+            self.facts['topics'] = ' '.join(
+                f'{name}:={self.resolve_topic_name(name)}' for name in (
+                    *self._frames.topics, *_OTHER_TOPICS, parameters.localizer_pose) if name)
         self._handoff = HandOff(self, self._robot.odometry)
         self._handoff.on_shown(self._robot.prior.follow)
         self._cases = CaseRecorder(bool(parameters.record_folder))

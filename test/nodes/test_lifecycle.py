@@ -142,7 +142,7 @@ def test_shutdown_works_from_every_state(manage, room_map, state):
 def test_sigterm_while_weights_load(start, tmp_path):
     for name in ('detector', 'relocalizer'):
         process = start(f'nodes.{name}', fresh=True, parameters=with_networks(name, tmp_path))
-        process.wait_for_import('torch')
+        process.wait_for_import('openvino')
         code, seconds = process.stop(signal.SIGTERM)
         assert code == 0, process.output()
         assert seconds < 2.0
