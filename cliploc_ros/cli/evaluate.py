@@ -199,13 +199,14 @@ def evaluate(options: argparse.Namespace) -> int:
     check_folder_options(options)
     if options.level and folder_of(options) is None:
         raise OptionsError('--level is for folders of images only')
-    if options.queries is None:
+    of_case = options.watch is None and options.bag is not None and _is_case(options)
+    if options.queries is None and not of_case:
         find_topics(options, options.bag)
     landmark_map = join_maps([LandmarkMap.from_file(file) for file in options.map],
                              [str(file) for file in options.map])
     if options.watch is not None:
         return _watch(options, landmark_map)
-    if options.bag is not None and _is_case(options):
+    if of_case:
         return _replay_case(options, landmark_map)
     paper = RelocalizerOptions(
         matching=RelocalizerOptions.matching if options.clip else 'class',
