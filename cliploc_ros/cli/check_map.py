@@ -179,6 +179,8 @@ def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Imag
         print(f'observations: {os.path.relpath(recording.observations)}', flush=True)
         detections, source = recording.load(), None
     else:
+        print('no recording is known of this map: the check is of the map alone, and simulated; '
+              'give --observations', flush=True)
         return None
     images = None
     try:

@@ -56,7 +56,9 @@ def run(options: argparse.Namespace) -> int:
         doctor(options.params_file, options.relocalizer, options.timeout, report)
     failed = [one.what for one in report.findings if one.state is State.FAIL]
     print(f'{len(failed)} of {len(report.findings)} failed: {", ".join(failed)}' if failed else
-          f'nothing failed in {len(report.findings)} checks')
+          f'nothing failed in {len(report.findings)} checks' + (
+              ', but no pose is found here' if any(
+                  one.state is State.REFUSED for one in report.findings) else ''))
     return int(bool(failed))
 
 

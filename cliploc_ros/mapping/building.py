@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The entry point of mapping: posed detections in, a map and a report out."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
@@ -189,8 +190,7 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     tell('done', 1.0)
     if len(draft.landmarks.centers) == 0:
         raise NothingFoundError(
-            f'no landmark is good enough for a map; {len(draft.reasons)} were left out, the first '
-            f'one because: {draft.reasons[0]}' if draft.reasons else
+            _why_none(draft.reasons) if draft.reasons else
             'no boxes of one class meet in space; check that poses and stamps belong to these '
             'images, that the poses are of the camera (z forward), and the intrinsics',
             _left_out(detections, draft))
@@ -272,6 +272,15 @@ def _settle(views: Views, landmarks: Landmarks, options: MappingOptions
                 for rows in boxes]
         landmarks = fit_landmarks(views, landmarks, boxes).select(np.array(seen, dtype=np.bool_))
     return landmarks, associate(views, landmarks, options.association_iou)
+
+
+def _why_none(reasons: Sequence[str]) -> str:
+    """Return why no landmark is good enough, the commonest reason first, and what to do."""
+    kinds = Counter(reason.partition(':')[0] for reason in reasons)
+    counts = ', '.join(f'{count} {kind}' for kind, count in kinds.most_common())
+    return (f'no landmark is good enough for a map; {len(reasons)} were left out ({counts}), the '
+            f'first one because: {reasons[0]}. Record while the camera moves past the objects, '
+            'not only turns, or map images with depth')
 
 
 def _with_poses(given: Views, odometry: NDArray[np.float64] | None, draft: _Draft,

@@ -69,6 +69,7 @@ class State(StrEnum):
     PASS = 'pass'
     FAIL = 'fail'
     NOT_CHECKED = 'not checked'
+    REFUSED = 'refused'  #: A request gets no pose here, although nothing is broken
 
 
 class Finding(NamedTuple):
@@ -348,7 +349,7 @@ def _check_request(node: Doctor, parameters: RelocalizerParameters,
             report.add('pose', State.PASS,
                        f'accepted with confidence {found.confidence:.3f}; not handed over')
         else:
-            report.skip('pose', f'refused here: {found.reason}')
+            report.add('pose', State.REFUSED, found.reason)
 
 
 def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) -> None:

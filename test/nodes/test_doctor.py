@@ -13,7 +13,7 @@ from processes import wait_for
 from rclpy.qos import qos_profile_system_default
 from tester import class_matching, make_frame
 
-LINE = re.compile('^(.{12}) (pass|fail|not checked) +(.*)$', re.MULTILINE)
+LINE = re.compile('^(.{12}) (pass|fail|not checked|refused) +(.*)$', re.MULTILINE)
 WHOLE = {'parameters': 'valid', 'map': '12 landmarks', 'camera': '640 x 480 px',
          'clock': 'images come', 'calibration': '65 degrees wide', 'tf': '0.50 m above',
          'odometry': 'the robot rests', 'detector': '12 boxes', 'localizer': 'amcl_pose',
