@@ -134,15 +134,20 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     from cliploc_ros.studio.studio import Studio
 
     images = detections = None
+    is_folder = options.images is not None and find_layout(options.images) is not None
     built_from = None if options.map is None else load_recording(options.map)
+    if is_folder and built_from is not None and built_from.source is not None and not (
+            built_from.source.samefile(options.images)):
+        built_from = None  # a folder has poses of its own
     if options.observations is not None:
         detections = load_observations(options.observations)
     elif built_from is not None:
         detections = built_from.load()
     if options.images is not None:
-        find_topics(options, None if find_layout(options.images) else options.images)
+        cameras = _cameras(options, detections)
+        find_topics(options, options.images if not is_folder and cameras == [''] else None)
         topics = BagTopics(options.image, options.camera_info, options.rectified)
-        images = open_images(options.images, topics, _cameras(options, detections))
+        images = open_images(options.images, topics, cameras)
     elif built_from is not None and detections is not None:
         images = images_of_recording(built_from, _cameras(options, detections))
     if detections is None and options.images is not None:

@@ -24,7 +24,8 @@ from cliploc_ros.models.openvino_networks import (
 
 #: The remedy of who has no CLIP, and how each program is told of a file of weights.
 WITHOUT_CLIP = ", or do without CLIP ('matching: class', --no-clip)"
-_FILE = 'clip_checkpoint_path (of programs: --clip-pretrained) to the file'
+#: How messages name the option for a file of weights.
+CHECKPOINT = 'clip_checkpoint_path (of programs: --clip-pretrained) to the file'
 _CONFIG_PARTS = ('embed_dim', 'vision_cfg', 'text_cfg')
 _WEIGHT_SUFFIXES = ('.pt', '.pth', '.bin', '.safetensors', '.npz', '.npy')
 
@@ -206,7 +207,7 @@ def _downloaded(model: str, tag: dict[str, Any], options: ClipOptions) -> Path:
     repository, name = os.path.split(tag.get('hf_hub', ''))
     if not repository:
         raise ModelError(f'{what} are on no model hub: download {tag.get("url", "them")} and set '
-                         f'{_FILE}{WITHOUT_CLIP}')
+                         f'{CHECKPOINT}{WITHOUT_CLIP}')
     newer, older = ((str(Path(name).with_suffix('.safetensors')), name) if name
                     else (HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME))
     own = resolve_cache_dir(options.cache_dir) / 'weights'
@@ -223,4 +224,4 @@ def _downloaded(model: str, tag: dict[str, Any], options: ClipOptions) -> Path:
 
     return download(what, own, (
         f'Without a network: download {newer} or {older} from https://huggingface.co/{repository} '
-        f'on another machine and set {_FILE}{WITHOUT_CLIP}'), fetch)
+        f'on another machine and set {CHECKPOINT}{WITHOUT_CLIP}'), fetch)

@@ -20,7 +20,12 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.clip_encoder import encode_labels
-from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.models.clip_weights import (
+    CHECKPOINT,
+    WITHOUT_CLIP,
+    ClipOptions,
+    resolve_clip_weights,
+)
 from cliploc_ros.models.files import fingerprint_file, first_line
 from cliploc_ros.models.label_embeddings import LabelCache
 from cliploc_ros.models.protocols import DetectorOptions, Prompts
@@ -119,8 +124,8 @@ def _tower(name: str, options: DetectorOptions
                                device=options.device, cache_dir=options.cache_dir)
             weights = resolve_clip_weights(clip)
         except ModelError as error:
-            raise ModelError(f'the text tower of {options.model}: '
-                             + str(error).replace('clip_checkpoint_path', 'text_model')) from error
+            remedy = str(error).replace(f'{CHECKPOINT}{WITHOUT_CLIP}', 'text_model to the file')
+            raise ModelError(f'the text tower of {options.model}: {remedy}') from error
         return weights.key, lambda texts: encode_labels(weights, texts, clip)
     if name not in ('clip', *_TOWERS):
         raise ModelError(f"{options.model} needs the text tower '{name}', which is unknown: "

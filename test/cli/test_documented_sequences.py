@@ -71,7 +71,7 @@ def drive(request, tmp_path_factory):
                        'clip_pretrained': ASSETS / 'clip.safetensors'}, []
     else:
         shared = request.getfixturevalue('shared_data')
-        write_drive(folder / 'drive', shared / 'rooms/tum_fr1_rpy', 4)
+        write_drive(folder / 'drive', shared / 'seven_scenes_kitchen', 1)
         found, more = {'model': shared / 'weights/yolov8n_coco.pt'}, ['--no-clip']
     arguments = [word for name, file in found.items()
                  for word in (f'--{name.replace("_", "-")}', str(file))]

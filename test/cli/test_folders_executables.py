@@ -84,7 +84,7 @@ def test_options_that_do_not_go_together(options, expected, tmp_path, capsys):
 def test_options_of_folders_with_other_sources(tmp_path, capsys):
     assert run(build_map, '--observations', tmp_path / 'o.npz', '--out', tmp_path / 'map.yaml',
                '--level', '--scale', 2) == 1
-    assert '--scale, --level: for folders of images only' in capsys.readouterr().err
+    assert '--scale: for folders of images only' in capsys.readouterr().err
     folder = write_colmap(tmp_path / 'scan', shots_of()[:2])
     with pytest.raises(DatasetError, match='does not know its unit; give --observations, too'):
         open_studio(make_parser().parse_args([str(tmp_path / 'map.yaml'), '--images',

@@ -103,7 +103,7 @@ def test_the_papers_table_on_real_queries(shared_data, tmp_path):
         tolerance = table['tolerance']['bf' if method.endswith('_bf') else 'sampled']
         assert rows[method] == pytest.approx(expected, abs=tolerance + 0.005), method
     assert {path.name for path in tmp_path.iterdir()} == {
-        'results.json', 'summary.csv', 'table.md', 'trajectories',
+        'results.json', 'summary.csv', 'table.md', 'trajectories', 'report.html',
         *(f'{name}.{kind}' for name in FIGURES for kind in ('png', 'svg'))}
     for name in FIGURES:
         image = cv2.imread(str(tmp_path / f'{name}.png'))
