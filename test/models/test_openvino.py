@@ -247,7 +247,7 @@ def test_a_network_that_openvino_runs_otherwise_is_run_by_pytorch(small_clip, tm
 
 
 def test_labels_and_crops_are_comparable(demo_clip, cache, demo_rgb, tmp_path):
-    alone = shutil.copy(demo_clip.file, tmp_path)  # away from the demo's networks of half precision
+    alone = shutil.copy(demo_clip.file, tmp_path)  # not beside networks of half precision
     options = ClipOptions(model=str(ASSETS / 'clip.json'), pretrained=str(alone),
                           device='cpu', cache_dir=str(cache), precision='fp32')
     loaded = load_encoder(options, ['a red mug', 'a keyboard'])
