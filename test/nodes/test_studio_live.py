@@ -51,7 +51,7 @@ def person(live, tmp_path):
     with (running_chromium() as chromium,
           serve_studio(studio, '127.0.0.1', 0, live) as (url, _)):
         person = Person(chromium, url)
-        person.page.get_by_role('tab', name='Robot').click()
+        person.mode('Test')
         yield person
     studio.document.close()
 
