@@ -169,7 +169,7 @@ class NewLandmark:
             if inside.mean() > 0.7:
                 best, least = int(view), abs(angles[view] - _GOOD_ANGLE_DEG)
         if best < 0:
-            raise EditError('no other view shows the place of the object; choose one yourself')
+            raise EditError('no other view is sure to show the object; choose one yourself')
         return best
 
 
