@@ -98,5 +98,5 @@ def test_the_camera_of_a_view_is_named(chromium, path):
             person.page.get_by_text(f'view {view} camera {name}').wait_for()
             image = server.scene._handle_from_node_name['/view/image']
             wait_for(lambda one=one, image=image: np.isclose(
-                image.render_width, 0.3 * one.width / one.fx), 'the image is as wide as its view')
+                image.render_width, 0.1 * one.width / one.fx), 'the image is as wide as its view')
         person.picture('cameras')
