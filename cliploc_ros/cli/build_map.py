@@ -80,7 +80,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--seed', type=int, default=0, help='(%(default)s)')
     parser.add_argument('--check', action=argparse.BooleanOptionalAction, default=True,
                         help='at the end, check the map as check_map does, with fewer views, into '
-                        'NAME_check; the exit code tells of the build alone (%(default)s)')
+                        'NAME_check; the exit code is that of the build (%(default)s)')
     labels = parser.add_argument_group('labels')
     labels.add_argument('--vocabulary', type=Path, metavar='FILE',
                         help='phrases by class (YAML), besides the shipped ones')

@@ -80,8 +80,10 @@ def load_recording(map_file: Path) -> MapRecording | None:
                  if values.get(name) is not None}
         found = MapRecording(**(values | {
             name: one if one.exists() else None for name, one in paths.items()}))
-        is_valid = np.array(found.rotation, dtype=float).shape == (3, 3) and found.scale > 0.0
-    except (OSError, ValueError, TypeError, KeyError) as error:
+        turn = np.array(found.rotation, dtype=float)
+        is_valid = turn.shape == (3, 3) and 0.0 < found.scale < np.inf and np.allclose(
+            turn @ turn.T, np.eye(3), atol=1e-6)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise DatasetError(f'{path}: cannot be read: {error}; remove it') from error
     if not is_valid:
         raise DatasetError(f'{path}: has no valid scale and rotation; remove it')

@@ -22,7 +22,7 @@ from cliploc_ros.models.openvino_networks import (
     stored_identity,
 )
 
-#: The remedy of who has no CLIP, and how each program is told of a file of weights.
+#: What those without CLIP can do, in the words of the nodes and of the programs.
 WITHOUT_CLIP = ", or do without CLIP ('matching: class', --no-clip)"
 #: How messages name the option for a file of weights.
 CHECKPOINT = 'clip_checkpoint_path (of programs: --clip-pretrained) to the file'

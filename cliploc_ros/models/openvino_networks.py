@@ -153,7 +153,7 @@ def stored_about(folder: Path) -> dict[str, Any]:
     """Return what the user of a stored network needs; empty where the file is damaged."""
     try:
         return dict(json.loads((folder / ABOUT).read_text())['about'])
-    except (OSError, ValueError, LookupError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return {}
 
 

@@ -17,6 +17,7 @@ from cliploc_ros.models.devices import resolve_device, resolve_precision
 from cliploc_ros.models.files import check_weights_file, download, first_line
 from cliploc_ros.models.images import check_image_rgb
 from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.yolo_boxes import without_doubles
 
 _WEIGHTS = 'model.safetensors'
 _FILES = ('config.json', 'preprocessor_config.json', _WEIGHTS)
@@ -95,7 +96,6 @@ class TransformersDetector:
         ImageError: for an image of another shape or type, or without pixels.
         """
         import torch
-        from torchvision.ops import batched_nms
 
         check_image_rgb(image_rgb)
         height, width = image_rgb.shape[:2]
@@ -105,13 +105,15 @@ class TransformersDetector:
             outputs: Any = self._model(**inputs.to(self.device, self._dtype))
             found = self._processor.post_process_object_detection(
                 outputs, threshold=self._options.conf, target_sizes=[(height, width)])[0]
-            boxes, scores = (found[name].float().cpu() for name in ('boxes', 'scores'))
-            labels = found['labels'].cpu()
-            kept = batched_nms(boxes, scores, labels, self._options.iou)[:self._options.max_det]
+            boxes, scores, labels = (found[name].float().cpu().numpy()
+                                     for name in ('boxes', 'scores', 'labels'))
+        rows = np.argsort(-scores, kind='stable')
+        rows = rows[without_doubles(boxes[rows], labels[rows], self._options.iou,
+                                    self._options.max_det)]
         return Detections(
-            bboxes_xyxy=np.clip(boxes[kept].numpy().astype(np.float64), 0.0, [width, height] * 2),
-            class_ids=tuple(self._names[int(label)] for label in labels[kept]),
-            scores=scores[kept].numpy().astype(np.float64))
+            bboxes_xyxy=np.clip(boxes[rows].astype(np.float64), 0.0, [width, height] * 2),
+            class_ids=tuple(self._names[int(label)] for label in labels[rows]),
+            scores=scores[rows].astype(np.float64))
 
 
 def _resolve(options: DetectorOptions) -> Path:

@@ -71,7 +71,7 @@ def select_boxes(output: NDArray[np.float32], conf: float, iou: float, max_det: 
     return np.hstack([boxes, scores[rows][:, None], classes[:, None]])[kept].astype(np.float32)
 
 
-def without_doubles(boxes_xyxy: NDArray[np.floating], classes: NDArray[np.int64], iou: float,
+def without_doubles(boxes_xyxy: NDArray[np.floating], classes: NDArray[np.number], iou: float,
                     most: int) -> NDArray[np.int64]:
     """Return the rows of boxes (n, 4) that no better one of their class covers.
 

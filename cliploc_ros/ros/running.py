@@ -116,7 +116,7 @@ class Running:
 
 
 def ask(name: str, patience_s: float) -> Running:
-    """Return what a running relocalizer tells of itself; it may take `patience_s` to be found.
+    """Return parameters, topics and state of a relocalizer; finding it may take `patience_s`.
 
     NotRunningError: it does not answer. OptionsError: no node can have this name.
     """

@@ -69,15 +69,15 @@ class Desk:
 
     def do(self, person: str, message: Message) -> None:
         """Do what a message says: the name of a command, and its values."""
-        name = message.get('do')
+        name = str(message.get('do'))
         if name in self._slow:
-            threading.Thread(target=self._do_slowly, args=(str(name),), daemon=True).start()
+            threading.Thread(target=self._do_slowly, args=(name,), daemon=True).start()
         elif name in self._commands:
             self._actions.act(lambda: self._commands[name](message))
             if name in ('next', 'previous', 'accept', 'review_delete', 'create') or (
                     name in ('select', 'select_at') and not message.get('joins')):
                 self._look(person, 'fly')
-        elif isinstance(name, str):
+        else:
             self._look(person, name)
 
     def _do_slowly(self, name: str) -> None:

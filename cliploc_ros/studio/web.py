@@ -87,7 +87,7 @@ class Board:
                 message = json.loads(text)
                 if isinstance(message, dict):
                     await asyncio.to_thread(do, message)
-        except (ConnectionClosed, ValueError):
+        except (ConnectionClosed, ValueError, RecursionError):
             pass
         finally:
             self._pages.discard(event)

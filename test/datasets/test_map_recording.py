@@ -50,7 +50,9 @@ def test_what_is_gone_is_none_and_what_is_damaged_is_named(built):
     assert load_recording(path).source is None
     (path.parent / 'drive.npz').unlink()
     assert load_recording(path) is None
-    for text in ('{', '{"speed": 1}', '{"observations": "m.yaml", "scale": -1}'):
+    for text in ('{', '{"speed": 1}', '{"observations": "m.yaml", "scale": -1}',
+                 '{"observations": "m.yaml", "scale": Infinity}', '[]', 9_999 * '[',
+                 '{"observations": "m.yaml", "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]}'):
         recording_path(path).write_text(text)
         with pytest.raises(DatasetError, match=r'm\.recording.json: .*remove it'):
             load_recording(path)

@@ -49,7 +49,7 @@ def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
     yield ('grid', 'Expected relocalization from above. A cell is a camera position: the darker, '
            'the more of the headings with at least three detectable landmarks give an accepted, '
            'right pose. Ticks point where the camera looked when a wrong pose was accepted. '
-           'Positions inside of a landmark, and beyond all objects, are left out. The numbers '
+           'Positions inside of a landmark, and beyond all objects, are left out. Numbers '
            'are those of the advice.', png_of(_grid_figure(canvas), _DPI))
     if report.recording is not None and report.recording.trials:
         yield ('frames', 'Recorded frames, each relocalized in a map that was fitted without '
