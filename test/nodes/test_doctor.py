@@ -29,10 +29,14 @@ class Robot:
         self._tester = tester
         self._odometry = tester.create_publisher(Odometry, 'odom', qos_profile_system_default)
         self.speed_m_s, self.late_s, self.change = 0.0, 0.0, lambda *frame: frame
+        self.detection_s = 0.0
 
     def pass_time(self):
         now = time.time()
-        self._tester.publish(self.change(*make_frame(stamp_s=now - self.late_s)))
+        frame = self.change(*make_frame(stamp_s=now - self.late_s))
+        self._tester.publish(frame[:2])
+        time.sleep(self.detection_s)
+        self._tester.publish(frame[2:])
         odometry = Odometry(child_frame_id='base_link')
         odometry.header.frame_id = 'odom'
         odometry.header.stamp = make_frame(stamp_s=now)[0].header.stamp
@@ -114,7 +118,7 @@ def test_a_whole_robot_passes_and_nothing_is_handed_over(own_relocalizer, examin
     ('detector', 'no class of the map is among its sofa', {'change': of_another_detector}, {}),
     ('localizer', 'nobody publishes /nowhere: start the localizer', {},
      {'localizer_pose': 'nowhere'}),
-    ('time', 'raise timeout_s', {}, {'timeout_s': 0.1})])
+    ('time', 'raise timeout_s', {'detection_s': 0.15}, {'timeout_s': 0.1})])
 def test_what_is_broken_fails_with_what_to_do(examine, robot, what, text, broken, parameters):
     for name, value in broken.items():
         setattr(robot, name, value)
