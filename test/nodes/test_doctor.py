@@ -118,7 +118,7 @@ def test_a_whole_robot_passes_and_nothing_is_handed_over(own_relocalizer, examin
     ('detector', 'no class of the map is among its sofa', {'change': of_another_detector}, {}),
     ('localizer', 'nobody publishes /nowhere: start the localizer', {},
      {'localizer_pose': 'nowhere'}),
-    ('time', 'raise timeout_s', {'detection_s': 0.15}, {'timeout_s': 0.1})])
+    ('time', 'raise timeout_s', {'detection_s': 0.5}, {'timeout_s': 0.1})])
 def test_what_is_broken_fails_with_what_to_do(examine, robot, what, text, broken, parameters):
     for name, value in broken.items():
         setattr(robot, name, value)
