@@ -35,7 +35,7 @@ def make_parser() -> argparse.ArgumentParser:
         '--wake-ups', type=positive_int, default=10, metavar='N',
         help='number of wake-ups along the recording (default: %(default)s)')
     parser.add_argument(
-        '--rate', type=positive, default=4.0, metavar='X',
+        '--rate', type=positive, default=8.0, metavar='X',
         help='speed between wake-ups; 2 is twice as fast as recorded (default: %(default)g)')
     parser.add_argument(
         '--method', default='hybrid_auto', metavar='MATCHING_ALGORITHM',

@@ -8,8 +8,10 @@ compiles them, as script/setup does.
 """
 
 import logging
+from multiprocessing import Process
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from cliploc_ros.core.fit.refinement import jacobian_of, one_to_one, refine_rig, residuals_of
@@ -21,7 +23,7 @@ from cliploc_ros.core.kernels.compiled import warm_up
 from cliploc_ros.core.map.pairs import find_repeats, make_pairs
 from cliploc_ros.core.map.similarities import keep_greatest
 from cliploc_ros.core.search.sampling import compatible_pairs, draw_ransac
-from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
+from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Scene, make_scene
 from cliploc_ros.core.search.strategies import (
     Leaders,
     are_near,
@@ -34,41 +36,62 @@ from cliploc_ros.core.search.strategies import (
 
 def call_every_kernel() -> None:
     """Call every kernel that a relocalization needs, with three boxes and three landmarks."""
-    rng = np.random.default_rng(0)
+    call_search_kernels()
+    call_fit_kernels()
+
+
+def call_search_kernels() -> None:
+    """Call the kernels that sample correspondences and search with them."""
+    scene, pairs = _make_scene()
+    list(search_samples(scene, draw_ransac(pairs, 1, np.random.default_rng(0)),
+                        Leaders.none_yet()))
+    list(search_exhaustively(scene, Leaders.none_yet()))
+    list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet()))
+    list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet(), size=2))
+    same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
+    are_near(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3), 0.05, 2.998)
+
+
+def call_fit_kernels() -> None:
+    """Call the kernels that verify and refine poses, and those that prepare a map."""
+    scene, _ = _make_scene()
+    rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None], np.zeros(3))
+    refine_rig(rig, np.eye(3), np.zeros(3))
+    found = verify_rig(rig, np.eye(3), np.zeros(3))
+    inliers = one_to_one(rig, found, np.eye(3), np.zeros(3)).pairs
+    residuals_of(inliers, VERTICAL_UNKNOWN, np.eye(3), np.zeros(3),
+                 np.empty(5 * len(inliers) + 3))
+    jacobian_of(inliers, VERTICAL_UNKNOWN, np.eye(3), np.zeros(3))
+    depth_errors(scene.depths, scene.centers, scene.shapes, np.zeros(3), np.eye(3), np.zeros(3))
+    project_ellipsoids(np.eye(4), scene.centers, scene.shapes)
+    keep_greatest(np.ones((1, 1), np.float32), 0, np.zeros((1, 1), np.int64),
+                  np.zeros((1, 1), np.float32))
+    classes = np.zeros(3, dtype=np.int64)
+    find_repeats(make_pairs(scene.centers, classes, cKDTree(scene.centers)), classes)
+    scores = scores_of(rig, np.eye(3)[None], np.zeros((1, 3)))
+    choose_distinct(scores, np.eye(3)[None], np.zeros((1, 3)), 1)
+
+
+def _make_scene() -> tuple[Scene, NDArray[np.int64]]:
+    """Return a scene and its pairs of a box and a landmark (3, 2)."""
     bboxes = np.array([[100, 100, 150, 160], [300, 120, 360, 150], [200, 300, 260, 390]],
                       dtype=np.float64)
     pairs = np.array([[0, 0], [1, 1], [2, 2]], dtype=np.int64)
     centers = np.array([[0.0, 0, 5], [1, 0, 6], [0, 1, 5]])
     shapes = np.tile([0.04, 0.0, 0.0, 0.04, 0.0, 0.04], (3, 1))
-    scene = make_scene(Camera(640, 480, 500.0, 500.0, 320.0, 240.0).normalize_bboxes(bboxes),
-                       centers, shapes, np.ones((3, 3), dtype=np.bool_), pairs, 0.2)
-    list(search_samples(scene, draw_ransac(pairs, 1, rng), Leaders.none_yet()))
-    list(search_exhaustively(scene, Leaders.none_yet()))
-    list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet()))
-    list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet(), size=2))
-    rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None], np.zeros(len(centers)))
-    scores = scores_of(rig, np.eye(3)[None], np.zeros((1, 3)))
-    choose_distinct(scores, np.eye(3)[None], np.zeros((1, 3)), 1)
-    found = verify_rig(rig, np.eye(3), np.zeros(3))
-    inliers = one_to_one(rig, found, np.eye(3), np.zeros(3)).pairs
-    residuals_of(inliers, VERTICAL_UNKNOWN, np.eye(3), np.zeros(3),
-                 np.empty(5 * len(inliers) + 3))
-    depth_errors(scene.depths, centers, shapes, np.zeros(3), np.eye(3), np.zeros(3))
-    jacobian_of(inliers, VERTICAL_UNKNOWN, np.eye(3), np.zeros(3))
-    refine_rig(rig, np.eye(3), np.zeros(3))
-    same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
-    are_near(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3), 0.05, 2.998)
-    project_ellipsoids(np.eye(4), centers, shapes)
-    classes = np.zeros(3, dtype=np.int64)
-    keep_greatest(np.ones((1, 1), np.float32), 0, np.zeros((1, 1), np.int64),
-                  np.zeros((1, 1), np.float32))
-    find_repeats(make_pairs(centers, classes, cKDTree(centers)), classes)
+    camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+    return make_scene(camera.normalize_bboxes(bboxes), centers, shapes,
+                      np.ones((3, 3), dtype=np.bool_), pairs, 0.2), pairs
 
 
 def main() -> None:
-    """Compile the kernels that are not on disk yet, and say where they are kept."""
+    """Compile the kernels that are not on disk yet, on two cores; say where they are kept."""
+    # The kernels of the fit are on disk when this process comes to them.
+    beside = Process(target=call_fit_kernels)
+    beside.start()
     logging.basicConfig(level=logging.INFO, format='%(message)s')
     warm_up(call_every_kernel)
+    beside.join()
 
 
 if __name__ == '__main__':

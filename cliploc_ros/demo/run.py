@@ -59,7 +59,7 @@ class DemoOptions:
     assets: Path
     out: Path  #: Folder for the pictures
     wake_ups: int = 10  #: Number of wake-ups
-    rate: float = 4.0  #: Speed between wake-ups; 1 is as recorded
+    rate: float = 8.0  #: Speed between wake-ups; 1 is as recorded
     method: str = 'hybrid_auto'  #: Matching and algorithm, joined as in the paper: ``hybrid_auto``
     rviz: bool = False  #: Whether to open RViz if it is installed
     wake_up_map: WakeUpMap | None = None  #: The map to wake up in; None: the assets' map.yaml
