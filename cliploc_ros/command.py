@@ -5,11 +5,13 @@
 import argparse
 import math
 import os
+import re
 import select
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import metadata
 from types import FrameType
 from typing import Self
 
@@ -62,12 +64,24 @@ def run_command(command: Callable[[], int], failure: int = 1) -> int:
     except ModuleNotFoundError as error:
         if not error.name or error.name.startswith('cliploc_ros'):
             raise
-        print(f'error: {error.name} is not installed; pip install the extra that this command '
-              'needs, see doc/install.md', file=sys.stderr)
+        package = error.name.partition('.')[0]
+        print(f'error: {package} is not installed; pip install {_extra_with(package)}',
+              file=sys.stderr)
         return failure
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return EXIT_INTERRUPTED
+
+
+def _extra_with(package: str) -> str:
+    """Return what brings a package: an extra of this one, in its installed metadata."""
+    try:
+        requirements = metadata.requires('cliploc_ros') or []
+    except metadata.PackageNotFoundError:  # it runs from its sources
+        requirements = []
+    extras = re.findall(rf"^{re.escape(package)}\b.*extra == ['\"](\w+)",
+                        '\n'.join(requirements), re.MULTILINE)
+    return f"'cliploc_ros[{extras[0]}]'" if extras else 'the extra that has it, see doc/install.md'
 
 
 def printable(text: str) -> str:

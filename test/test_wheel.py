@@ -163,6 +163,18 @@ def test_images_need_the_extra_with_the_networks(programs, tmp_path):
     assert done.stderr.count('\n') == 1
 
 
+def test_what_is_missing_names_its_extra(programs, tmp_path):
+    (link,) = programs.parent.glob('lib/python3*/site-packages/viser')
+    target = link.readlink()
+    link.unlink()
+    try:
+        done = run(programs / 'cliploc_studio', ROOM / 'map.yaml', '--no-browser', cwd=tmp_path)
+    finally:
+        link.symlink_to(target)
+    assert (done.returncode, done.stderr) == (
+        1, "error: viser is not installed; pip install 'cliploc_ros[studio]'\n")
+
+
 def test_studio_serves_its_page(programs, tmp_path):
     with subprocess.Popen([programs / 'cliploc_studio', ROOM / 'map.yaml', '--no-browser'],
                           cwd=tmp_path, env=environment(), text=True, stdout=subprocess.PIPE,

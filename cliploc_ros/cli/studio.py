@@ -84,11 +84,7 @@ def serve(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C; return the exit code."""
     # Late, so that --help is fast.
     from cliploc_ros.core.geometry.tilt import tilt_note
-
-    try:
-        from cliploc_ros.studio.page import serve_studio
-    except ModuleNotFoundError as error:
-        raise OptionsError(f'{error.name} is not installed; pip install viser==1.1.1') from error
+    from cliploc_ros.studio.page import serve_studio
 
     studio = open_studio(options)
     try:
