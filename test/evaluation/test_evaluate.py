@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -45,15 +46,9 @@ def evaluate(*arguments, **options):
 
 
 @pytest.fixture
-def evaluate_here(capsys):
-    """Run it in this process, where the imports are done, with one worker unless told."""
-    handler = signal.getsignal(signal.SIGTERM)
-
-    def run(*arguments):
-        code = main(['--workers', '1', *map(str, arguments)])
-        return subprocess.CompletedProcess(arguments, code, *capsys.readouterr())
-    yield run
-    signal.signal(signal.SIGTERM, handler)
+def evaluate_here(run_here):
+    """Run it in this process, with one worker unless told."""
+    return partial(run_here, main, '--workers', 1)
 
 
 def small(files, *arguments):
