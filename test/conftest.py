@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import socket
+import subprocess
 import sys
 from pathlib import Path
 
@@ -179,6 +180,18 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f'the shared data folder is missing: {SHARED_DATA}')
     return SHARED_DATA
+
+
+@pytest.fixture
+def run_here(capsys):
+    """Run the main of an executable in this process, which has done the imports."""
+    handler = signal.getsignal(signal.SIGTERM)
+
+    def run(main, *arguments):
+        code = main([*map(str, arguments)])
+        return subprocess.CompletedProcess(arguments, code, *capsys.readouterr())
+    yield run
+    signal.signal(signal.SIGTERM, handler)
 
 
 @pytest.fixture(scope='session')

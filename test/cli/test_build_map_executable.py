@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable build_map, as a user starts it."""
+"""The executable build_map."""
 
 import json
-import subprocess
-import sys
+from functools import partial
 
 import pytest
 
+from cliploc_ros.cli.build_map import main
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.observations import load_observations, save_observations
 
@@ -21,13 +21,12 @@ def observations(shared_data, tmp_path_factory):
     return path
 
 
-def build_map(*args):
-    return subprocess.run([sys.executable, '-m', 'cliploc_ros.cli.build_map', '--no-check',
-                           *map(str, args)],
-                          capture_output=True, text=True, timeout=300)
+@pytest.fixture
+def build_map(run_here):
+    return partial(run_here, main, '--no-check')
 
 
-def test_builds_a_map_and_a_report(observations, tmp_path):
+def test_builds_a_map_and_a_report(build_map, observations, tmp_path):
     out, report = tmp_path / 'office.yaml', tmp_path / 'office.json'
     old_layer = tmp_path / 'office.keyframes.npz'
     old_layer.touch()
@@ -47,7 +46,7 @@ def test_builds_a_map_and_a_report(observations, tmp_path):
     assert f'wrote {out}' in done.stdout
 
 
-def test_refines_poses_when_they_have_noise(observations, tmp_path):
+def test_refines_poses_when_they_have_noise(build_map, observations, tmp_path):
     done = build_map('--observations', observations, '--out', tmp_path / 'm.yaml', '--every', 2,
                      '--pose-noise', 0.02, 0.5)
     assert done.returncode == 0, done.stderr
@@ -55,7 +54,7 @@ def test_refines_poses_when_they_have_noise(observations, tmp_path):
     assert 'from 81 frames' in done.stdout
 
 
-def test_an_existing_map_stays_when_building_fails(observations, tmp_path):
+def test_an_existing_map_stays_when_building_fails(build_map, observations, tmp_path):
     old = tmp_path / 'old.yaml'
     old.write_text('precious')
     cut = tmp_path / 'cut.npz'
@@ -75,7 +74,7 @@ def test_an_existing_map_stays_when_building_fails(observations, tmp_path):
     (('--out', '.'), 'is a folder; name the map file to write'),
     (('--out', 'm.yaml', '--no-joint', '--pose-noise', 1, 1), '--pose-noise is for --joint'),
 ])
-def test_wrong_options_are_named_at_once(observations, args, message):
+def test_wrong_options_are_named_at_once(build_map, observations, args, message):
     done = build_map('--observations', observations, *args)
     assert done.returncode == 1
     assert message in done.stderr

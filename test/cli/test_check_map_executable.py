@@ -1,24 +1,24 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable check_map, as a user starts it."""
+"""The executable check_map."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from scene import make_room
 
+from cliploc_ros.cli.check_map import main
 from cliploc_ros.core.map.map_file import write_map
 
 FAST = ('--positions', 4, '--headings', 2)
 
 
-def check_map(*args):
-    return subprocess.run([sys.executable, '-m', 'cliploc_ros.cli.check_map', *map(str, args)],
-                          capture_output=True, text=True, timeout=300)
+@pytest.fixture
+def check_map(run_here):
+    return partial(run_here, main)
 
 
 def doubled(room):
@@ -34,7 +34,7 @@ def room_file(tmp_path):
     return tmp_path / 'room.yaml'
 
 
-def test_a_map_without_observations(room_file, tmp_path):
+def test_a_map_without_observations(check_map, room_file, tmp_path):
     done = check_map(room_file, '--out', tmp_path / 'out', '--min-positions', 0, *FAST)
     assert done.returncode == 0, done.stdout + done.stderr
     checked = json.loads((tmp_path / 'out/check.json').read_text())
@@ -48,7 +48,7 @@ def test_a_map_without_observations(room_file, tmp_path):
     assert 'data:image/png;base64,' in page
 
 
-def test_a_doubled_map_fails(tmp_path):
+def test_a_doubled_map_fails(check_map, tmp_path):
     write_map(tmp_path / 'doubled.yaml', doubled(make_room()))
     done = check_map(tmp_path / 'doubled.yaml', '--out', tmp_path / 'out', *FAST)
     assert done.returncode == 1
@@ -64,7 +64,7 @@ def test_a_doubled_map_fails(tmp_path):
     (('{room}', '--observations', '{folder}/none.npz', '--out', '{folder}/out'), 'none.npz'),
     (('{room}', '--folds', '1', '--out', '{folder}/out'), 'folds: 1'),
 ], ids=['no map', 'out is a file', 'no npz', 'no observations', 'folds'])
-def test_what_to_correct_is_named(room_file, tmp_path, args, named):
+def test_what_to_correct_is_named(check_map, room_file, tmp_path, args, named):
     done = check_map(*(one.format(folder=tmp_path, room=room_file) for one in args))
     assert done.returncode == 1
     assert done.stderr.startswith('error: ')
@@ -73,7 +73,7 @@ def test_what_to_correct_is_named(room_file, tmp_path, args, named):
     assert not (tmp_path / 'out/check.json').exists()
 
 
-def test_the_office_passes(shared_data, tmp_path):
+def test_the_office_passes(check_map, shared_data, tmp_path):
     office = shared_data / 'tum_fr3_office'
     done = check_map(office / 'map.yaml', '--observations', office / 'observations.npz',
                      '--queries', office / 'queries.npz', '--every', 20, '--frames', 10,

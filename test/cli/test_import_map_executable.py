@@ -1,22 +1,22 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable import_map, as a user starts it."""
+"""The executable import_map."""
 
 import json
-import subprocess
-import sys
+from functools import partial
 
 import numpy as np
 import pytest
 from foreign_maps import goreloc_file, msgloc_text, oaslam_text, table_text
 
+from cliploc_ros.cli.import_map import main
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.observations import load_observations, save_observations
 
 
-def import_map(*args):
-    return subprocess.run([sys.executable, '-m', 'cliploc_ros.cli.import_map', *map(str, args)],
-                          capture_output=True, text=True, timeout=300)
+@pytest.fixture
+def import_map(run_here):
+    return partial(run_here, main)
 
 
 @pytest.fixture(scope='module')
@@ -47,7 +47,7 @@ def table(office, tmp_path_factory):
     return path
 
 
-def test_refits_to_a_recording(office, table, observations, tmp_path):
+def test_refits_to_a_recording(import_map, office, table, observations, tmp_path):
     out, report = tmp_path / 'map.yaml', tmp_path / 'map.json'
     done = import_map('--from', 'csv', table, '--refit', observations, '--out', out,
                       '--report', report, '--frame-id', 'world')
@@ -69,7 +69,7 @@ def test_refits_to_a_recording(office, table, observations, tmp_path):
     assert 'semi-axes' in left_out['thin'] and 'ghost' in left_out
 
 
-def test_keeps_what_cannot_be_fitted_where_asked_for(table, observations, tmp_path):
+def test_keeps_what_cannot_be_fitted_where_asked_for(import_map, table, observations, tmp_path):
     out = tmp_path / 'map.yaml'
     done = import_map('--from', 'csv', table, '--refit', observations, '--out', out,
                       '--keep-unsupported')
@@ -83,7 +83,7 @@ def test_keeps_what_cannot_be_fitted_where_asked_for(table, observations, tmp_pa
 
 @pytest.mark.parametrize(('name', 'write'), [
     ('msgloc', msgloc_text), ('goreloc', goreloc_file), ('oaslam', oaslam_text)])
-def test_every_format_becomes_a_map(office, name, write, tmp_path):
+def test_every_format_becomes_a_map(import_map, office, name, write, tmp_path):
     content = write(office)
     path = tmp_path / 'theirs'
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -96,7 +96,7 @@ def test_every_format_becomes_a_map(office, name, write, tmp_path):
                                2.0 * office.centers + [1, 2, 3], atol=1e-4)
 
 
-def test_an_existing_map_stays_when_the_import_fails(office, observations, tmp_path):
+def test_an_existing_map_stays_when_the_import_fails(import_map, office, observations, tmp_path):
     old, link, table = tmp_path / 'old.yaml', tmp_path / 'link.yaml', tmp_path / 'far.csv'
     old.write_text('precious')
     link.symlink_to(old)
@@ -128,7 +128,7 @@ def test_an_existing_map_stays_when_the_import_fails(office, observations, tmp_p
     (('--out', 'm.yaml', '--frame-id', ''), '--frame-id: must not be empty'),
     (('--out', 'm.yaml', '--class-names', 'IN'), '--class-names is not for csv'),
 ])
-def test_wrong_options_are_named(table, args, message):
+def test_wrong_options_are_named(import_map, table, args, message):
     before = table.read_bytes()
     args = [table if arg == 'IN' else arg for arg in args]
     done = import_map('--from', 'csv', table, *args)

@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 import yaml
 
+from cliploc_ros.cli.demo import main
+
 PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'cliploc_ros' / 'demo' / 'assets'
 
@@ -50,8 +52,8 @@ def test_poses_are_right_or_refused(finished):
     rows = ROW.findall(output)
     errors_m = [float(error) for _, answer, error in rows if answer == 'accepted']
     assert f'{WAKE_UPS} wake-ups: {len(errors_m)} accepted' in output
-    assert errors_m
-    assert max(errors_m) < 1.0
+    assert len(errors_m) >= 0.8 * WAKE_UPS
+    assert max(errors_m) < 0.5
 
 
 @pytest.mark.clock  # the request takes the cameras whose images come in time
@@ -184,12 +186,12 @@ def test_no_process_outlives_it(executables, tmp_path, number, expected):
     (['--map', '--assets', '/nowhere'], '/nowhere/sequence is missing'),
     (['--map', '--method', 'class_bf'], '--method class_bf'),
 ])
-def test_bad_input_is_named_in_one_line(executables, tmp_path, arguments, named):
-    code, output, errors = run(executables, '--out', tmp_path, *arguments)
-    assert code == 1, output
-    assert errors.startswith('error: ')
-    assert named in errors
-    assert len(errors.splitlines()) == 1
+def test_bad_input_is_named_in_one_line(run_here, tmp_path, arguments, named):
+    done = run_here(main, '--out', tmp_path, *arguments)
+    assert done.returncode == 1, done.stdout
+    assert done.stderr.startswith('error: ')
+    assert named in done.stderr
+    assert len(done.stderr.splitlines()) == 1
 
 
 def test_weights_that_do_not_load_are_named(executables, tmp_path):

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -45,15 +46,9 @@ def evaluate(*arguments, **options):
 
 
 @pytest.fixture
-def evaluate_here(capsys):
-    """Run it in this process: refusals are quick but for the imports."""
-    handler = signal.getsignal(signal.SIGTERM)
-
-    def run(*arguments):
-        code = main([*map(str, arguments)])
-        return subprocess.CompletedProcess(arguments, code, *capsys.readouterr())
-    yield run
-    signal.signal(signal.SIGTERM, handler)
+def evaluate_here(run_here):
+    """Run it in this process, with one worker unless told."""
+    return partial(run_here, main, '--workers', 1)
 
 
 def small(files, *arguments):
@@ -120,7 +115,7 @@ def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_
     noise = ('--odometry-noise', 0.02, 0.5)
     for name, more in (('exact', ('--trials', 2)), ('noisy', (*noise, '--trials', 2)),
                        ('other', (*noise, '--trials', 1, '--seed', 1))):
-        done = evaluate(*given, *more, '--out', tmp_path / name)
+        done = evaluate_here(*given, *more, '--out', tmp_path / name)
         assert done.returncode == 0, done.stderr
     exact, noisy, other = (results_of(tmp_path / name) for name in ('exact', 'noisy', 'other'))
     assert len(exact) == 12
@@ -139,9 +134,9 @@ def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_
                  '--fuse', 'neighbouring')
 
 
-def test_trajectories_are_what_was_found(files, tmp_path):
-    assert evaluate(*small(files, '--methods', 'class_bf', '--out', tmp_path,
-                           '--no-figures')).returncode == 0
+def test_trajectories_are_what_was_found(files, tmp_path, evaluate_here):
+    assert evaluate_here(*small(files, '--methods', 'class_bf', '--out', tmp_path,
+                                '--no-figures')).returncode == 0
     rows = results_of(tmp_path)
     for name, chosen in (('class_bf', 'solved'), ('class_bf.accepted', 'accepted')):
         trajectory = read_tum_trajectory(tmp_path / f'trajectories/{name}.txt')
@@ -154,12 +149,12 @@ def test_trajectories_are_what_was_found(files, tmp_path):
     assert not list(tmp_path.glob('*.png'))
 
 
-def test_one_worker_or_two(files, tmp_path):
+def test_one_worker_or_two(files, tmp_path, evaluate_here):
     arguments = small(files, '--trials', 3, '--seed', 7, '--iterations', 100, '--sweep', 50,
                       '--no-figures')
     for workers in (1, 2):
-        assert evaluate(*arguments, '--workers', workers, '--out',
-                        tmp_path / str(workers)).returncode == 0
+        assert evaluate_here(*arguments, '--workers', workers, '--out',
+                             tmp_path / str(workers)).returncode == 0
     first, second = (re.sub(r'"search_ms": [-+.e\d]+', '', (tmp_path / name / 'results.json')
                             .read_text()) for name in '12')
     assert first == second
@@ -170,9 +165,9 @@ def test_one_worker_or_two(files, tmp_path):
 def long_run(files, tmp_path_factory):
     """The arguments of a run of seconds, and its results."""
     arguments = small(files, '--methods', 'hybrid_b-prosac', 'class_ransac', '--iterations', 20000,
-                      '--trials', 2, '--sweep', '--workers', 2, '--no-figures')
+                      '--trials', 2, '--sweep', '--no-figures')
     whole = tmp_path_factory.mktemp('whole')
-    assert evaluate(*arguments, '--out', whole).returncode == 0
+    assert evaluate(*arguments, '--workers', 1, '--out', whole).returncode == 0
     return arguments, results_of(whole)
 
 
@@ -180,7 +175,7 @@ def long_run(files, tmp_path_factory):
 def test_broken_off_and_resumed(long_run, tmp_path, number, evaluate_here):
     arguments, whole = long_run
     broken = tmp_path / 'broken'
-    process = subprocess.Popen(command(*arguments, '--out', broken), cwd=PROJECT,
+    process = subprocess.Popen(command(*arguments, '--workers', 2, '--out', broken), cwd=PROJECT,
                                stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     journal = broken / 'unfinished.jsonl'
     deadline = time.monotonic() + TIMEOUT_S
@@ -204,7 +199,7 @@ def test_broken_off_and_resumed(long_run, tmp_path, number, evaluate_here):
     assert_error(evaluate_here(*arguments, '--out', broken), 'unfinished run', '--resume')
     other = (*arguments, '--out', broken, '--resume', '--seed', 5)
     assert_error(evaluate_here(*other), 'begun with another methods')
-    assert evaluate(*arguments, '--out', broken, '--resume').returncode == 0
+    assert evaluate_here(*arguments, '--out', broken, '--resume').returncode == 0
     assert results_of(broken) == whole
     assert not journal.exists()
     print(f'\nstopped after {done} parts, then resumed')
@@ -232,7 +227,8 @@ def walk(tmp_path_factory):
     return folder
 
 
-METHODS = ('--methods', 'hybrid_b-prosac', 'auto', '--trials', 2, '--sweep', '--no-figures')
+METHODS = ('--methods', 'hybrid_b-prosac', 'auto', '--trials', 2, '--sweep', '--no-figures',
+           '--workers', 1)
 
 
 @pytest.fixture(scope='module')
@@ -244,12 +240,12 @@ def evaluated_bag(walk):
     return done
 
 
-def test_a_bag_a_folder_and_the_saved_queries_say_the_same(walk, evaluated_bag):
+def test_a_bag_a_folder_and_the_saved_queries_say_the_same(walk, evaluated_bag, evaluate_here):
     assert f'skipped without ground truth within 20 ms: 1 of {IMAGES}' in evaluated_bag.stdout
-    done = evaluate('--tum', walk / 'tum', *NETWORKS, *METHODS, '--out', walk / 'from_tum')
+    done = evaluate_here('--tum', walk / 'tum', *NETWORKS, *METHODS, '--out', walk / 'from_tum')
     assert done.returncode == 0, done.stderr
-    done = evaluate('--queries', walk / 'saved.npz', '--map', ASSETS / 'map.yaml', *METHODS,
-                    '--out', walk / 'from_saved')
+    done = evaluate_here('--queries', walk / 'saved.npz', '--map', ASSETS / 'map.yaml', *METHODS,
+                         '--out', walk / 'from_saved')
     assert done.returncode == 0, done.stderr
     results = results_of(walk / 'from_bag')
     assert results == results_of(walk / 'from_saved')
@@ -266,25 +262,26 @@ def test_a_bag_a_folder_and_the_saved_queries_say_the_same(walk, evaluated_bag):
     assert len(right) > 0.9 * len(results)
 
 
-def test_detector_and_clip_run_once(walk, evaluated_bag):
+def test_detector_and_clip_run_once(walk, evaluated_bag, evaluate_here, caplog):
     cache, = walk.glob('bag.cliploc-*.npz')
     before = cache.stat().st_mtime_ns
-    done = evaluate('--bag', walk / 'bag', *NETWORKS, '--methods', 'clip_b-prosac', '--sweep',
-                    '--trials', 1, '--out', walk / 'again', '--no-figures')
+    given = ('--bag', walk / 'bag', *NETWORKS, '--methods', 'clip_b-prosac', '--sweep',
+             '--trials', 1, '--no-figures')
+    done = evaluate_here(*given, '--out', walk / 'again')
     assert done.returncode == 0, done.stderr
-    assert str(cache) in done.stderr
+    assert str(cache) in caplog.text
     assert cache.stat().st_mtime_ns == before
     cache.write_bytes(b'rubbish')
-    done = evaluate('--bag', walk / 'bag', *NETWORKS, '--methods', 'clip_b-prosac', '--sweep',
-                    '--trials', 1, '--out', walk / 'once_more', '--no-figures')
+    done = evaluate_here(*given, '--out', walk / 'once_more')
     assert done.returncode == 0
-    assert 'recording again' in done.stderr
+    assert 'recording again' in caplog.text
     assert results_of(walk / 'again') == results_of(walk / 'once_more')
 
 
 def test_no_ros_is_needed(files, tmp_path):
+    arguments = small(files, '--methods', 'auto', '--workers', 1, '--out', tmp_path)
     code = ('import sys; from cliploc_ros.cli.evaluate import main; '
-            f'code = main({[*map(str, small(files, "--methods", "auto", "--out", tmp_path))]!r}); '
+            f'code = main({[*map(str, arguments)]!r}); '
             "assert 'rclpy' not in sys.modules and 'torch' not in sys.modules; sys.exit(code)")
     assert subprocess.run([sys.executable, '-c', code], cwd=PROJECT, check=False,
                           timeout=TIMEOUT_S).returncode == 0

@@ -115,7 +115,7 @@ def test_confidences_are_true_where_nothing_was_fitted(office):
     relocalizer = Relocalizer(landmark_map, RelocalizerOptions())
     found = [judge(relocalizer.relocalize([query.observation]), query.map_from_camera,
                    Setting(len(landmark_map)))
-             for query in make_queries(recorded, landmark_map, True)]
+             for query in make_queries(recorded, landmark_map, True)[::2]]
     likely, right = outcomes([one for one in found if len(one.supports)])
     accepted = likely >= 0.9
     print(f'\naccepted {accepted.sum()}, {(accepted & ~right).sum()} of them wrong; of '

@@ -15,11 +15,11 @@ from studies.acceptance.troubles import exchange_landmarks
 
 @pytest.fixture(scope='module')
 def office(shared_data):
-    """The real map and every fourth of its main queries."""
+    """The real map and every eighth of its main queries."""
     folder = shared_data / 'tum_fr3_office'
     landmark_map = LandmarkMap.from_file(folder / 'map.yaml')
     recorded = load_queries(folder / 'queries.npz', landmark_map.landmark_ids)
-    return landmark_map, make_queries(recorded, landmark_map)[::4]
+    return landmark_map, make_queries(recorded, landmark_map)[::8]
 
 
 def test_agreement_prevents_false_accepts_in_another_place(office):
