@@ -22,7 +22,11 @@ from cliploc_ros.evaluation.map_check.pictures import draw_pictures
 from cliploc_ros.evaluation.map_check.views import Views
 from cliploc_ros.mapping.check.advice import give_advice
 from cliploc_ros.mapping.check.checking import check_map
-from cliploc_ros.mapping.check.landmark_faults import find_map_overlaps, hear_witness
+from cliploc_ros.mapping.check.landmark_faults import (
+    check_landmarks,
+    find_map_overlaps,
+    hear_witness,
+)
 from cliploc_ros.mapping.check.places import LookAlike, find_look_alikes, make_grid
 from cliploc_ros.mapping.check.relocalization import (
     make_folds,
@@ -103,6 +107,18 @@ def test_a_moved_landmark_is_the_worst_and_named_in_the_advice(detections):
     assert 'is never detected' in report.landmarks[0].faults[0]
     assert any(text.startswith('thing_4 is never detected') for text in report.advice)
     assert report.landmarks[1].severity == 0.0
+
+
+@pytest.mark.parametrize('is_recorded', [False, True])
+def test_a_misspelt_class_is_named_with_the_right_one(detections, is_recorded):
+    right = TABLE.class_ids[4]
+    wrong = replace(TABLE, class_ids=(*TABLE.class_ids[:4], f'{right}k', *TABLE.class_ids[5:]))
+    _, witness = witness_of(wrong, detections) if is_recorded else (None, None)
+    worst, *others = check_landmarks(wrong, witness, [], MAPPING)
+    assert worst.landmark_id == 'thing_4'
+    assert worst.faults == (f"has the class '{right}k', which the detector does not have "
+                            f"(did you mean '{right}'?): correct its class_id",)
+    assert all(one.severity == 0.0 for one in others)
 
 
 def test_a_landmark_of_few_frames_counts_little(detections):

@@ -49,5 +49,5 @@ def test_mistyped_names_and_whole_numbers(own_relocalizer, tester):
     request = GetParameters.Request(names=['timeout_s'])
     answer = tester.call(GetParameters, '/relocalizer/get_parameters', request)
     assert answer.values[0].double_value == 3.0
-    assert "unknown parameter 'itterations' has no effect; did you mean 'iterations'?" in (
+    assert "unknown parameter 'itterations' has no effect (did you mean 'iterations'?)" in (
         process.output())
