@@ -33,6 +33,7 @@ from cliploc_ros.mapping.check.relocalization import (
     measure_detector,
     try_recording,
 )
+from cliploc_ros.mapping.check.report import Measure
 from cliploc_ros.mapping.options import CheckOptions, MappingOptions, Thresholds
 from cliploc_ros.mapping.systematic import find_corrections
 from cliploc_ros.mapping.views import make_views
@@ -241,7 +242,7 @@ def test_limits_decide():
     strict = replace(eased, min_positions=1.0, max_faulty=0.0)
     report = check_map(TABLE, options=QUICK, thresholds=strict)
     assert [text.split(':')[0] for text in report.failures] == [
-        'positions with an accepted heading']
+        'positions with a heading accepted by objects']
 
 
 def pixels(detections, shift_px):
@@ -333,6 +334,23 @@ def test_stretches_without_landmarks_become_advice(detections):
     report = check_map(TABLE, gap, options=QUICK)
     assert any(re.match(r'record this side: \d frames at [45] s.* show no landmarks', text)
                for text in report.advice), report.advice
+
+
+def test_a_side_that_was_passed_twice_is_told_once(report):
+    recording = report.recording
+    first = recording.trials[0]
+    stretch = [replace(first, verdict='refused', landmarks=0)] * 3
+    twice = replace(recording, trials=(*stretch, replace(first, verdict='accepted'), *stretch[1:]))
+    told = [one.text for one in give_advice(replace(report, recording=twice))
+            if one.text.startswith('record this side')]
+    assert len(told) == 1 and '5 frames of 2 passes' in told[0]
+
+
+@pytest.mark.parametrize(('value', 'limit', 'shown'), [
+    (0.005952, 0.01, '0.6 %'), (0.1234, 0.05, '12 %'), (1.0, 0.9, '100 %'),
+    (0.8961, 0.9, '89.61 %')])
+def test_shares_have_two_digits_where_these_tell(value, limit, shown):
+    assert Measure('a share', value, limit, is_most=False).show(value) == shown
 
 
 def test_too_few_views_are_named_as_the_cause(detections):
