@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors that the user can fix."""
 
+import difflib
+from collections.abc import Iterable
 
 # A longer message loses its middle: it begins with what is wrong and ends with what to do.
 _HEAD, _TAIL = 700, 250
@@ -20,6 +22,17 @@ class CliplocError(Exception):
         if len(text) > _HEAD + _TAIL:
             text = f'{text[:_HEAD]} ... {text[-_TAIL:]}'
         return ''.join(char if char.isprintable() else ' ' for char in text)
+
+
+def did_you_mean(name: str, known: Iterable[str], most: int = 1, alike: float = 0.6) -> str:
+    """Return a hint with the known names nearest to a name, for a message; empty if none is near.
+
+    `alike` is how much of a name has to agree, 0 to 1.
+    """
+    by_lower_case = {one.lower(): one for one in known}
+    near = difflib.get_close_matches(name.lower(), by_lower_case, most, alike)
+    names = ' or '.join(f"'{by_lower_case[one]}'" for one in near)
+    return f' (did you mean {names}?)' if near else ''
 
 
 class MapError(CliplocError):

@@ -6,10 +6,12 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cliploc_ros.cli import check_map
 from cliploc_ros.cli.map_layer import (
@@ -118,7 +120,6 @@ def build(options: argparse.Namespace) -> int:
     from cliploc_ros.core.map.map_file import write_map
     from cliploc_ros.datasets.frames import move_frames
     from cliploc_ros.datasets.map_recording import save_recording
-    from cliploc_ros.files.storage import write_text
     from cliploc_ros.make_map import find_labeller, make_map, update_map
     from cliploc_ros.mapping.options import MappingOptions, OdometryErrors
 
@@ -144,8 +145,9 @@ def build(options: argparse.Namespace) -> int:
                              options.vocabulary)
     layer, note = None, ''
     if update is None:
-        with StageBar() as bar:
+        with StageBar() as bar, _reporting_failure(options.report):
             made = make_map(detections, labeller, mapping, progress=bar.show)
+        _write_report(options.report, made.report.as_dict())
         frames = source.frames and move_frames(source.frames, scale, rotation)
         layer, note = make_layer(options, frames, made.landmark_map)
         lines = made.report.lines()
@@ -153,7 +155,9 @@ def build(options: argparse.Namespace) -> int:
         if made.mount is not None:
             lines.append(_mount_option(options, made.mount.given_from_corrected))
     else:
-        made = update_map(update, detections, labeller, mapping)
+        with _reporting_failure(options.report):
+            made = update_map(update, detections, labeller, mapping)
+        _write_report(options.report, made.report.as_dict())
         lines = made.report.lines()
         head = [f'{update.name}, updated by build_map from {name}', lines[0]]
     write_map(path, made.landmark_map, head, made.embeddings)
@@ -163,13 +167,31 @@ def build(options: argparse.Namespace) -> int:
         lines.append(write_layer(path, layer))
     elif not is_same_map and (removed := remove_layer(path)):
         lines.append(removed)
-    if options.report is not None:
-        write_text(options.report, json.dumps(made.report.as_dict(), indent=1))
     print('\n'.join(lines))
     for text in filter(None, (labeller.note, note)):
         print(f'note: {text}')
     print(f'wrote {path} in {time.monotonic() - begin:.1f} s', flush=True)
     return _check_map(path, options.check)
+
+
+@contextmanager
+def _reporting_failure(path: Path | None) -> Iterator[None]:
+    """Make a report of a MappingError: why there is no map, and what was left out of it."""
+    try:
+        yield
+    except MappingError as error:
+        left_out = [asdict(one) for one in getattr(error, 'left_out', ())]
+        _write_report(path, {'failure': str(error), 'left_out': left_out})
+        raise
+
+
+def _write_report(path: Path | None, report: dict[str, Any]) -> None:
+    """Write a report where one is wanted, and say so."""
+    from cliploc_ros.files.storage import write_text
+
+    if path is not None:
+        write_text(path, json.dumps(report, indent=1))
+        print(f'report: {path}', flush=True)
 
 
 def _check_map(path: Path, wanted: bool) -> int:

@@ -25,6 +25,7 @@ from cliploc_ros.cli.sources import (
     folder_of,
     mount_of,
     read_named_folder,
+    source_of,
 )
 from cliploc_ros.command import not_negative, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
@@ -248,8 +249,21 @@ def evaluate(options: argparse.Namespace) -> int:
     compare_methods(landmark_map, draws[0], methods, options.out, trials=options.trials,
                     workers=options.workers or _cores(), scheduler=options.scheduler,
                     layer=layer, noisy=draws if is_noisy else (), sweep=options.sweep,
-                    resume=options.resume, figures=options.figures, frames=recorded.frames)
+                    resume=options.resume, figures=options.figures, frames=recorded.frames,
+                    remarks=_notes_on_maps(options))
     return 0
+
+
+def _notes_on_maps(options: argparse.Namespace) -> list[str]:
+    """Return a note on each map that was built from the images it is evaluated on."""
+    from cliploc_ros.datasets.map_recording import load_recording
+
+    if options.queries is not None:
+        return []
+    images, sources = source_of(options).resolve(), {
+        file: found.source for file in options.map if (found := load_recording(file)) is not None}
+    return [f'note: {file} was built from these images ({images}): expect less on others'
+            for file, one in sources.items() if one is not None and one.resolve() == images]
 
 
 def _watch(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:

@@ -7,10 +7,9 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.errors import OptionsError
+from cliploc_ros.errors import OptionsError, did_you_mean
 
 #: The rows of the paper's Table 1. PROSAC needs similarities, which class matching has not.
 PAPER_METHODS = ('class_bf', 'class_ransac', 'clip_bf', 'clip_ransac', 'clip_prosac',
@@ -85,20 +84,15 @@ def _named(name: str, paper: RelocalizerOptions, landmarks: int) -> Method:
                           tilt_deviation_deg=0.0)
     else:
         raise OptionsError(f"'{name}' is none of {', '.join(PAPER_METHODS)}, {ALL}, {AUTO}, "
-                           'nor a YAML file')
+                           f'nor a YAML file{did_you_mean(name, [*PAPER_METHODS, ALL, AUTO])}')
     return Method(name, replace(options, k=min(options.k, landmarks)), name == AUTO)
 
 
 def _read(path: Path, paper: RelocalizerOptions, landmarks: int) -> list[Method]:
-    try:
-        content = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except OSError as error:
-        raise OptionsError(f'{path}: cannot be read: {error.strerror}') from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise OptionsError(f'{path}: is not YAML: {error}') from error
-    if not isinstance(content, Mapping) or not content:
+    content = read_parameter_file(path)
+    if not content:
         raise OptionsError(f'{path}: is not a mapping of names to options')
-    return [_made(f'{path}: {name}', str(name), options, paper, landmarks)
+    return [_made(f'{path}: {name}', name, options, paper, landmarks)
             for name, options in content.items()]
 
 
@@ -114,7 +108,7 @@ def _made(where: str, name: str, values: Any, paper: RelocalizerOptions, landmar
     for option, value in changes.items():
         if option not in _FIELDS:
             raise OptionsError(f"{where}: '{option}' is none of base, {', '.join(_FIELDS)}, "
-                               'keyframes')
+                               f'keyframes{did_you_mean(option, _FIELDS)}')
         changes[option] = _converted(f'{where}: {option}', value, _FIELDS[option].default)
     try:
         return Method(name, replace(base.options, **changes), keyframes)

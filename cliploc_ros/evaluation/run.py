@@ -152,7 +152,8 @@ class _MakeSearch:
 def compare_methods(landmark_map: LandmarkMap, queries: Sequence[Query],
                     methods: Sequence[Method], out: Path, *, sweep: Sequence[int] = (),
                     resume: bool = False, figures: bool = True,
-                    frames: Sequence[QueryFrame] = (), **running: Any) -> list[Summary]:
+                    frames: Sequence[QueryFrame] = (), remarks: Sequence[str] = (),
+                    **running: Any) -> list[Summary]:
     """Run methods, print the table, write all files to a folder; return their summaries.
 
     CliplocError: the run cannot be resumed, or a file cannot be written.
@@ -167,6 +168,8 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[Query],
         Continue an unfinished run.
     frames : sequence of QueryFrame
         Frames of the query file, for the times of detector and CLIP.
+    remarks : sequence of str
+        Notes on the input, shown with the table.
     running
         trials, workers, scheduler, layer, noisy: see run_methods.
     """
@@ -196,7 +199,7 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[Query],
         summaries = summarize(own)
         rows = table_rows(summaries)
         write_trajectories(out / 'trajectories', queries, own)
-        remarks = notes(summaries)
+        remarks = [*remarks, *notes(summaries)]
         print('\n'.join(['', as_text(rows), *remarks, '']), flush=True)
         write_text(out / 'table.md', '\n\n'.join([as_markdown(rows), *remarks]) + '\n')
         write_text(out / 'results.json', as_json(own))

@@ -2,16 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the CLIP that the options name: architecture, file of weights, activation."""
 
-import difflib
 import json
 import os
 import zipfile
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.errors import ModelError, OptionsError, did_you_mean
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.devices import check_run, needs_pytorch
 from cliploc_ros.models.files import check_weights_file, download, fingerprint_file
@@ -133,7 +131,7 @@ def _resolve_by_open_clip(options: ClipOptions, identity: tuple[str, ...]) -> Cl
     config = open_clip.get_model_config(model) if model in open_clip.list_models() else None
     if config is None:
         raise ModelError(f"unknown CLIP model '{options.model}'"
-                         f'{_nearest(model, open_clip.list_models())} '
+                         f'{did_you_mean(model, open_clip.list_models(), 4, 0.5)} '
                          '(open_clip.list_models() names all)')
     if {'hf_model_name', 'hf_tokenizer_name'} & config['text_cfg'].keys():
         raise ModelError(f"CLIP model '{options.model}' takes its tokenizer from the transformers "
@@ -146,7 +144,8 @@ def _resolve_by_open_clip(options: ClipOptions, identity: tuple[str, ...]) -> Cl
             raise ModelError(f'{name} does not exist: check the path of the weights')
         tags = open_clip.list_pretrained_tags_by_model(model)
         raise ModelError(f"unknown weights '{name}' for CLIP model '{model}'"
-                         f"{_nearest(name, tags)} (there are: {', '.join(tags) or 'none'})")
+                         f'{did_you_mean(name, tags, 4, 0.5)} (there are: '
+                         f"{', '.join(tags) or 'none'})")
     if tag and not options.checkpoint_path:
         file = _downloaded(model, tag, options)
     check_weights_file(file)
@@ -186,12 +185,6 @@ def is_torchscript(file: Path) -> bool:
         return False
     with zipfile.ZipFile(file) as archive:
         return any(name.endswith('/constants.pkl') for name in archive.namelist())
-
-
-def _nearest(name: str, known: Iterable[str]) -> str:
-    by_lower_case = {known_name.lower(): known_name for known_name in known}
-    near = difflib.get_close_matches(name.lower(), by_lower_case, n=4, cutoff=0.5)
-    return f': did you mean {", ".join(by_lower_case[match] for match in near)}?' if near else ''
 
 
 def _downloaded(model: str, tag: dict[str, Any], options: ClipOptions) -> Path:

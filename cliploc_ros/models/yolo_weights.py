@@ -7,7 +7,6 @@ before the import.
 """
 
 import atexit
-import difflib
 import logging
 import os
 import shutil
@@ -17,7 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from cliploc_ros.errors import ModelError
+from cliploc_ros.errors import ModelError, did_you_mean
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.devices import needs_pytorch
 from cliploc_ros.models.files import check_weights_file, download, first_line
@@ -97,10 +96,8 @@ def resolve_published(given: str, cache_dir: str, option: str) -> Path:
     from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES, attempt_download_asset
 
     if name not in GITHUB_ASSETS_NAMES:
-        near = difflib.get_close_matches(name, GITHUB_ASSETS_NAMES, n=4, cutoff=0.5)
-        hint = f': did you mean {", ".join(near)}?' if near else ''
         raise ModelError(f"'{given}' is neither a file here nor a published YOLO model"
-                         f'{hint}')
+                         f'{did_you_mean(name, GITHUB_ASSETS_NAMES, 4, 0.5)}')
 
     def fetch() -> Path:
         # Ultralytics' early versions write to the final path: only a whole file is moved there.

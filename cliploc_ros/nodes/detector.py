@@ -30,6 +30,12 @@ from cliploc_ros.ros.node.process import run_node
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
 _LOG_PERIOD_S = 5.0
+ABOUT = """\
+Publishes what a network detects in the newest image, while something subscribes to it.
+
+  in    image, image/compressed
+  out   detections, /diagnostics
+"""
 
 
 class _Camera:
@@ -167,7 +173,7 @@ def detector_options(parameters: DetectorParameters) -> DetectorOptions:
 
 def main() -> NoReturn:
     """Run the node until it is told to stop."""
-    run_node(DetectorNode)
+    run_node('detector', DetectorNode, ABOUT)
 
 
 if __name__ == '__main__':

@@ -37,6 +37,17 @@ from cliploc_ros.ros.request import Pipeline, Requests
 from cliploc_ros.ros.watch import Watcher
 
 _LOG_PERIOD_S = 5.0
+ABOUT = """\
+Answers where the robot is in a map of objects: on request, or with every image.
+
+  in         image, image/compressed, camera_info, detections; optional: odom, imu, depth
+  out        ~/pose, initialpose, ~/hypotheses, ~/landmarks, ~/matches, ~/debug_image, ~/answer,
+             /diagnostics
+  services   ~/relocalize, ~/relocalize_fields, ~/record, ~/reload_map,
+             reinitialize_global_localization
+
+It needs a map: -p map_file:=MAP.yaml, made by build_map.
+"""
 # Its diagnostics name them, and those of its cameras, for doctor.
 _OTHER_TOPICS = ('odom', 'imu', 'initialpose', '/tf', '/tf_static')
 
@@ -219,7 +230,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
 
 def main() -> NoReturn:
     """Run the node until it is told to stop."""
-    run_node(RelocalizerNode)
+    run_node('relocalizer', RelocalizerNode, ABOUT)
 
 
 if __name__ == '__main__':

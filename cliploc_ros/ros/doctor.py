@@ -55,6 +55,7 @@ from cliploc_ros.ros.parameters import (
 from cliploc_ros.ros.request import time_is_up
 from cliploc_ros.ros.running import NotRunningError, ask, parameters_of_files
 from cliploc_ros.units import NS_PER_S
+from cliploc_ros.vocabulary.vocabulary import misspelt_classes
 
 # Images that come later after their stamps show clocks that differ (a guess).
 _MOST_LAG_S = 1.0
@@ -325,6 +326,11 @@ def _check_detections(parameters: RelocalizerParameters, localizer: FrameLocaliz
             names = ', '.join(sorted(set(found.class_ids))[:5])
             return report.add('detector', State.FAIL, f'no class of the map is among its {names}: '
                               'use the detector of the map, or class_map')
+        misspelt = misspelt_classes(localizer.landmark_map.class_ids)
+        if names := ', '.join(f"'{name}'{hint}" for name, hint in misspelt.items()
+                              if name not in found.class_ids):
+            return report.add('detector', State.FAIL, 'it does not have the class of the map '
+                              f'{names}: correct class_id in the map')
     report.add('detector', State.PASS, text)
 
 

@@ -53,7 +53,7 @@ class Places(NamedTuple):
         """The figures by name."""
         count, verdicts = len(self.check.positions), count_verdicts(self.check.trials)
         views = len(self.check.trials)
-        return {'positions with an accepted heading':
+        return {'positions with a heading accepted by objects':
                 f'{int((self.check.accepted > 0).sum())} of {count}',
                 'views accepted': f'{verdicts["accepted"]} of {views}',
                 'views misled': f'{verdicts["misled"]} of {views}',

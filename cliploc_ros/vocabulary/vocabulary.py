@@ -4,6 +4,7 @@
 
 import os
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from cliploc_ros.core.map.parameter_file import read_parameter_file
-from cliploc_ros.errors import OptionsError
+from cliploc_ros.errors import OptionsError, did_you_mean
 
 #: Symbols with a meaning of their own: the first kind, and a colour other than the first one.
 NAME, SECOND = 'name', 'second'
@@ -27,6 +28,8 @@ _A_BEFORE_VOWEL = re.compile(r'\b(a)(?= (?:[aeio]|u(?!ni|se)))', re.IGNORECASE)
 Rules = Mapping[str, Sequence[str]]
 _FOLDER = Path(__file__).parent
 _GENERAL = 'general'
+# Of the letters of a class, taken for another one that is misspelt. A guess: chair and charr.
+_ALIKE = 0.8
 
 
 def expand_phrases(rules: Rules) -> tuple[str, ...]:
@@ -121,6 +124,18 @@ def load_vocabulary(path: str | os.PathLike[str] | None = None) -> Vocabulary:
 def shipped_classes() -> tuple[str, ...]:
     """Return the classes that the shipped vocabulary knows by name."""
     return tuple(_shipped('coco.yaml'))
+
+
+def misspelt_classes(class_ids: Sequence[str]) -> dict[str, str]:
+    """Return the classes of a map that look misspelt, each with a hint of the right one.
+
+    A class of one landmark that the shipped vocabulary lacks, and that is nearly one of those or
+    of several landmarks.
+    """
+    counts = Counter(class_ids)
+    known = {*shipped_classes(), *(name for name, count in counts.items() if count > 1)}
+    return {name: hint for name in counts
+            if name not in known and (hint := did_you_mean(name, known, alike=_ALIKE))}
 
 
 def shipped_phrases(name: str) -> tuple[str, ...]:

@@ -65,8 +65,15 @@ def test_an_existing_map_stays_when_building_fails(build_map, observations, tmp_
     done = build_map('--observations', observations, '--out', old, '--every', 400)
     assert done.returncode == 1
     assert 'viewpoints, at least 3 are needed' in done.stderr
+    report = tmp_path / 'failed.json'
+    done = build_map('--observations', observations, '--out', old, '--min-baseline', 179,
+                     '--report', report)
+    assert done.returncode == 1 and f'report: {report}' in done.stdout
+    found = json.loads(report.read_text())
+    assert found['failure'] in done.stderr and len(found['left_out']) > 9
     assert old.read_text() == 'precious'
-    assert sorted(path.name for path in tmp_path.iterdir()) == ['cut.npz', 'old.yaml']
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        'cut.npz', 'failed.json', 'old.yaml']
 
 
 @pytest.mark.parametrize(('args', 'message'), [

@@ -82,7 +82,7 @@ def test_missing_fields_are_named(tmp_path, field):
     ('', 'no YAML mapping'),
     ('just text', 'no YAML mapping'),
     ('- a\n- b\n', 'no YAML mapping'),
-    ('a: [1, 2', 'not valid YAML'),
+    ('a: [1, 2', 'not valid YAML: [^<]* at line 1, column 4'),
     ('a: 1\n---\nb: 2\n', 'not valid YAML|more than one'),
     ('a: &x [1]\nb: *x\n', 'an alias'),
     ('a: 1\na: 2\n', "'a' is repeated"),
@@ -97,6 +97,7 @@ def test_missing_fields_are_named(tmp_path, field):
     (file_of({'a.b': CUP}), 'without dots'),
     (file_of({'a': CUP}, ''), 'frame_id: must be non-empty text'),
     (file_of({'a': 'cup'}), "landmark 'a': expected the fields"),
+    (file_of({'a': {'centre': 0, **CUP}}), r"unknown field: centre \(did you mean 'center'\?\)"),
     (file_of({'a': CUP}) | {'/x': {'ros__parameters': {'map': {}}}}, 'more than one map'),
     ('!!python/object/apply:os.system [echo]', 'no YAML mapping'),
 ])

@@ -80,7 +80,7 @@ def test_a_way_is_blocked_by_a_wall_between_its_ends_only():
     ('image: walls', 'image: gone', 'gone.pgm'), ('resolution: 0.5\n', '', "'resolution' is miss"),
     ('0.5', '.nan', 'resolution nan'), ('0.5', '0.0', 'resolution 0.0'),
     ('[1.0, -2.0, {yaw}]', '[1.0, .inf, 0.0]', 'origin'), ('[1.0, -2.0, {yaw}]', '[1.0]', ''),
-    ('0.196', '0.9', 'must rise'), (YAML, 'walls', 'no YAML file'), (YAML, '\t{{', ''),
+    ('0.196', '0.9', 'must rise'), (YAML, 'walls', 'no YAML mapping'), (YAML, '\t{{', ''),
     ('negate: {negate}', 'negate: maybe', 'maybe'), ('negate: {negate}', 'negate: .inf', ''),
     (YAML, '[' * 5000, '')])
 def test_a_damaged_file_is_refused_by_name(tmp_path, before, after, text):

@@ -5,7 +5,7 @@
 import pytest
 
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.errors import OptionsError
+from cliploc_ros.errors import CliplocError
 from cliploc_ros.evaluation.methods import PAPER_METHODS, parse_methods
 
 PAPER = RelocalizerOptions(iterations=500, k=5, random_seed=4)
@@ -59,13 +59,13 @@ def test_keyframes_are_for_auto_and_what_is_based_on_it(tmp_path):
     ('wide: {base: best}', "'best' is none of"),
     ('a@b: {k: 2}', 'must hold neither'),
     ('auto: {k: 2}', "two different methods are called 'auto'"),
-    ('[1, 2]', 'is not a mapping of names'),
-    ('{', 'is not YAML'),
+    ('[1, 2]', 'holds no YAML mapping'),
+    ('{', 'not valid YAML'),
 ])
 def test_bad_files_are_named(tmp_path, text, named):
     path = tmp_path / 'mine.yaml'
     path.write_text(text)
-    with pytest.raises(OptionsError) as caught:
+    with pytest.raises(CliplocError) as caught:
         parse_methods(['auto', str(path)], PAPER, 40)
     assert named in str(caught.value)
 
@@ -74,5 +74,5 @@ def test_bad_files_are_named(tmp_path, text, named):
     (['class_prosac'], "'class_prosac' is none of"), (['/nowhere.yaml'], '/nowhere.yaml'),
     ([], 'no method is named')])
 def test_bad_names_are_named(words, named):
-    with pytest.raises(OptionsError, match=named):
+    with pytest.raises(CliplocError, match=named):
         parse_methods(words, PAPER, 40)

@@ -22,13 +22,18 @@ from cliploc_ros.evaluation.map_check.pictures import draw_pictures
 from cliploc_ros.evaluation.map_check.views import Views
 from cliploc_ros.mapping.check.advice import give_advice
 from cliploc_ros.mapping.check.checking import check_map
-from cliploc_ros.mapping.check.landmark_faults import find_map_overlaps, hear_witness
+from cliploc_ros.mapping.check.landmark_faults import (
+    check_landmarks,
+    find_map_overlaps,
+    hear_witness,
+)
 from cliploc_ros.mapping.check.places import LookAlike, find_look_alikes, make_grid
 from cliploc_ros.mapping.check.relocalization import (
     make_folds,
     measure_detector,
     try_recording,
 )
+from cliploc_ros.mapping.check.report import Measure
 from cliploc_ros.mapping.options import CheckOptions, MappingOptions, Thresholds
 from cliploc_ros.mapping.systematic import find_corrections
 from cliploc_ros.mapping.views import make_views
@@ -103,6 +108,18 @@ def test_a_moved_landmark_is_the_worst_and_named_in_the_advice(detections):
     assert 'is never detected' in report.landmarks[0].faults[0]
     assert any(text.startswith('thing_4 is never detected') for text in report.advice)
     assert report.landmarks[1].severity == 0.0
+
+
+@pytest.mark.parametrize('is_recorded', [False, True])
+def test_a_misspelt_class_is_named_with_the_right_one(detections, is_recorded):
+    right = TABLE.class_ids[4]
+    wrong = replace(TABLE, class_ids=(*TABLE.class_ids[:4], f'{right}k', *TABLE.class_ids[5:]))
+    _, witness = witness_of(wrong, detections) if is_recorded else (None, None)
+    worst, *others = check_landmarks(wrong, witness, [], MAPPING)
+    assert worst.landmark_id == 'thing_4'
+    assert worst.faults == (f"has the class '{right}k', which the detector does not have "
+                            f"(did you mean '{right}'?): correct its class_id",)
+    assert all(one.severity == 0.0 for one in others)
 
 
 def test_a_landmark_of_few_frames_counts_little(detections):
@@ -225,7 +242,7 @@ def test_limits_decide():
     strict = replace(eased, min_positions=1.0, max_faulty=0.0)
     report = check_map(TABLE, options=QUICK, thresholds=strict)
     assert [text.split(':')[0] for text in report.failures] == [
-        'positions with an accepted heading']
+        'positions with a heading accepted by objects']
 
 
 def pixels(detections, shift_px):
@@ -317,6 +334,23 @@ def test_stretches_without_landmarks_become_advice(detections):
     report = check_map(TABLE, gap, options=QUICK)
     assert any(re.match(r'record this side: \d frames at [45] s.* show no landmarks', text)
                for text in report.advice), report.advice
+
+
+def test_a_side_that_was_passed_twice_is_told_once(report):
+    recording = report.recording
+    first = recording.trials[0]
+    stretch = [replace(first, verdict='refused', landmarks=0)] * 3
+    twice = replace(recording, trials=(*stretch, replace(first, verdict='accepted'), *stretch[1:]))
+    told = [one.text for one in give_advice(replace(report, recording=twice))
+            if one.text.startswith('record this side')]
+    assert len(told) == 1 and '5 frames of 2 passes' in told[0]
+
+
+@pytest.mark.parametrize(('value', 'limit', 'shown'), [
+    (0.005952, 0.01, '0.6 %'), (0.1234, 0.05, '12 %'), (1.0, 0.9, '100 %'),
+    (0.8961, 0.9, '89.61 %')])
+def test_shares_have_two_digits_where_these_tell(value, limit, shown):
+    assert Measure('a share', value, limit, is_most=False).show(value) == shown
 
 
 def test_too_few_views_are_named_as_the_cause(detections):

@@ -69,6 +69,9 @@ def test_places_without_a_keyframe_are_counted_and_named(report):
     text = 'no keyframe is within reach of'
     assert any(text in one.text for one in give_advice(replace(report, keyframes=nowhere)))
     assert not any(text in one.text for one in give_advice(replace(report, keyframes=full)))
+    by_keyframes = replace(report, keyframes=full, grid=replace(grid, accepted=0 * grid.accepted))
+    assert any('by objects' in one.text and 'only keyframes reach them' in one.text
+               for one in give_advice(by_keyframes))
 
 
 def test_the_report_has_keyframes_only_where_there_are_some(tmp_path, capsys):

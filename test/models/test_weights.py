@@ -156,9 +156,9 @@ def test_unknown_names(tmp_path):
     text = refusal(options('ViT-L14', 'openai', tmp_path))
     assert "'ViT-L14'" in text and 'ViT-L-14' in text
     text = refusal(options('ViT-B-32', 'laoin2b', tmp_path))
-    assert 'did you mean laion2b' in text and 'openai' in text
+    assert "did you mean 'laion2b" in text and 'openai' in text
     text = refusal(options('ViT-B-32', 'opnai', tmp_path, checkpoint_path=str(tmp_path)))
-    assert 'did you mean openai' in text
+    assert "did you mean 'openai" in text
     assert 'transformers' in refusal(options('ViT-B-16-SigLIP', 'webli', tmp_path))
     # OpenAI's own spelling
     assert 'gone.pt' in refusal(options('ViT-B/32', 'gone.pt', tmp_path))

@@ -113,7 +113,7 @@ def test_the_map_is_read_anew_and_a_bad_one_changes_nothing(own_relocalizer, tes
     assert tester.relocalize(make_frame()).success
     tester.wait(lambda: tester.poses, 'a pose')
     assert tester.poses[-1].header.frame_id == 'hall'
-    for bad, reason in ((text.replace('semi_axes', 'half_axes'), 'missing field: semi_axes'),
+    for bad, reason in ((text.replace('semi_axes', 'half_axes'), 'unknown field: half_axes'),
                         ('', 'YAML'), (text[:len(text) // 2], str(own_map))):
         own_map.write_text(bad)
         answer = reload_map(tester)

@@ -103,7 +103,7 @@ def test_problems_are_reported_together_and_corrected_one_by_one(declare):
 def test_mistyped_names_are_warned_of_with_the_nearest(declare, capfd):
     declare(given(ratoi=0.5, qqq=1) + '    map:\n      frame_id: map\n')
     log = capfd.readouterr().err
-    assert "unknown parameter 'ratoi' has no effect; did you mean 'ratio'?" in log
+    assert "unknown parameter 'ratoi' has no effect (did you mean 'ratio'?)" in log
     assert "unknown parameter 'qqq' has no effect\n" in log
     assert 'map' not in log and 'use_sim_time' not in log
 

@@ -31,7 +31,7 @@ from cliploc_ros.core.map.parameter_file import (
     parse_written_map,
     read_text,
 )
-from cliploc_ros.errors import MapError
+from cliploc_ros.errors import MapError, did_you_mean
 
 _UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation')
@@ -300,14 +300,14 @@ def _check_keys(tree: Any, expected: tuple[str, ...], where: str,
                 optional: tuple[str, ...] = ()) -> None:
     if not isinstance(tree, Mapping):
         raise MapError(f'{where}: expected the fields {", ".join(expected)}')
-    missing = [key for key in expected if key not in tree]
-    if missing:
-        raise MapError(f'{where}: missing field: {", ".join(missing)}')
     known = tuple(dict.fromkeys(expected + optional))
     unknown = [str(key) for key in tree if key not in known]
     if unknown:
-        raise MapError(f'{where}: unknown field: {", ".join(unknown[:5])} '
-                       f'(known: {", ".join(known)})')
+        named = ', '.join(f'{key}{did_you_mean(key, known)}' for key in unknown[:5])
+        raise MapError(f'{where}: unknown field: {named} (known: {", ".join(known)})')
+    missing = [key for key in expected if key not in tree]
+    if missing:
+        raise MapError(f'{where}: missing field: {", ".join(missing)}')
 
 
 def _text(value: Any, where: str) -> str:

@@ -4,16 +4,15 @@
 
 import math
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
+from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import MapError
 
 FREE, OCCUPIED, UNKNOWN = 0, 1, -1
@@ -87,20 +86,17 @@ def read_occupancy_grid(file: Path, frame_id: str) -> OccupancyGrid:
 
     MapError: names the file and what to correct.
     """
+    fields = read_parameter_file(file)
     try:
-        fields = yaml.safe_load(file.read_text(encoding='utf-8'))
         return _grid(fields, file, frame_id)
     except MapError as error:
         raise MapError(f'occupancy_grid {file}: {error}') from error
-    except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError,
-            yaml.YAMLError) as error:
+    except (OSError, ValueError, TypeError, KeyError, OverflowError) as error:
         text = f'{error} is missing' if isinstance(error, KeyError) else str(error)
         raise MapError(f'occupancy_grid {file}: {text.splitlines()[0]}') from error
 
 
-def _grid(fields: Any, file: Path, frame_id: str) -> OccupancyGrid:
-    if not isinstance(fields, Mapping):
-        raise MapError('is no YAML file of nav2_map_server')
+def _grid(fields: dict[str, Any], file: Path, frame_id: str) -> OccupancyGrid:
     image = _read_image(file.parent / str(fields['image']))
     x, y, yaw = map(float, fields['origin'])
     occupied, free = float(fields['occupied_thresh']), float(fields['free_thresh'])

@@ -77,7 +77,7 @@ def read_text(path: str | os.PathLike[str]) -> str:
             raise MapError(f'{path}: larger than {MAX_FILE_BYTES // 2**20} MiB')
         return content.decode('utf-8')
     except OSError as error:
-        raise MapError(f'{path}: {error.strerror}') from error
+        raise MapError(f'{path.absolute()}: {error.strerror}') from error
     except UnicodeDecodeError as error:
         raise MapError(f'{path}: not a text file in UTF-8 (byte {error.start})') from error
 
@@ -87,7 +87,8 @@ def parse_parameters(text: str, path: str | os.PathLike[str]) -> dict[str, Any]:
     try:
         tree = _build_tree(text)
     except yaml.YAMLError as error:
-        raise MapError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from error
+        said = ' '.join(str(error).replace(' in "<unicode string>",', ' at').split())
+        raise MapError(f'{path}: not valid YAML: {said}') from error
     except _TreeError as error:
         raise MapError(f'{path}: {error}') from error
     if not isinstance(tree, dict):

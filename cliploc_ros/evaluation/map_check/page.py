@@ -48,8 +48,8 @@ _MOST_LANDMARKS = 300
 _MOST_MATCHED = 12
 # Of the first screen.
 _NUMBERS, FIRST_ADVICE = 3, 3
-# Figures for large type, the most telling first.
-_TELLING = ('recorded frames accepted', 'positions with an accepted heading',
+# How the names of figures for large type begin, the most telling first.
+_TELLING = ('recorded frames accepted by', 'positions with a heading accepted',
             'views that mislead a robot', 'landmarks with a serious fault')
 
 
@@ -86,8 +86,8 @@ def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, byt
     missed = len(report.failures)
     said = verdict('The map reaches all thresholds.' if report.passed else
                    f'The map misses {missed} of {len(report.measures)} thresholds.', report.passed)
-    by_name = {one.name: one for one in report.measures}
-    told = [by_name[one] for one in _TELLING if one in by_name][:_NUMBERS]
+    told = [one for name in _TELLING for one in report.measures if one.name.startswith(name)
+            ][:_NUMBERS]
     first, *others = (figure(png, caption, picture) for picture, caption, png in pictures)
     cards = [_card(number, one, views) for number, one in enumerate(report.to_do, start=1)]
     parts = [first_screen(
@@ -150,7 +150,7 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
              'was built from this recording)'),
             ('explained boxes, median IoU; held out',
              f'{one.held_out.explained:.1%}, {one.held_out.median_iou:.3f}'),
-            ('recorded frames, cross-validated', _verdicts(one.judged) + (
+            (f'recorded frames, cross-validated, {report.evidence}', _verdicts(one.judged) + (
                 '' if len(one.judged) == len(one.trials) else
                 f'; of all {_verdicts(one.trials)}: no other part of the recording shows the '
                 'objects of the rest')),
@@ -160,12 +160,12 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
             ('noise of box edges', f'{one.edge_scale:.2f} times that assumed by build_map')]
     if report.queries:
         rows.append(('queries with recorded similarities', _verdicts(report.queries)))
-    rows += [('grid views', _verdicts(report.grid.trials)),
-             ('grid positions near the recording with an accepted heading'
-              if report.recording else 'grid positions with an accepted heading',
+    near = ' near the recording' if report.recording else ''
+    rows += [('grid views, by objects alone', _verdicts(report.grid.trials)),
+             (f'grid positions{near} with a heading accepted by objects alone',
               f'{report.grid.accepted_positions:.0%} of {int(report.grid.is_near.sum())}')]
     if report.accepted_positions != report.grid.accepted_positions:
-        rows.append(('these positions, with keyframes', f'{report.accepted_positions:.0%}'))
+        rows.append((f'these positions, {report.evidence}', f'{report.accepted_positions:.0%}'))
     if (layer := report.keyframes) is not None:
         rows.append(('keyframes', f'{layer.keyframes} with {layer.points} points'))
         if len(layer.recorded):

@@ -20,6 +20,8 @@ from cliploc_ros.mapping.check.report import SERIOUS, Advice, CheckReport, GridC
 _MOST_OF_A_KIND, _MOST_MISLED = 5, 3
 # A shorter run of refused frames is no side of a room.
 _MIN_SPAN = 2
+# Cosine of the angle between views of one side: 45 degrees, a guess.
+_ONE_SIDE = 0.7
 _FEW_LANDMARKS = 3
 # Fewer frames of a landmark leave others unmapped, if besides more than this share of the boxes
 # belongs to none. Guesses, between maps of fr3 from every 10th and from every 30th frame.
@@ -121,9 +123,18 @@ def _on_misled(report: CheckReport) -> Iterator[Advice]:
 def _on_spans(report: CheckReport) -> Iterator[Advice]:
     if report.recording is None:
         return
-    for run in list(refused_spans(report.recording.trials))[:_MOST_OF_A_KIND]:
+    sides: list[list[list[Trial]]] = []  # runs that show one side are told once
+    for run in refused_spans(report.recording.trials):
+        if len(run) < _MIN_SPAN:
+            continue
+        if same := [side for side in sides if _is_one_side(side[0], run)]:
+            same[0].append(run)
+        else:
+            sides.append([run])
+    for side in sides[:_MOST_OF_A_KIND]:
+        run = side[0]
         seen, halfway = int(np.median([one.landmarks for one in run])), run[len(run) // 2]
-        if len(run) < _MIN_SPAN or run[0].stamp_s is None or run[-1].stamp_s is None:
+        if run[0].stamp_s is None or run[-1].stamp_s is None:
             continue
         if seen > _FEW_LANDMARKS and _sees_double(halfway.position, report):
             continue
@@ -132,9 +143,18 @@ def _on_spans(report: CheckReport) -> Iterator[Advice]:
         center = np.mean([one.position for one in run], axis=0)
         what = 'record this side' if seen <= _FEW_LANDMARKS else (
             'describe these objects better in their labels, or record this side again')
-        yield Advice(f'{what}: {len(run)} frames at {middle:.0f} s, around {_place(center)} '
+        frames = f'{len(run)} frames' if len(side) == 1 else (
+            f'{sum(map(len, side))} frames of {len(side)} passes, most')
+        yield Advice(f'{what}: {frames} at {middle:.0f} s, around {_place(center)} '
                      f'looking {_heading(halfway)}, show {_landmarks(seen)} and none is accepted',
                      view=halfway)
+
+
+def _is_one_side(first: Sequence[Trial], second: Sequence[Trial]) -> bool:
+    """Return whether two runs of frames look the same way at nearly the same place."""
+    one, other = first[len(first) // 2], second[len(second) // 2]
+    return bool(np.linalg.norm(one.position - other.position) < RADIUS_M
+                and one.forward @ other.forward > _ONE_SIDE)
 
 
 def _on_grid(report: CheckReport) -> Iterator[Advice]:
@@ -144,9 +164,11 @@ def _on_grid(report: CheckReport) -> Iterator[Advice]:
         if np.mean([_sees_double(one, report) for one in grid.positions[rows]]) <= 0.5:
             best = int(grid.visible[rows].max())
             fullest = int(rows[0] * grid.headings + grid.visible[rows[0]].argmax())
-            yield Advice(f'no heading is accepted at {_area(grid, rows)}: a view from there shows '
-                         f'{_landmarks(best)} at most; map more objects that can be seen from '
-                         'there', view=grid.trials[fullest])
+            reached = report.keyframes is not None and (report.keyframes.headings[rows] > 0).all()
+            yield Advice(f'no heading is accepted by objects at {_area(grid, rows)}'
+                         f'{", only keyframes reach them" if reached else ""}: a view from there '
+                         f'shows {_landmarks(best)} at most; map more objects that can be seen '
+                         'from there', view=grid.trials[fullest])
     if report.keyframes is not None:
         yield from _some([
             Advice(f'no keyframe is within reach of {_area(grid, rows)}: drive there when the '

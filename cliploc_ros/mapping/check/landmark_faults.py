@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.errors import did_you_mean
 from cliploc_ros.mapping.association import associate, close_pairs, seen_apart
 from cliploc_ros.mapping.evidence import Evidence, gather_evidence
 from cliploc_ros.mapping.fitting import fit_landmarks
@@ -17,6 +18,7 @@ from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_m
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.update.sight import look_for
 from cliploc_ros.mapping.views import Views
+from cliploc_ros.vocabulary.vocabulary import misspelt_classes
 
 # Landmarks nearer than this are reported, see normalized_distance. Those of one class are one
 # object, unless they are farther apart than the second distance and frames show both at once.
@@ -69,6 +71,7 @@ class LandmarkCheck:
 class Witness(NamedTuple):
     """What a recording says of a map."""
 
+    class_names: tuple[str, ...]  #: Of the recording
     landmarks: Landmarks  #: Of the map, with the recording's classes
     shown: NDArray[np.int64]  #: (n,): the landmark that each box shows, -1 for none
     evidence: Evidence
@@ -88,7 +91,7 @@ def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str
     sight = look_for(views, landmarks, shown, np.ones(len(landmarks.centers), dtype=np.bool_))
     expected = np.where(evidence.support == 0, sight.expected_frames, evidence.expected)
     fitted = fit_landmarks(views, landmarks, group_boxes(shown, len(landmarks.centers)))
-    return Witness(landmarks, shown, evidence, expected, fitted,
+    return Witness(class_names, landmarks, shown, evidence, expected, fitted,
                    gather_evidence(views, fitted, shown).position_sigma)
 
 
@@ -118,6 +121,10 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
         partners[one.first].append((one.second, one))
         partners[one.second].append((one.first, one))
     supports = [one.support for one in landmark_map.details]
+    # without a recording, a class may be a detector's that is not known here
+    misspelt = misspelt_classes(classes) if witness is None else {
+        name: did_you_mean(name, witness.class_names)
+        for name in {*classes} - {*witness.class_names}}
     weights = np.array(supports if all(supports) else [], dtype=np.float64)
     checks = []
     for row, others in enumerate(partners):
@@ -130,6 +137,9 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
             overlaps=tuple((ids[other], one.distance) for other, one in others))
         faults = [(1.5, f'is the same object as {ids[other]}: delete one of them')
                   for other, one in others if one.is_duplicate]
+        if hint := misspelt.get(classes[row]):
+            faults.append((1.6, f"has the class '{classes[row]}', which the detector does not "
+                                f'have{hint}: correct its class_id'))
         if not faults:
             faults += _support_faults(check, float(np.linalg.norm(semi_axes)), options)
         faults += [(0.4, f'lies in {ids[other]} of class {classes[other]}: one object under two '

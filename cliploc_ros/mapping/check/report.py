@@ -49,8 +49,11 @@ class Measure(NamedTuple):
         return self.value > self.limit if self.is_most else self.value < self.limit
 
     def show(self, value: float) -> str:
-        """Return a value in words, with enough digits to show that it is below its limit."""
-        return f'{100.0 * value:.4g} %' if self.unit == 'share' else f'{value:.4g}'
+        """Return a value in words, with enough digits to show that it is beyond its limit."""
+        if self.unit != 'share':
+            return f'{value:.4g}'
+        told_apart = _percent(self.value, 2) != _percent(self.limit, 2)
+        return _percent(value, 2 if told_apart or not self.is_missed else 4)
 
 
 @dataclass(frozen=True)
@@ -223,15 +226,25 @@ class CheckReport:
         return not self.failures
 
     @property
+    def _by_images(self) -> list[Trial]:
+        """Return the recorded frames that were relocalized by keyframes, too."""
+        return [] if self.recording is None else [
+            one for one in self.recording.judged if one.by_objects is not None]
+
+    @property
+    def evidence(self) -> str:
+        """Return what gives the accepted poses that count, in words."""
+        return 'by objects or keyframes' if self.keyframes is not None and self._by_images else (
+            'by objects')
+
+    @property
     def accepted_positions(self) -> float:
         """Return the share of the grid positions near the recording with an accepted heading.
 
         A keyframe within reach counts where recorded images were relocalized by the keyframes of
         other parts of the recording, by the share of them that was accepted.
         """
-        by_images = [] if self.recording is None else [
-            one for one in self.recording.judged if one.by_objects is not None]
-        if self.keyframes is None or not by_images:
+        if self.keyframes is None or not (by_images := self._by_images):
             return self.grid.accepted_positions
         near = self.grid.is_near
         chance = share(by_images, 'accepted') * (self.keyframes.headings[near] > 0)
@@ -289,15 +302,20 @@ def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
             demand('held-out median IoU', recording.held_out.median_iou, limits.min_iou, False,
                    'number')
         if recording.can_judge_frames:
-            demand('recorded frames accepted', share(recording.judged, 'accepted'),
-                   limits.min_accepted, False)
+            demand(f'recorded frames accepted {report.evidence}',
+                   share(recording.judged, 'accepted'), limits.min_accepted, False)
         else:  # a map of a walk that passes each object once
             demand('recorded frames accepted with simulated boxes',
                    share(recording.simulated, 'accepted'), limits.min_accepted, False)
-    demand('positions with an accepted heading', report.accepted_positions,
+    demand(f'positions with a heading accepted {report.evidence}', report.accepted_positions,
            limits.min_positions, False)
     demand('views that mislead a robot', share(views, 'misled'), limits.max_misled, True)
     return measures
+
+
+def _percent(value: float, digits: int) -> str:
+    return np.format_float_positional(100.0 * value, digits, unique=False, fractional=False,
+                                      trim='-') + ' %'
 
 
 def count_by_objects(trials: Sequence[Trial]) -> dict[str, int]:

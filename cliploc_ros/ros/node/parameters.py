@@ -5,7 +5,6 @@
 generate_parameter_library does the same at build time, but has no package outside of apt.
 """
 
-import difflib
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
@@ -20,7 +19,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from cliploc_ros.errors import OptionsError
+from cliploc_ros.errors import OptionsError, did_you_mean
 
 Value = str | int | float | bool | list[float] | list[str]
 
@@ -104,9 +103,8 @@ class ParameterRow:
             raise OptionsError(f'{self.name}: must be of type {type(self.default).__name__}, '
                                f'not {type(value).__name__} ({value!r:.60})')
         if self.choices and value not in self.choices:
-            nearest = difflib.get_close_matches(str(value), self.choices, 1)
-            hint = f" (did you mean '{nearest[0]}'?)" if nearest else ''
-            raise OptionsError(f"{self.name}: '{value}' is none of {self.allowed}{hint}")
+            raise OptionsError(f"{self.name}: '{value}' is none of {self.allowed}"
+                               f'{did_you_mean(str(value), self.choices)}')
         if isinstance(value, int | float) and not self.low <= value <= self.high:
             raise OptionsError(f'{self.name}: {value} must be {self.allowed}')
         return value
@@ -198,9 +196,8 @@ class NodeParameters[P: Parameters]:
             if (name in self._rows or name in others or name in _FOREIGN_NAMES
                     or name.startswith(_FOREIGN_PREFIXES)):
                 continue
-            nearest = difflib.get_close_matches(name, self._rows, 1)
-            hint = f"; did you mean '{nearest[0]}'?" if nearest else ''
-            self._node.get_logger().warning(f"unknown parameter '{name}' has no effect{hint}")
+            self._node.get_logger().warning(f"unknown parameter '{name}' has no effect"
+                                            f'{did_you_mean(name, self._rows)}')
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
         """Allow a change if all values are valid together; another callback may refuse it."""

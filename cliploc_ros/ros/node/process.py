@@ -13,17 +13,31 @@ from typing import NoReturn
 
 import rclpy
 
-from cliploc_ros.command import Interruption
+from cliploc_ros.command import Interruption, split_ros_args
 from cliploc_ros.ros.node.executor import NodeExecutor, log_failure
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 
 _M_ARENA_MAX = -8  # malloc.h
 # Time for callbacks to end before their node is destroyed.
 _GRACE_S = 1.0
+_HELP = """\
+usage: ros2 run cliploc_ros {name} --ros-args [--params-file FILE] [-p NAME:=VALUE] [-r OLD:=NEW]
+
+{about}
+parameters, each with its default and meaning:
+  $(ros2 pkg prefix --share cliploc_ros)/config/{name}.yaml
+
+ros2 launch cliploc_ros relocalization.launch.py starts detector and relocalizer together."""
 
 
-def run_node(make_node: Callable[[], ManagedNode]) -> NoReturn:
-    """Spin a node until SIGINT or SIGTERM; then end the process with exit code 0 within 2 s."""
+def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoReturn:
+    """Spin a node until SIGINT or SIGTERM; then end the process with exit code 0 within 2 s.
+
+    With --help print what it is about in place of that.
+    """
+    if {'-h', '--help'} & {*split_ros_args(sys.argv[1:])[0]}:
+        print(_HELP.format(name=name, about=about))
+        sys.exit()
     # The networks of both nodes share a robot's cores. PyTorch's threads wait by spinning, which
     # slows the other process tenfold. PyTorch reads this when it is loaded.
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
