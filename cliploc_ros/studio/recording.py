@@ -214,7 +214,7 @@ def fit_boxes(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64],
     """
     count = len(bboxes_xyxy)
     if count < 2:
-        raise EditError(f'create: {count} boxes drawn; draw one in each of two images or more, '
+        raise EditError(f'create: boxes drawn: {count}; draw one in each of two images or more, '
                         'best three')
     for box in bboxes_xyxy:
         if not (box[2:] - box[:2] >= MIN_BOX_PX).all():
