@@ -82,6 +82,7 @@ class NewLandmark:
         """Forget the box of a view, or all of them."""
         self.boxes = {key: box for key, box in self.boxes.items()
                       if view is not None and key != view}
+        self._offered = []
         if not self.boxes:
             self.class_id = ''
         return f'boxes drawn: {len(self.boxes)}'
@@ -171,8 +172,8 @@ class NewLandmark:
         for view in np.flatnonzero(values.any(axis=1)):
             camera = detections.camera_of(view)
             pixels, is_front = _project(camera, detections.map_from_camera[view], places)
-            size = np.array([camera.width, camera.height])
-            values[view] *= is_front & ((pixels > 0.05 * size) & (pixels < 0.95 * size)).all(axis=1)
+            off_middle = np.abs(pixels / (camera.width, camera.height) - 0.5)
+            values[view] *= is_front & (off_middle < 0.45).all(axis=1)
         best = int(np.argmax(values.mean(axis=1)))
         if not values[best].any():
             self._offered = []
