@@ -169,7 +169,7 @@ class NewLandmark:
         off = np.abs(angles_to(boxed) - _GOOD_ANGLE_DEG) / _GOOD_ANGLE_DEG
         values = np.maximum(0.0, 1.0 - off) ** 2 * (angles_to(self._offered) > _OTHER_ANGLE_DEG)
         values[boxed] = 0.0
-        for view in np.flatnonzero(values.any(axis=1)):
+        for view in np.flatnonzero(values.any(axis=1)).tolist():
             camera = detections.camera_of(view)
             pixels, is_front = _project(camera, detections.map_from_camera[view], places)
             off_middle = np.abs(pixels / (camera.width, camera.height) - 0.5)

@@ -164,7 +164,7 @@ class Page:
 
     def _show_gizmo(self) -> None:
         selected = self._studio.document.selected
-        is_shown = selected is not None and not selected[1].is_locked
+        is_shown = selected is not None and not selected[1].marks.is_locked
         if self._gizmo.visible != is_shown:
             self._gizmo.visible = is_shown
         if selected is None:

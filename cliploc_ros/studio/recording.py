@@ -135,7 +135,7 @@ class Recording:
 
         EditError: one is locked. MappingError: none can be fitted.
         """
-        if locked := [key for key in landmark_ids if landmarks[key].is_locked]:
+        if locked := [key for key in landmark_ids if landmarks[key].marks.is_locked]:
             raise EditError(f"landmark '{locked[0]}' is locked: unlock it first")
         chosen = np.array([key in set(landmark_ids) for key in landmarks])
         # the others keep their boxes, so that none takes those of its neighbour

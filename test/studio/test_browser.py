@@ -129,9 +129,9 @@ def test_hide_and_lock_by_the_rows(person, studio):
     person.find('mug_2')
     person.row('mug_2').hover()
     person.page.get_by_label('Hide mug_2').click()
-    wait_for(lambda: 'mug_2' in studio.hidden and 'mug_2' not in studio.shown(), 'hiding')
+    wait_for(lambda: 'mug_2' not in studio.shown(), 'hiding')
     person.page.get_by_label('Lock mug_2').click()
-    wait_for(lambda: document.landmarks['mug_2'].is_locked, 'the lock')
+    wait_for(lambda: document.landmarks['mug_2'].marks.is_locked, 'the lock')
     assert document.is_saved, 'the file holds neither'
 
 

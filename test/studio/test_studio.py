@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The studio's actions and its gate, without a browser."""
 
+import json
 import resource
 import shutil
 import time
@@ -79,7 +80,7 @@ def test_moved_landmarks_come_back_by_refitting(office):
     office.refit_all()
     fitted = document.landmarks
     moved = [key for key in ('tv_1', 'keyboard_1', 'book_3') if key in fitted]
-    document.apply(edits.lock(fitted, ['book_1']))
+    document.apply(edits.mark(fitted, ['book_1'], 'lock', is_locked=True))
     for key in moved:
         one = document.landmarks[key]
         document.apply(edits.move(document.landmarks, key, one.center + 0.3 * one.semi_axes))
@@ -128,6 +129,26 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
         assert len(document.selection) == 1
     counts = review.counts()
     assert counts['accepted'] + counts['fixed'] + counts['deleted'] == counts['total'] == total
+
+
+def test_the_review_goes_on_where_it_was(office):
+    """After a restart, too; what is new joins the queue; undo takes a decision back."""
+    document, review = office.document, office.review
+    review.check()
+    first, = document.selection
+    review.accept()
+    again = Studio(document, office.recording)
+    again.review.check()
+    assert again.review.decision(first) == 'accepted' and document.selection != (first,)
+    twin = document.landmarks[first]
+    document.apply(edits.create(document.landmarks, 'a twin', 'cup', twin.center + 1.0,
+                                twin.basis))
+    counts = again.review.counts()
+    assert counts['total'] == len(document.landmarks) and counts['accepted'] == 1
+    assert list(document.landmarks)[-1] == again.review.order[-1] == again.rows()[-1].landmark_id
+    document.undo()
+    document.undo()
+    assert not again.review.decision(first)
 
 
 def test_without_a_recording_the_studio_says_what_is_missing(tmp_path):
@@ -254,6 +275,29 @@ def test_the_page_is_for_this_machine_only(tmp_path):
         assert opens(host, None) is False
         assert opens(host, 'http://evil.example') is False, 'a foreign page'
         assert opens(host, f'http://{host}') is True
+
+
+@pytest.mark.needs('viser')
+@pytest.mark.parametrize(('message', 'answer'), [
+    ({'do': 'view'}, "'view' lacks 'view'"), ({'do': 'view', 'view': 'x'}, "view: 'x'"),
+    ({'do': 'edit'}, "'edit' lacks 'field'"), ({'do': 'edit', 'field': 'label'}, "lacks 'value'"),
+    ({'do': 'edit', 'field': [], 'value': [0, 0, 0]}, 'no field'),
+    ({'do': 'create', 'label': ''}, "lacks 'class_id'"), ({'do': 'select'}, "lacks 'id'"),
+    ({'do': 'hide', 'ids': 3}, 'ids: 3 is no list'),
+    ({'do': 'hide', 'ids': ['mug_2']}, 'hid mug_2'),
+    ({'do': 'edit', 'field': 'class_id', 'value': 'cup'}, "mug_1: class 'cup'")])
+def test_the_log_answers_a_message_of_the_page(studio, message, answer, caplog):
+    from websockets.sync.client import connect
+
+    studio.document.select(['mug_1'])
+    with open_page(studio) as (url, _):
+        host = url.removeprefix('http://').rstrip('/')
+        with connect(f'ws://{host}/socket/me', origin=f'http://{host}') as page:
+            page.send(json.dumps(message))
+            while not any(answer in line[2] for line in dict(json.loads(page.recv(60))).get(
+                    'log', ())):
+                pass
+    assert not caplog.records, 'no traceback'
 
 
 @pytest.mark.needs('viser')

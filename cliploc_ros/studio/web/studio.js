@@ -319,7 +319,7 @@ function showRows() {
   const rows = found.slice(0, MOST_ROWS);
   for (const row of found.slice(MOST_ROWS)) if (chosen.has(row[0])) rows.push(row);
   const top = $('rows').scrollTop;
-  fill($('rows'), rows.map(([id, label, name, isLocked, severity, decision, color, isHidden]) => {
+  fill($('rows'), rows.map(([id, label, name, isLocked, isHidden, severity, decision, color]) => {
     const side = (one, text, isOn, action) => el('button', {
       className: `icon${isOn ? ' on' : ''}`, title: text, 'aria-label': `${text} ${id}`.slice(0, 90),
       onclick: event => { event.stopPropagation(); send(action, {ids: [id]}); }}, icon(one));
@@ -351,7 +351,7 @@ function showView() {
   if (document.activeElement !== $('slider')) $('slider').value = view.view;
   $('where').textContent = `view ${view.view}${view.camera ? ` camera ${view.camera}` : ''}`;
   $('empty').textContent = state.file.images ? '' : 'No images: give --images, or look at the boxes';
-  const colors = Object.fromEntries(state.rows.map(row => [row[0], row[6]]));
+  const colors = Object.fromEntries(state.rows.map(row => [row[0], row[7]]));
   const chosen = new Set(state.selection.ids), scale = pixel();
   const ellipse = ([cx, cy, rx, ry, turn], name, color) => drawn('ellipse', {
     cx, cy, rx, ry, transform: `rotate(${turn} ${cx} ${cy})`, class: name,
@@ -557,7 +557,7 @@ for (const one of document.querySelectorAll('[data-icon]')) {
 for (const one of document.querySelectorAll('[data-do]')) {
   one.addEventListener('click', () => { send(one.dataset.do); $('menu').open = false; });
 }
-$('show_all').onclick = () => { send('hide', {ids: state.rows.filter(row => row[7]).map(row => row[0])}); $('menu').open = false; };
+$('show_all').onclick = () => { send('hide', {ids: state.rows.filter(row => row[4]).map(row => row[0])}); $('menu').open = false; };
 $('help').onclick = () => { $('menu').open = false; showKeys(); };
 $('keys').onclick = () => $('keys').close();
 $('find').oninput = showRows;
