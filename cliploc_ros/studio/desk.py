@@ -60,6 +60,7 @@ class Desk:
         recording = self._studio.recording
         self._finder = None if recording is None else SightingFinder(
             recording, self._studio.images, actions.changed.set)
+        self._modes: dict[str, str] = {}
         # the digest of a foreign content of the file, of which the person has to decide
         self._found = ''
         self._commands = self._make_commands()
@@ -77,7 +78,9 @@ class Desk:
         """Do what a message says."""
         message = Message(content)
         name = str(message.get('do'))
-        if name in self._slow:
+        if name == 'mode':
+            self.show_mode(person, str(message.get('mode')))
+        elif name in self._slow:
             threading.Thread(target=self._do_slowly, args=(name,), daemon=True).start()
         elif name in self._commands:
             self._actions.act(lambda: self._commands[name](message))
@@ -86,6 +89,11 @@ class Desk:
                 self._look(person, 'fly')
         else:
             self._look(person, name)
+
+    def show_mode(self, person: str, mode: str) -> None:
+        """Take the mode of a person's page, '' for a closed one; coverage is for the mode test."""
+        self._modes[person] = mode
+        self.places.set_wanted('test' in self._modes.values())
 
     def _do_slowly(self, name: str) -> None:
         with self._actions.busy(name):

@@ -89,6 +89,8 @@ class Review:
         """Delete the selection, and go on."""
         ids = self._selected()
         self._document.apply(edits.delete(self._document.landmarks, ids))
+        if self._document.landmarks and any({*pair} & {*ids} for pair in self._duplicates):
+            self._judge()  # or else its duplicate would be called one
         return self._go_on(ids[-1], f'deleted {", ".join(ids)}')
 
     def fix(self) -> str:

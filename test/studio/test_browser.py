@@ -135,6 +135,21 @@ def test_hide_and_lock_by_the_rows(person, studio):
     assert document.is_saved, 'the file holds neither'
 
 
+def test_a_text_stays_with_its_landmark(person, studio):
+    """Another landmark is selected while the field of the label has the focus."""
+    document = studio.document
+    person.select(document, 'mug_1')
+    person.page.keyboard.press('e')
+    before = document.landmarks
+    document.select(['mug_2'])
+    person.page.locator('#card').get_by_text('mug_2', exact=True).wait_for()
+    assert person.field('Label').input_value() == before['mug_2'].label
+    person.page.keyboard.press('Enter')
+    person.page.keyboard.press('h')
+    person.page.get_by_text('hid mug_2').wait_for()
+    assert document.to_undo == 'hide mug_2', 'the only edit'
+
+
 def test_the_gizmo_is_dragged(chromium, studio):
     """The landmark follows, along the axis that was grabbed; one undo takes all of it back."""
     person = Person(chromium, studio.url, has_scene=True)

@@ -131,6 +131,18 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
     assert counts['accepted'] + counts['fixed'] + counts['deleted'] == counts['total'] == total
 
 
+def test_a_landmark_whose_duplicate_is_deleted_is_none(office):
+    document, review = office.document, office.review
+    twin = document.landmarks['book_2']
+    document.apply(edits.create(document.landmarks, 'a twin', 'book', twin.center + 0.01,
+                                twin.basis))
+    review.check()
+    assert 'same object' in review.check_of('book_2').faults[0]
+    document.select([list(document.landmarks)[-1]])
+    review.delete()
+    assert not any('same object' in text for text in review.check_of('book_2').faults)
+
+
 def test_the_review_goes_on_where_it_was(office):
     """After a restart, too; what is new joins the queue; undo takes a decision back."""
     document, review = office.document, office.review

@@ -196,7 +196,8 @@ def _support_faults(check: LandmarkCheck, size_m: float, options: MappingOptions
                       'if it is gone, or map again')]
     faults = []
     if support is not None and support < options.min_viewpoints:
-        faults.append((1.1, f'was seen in {support} frames: record it from more sides'))
+        frames = 'frame' if support == 1 else 'frames'
+        faults.append((1.1, f'was seen in {support} {frames}: record it from more sides'))
     if ratio is not None and ratio < options.min_seen_ratio:
         faults.append((1.2, f'is detected in {ratio:.1%} of the frames that should show it: '
                             'delete it if it has moved, or is hard to detect'))
