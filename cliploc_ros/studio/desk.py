@@ -39,7 +39,13 @@ _MAX_SHOWN = 60
 # Answers that are listed after a run over the recording.
 _MAX_ANSWERS = 100
 
-Message = dict[str, Any]
+
+class Message(dict[str, Any]):
+    """What a page says: the name of a command, and its values."""
+
+    def __missing__(self, name: str) -> Any:
+        """Say that a value is missing."""
+        raise EditError(f"the page's message '{self.get('do')}' lacks '{name}'")
 
 
 class Desk:
@@ -54,6 +60,7 @@ class Desk:
         recording = self._studio.recording
         self._finder = None if recording is None else SightingFinder(
             recording, self._studio.images, actions.changed.set)
+        self._modes: dict[str, str] = {}
         # the digest of a foreign content of the file, of which the person has to decide
         self._found = ''
         self._commands = self._make_commands()
@@ -67,10 +74,13 @@ class Desk:
 
     # ---- what a person does ---------------------------------------------------------------------
 
-    def do(self, person: str, message: Message) -> None:
-        """Do what a message says: the name of a command, and its values."""
+    def do(self, person: str, content: dict[str, Any]) -> None:
+        """Do what a message says."""
+        message = Message(content)
         name = str(message.get('do'))
-        if name in self._slow:
+        if name == 'mode':
+            self.show_mode(person, str(message.get('mode')))
+        elif name in self._slow:
             threading.Thread(target=self._do_slowly, args=(name,), daemon=True).start()
         elif name in self._commands:
             self._actions.act(lambda: self._commands[name](message))
@@ -80,12 +90,17 @@ class Desk:
         else:
             self._look(person, name)
 
+    def show_mode(self, person: str, mode: str) -> None:
+        """Take the mode of a person's page, '' for a closed one; coverage is for the mode test."""
+        self._modes[person] = mode
+        self.places.set_wanted('test' in self._modes.values())
+
     def _do_slowly(self, name: str) -> None:
         with self._actions.busy(name):
             self._actions.ask(self._slow[name])
 
     def _make_commands(self) -> dict[Any, Callable[[Message], str | None]]:
-        studio, document, review = self._studio, self._studio.document, self._studio.review
+        studio, review = self._studio, self._studio.review
 
         def plain(action: Callable[[], Any]) -> Callable[[Message], str | None]:
             def run(message: Message) -> str | None:
@@ -108,11 +123,10 @@ class Desk:
                 ('show_links', self.places.toggle_links))},
             'select': self._select,
             'select_at': lambda message: studio.select_at(_numbers(message, 'pixel', 2)),
-            'hide': lambda message: studio.hide(map(str, message['ids'])),
-            'lock': lambda message: studio.toggle_lock([
-                key for key in message.get('ids', ()) if key in document.landmarks]),
+            'hide': lambda message: studio.toggle_hidden(_texts(message, 'ids')),
+            'lock': lambda message: studio.toggle_lock(_texts(message, 'ids')),
             'edit': self._edit,
-            'view': lambda message: studio.show_view(int(message['view'])),
+            'view': lambda message: studio.show_view(int(_numbers(message, 'view', 1)[0])),
             'draw': lambda message: self._new().draw(
                 studio.view, _numbers(message, 'corner', 2), _numbers(message, 'other', 2)),
             'take': lambda message: self._new().take(studio.view, _numbers(message, 'pixel', 2)),
@@ -141,26 +155,29 @@ class Desk:
         else:
             self._studio.document.select([str(message['id'])])
 
-    def _edit(self, message: Message) -> None:
+    def _edit(self, message: Message) -> str | None:
         """Set a field of the selected landmark, or move it by some metres."""
-        document, field = self._studio.document, message['field']
+        document, field = self._studio.document, str(message['field'])
         if document.selected is None:
             raise EditError('select exactly one landmark first')
         key, one = document.selected
-        landmarks = document.landmarks
-        if field == 'label':
-            change = edits.relabel(landmarks, [key], str(message['value']))
-        elif field == 'class_id':
-            change = edits.reclass(landmarks, [key], str(message['value']))
+        landmarks, text = document.landmarks, ''
+        if field in ('label', 'class_id'):
+            text = str(message['value'])
+            change = (edits.relabel if field == 'label' else edits.reclass)(landmarks, [key], text)
         else:
             values = _numbers(message, 'value', 3)
-            change = {
+            makers = {
                 'center': lambda: edits.move(landmarks, key, values),
                 'by': lambda: edits.move(landmarks, key, one.center + values),
                 'angles': lambda: edits.rotate(landmarks, key, Rotation.from_euler(
                     'xyz', values, degrees=True).as_quat()),
-                'semi_axes': lambda: edits.set_axes(landmarks, key, values)}[field]()
+                'semi_axes': lambda: edits.set_axes(landmarks, key, values)}
+            if field not in makers:
+                raise EditError(f'{field!r:.60} is no field of a landmark')
+            change = makers[field]()
         document.apply(change, gesture=(field, key, message.get('gesture')))
+        return f'{key}: {change.what}' if text and change.after else None
 
     def _undo(self) -> str | None:
         what = self._studio.document.to_undo
@@ -224,8 +241,8 @@ class Desk:
         studio = self._studio
         found = {
             'file': self._file_part(),
-            'rows': [[*row, '#{:02x}{:02x}{:02x}'.format(*studio.color_of(row.class_id)),
-                      row.landmark_id in studio.hidden] for row in studio.rows()],
+            'rows': [[*row, '#{:02x}{:02x}{:02x}'.format(*studio.color_of(row.class_id))]
+                     for row in studio.rows()],
             'selection': self._selection_part(),
             'review': {**studio.review.counts(), 'running': self._actions.running},
             'log': self._actions.lines[-_MAX_SHOWN:],
@@ -257,13 +274,14 @@ class Desk:
         sightings = None if self._finder is None else self._finder.find(
             document.landmarks, key, document.is_in_gesture)
         part['one'] = {
-            'id': key, 'label': one.label, 'class_id': one.class_id, 'is_locked': one.is_locked,
+            'id': key, 'label': one.label, 'class_id': one.class_id,
+            'is_locked': one.marks.is_locked, 'decision': one.marks.decision,
             'center': one.center.tolist(), 'semi_axes': one.semi_axes.tolist(),
             'angles': [round(float(angle), 3) + 0.0 for angle in Rotation.from_quat(
                 one.quat_xyzw).as_euler('xyz', degrees=True)],
             'phrases': studio.phrases(), 'note': studio.phrase_note,
             'severity': known.get('severity', 0.0), 'faults': known.get('faults', ()),
-            'is_checked': check is not None, 'decision': studio.review.decision(key),
+            'is_checked': check is not None,
             'support': known.get('support'), 'ratio': known.get('seen_ratio'),
             'sightings': None if sightings is None else [
                 [one.view, *(round(float(value), 1) for value in one.bbox_xyxy), one.is_detected]
@@ -352,9 +370,17 @@ def _axes_of(outline: Outline) -> list[float]:
 def _numbers(message: Message, name: str, count: int) -> NDArray[np.float64]:
     """Return numbers of a message; EditError: they are not that many finite numbers."""
     try:
-        values = np.array(message.get(name), dtype=np.float64)
+        values = np.atleast_1d(np.array(message[name], dtype=np.float64))
     except (TypeError, ValueError):
         values = np.empty(0)
     if values.shape != (count,) or not np.isfinite(values).all():
-        raise EditError(f'{name}: {message.get(name)!r:.60} is no list of {count} numbers')
+        raise EditError(f'{name}: {message[name]!r:.60} is no list of {count} numbers')
     return values
+
+
+def _texts(message: Message, name: str) -> list[str]:
+    """Return texts of a message, none where it lacks them; EditError: they are no list."""
+    values = message.get(name, [])
+    if not isinstance(values, list):
+        raise EditError(f'{name}: {values!r:.60} is no list')
+    return list(map(str, values))

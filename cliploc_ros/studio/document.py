@@ -8,7 +8,7 @@ once holds it, too.
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from threading import RLock
 from typing import Any
@@ -17,7 +17,14 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError, DatasetError, MapError
 from cliploc_ros.files.log import Log
 from cliploc_ros.studio.edits import Change, EditError, Landmarks, change_from_json
-from cliploc_ros.studio.landmark import KNOWN_FIELDS, Landmark, Look, look_from_json, map_of
+from cliploc_ros.studio.landmark import (
+    KNOWN_FIELDS,
+    Landmark,
+    Look,
+    Marks,
+    look_from_json,
+    map_of,
+)
 from cliploc_ros.studio.map_file import (
     NO_FILE,
     ChangedOnDiskError,
@@ -240,7 +247,7 @@ class Document:
             self._file = read_map_file(self.path)
             self._look_file = self._read_looks()
             before = self.landmarks
-            found = {key: replace(one, is_locked=key in before and before[key].is_locked)
+            found = {key: replace(one, marks=before[key].marks if key in before else Marks())
                      for key, one in self._landmarks_of_file().items()}
             after = {**dict.fromkeys(before), **found}
             self._take('edit', Change('reload the file', {key: before.get(key) for key in after},
@@ -251,9 +258,9 @@ class Document:
             self._tell()
 
     def close(self) -> None:
-        """Release the journal, which stays if it holds edits or locks."""
+        """Release the journal, which stays if it holds edits or marks."""
         with self.lock:
-            is_needed = not self.is_saved or self._locked()
+            is_needed = not self.is_saved or self._marks()
             self._journal.close() if is_needed else self._journal.remove()
 
     def _landmarks_of_file(self) -> dict[str, Landmark]:
@@ -291,10 +298,11 @@ class Document:
         self._journal.restart([self._header()])
 
     def _header(self) -> dict[str, Any]:
-        return {'base': self._file.digest, 'locked': self._locked()}
+        return {'base': self._file.digest, 'marks': self._marks()}
 
-    def _locked(self) -> list[str]:
-        return [key for key, one in self.landmarks.items() if one.is_locked]
+    def _marks(self) -> dict[str, Any]:
+        return {key: asdict(one.marks) for key, one in self.landmarks.items()
+                if one.marks != Marks()}
 
     def _replay(self, entries: list[dict[str, Any]]) -> None:
         """Do again the edits in the journal, from the content that the file has."""
@@ -329,26 +337,26 @@ class Document:
                                   if key not in in_file), *edits[:count]])
             self.notes += (f'the last {len(edits) - count} edits of an earlier session cannot be '
                            f'restored ({error}); they lie in {aside.name}',)
-        if count:
+        if count and not self.is_saved:
             self.notes += (f'restored {count} edits that were not saved; undo takes them back',)
 
     def _restore_start(self, entries: list[dict[str, Any]], looks: Mapping[str, Look]) -> None:
-        """Restore the state that belongs to the file's content: its locks and looks.
+        """Restore the state that belongs to the file's content: its marks and looks.
 
-        Locks before a content that was written come from the header and the edits up to it. A
+        Marks before a content that was written come from the header and the edits up to it. A
         save that ended between the map and its image embeddings is finished.
         """
-        locked: dict[str, bool] = {}
+        marks: dict[str, Any] = {}
         for entry in entries:
-            if isinstance(ids := entry.get('locked'), list):
-                locked |= dict.fromkeys(map(str, ids), True)
+            if isinstance(kept := entry.get('marks'), dict):
+                marks |= kept
             if isinstance(after := entry.get('after'), dict):
-                locked |= {key: isinstance(one, dict) and one.get('locked') is True
-                           for key, one in after.items()}
+                marks |= {key: one.get('marks') for key, one in after.items()
+                          if isinstance(one, dict)}
         keys = entries[-1].get('looks')
         keys = keys if isinstance(keys, dict) else {}
         self.landmarks = self._saved = {
-            key: replace(one, is_locked=locked.get(key, False),
+            key: replace(one, marks=Marks.from_json(marks.get(key)),
                          look=looks.get(str(keys[key])) if key in keys else one.look)
             for key, one in self.landmarks.items()}
         if keys:

@@ -7,7 +7,7 @@ A change holds landmarks before and after; undo exchanges the two.
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from cliploc_ros.studio.landmark import (
     LEAST_SEMI_AXIS_M,
     Landmark,
     Look,
+    Marks,
     map_of,
     merge_looks,
     rounded,
@@ -71,7 +72,7 @@ class Change:
     def to_json(self) -> dict[str, Any]:
         """Return the change as JSON holds it; looks are named by their keys."""
         def side(landmarks: Mapping[str, Landmark | None]) -> dict[str, Any]:
-            return {key: one and {'fields': one.fields, 'locked': one.is_locked,
+            return {key: one and {'fields': one.fields, 'marks': asdict(one.marks),
                                   **({'look': one.look.key} if one.look else {})}
                     for key, one in landmarks.items()}
 
@@ -86,7 +87,7 @@ def change_from_json(tree: Any, looks: Mapping[str, Look]) -> Change:
     try:
         what = tree['what']
         before, after = ({key: None if one is None else
-                          Landmark(dict(one['fields']), bool(one['locked']),
+                          Landmark(dict(one['fields']), Marks.from_json(one['marks']),
                                    looks.get(str(one.get('look'))))
                           for key, one in tree[side].items()} for side in ('before', 'after'))
     except (KeyError, TypeError, AttributeError) as error:
@@ -104,7 +105,8 @@ def _change_of(what: str, landmarks: Landmarks, after: Mapping[str, Landmark | N
     changed = {key: one for key, one in after.items() if one != landmarks.get(key)}
     for landmark_id, landmark in changed.items():
         old = landmarks.get(landmark_id)
-        if old is not None and old.is_locked and (landmark is None or landmark.is_locked):
+        if old is not None and old.marks.is_locked and (
+                landmark is None or landmark.fields != old.fields):
             raise EditError(f"landmark '{landmark_id}' is locked: unlock it first")
         if landmark is not None:
             map_of({landmark_id: landmark}, 'map', what)
@@ -172,16 +174,11 @@ def delete(landmarks: Landmarks, landmark_ids: Iterable[str]) -> Change:
     return _change_of(f'delete {", ".join(after)}'[:80], landmarks, after)
 
 
-def lock(landmarks: Landmarks, landmark_ids: Iterable[str]) -> Change:
-    """Refuse further edits of landmarks."""
-    after = {key: replace(_get(landmarks, key), is_locked=True) for key in landmark_ids}
-    return _change_of(f'lock {", ".join(after)}'[:80], landmarks, after)
-
-
-def unlock(landmarks: Landmarks, landmark_ids: Iterable[str]) -> Change:
-    """Allow edits of landmarks again."""
-    after = {key: replace(_get(landmarks, key), is_locked=False) for key in landmark_ids}
-    return _change_of(f'unlock {", ".join(after)}'[:80], landmarks, after)
+def mark(landmarks: Landmarks, landmark_ids: Iterable[str], what: str, **marks: Any) -> Change:
+    """Set marks of landmarks, locked ones included."""
+    after = {key: replace(one, marks=replace(one.marks, **marks))
+             for key in landmark_ids if (one := _get(landmarks, key))}
+    return _change_of(f'{what} {", ".join(after)}'[:80], landmarks, after)
 
 
 def create(landmarks: Landmarks, label: str, class_id: str, center: NDArray[np.float64],

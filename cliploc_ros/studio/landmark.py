@@ -100,11 +100,28 @@ def looks_of(embeddings: LandmarkEmbeddings) -> dict[str, Look]:
 
 
 @dataclass(frozen=True)
+class Marks:
+    """What the studio keeps of a landmark; the map file does not hold it."""
+
+    is_locked: bool = False  #: Edits are refused
+    is_hidden: bool = False  #: The scene and the views leave it out
+    decision: str = ''  #: Of the review: accepted, fixed; '' for none
+
+    @classmethod
+    def from_json(cls, tree: Any) -> 'Marks':
+        """Return marks from JSON; what is none of them is left out."""
+        known = tree if isinstance(tree, dict) else {}
+        decision = known.get('decision')
+        return cls(known.get('is_locked') is True, known.get('is_hidden') is True,
+                   decision if decision in ('accepted', 'fixed') else '')
+
+
+@dataclass(frozen=True)
 class Landmark:
     """A landmark of the map that is edited."""
 
     fields: Mapping[str, Any]  #: As in the map file, below the landmark's id
-    is_locked: bool = False  #: Edits are refused. The map file does not hold it.
+    marks: Marks = Marks()
     look: Look | None = field(default=None, compare=False)  #: From the file next to the map
 
     @cached_property

@@ -25,6 +25,8 @@ _DEPTHS_M = np.geomspace(0.4, 12.0, 24)
 _SAME_IOU = 0.5
 # A view of the next box is this far from those of the other ones, if there is one [deg].
 _GOOD_ANGLE_DEG = 45.0
+# A person who asks once more saw no object there: the next view is this far from it [deg].
+_OTHER_ANGLE_DEG = 10.0
 
 
 class NewLandmark:
@@ -36,6 +38,8 @@ class NewLandmark:
         #: Of the detector's boxes that were taken or drawn over; '' for none
         self.class_id = ''
         self._fitted: tuple[dict[int, Box], Fit | None, str] = ({}, None, '')
+        # the next views since the last box
+        self._offered: list[int] = []
 
     def draw(self, view: int, corner: Pixel, other: Pixel) -> str:
         """Put a box into a view, between two opposite corners (2,) [px]."""
@@ -65,22 +69,23 @@ class NewLandmark:
     def _put(self, view: int, box: NDArray[np.float64], row: int) -> str:
         left, top, right, bottom = (float(value) for value in box)
         what = 'changed' if view in self.boxes else 'drew'
-        self.boxes = {**self.boxes, view: (left, top, right, bottom)}
+        self.boxes, self._offered = {**self.boxes, view: (left, top, right, bottom)}, []
         detections = self._recording.detections
         if row >= 0:
             number = detections.classes[detections.frame_offsets[view] + row]
             self.class_id = detections.class_names[number]
         _, doubt = self.fit()
-        return (f'{what} the box of view {view}; {len(self.boxes)} boxes'
+        return (f'{what} the box of view {view}; boxes drawn: {len(self.boxes)}'
                 + (f'; {doubt}' if doubt else ''))
 
     def forget(self, view: int | None) -> str:
         """Forget the box of a view, or all of them."""
         self.boxes = {key: box for key, box in self.boxes.items()
                       if view is not None and key != view}
+        self._offered = []
         if not self.boxes:
             self.class_id = ''
-        return f'{len(self.boxes)} boxes drawn'
+        return f'boxes drawn: {len(self.boxes)}'
 
     def fit(self) -> tuple[Fit | None, str]:
         """Return the ellipsoid that fits the boxes, if there is one, and what is doubtful."""
@@ -143,33 +148,37 @@ class NewLandmark:
         return pixels[is_front]
 
     def next_view(self) -> int:
-        """Return a view without a box that shows the object from another side.
+        """Return the view without a box that is best for the next one; again: another one.
 
-        EditError: there is no box, or no other view shows the place.
+        It is seen from another side, and shows as many of the object's possible places as
+        possible. EditError: there is no box, or no other view shows one of these places.
         """
         places = self._places()
         if not len(places):
             raise EditError('draw the first box: it tells which views show the object')
-        detections = self._recording.detections
         if len(places) > 1:
-            places = places[(_DEPTHS_M > 0.9) & (_DEPTHS_M < 3.5)]
-        middle = places.mean(axis=0)
-        rays = detections.map_from_camera[:, :3, 3] - middle
-        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
-        cosines = (rays @ rays[list(self.boxes)].T).max(axis=1)
-        angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-        best, least = -1, np.inf
-        for view in np.argsort(np.abs(angles - _GOOD_ANGLE_DEG)):
-            if view in self.boxes or abs(angles[view] - _GOOD_ANGLE_DEG) >= least:
-                continue
+            places = places[(_DEPTHS_M > 0.8) & (_DEPTHS_M < 4.0)]
+        detections, boxed = self._recording.detections, list(self.boxes)
+        rays = detections.map_from_camera[:, None, :3, 3] - places
+        rays /= np.maximum(np.linalg.norm(rays, axis=2, keepdims=True), 1e-9)
+
+        def angles_to(views: list[int]) -> NDArray[np.float64]:
+            cosines = np.einsum('vpk,bpk->vbp', rays, rays[views]).max(axis=1, initial=-1.0)
+            return np.asarray(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))))
+
+        off = np.abs(angles_to(boxed) - _GOOD_ANGLE_DEG) / _GOOD_ANGLE_DEG
+        values = np.maximum(0.0, 1.0 - off) ** 2 * (angles_to(self._offered) > _OTHER_ANGLE_DEG)
+        values[boxed] = 0.0
+        for view in np.flatnonzero(values.any(axis=1)).tolist():
             camera = detections.camera_of(view)
             pixels, is_front = _project(camera, detections.map_from_camera[view], places)
-            size = np.array([camera.width, camera.height])
-            inside = is_front & ((pixels > 0.1 * size) & (pixels < 0.9 * size)).all(axis=1)
-            if inside.mean() > 0.7:
-                best, least = int(view), abs(angles[view] - _GOOD_ANGLE_DEG)
-        if best < 0:
+            off_middle = np.abs(pixels / (camera.width, camera.height) - 0.5)
+            values[view] *= is_front & (off_middle < 0.45).all(axis=1)
+        best = int(np.argmax(values.mean(axis=1)))
+        if not values[best].any():
+            self._offered = []
             raise EditError('no other view is sure to show the object; choose one yourself')
+        self._offered.append(best)
         return best
 
 

@@ -104,6 +104,7 @@ class Page:
         camera.look_at = tuple(extent.middle)
         camera.position = tuple(viewpoint.overview(extent, viewpoint.USUAL_ASPECT))
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._server.gui.set_panel_label('Layers and viewpoints')
         self._server.gui.main_panel.minimize()
         self._scene_panel = ScenePanel(self._actions, self._labels, self._recorded)
 
@@ -164,7 +165,7 @@ class Page:
 
     def _show_gizmo(self) -> None:
         selected = self._studio.document.selected
-        is_shown = selected is not None and not selected[1].is_locked
+        is_shown = selected is not None and not selected[1].marks.is_locked
         if self._gizmo.visible != is_shown:
             self._gizmo.visible = is_shown
         if selected is None:
@@ -209,6 +210,7 @@ def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | 
         if pages:
             await pages[0].board.serve(
                 connection, lambda message: pages[0].desk.do(person, message))
+            pages[0].desk.show_mode(person, '')
 
     with gate.guard(answer, talk), redirect_stdout(io.StringIO()):  # viser prints another URL
         server = viser.ViserServer(host, port, verbose=False)

@@ -135,7 +135,7 @@ class Recording:
 
         EditError: one is locked. MappingError: none can be fitted.
         """
-        if locked := [key for key in landmark_ids if landmarks[key].is_locked]:
+        if locked := [key for key in landmark_ids if landmarks[key].marks.is_locked]:
             raise EditError(f"landmark '{locked[0]}' is locked: unlock it first")
         chosen = np.array([key in set(landmark_ids) for key in landmarks])
         # the others keep their boxes, so that none takes those of its neighbour
@@ -214,7 +214,7 @@ def fit_boxes(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64],
     """
     count = len(bboxes_xyxy)
     if count < 2:
-        raise EditError(f'create: {count} boxes drawn; draw one in each of two images or more, '
+        raise EditError(f'create: boxes drawn: {count}; draw one in each of two images or more, '
                         'best three')
     for box in bboxes_xyxy:
         if not (box[2:] - box[:2] >= MIN_BOX_PX).all():

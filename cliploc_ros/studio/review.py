@@ -3,10 +3,11 @@
 """The review: each landmark of the map once, the worst first, until a person has decided on all.
 
 The order is that of the last check, so that a decision moves no landmark below the person's hand.
+Landmarks that are newer come last. Decisions are marks of the landmarks: undo takes them back,
+and they survive a restart.
 """
 
-from collections.abc import Iterable
-from typing import Literal
+from collections.abc import Sequence
 
 from cliploc_ros.mapping.check.landmark_faults import (
     LandmarkCheck,
@@ -20,26 +21,18 @@ from cliploc_ros.studio.edits import EditError
 from cliploc_ros.studio.landmark import map_of
 from cliploc_ros.studio.recording import Recording
 
-Decision = Literal['accepted', 'fixed', 'deleted']
 #: Faults from here on are serious.
 SERIOUS = 1.0
 
 
 class Review:
-    """The queue of landmarks, and the decisions on them.
-
-    Attributes
-    ----------
-    order : tuple of str
-        The landmarks of the last check, the worst first; empty before it.
-    """
+    """The queue of landmarks, and the decisions on them."""
 
     def __init__(self, document: Document, recording: Recording | None):
         self._document, self._recording = document, recording
-        self._decisions: dict[str, Decision] = {}
         self._checks: dict[str, LandmarkCheck] = {}
         self._duplicates: list[tuple[str, str]] = []
-        self.order: tuple[str, ...] = ()
+        self._order: tuple[str, ...] = ()
 
     # ---- what is known --------------------------------------------------------------------------
 
@@ -52,11 +45,15 @@ class Review:
         """Return the last check of a landmark."""
         return self._checks.get(landmark_id)
 
-    def decision(self, landmark_id: str) -> Decision | None:
-        """Return the decision on a landmark; an undone deletion is none."""
-        if landmark_id not in self._document.landmarks:
-            return 'deleted'
-        return self._decisions.get(landmark_id)
+    @property
+    def order(self) -> list[str]:
+        """The landmarks of the last check, the worst first, deleted ones included; newer ones."""
+        return list(dict.fromkeys([*self._order, *self._document.landmarks]))
+
+    def decision(self, landmark_id: str) -> str:
+        """Return the decision on a landmark, '' for none; an undone deletion is none."""
+        one = self._document.landmarks.get(landmark_id)
+        return 'deleted' if one is None else one.marks.decision
 
     def severity(self, landmark_id: str) -> float:
         """Return how bad the faults of a landmark are; 0 once a person has decided on it."""
@@ -64,22 +61,24 @@ class Review:
         return 0.0 if check is None or self.decision(landmark_id) else check.severity
 
     def counts(self) -> dict[str, int]:
-        """Return the number of landmarks in the queue, and of each decision."""
-        found = [self.decision(key) for key in self.order]
+        """Return the number of landmarks in the queue, 0 before it, and of each decision."""
+        found = [self.decision(key) for key in self.order if self._order]
         return {'total': len(found), **{name: found.count(name)
                                         for name in ('accepted', 'fixed', 'deleted')}}
 
     # ---- what a person does ---------------------------------------------------------------------
 
     def check(self) -> str:
-        """Judge all landmarks; a new queue begins, and its worst landmark is selected."""
+        """Judge all landmarks; once more after a complete review, a new one begins."""
         self._judge()
-        self.order, self._decisions = tuple(self._checks), {}
+        landmarks = self._document.landmarks
+        if self._order and all(self.decision(key) for key in landmarks):
+            self._document.apply(edits.mark(landmarks, landmarks, 'review', decision=''))
+        self._order = tuple(self._checks)
         serious = sum(one.severity >= SERIOUS for one in self._checks.values())
-        if self.order:
-            self._document.select([self.order[0]])
         source = '' if self.has_boxes else ' by the map alone: there are no boxes of a recording'
-        return f'checked {len(self.order)} landmarks{source}: {serious} with a serious fault'
+        return self._go_on('', f'checked {len(self._order)} landmarks{source}: {serious} with a '
+                           'serious fault')
 
     def accept(self) -> str:
         """Accept the selection as it is, whatever the check says, and go on."""
@@ -90,6 +89,8 @@ class Review:
         """Delete the selection, and go on."""
         ids = self._selected()
         self._document.apply(edits.delete(self._document.landmarks, ids))
+        if self._document.landmarks and any({*pair} & {*ids} for pair in self._duplicates):
+            self._judge()  # or else its duplicate would be called one
         return self._go_on(ids[-1], f'deleted {", ".join(ids)}')
 
     def fix(self) -> str:
@@ -112,49 +113,46 @@ class Review:
                 raise EditError(f'{landmark_id} {left_out[landmark_id]}: edit, accept or delete '
                                 'it')
             what = f'fitted {landmark_id} to its boxes'
-        self._document.apply(change)
+        gesture = object()  # one undo takes back both
+        self._document.apply(change, gesture)
         self._judge()
         left = self._checks[landmark_id]
         if left.severity >= SERIOUS:
             self._document.select([landmark_id])
             return f'{what}; it still {left.faults[0]}'
-        return self._decide([landmark_id], 'fixed', what)
+        return self._decide([landmark_id], 'fixed', what, gesture)
 
     def step(self, count: int) -> str | None:
         """Select the landmark that lies some places farther in the queue."""
-        ids, selection = self._ids(), self._document.selection
-        place = ids.index(selection[0]) + count if selection and selection[0] in ids else 0
+        ids = [key for key in self.order if key in self._document.landmarks]
+        if not ids:
+            raise EditError('there are no landmarks')
+        selection = self._document.selection
+        place = ids.index(selection[0]) + count if selection else 0
         self._document.select([ids[place % len(ids)]])
         return None
 
     # ---------------------------------------------------------------------------------------------
-
-    def _ids(self) -> list[str]:
-        """Return the landmarks in the order of the queue; those that it lacks come last."""
-        landmarks = self._document.landmarks
-        if not landmarks:
-            raise EditError('there are no landmarks')
-        return list(dict.fromkeys([key for key in self.order if key in landmarks]
-                                  + list(landmarks)))
 
     def _selected(self) -> tuple[str, ...]:
         if not self._document.selection:
             raise EditError('select a landmark first')
         return self._document.selection
 
-    def _decide(self, ids: Iterable[str], decision: Decision, what: str) -> str:
+    def _decide(self, ids: Sequence[str], decision: str, what: str, gesture: object = None
+                ) -> str:
         """Keep a decision, and select the next landmark without one."""
-        self._decisions |= dict.fromkeys(ids, decision)
-        return self._go_on(list(ids)[-1], what)
+        self._document.apply(edits.mark(self._document.landmarks, ids, decision,
+                                        decision=decision), gesture)
+        return self._go_on(ids[-1], what)
 
     def _go_on(self, last: str, what: str) -> str:
-        places = {key: place for place, key in enumerate(self.order)}
-        start = places.get(last, -1)
-        rest = [key for key in self.order if self.decision(key) is None]
+        order = self.order
+        start = order.index(last) + 1 if last in order else 0
+        rest = [key for key in order[start:] + order[:start] if not self.decision(key)]
         if not rest:
-            return f'{what}; the review is complete' if self.order else what
-        self._document.select([min(
-            rest, key=lambda key: (places[key] <= start, places[key]))])
+            return f'{what}; the review is complete'
+        self._document.select(rest[:1])
         return what
 
     def _partner(self, landmark_id: str) -> str | None:

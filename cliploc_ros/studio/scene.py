@@ -66,7 +66,7 @@ class Ellipsoids:
              rgb_of: Callable[[str], tuple[int, int, int]]) -> None:
         """Show these landmarks, in the colours of their classes."""
         landmarks = tuple(landmarks)
-        if landmarks == self._shown:
+        if _fields_of(landmarks) == _fields_of(self._shown):
             return
         count_changed = len(landmarks) != len(self._shown)
         self._shown = landmarks
@@ -110,6 +110,10 @@ class Ellipsoids:
         shown = self._shown
         if event.instance_index is not None and event.instance_index < len(shown):
             self._on_click(event, shown[event.instance_index][0])
+
+
+def _fields_of(landmarks: Sequence[tuple[str, Landmark]]) -> list[tuple[str, object]]:
+    return [(key, one.fields) for key, one in landmarks]
 
 
 class Labels:

@@ -151,7 +151,8 @@ class SightingFinder:
         """
         with self._condition:
             known = self._found.get(landmark_id)
-            if known is not None and (known[0] == landmarks[landmark_id] or is_moving):
+            if known is not None and (known[0].fields == landmarks[landmark_id].fields
+                                      or is_moving):
                 return known[1]
             self._wanted.pop(landmark_id, None)
             self._wanted[landmark_id] = landmarks

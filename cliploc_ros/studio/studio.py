@@ -5,7 +5,7 @@
 Every action returns a line that says what it did, or raises a CliplocError.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +45,7 @@ class Row(NamedTuple):
     label: str
     class_id: str
     is_locked: bool
+    is_hidden: bool
     severity: float
     decision: str
 
@@ -68,8 +69,6 @@ class Studio:
         self.review = Review(document, recording)
         self.new = None if recording is None else NewLandmark(document, recording)
         self.view = 0
-        #: Landmarks that the scene and the views leave out; the map file does not hold it.
-        self.hidden: frozenset[str] = frozenset()
         #: The relocalizer's answers that are shown; an edit leaves them as they are.
         self.answers: tuple[Answer, ...] = ()
         # of the last run over the whole recording, by verdict
@@ -142,11 +141,7 @@ class Studio:
     def shown(self) -> dict[str, Landmark]:
         """Return the landmarks that are not hidden."""
         return {key: one for key, one in self.document.landmarks.items()
-                if key not in self.hidden}
-
-    def hide(self, landmark_ids: Iterable[str]) -> None:
-        """Hide landmarks, and show those among them that are hidden."""
-        self.hidden = self.hidden ^ frozenset(landmark_ids)
+                if not one.marks.is_hidden}
 
     def select_at(self, pixel: Pixel) -> str:
         """Select the landmark whose outline in the view is around a pixel."""
@@ -180,10 +175,22 @@ class Studio:
 
     def toggle_lock(self, landmark_ids: Sequence[str] = ()) -> str:
         """Lock landmarks, by default the selection; unlock them if all are locked."""
-        ids, landmarks = tuple(landmark_ids) or self._selected(), self.document.landmarks
-        are_locked = all(landmarks[key].is_locked for key in ids)
-        self.document.apply((edits.unlock if are_locked else edits.lock)(landmarks, ids))
+        ids, landmarks = self._known(landmark_ids), self.document.landmarks
+        are_locked = all(landmarks[key].marks.is_locked for key in ids)
+        self.document.apply(edits.mark(landmarks, ids, 'unlock' if are_locked else 'lock',
+                                       is_locked=not are_locked))
         return f'{"unlocked" if are_locked else "locked"} {", ".join(ids)}'
+
+    def toggle_hidden(self, landmark_ids: Sequence[str] = ()) -> str:
+        """Hide landmarks, by default the selection; show them if all are hidden."""
+        ids, landmarks = self._known(landmark_ids), self.document.landmarks
+        are_hidden = all(landmarks[key].marks.is_hidden for key in ids)
+        self.document.apply(edits.mark(landmarks, ids, 'show' if are_hidden else 'hide',
+                                       is_hidden=not are_hidden))
+        return f'{"showed" if are_hidden else "hid"} {", ".join(ids)}'
+
+    def _known(self, landmark_ids: Sequence[str]) -> Sequence[str]:
+        return [key for key in landmark_ids if key in self.document.landmarks] or self._selected()
 
     def split(self) -> str:
         """Split the selected landmark along its longest axis, and select both halves."""
@@ -209,7 +216,7 @@ class Studio:
     def refit_all(self) -> str:
         """Fit all unlocked landmarks to their boxes."""
         return self._refit([key for key, one in self.document.landmarks.items()
-                            if not one.is_locked])
+                            if not one.marks.is_locked])
 
     def _refit(self, landmark_ids: Sequence[str]) -> str:
         change, reasons = self._recording().refitted(self.document.landmarks, landmark_ids)
@@ -220,10 +227,10 @@ class Studio:
 
     def rows(self) -> list[Row]:
         """Return the list of landmarks, in the order of the review."""
-        review, places = self.review, {key: at for at, key in enumerate(self.review.order)}
-        rows = [Row(key, one.label, one.class_id, one.is_locked, review.severity(key),
-                    review.decision(key) or '') for key, one in self.document.landmarks.items()]
-        return sorted(rows, key=lambda row: places.get(row.landmark_id, len(places)))
+        review, landmarks = self.review, self.document.landmarks
+        return [Row(key, one.label, one.class_id, one.marks.is_locked, one.marks.is_hidden,
+                    review.severity(key), one.marks.decision)
+                for key in review.order if (one := landmarks.get(key))]
 
     # ---- the relocalizer ------------------------------------------------------------------------
 

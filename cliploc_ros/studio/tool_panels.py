@@ -67,6 +67,12 @@ class PlacesPanel:
         self._coverage: list[Any] = []
         self._links: list[Any] = []
         self.shows_coverage = self.shows_links = True
+        self._is_wanted = False
+
+    def set_wanted(self, is_wanted: bool) -> None:
+        """Show the layers only where a page asks for them."""
+        self._is_wanted = is_wanted
+        self._set_visible()
 
     def toggle_coverage(self) -> None:
         """Show or hide the tiles of coverage."""
@@ -102,7 +108,7 @@ class PlacesPanel:
         for handles, is_shown in ((self._coverage, self.shows_coverage),
                                   (self._links, self.shows_links)):
             for handle in handles:
-                handle.visible = is_shown
+                handle.visible = is_shown and self._is_wanted
 
     def _draw_coverage(self, places: Places) -> list[Any]:
         scene, check = self._actions.server.scene, places.check

@@ -122,6 +122,19 @@ def test_a_misspelt_class_is_named_with_the_right_one(detections, is_recorded):
     assert all(one.severity == 0.0 for one in others)
 
 
+@pytest.mark.parametrize(('label', 'class_id', 'other'), [
+    ('a red cup', 'book', 'cup'), ('two books', 'cup', 'book'), ('a cup by a book', 'book', None),
+    ('a mobile phone by a cup', 'cell phone', None), ('a cupboard', 'book', None)])
+def test_a_label_of_another_class_is_a_fault(label, class_id, other):
+    ids = ('cup', class_id, 'book', *TABLE.class_ids[3:])
+    named = replace(TABLE, class_ids=ids, labels=('a cup', label, 'a book', *TABLE.labels[3:]))
+    faults = {one.landmark_id: one.faults for one in check_map(named, options=QUICK).landmarks}
+    assert faults.pop(TABLE.landmark_ids[1]) == (() if other is None else (
+        f"is labelled '{label}', a {other} by that, and has the class {class_id}: correct the "
+        'wrong one',))
+    assert not any(faults.values())
+
+
 def test_a_landmark_of_few_frames_counts_little(detections):
     higher = moved(TABLE, {4: TABLE.centers[4] + (0.0, 0.0, 0.45)})
     rare = replace(higher, details=tuple(LandmarkDetails(support=3 if row == 4 else 50)

@@ -25,7 +25,7 @@ def test_coverage_and_look_alikes(chromium, path):
     """They are found, stale after an edit, and found again with what has changed."""
     write_two_rooms(path)
     document = Document(path)
-    with person_at(chromium, Studio(document)) as (person, _):
+    with person_at(chromium, Studio(document)) as (person, server):
         page = person.page
         person.mode('Test')
         person.click('Coverage and look-alikes')
@@ -33,6 +33,10 @@ def test_coverage_and_look_alikes(chromium, path):
         wait_for(lambda: document.selection == ('cup_0',), 'the page answers meanwhile')
         page.get_by_text('pairs of places that look alike: 1').wait_for()
         person.picture('places')
+        tiles = server.scene._handle_from_node_name['/coverage/tiles']
+        for mode, is_shown in (('Edit', False), ('Test', True)):
+            person.mode(mode)
+            wait_for(lambda is_shown=is_shown: tiles.visible == is_shown, 'the tiles')
         with document.lock:
             document.apply(edits.delete(document.landmarks, ['cup_0']))
         page.get_by_text('of the map before the last edits').wait_for()
@@ -73,7 +77,7 @@ def test_keyframes_are_shown_and_hidden(chromium, path):
         frusta = nodes['/keyframes']
         assert frusta.points.shape == (8 * KEYFRAMES, 2, 3) and not frusta.visible
         scene = person.page.frame_locator('iframe')
-        scene.get_by_text('Connected').click()
+        scene.get_by_text('Layers and viewpoints').click()
         box = scene.get_by_label('Keyframes', exact=True)
         box.wait_for()
         box.check(force=True)

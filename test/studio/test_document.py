@@ -19,6 +19,7 @@ from cliploc_ros.errors import CliplocError, DatasetError, MapError
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.edits import EditError
+from cliploc_ros.studio.landmark import Marks
 from cliploc_ros.studio.map_file import ChangedOnDiskError
 
 
@@ -161,8 +162,8 @@ def test_every_edit_is_undone_and_done_again(document):
                  lambda all: edits.reclass(all, ['cup_1'], 'mug'),
                  lambda all: edits.split(all, 'book_1'),
                  lambda all: edits.merge(all, ['book_1', 'book_2', 'cup_1']),
-                 lambda all: edits.lock(all, ['plant_1']),
-                 lambda all: edits.unlock(all, ['plant_1']),
+                 lambda all: edits.mark(all, ['plant_1'], 'lock', is_locked=True),
+                 lambda all: edits.mark(all, ['plant_1'], 'unlock', is_locked=False),
                  lambda all: edits.delete(all, ['plant_1', 'book_1'])):
         document.apply(edit(document.landmarks))
         assert document.landmarks != states[-1]
@@ -206,16 +207,20 @@ def test_what_no_map_may_hold_is_refused(document, edit, message):
 
 
 def test_a_locked_landmark_is_not_edited(document, path):
-    document.apply(edits.lock(document.landmarks, ['cup_1']))
+    document.apply(edits.mark(document.landmarks, ['cup_1'], 'lock', is_locked=True))
     for edit in (lambda all: edits.move(all, 'cup_1', [0, 0, 0]),
                  lambda all: edits.delete(all, ['cup_1']),
                  lambda all: edits.merge(all, ['book_1', 'cup_1'])):
         with pytest.raises(EditError, match="'cup_1' is locked"):
             edit(document.landmarks)
-    assert document.is_saved, 'a lock is not in the map file'
+    document.apply(edits.mark(document.landmarks, ['cup_1'], 'hide', is_hidden=True))
+    assert document.is_saved, 'marks are not in the map file'
     document.save()
+    document.apply(edits.mark(document.landmarks, ['cup_1'], 'accepted', decision='accepted'))
     document.close()
-    assert Document(path).landmarks['cup_1'].is_locked, 'but the journal keeps it'
+    again = Document(path)
+    assert again.landmarks['cup_1'].marks == Marks(True, True, 'accepted')
+    assert not again.notes
 
 
 def test_a_moved_landmark_has_no_measured_uncertainty(document, path):

@@ -88,7 +88,7 @@ def test_a_search_runs_beside_edits_and_is_stopped(studio):
     assert search.is_stale()
     document.undo()
     assert not search.is_stale(), 'the map is as it was'
-    document.apply(edits.lock(document.landmarks, ['cup_0']))
+    document.apply(edits.mark(document.landmarks, ['cup_0'], 'lock', is_locked=True))
     assert not search.is_stale(), 'a lock changes nothing'
 
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The studio's actions and its gate, without a browser."""
 
+import json
 import resource
 import shutil
 import time
@@ -17,7 +18,7 @@ from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.edits import EditError
-from cliploc_ros.studio.images import landmark_at, views_of_folder
+from cliploc_ros.studio.images import landmark_at, outlines_of, views_of_folder
 from cliploc_ros.studio.recording import Recording
 from cliploc_ros.studio.sightings import find_sightings
 from cliploc_ros.studio.studio import Studio
@@ -79,7 +80,7 @@ def test_moved_landmarks_come_back_by_refitting(office):
     office.refit_all()
     fitted = document.landmarks
     moved = [key for key in ('tv_1', 'keyboard_1', 'book_3') if key in fitted]
-    document.apply(edits.lock(fitted, ['book_1']))
+    document.apply(edits.mark(fitted, ['book_1'], 'lock', is_locked=True))
     for key in moved:
         one = document.landmarks[key]
         document.apply(edits.move(document.landmarks, key, one.center + 0.3 * one.semi_axes))
@@ -130,6 +131,38 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
     assert counts['accepted'] + counts['fixed'] + counts['deleted'] == counts['total'] == total
 
 
+def test_a_landmark_whose_duplicate_is_deleted_is_none(office):
+    document, review = office.document, office.review
+    twin = document.landmarks['book_2']
+    document.apply(edits.create(document.landmarks, 'a twin', 'book', twin.center + 0.01,
+                                twin.basis))
+    review.check()
+    assert 'same object' in review.check_of('book_2').faults[0]
+    document.select([list(document.landmarks)[-1]])
+    review.delete()
+    assert not any('same object' in text for text in review.check_of('book_2').faults)
+
+
+def test_the_review_goes_on_where_it_was(office):
+    """After a restart, too; what is new joins the queue; undo takes a decision back."""
+    document, review = office.document, office.review
+    review.check()
+    first, = document.selection
+    review.accept()
+    again = Studio(document, office.recording)
+    again.review.check()
+    assert again.review.decision(first) == 'accepted' and document.selection != (first,)
+    twin = document.landmarks[first]
+    document.apply(edits.create(document.landmarks, 'a twin', 'cup', twin.center + 1.0,
+                                twin.basis))
+    counts = again.review.counts()
+    assert counts['total'] == len(document.landmarks) and counts['accepted'] == 1
+    assert list(document.landmarks)[-1] == again.review.order[-1] == again.rows()[-1].landmark_id
+    document.undo()
+    document.undo()
+    assert not again.review.decision(first)
+
+
 def test_without_a_recording_the_studio_says_what_is_missing(tmp_path):
     studio = Studio(Document(tmp_path / 'map.yaml'))
     for action in (studio.refit_all, studio.relocalize_all, lambda: studio.image(0)):
@@ -154,6 +187,30 @@ def test_a_box_of_the_detector_is_taken(office):
     assert 'changed' in office.new.draw(view, box[:2], box[2:] + 3.0), 'one box a view'
     with pytest.raises(EditError, match='no box'):
         office.new.take(view, (-1.0, -1.0))
+
+
+def test_the_next_view_for_a_box_shows_the_object(tmp_path):
+    """It does for each landmark of the demo's first walk; asked once more, it is another one."""
+    shutil.copy(ASSETS / 'map.yaml', tmp_path / 'map.yaml')
+    detections = views_of_folder(ASSETS / 'mapping')
+    studio = Studio(Document(tmp_path / 'map.yaml'), Recording(detections))
+    new, shown = studio.new, []
+    for key, one in studio.document.landmarks.items():
+        boxes = {}
+        for view, pose in enumerate(detections.map_from_camera):
+            if outline := outlines_of({key: one}, detections.camera_of(view), pose):
+                half = np.sqrt(outline[0].ellipse[[2, 4]])
+                box = np.array([outline[0].ellipse[:2] - half, outline[0].ellipse[:2] + half])
+                if box.min() > 0.0 and (box[1] < (640.0, 480.0)).all():
+                    boxes[view] = box
+        if len(boxes) > 2:
+            new.forget(None)
+            new.draw(next(iter(boxes)), *next(iter(boxes.values())))
+            views = [new.next_view(), new.next_view()]
+            assert len({*views, *new.boxes}) == 3
+            shown.append(views[0] in boxes)
+    studio.document.close()
+    assert len(shown) > 50 and np.mean(shown) > 0.95
 
 
 def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
@@ -230,6 +287,29 @@ def test_the_page_is_for_this_machine_only(tmp_path):
         assert opens(host, None) is False
         assert opens(host, 'http://evil.example') is False, 'a foreign page'
         assert opens(host, f'http://{host}') is True
+
+
+@pytest.mark.needs('viser')
+@pytest.mark.parametrize(('message', 'answer'), [
+    ({'do': 'view'}, "'view' lacks 'view'"), ({'do': 'view', 'view': 'x'}, "view: 'x'"),
+    ({'do': 'edit'}, "'edit' lacks 'field'"), ({'do': 'edit', 'field': 'label'}, "lacks 'value'"),
+    ({'do': 'edit', 'field': [], 'value': [0, 0, 0]}, 'no field'),
+    ({'do': 'create', 'label': ''}, "lacks 'class_id'"), ({'do': 'select'}, "lacks 'id'"),
+    ({'do': 'hide', 'ids': 3}, 'ids: 3 is no list'),
+    ({'do': 'hide', 'ids': ['mug_2']}, 'hid mug_2'),
+    ({'do': 'edit', 'field': 'class_id', 'value': 'cup'}, "mug_1: class 'cup'")])
+def test_the_log_answers_a_message_of_the_page(studio, message, answer, caplog):
+    from websockets.sync.client import connect
+
+    studio.document.select(['mug_1'])
+    with open_page(studio) as (url, _):
+        host = url.removeprefix('http://').rstrip('/')
+        with connect(f'ws://{host}/socket/me', origin=f'http://{host}') as page:
+            page.send(json.dumps(message))
+            while not any(answer in line[2] for line in dict(json.loads(page.recv(60))).get(
+                    'log', ())):
+                pass
+    assert not caplog.records, 'no traceback'
 
 
 @pytest.mark.needs('viser')

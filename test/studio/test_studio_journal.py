@@ -30,7 +30,7 @@ from pathlib import Path
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 document = Document(Path(sys.argv[1]))
-document.apply(edits.lock(document.landmarks, ['book_1']))
+document.apply(edits.mark(document.landmarks, ['book_1'], 'lock', is_locked=True))
 document.apply(edits.delete(document.landmarks, ['plant_1']))
 document.save()
 document.apply(edits.relabel(document.landmarks, ['cup_1'], 'undone'))
@@ -54,7 +54,7 @@ def test_a_killed_studio_loses_nothing(path):
     editor.wait()
     document = Document(path)
     assert document.landmarks['cup_1'].center[0] >= last
-    assert document.landmarks['book_1'].is_locked and 'plant_1' not in document.landmarks
+    assert document.landmarks['book_1'].marks.is_locked and 'plant_1' not in document.landmarks
     assert any('restored' in note for note in document.notes)
     document.undo()
     assert document.is_saved, 'the drag is one edit'

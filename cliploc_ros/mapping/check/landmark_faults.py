@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each landmark of a map: how well a recording supports it, and its faults."""
 
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -111,7 +113,7 @@ def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views:
 
 def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
                     overlaps: list[Overlap], options: MappingOptions) -> list[LandmarkCheck]:
-    """Return each landmark's check, the worst first.
+    """Return each landmark's check, the worst first; of equal ones, the one that is seen least.
 
     Without a recording, support comes from the map's own fields. The options have the limits.
     """
@@ -148,12 +150,26 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
         if check.thinness < _MIN_THINNESS:
             faults.append((0.3, f'is a sheet: its axes have the ratio {check.thinness:.3f}; '
                                 'record it from another side, or give it thickness'))
+        if other := _class_of_label(check.label, check.class_id, classes):
+            faults.append((0.6, f"is labelled '{check.label:.60}', a {other} by that, and has the "
+                                f'class {check.class_id}: correct the wrong one'))
         faults.sort(key=lambda one: -one[0])
         checks.append(replace(
             check, faults=tuple(text for _, text in faults),
             severity=faults[0][0] + 0.05 * (len(faults) - 1) if faults else 0.0,
             weight=float(weights[row]) if len(weights) else 1.0))
-    return sorted(checks, key=lambda one: -one.severity)
+    return sorted(checks, key=lambda one: (
+        -one.severity, 1.0 if one.seen_ratio is None else one.seen_ratio))
+
+
+def _class_of_label(label: str, class_id: str, classes: Iterable[str]) -> str | None:
+    """Return the class that a label names, if it is another one and the label names no other."""
+    def is_named(text: str) -> bool:
+        return re.search(rf'\b{re.escape(text.casefold())}(e?s)?\b', label.casefold()) is not None
+
+    if any(word.casefold() in label.casefold() for word in class_id.split()):
+        return None
+    return next((one for one in sorted(set(classes)) if is_named(one)), None)
 
 
 def _support(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> dict[str, Any]:
@@ -190,7 +206,8 @@ def _support_faults(check: LandmarkCheck, size_m: float, options: MappingOptions
                       'if it is gone, or map again')]
     faults = []
     if support is not None and support < options.min_viewpoints:
-        faults.append((1.1, f'was seen in {support} frames: record it from more sides'))
+        frames = 'frame' if support == 1 else 'frames'
+        faults.append((1.1, f'was seen in {support} {frames}: record it from more sides'))
     if ratio is not None and ratio < options.min_seen_ratio:
         faults.append((1.2, f'is detected in {ratio:.1%} of the frames that should show it: '
                             'delete it if it has moved, or is hard to detect'))

@@ -28,7 +28,7 @@ function send(name, values = {}) {
 
 function connect() {
   socket = new WebSocket(`${location.origin.replace(/^http/, 'ws')}${base}socket/${person}`);
-  socket.onopen = () => { $('lost').hidden = true; };
+  socket.onopen = () => { $('lost').hidden = true; send('mode', {mode}); };
   socket.onmessage = event => {
     const parts = JSON.parse(event.data);
     for (const [name, value] of parts) state[name] = value;
@@ -69,15 +69,16 @@ function button(text, action, {key = '', kind = '', off = false, hint = ''} = {}
 }
 
 const doing = (name, values) => () => send(name, values);
+const capital = text => text[0].toUpperCase() + text.slice(1);
 const buttons = (...children) => el('div', {className: 'buttons'}, ...children);
 const note = text => text ? el('p', {className: 'note'}, text) : null;
 
 // A text or numbers; what a person types is left alone until it is sent. Numbers are shown rounded,
 // and those that are not typed stay as exact as they were.
-function field(name, values, apply, {isText = false, isOff = false, list = ''} = {}) {
+function field(name, values, apply, {isText = false, isOff = false, list = '', of = ''} = {}) {
   const shown = values.map(value => isText ? value : String(Number(value.toFixed(3))));
   const inputs = values.map((value, place) => el('input', {
-    type: isText ? 'text' : 'number', step: 'any', value: shown[place], disabled: isOff,
+    type: isText ? 'text' : 'number', step: 'any', value: shown[place], title: value, disabled: isOff, 'data-of': of,
     'aria-label': name + (values.length > 1 ? ` ${'xyz'[place]}` : ''),
     onchange: () => apply(isText ? inputs[0].value : inputs.map(
       (one, row) => one.value === shown[row] ? values[row] : Number(one.value))),
@@ -87,16 +88,17 @@ function field(name, values, apply, {isText = false, isOff = false, list = ''} =
             el('span', {}, name), ...inputs);
 }
 
-// Replaces children; a field with the focus keeps it, and what is typed in it.
+// Replaces children; a field with the focus keeps it, and what is typed in it for the same landmark.
 function fill(where, children) {
   const active = document.activeElement;
   const name = where.contains(active) && active.tagName === 'INPUT' ? active.ariaLabel : null;
   where.replaceChildren(...children.filter(child => child !== null));
   const again = name && [...where.querySelectorAll('input')].find(one => one.ariaLabel === name);
   if (!again) return;
+  again.focus();
+  if (again.dataset.of !== active.dataset.of) { again.select(); return; }
   const shown = again.value;
   again.value = active.value;
-  again.focus();
   if (again.type === 'text') again.setSelectionRange(active.selectionStart, active.selectionEnd);
   again.addEventListener('blur', () => { if (again.isConnected && again.value !== shown) again.dispatchEvent(new Event('change')); }, {once: true});
 }
@@ -130,7 +132,9 @@ function setMode(name) {
   resize();
   fill($('modes'), MODES.map((one, place) => el('button', {
     'aria-pressed': String(one === name), onclick: () => setMode(one),
-    title: `${one} (${place + 1})`}, one[0].toUpperCase() + one.slice(1))));
+    title: `${one} (${place + 1})`}, capital(one))));
+  send('mode', {mode});
+  if (mode === 'create') { send('select', {id: ''}); send('overview'); }
   if (state.file.name) show(new Set(Object.keys(state)));
 }
 
@@ -154,7 +158,7 @@ function showFile() {
   for (const name of ['undo', 'redo']) {
     const one = document.querySelector(`header [data-do=${name}]`);
     one.disabled = !file[name];
-    one.title = `${name[0].toUpperCase()}${name.slice(1)} ${file[name] || ''} (Ctrl-${name === 'undo' ? 'Z' : 'Y'})`;
+    one.title = `${capital(name)} ${file[name] || ''} (Ctrl-${name === 'undo' ? 'Z' : 'Y'})`;
   }
   $('conflict').hidden = !file.conflict;
   fill($('classes'), file.classes.map(value => el('option', {value})));
@@ -192,7 +196,7 @@ function showCard() {
     return;
   }
   const set = name => value => send('edit', {field: name, value, gesture: ++gesture});
-  const off = {isOff: one.is_locked};
+  const off = {isOff: one.is_locked, of: one.id};
   fill($('card'), [
     el('div', {className: 'head'}, el('span', {}, one.id),
        toggle(one.is_locked ? 'locked' : 'open', one.is_locked ? 'Unlock' : 'Lock', 'L',
@@ -235,8 +239,8 @@ const PANELS = {
       one && one.decision ? el('p', {className: 'note done'}, one.decision) : null,
       one && one.is_checked ? (one.faults.length
         ? el('ul', {className: 'faults'}, ...one.faults.map(text => el('li', {}, text)))
-        : el('p', {className: 'note done'}, 'no fault found')) : null,
-      one?.support != null ? note(`in ${one.support} frames`
+        : el('p', {className: 'note done'}, 'no fault found')) : note(one && 'new since the check'),
+      one?.support != null ? note(`in ${one.support} ${one.support === 1 ? 'frame' : 'frames'}`
         + (one.ratio === null ? '' : `, ${Math.round(100 * one.ratio)} % of those that should show it`)) : null,
       done === total ? buttons(button('Check again', doing('check'))) : null];
   },
@@ -319,7 +323,7 @@ function showRows() {
   const rows = found.slice(0, MOST_ROWS);
   for (const row of found.slice(MOST_ROWS)) if (chosen.has(row[0])) rows.push(row);
   const top = $('rows').scrollTop;
-  fill($('rows'), rows.map(([id, label, name, isLocked, severity, decision, color, isHidden]) => {
+  fill($('rows'), rows.map(([id, label, name, isLocked, isHidden, severity, decision, color]) => {
     const side = (one, text, isOn, action) => el('button', {
       className: `icon${isOn ? ' on' : ''}`, title: text, 'aria-label': `${text} ${id}`.slice(0, 90),
       onclick: event => { event.stopPropagation(); send(action, {ids: [id]}); }}, icon(one));
@@ -351,7 +355,7 @@ function showView() {
   if (document.activeElement !== $('slider')) $('slider').value = view.view;
   $('where').textContent = `view ${view.view}${view.camera ? ` camera ${view.camera}` : ''}`;
   $('empty').textContent = state.file.images ? '' : 'No images: give --images, or look at the boxes';
-  const colors = Object.fromEntries(state.rows.map(row => [row[0], row[6]]));
+  const colors = Object.fromEntries(state.rows.map(row => [row[0], row[7]]));
   const chosen = new Set(state.selection.ids), scale = pixel();
   const ellipse = ([cx, cy, rx, ry, turn], name, color) => drawn('ellipse', {
     cx, cy, rx, ry, transform: `rotate(${turn} ${cx} ${cy})`, class: name,
@@ -526,10 +530,12 @@ function focusLabel() {
   input?.select();
 }
 
+const SIGNS = {arrowleft: '←', arrowright: '→', arrowup: '↑', arrowdown: '↓', pageup: 'Page ↑', pagedown: 'Page ↓'};
+
 function showKeys() {
   const table = keys => el('table', {}, ...Object.entries(keys).map(([key, [text]]) => el(
-    'tr', {}, el('td', {}, el('kbd', {}, key)), el('td', {}, text))));
-  fill($('keys'), [el('b', {}, `Keys: ${mode}`), table(KEYS[mode]), el('b', {}, 'Always'), table(KEYS.all)]);
+    'tr', {}, el('td', {}, el('kbd', {}, SIGNS[key] || key.split('+').map(capital).join('+'))), el('td', {}, capital(text)))));
+  fill($('keys'), [el('b', {}, capital(mode)), table(KEYS[mode]), el('b', {}, 'Always'), table(KEYS.all)]);
   $('keys').showModal();
 }
 
@@ -557,7 +563,7 @@ for (const one of document.querySelectorAll('[data-icon]')) {
 for (const one of document.querySelectorAll('[data-do]')) {
   one.addEventListener('click', () => { send(one.dataset.do); $('menu').open = false; });
 }
-$('show_all').onclick = () => { send('hide', {ids: state.rows.filter(row => row[7]).map(row => row[0])}); $('menu').open = false; };
+$('show_all').onclick = () => { send('hide', {ids: state.rows.filter(row => row[4]).map(row => row[0])}); $('menu').open = false; };
 $('help').onclick = () => { $('menu').open = false; showKeys(); };
 $('keys').onclick = () => $('keys').close();
 $('find').oninput = showRows;
