@@ -21,6 +21,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.datasets.depth import depths_from_msg
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.messages import (
     camera_from_msg,
@@ -41,7 +42,7 @@ from cliploc_ros.ros.inputs.frame_source import (
     of_camera,
 )
 from cliploc_ros.ros.inputs.rig import frames_of
-from cliploc_ros.ros.inputs.robot_state import RobotStateSource
+from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.node.diagnostics import Health, StageTimes, in_words
 from cliploc_ros.ros.node.executor import NodeExecutor
@@ -334,6 +335,27 @@ def _check_detections(parameters: RelocalizerParameters, localizer: FrameLocaliz
     report.add('detector', State.PASS, text)
 
 
+def _check_depth(frame: Frame, state: RobotState, parameters: RelocalizerParameters,
+                 report: Report) -> None:
+    """Check that depth comes with an image and belongs to it: localizing goes on without."""
+    what = of_camera(frame.camera, 'depth')
+    if frame.depth is None:
+        return report.add(what, State.FAIL, 'none within depth_tolerance_s of the image, '
+                          f'{parameters.depth_tolerance_s:g} s: remap depth, start its publisher, '
+                          'or set depth_transport to none')
+    with report.failing(what):
+        size = image_from_msg(frame.image).shape[1::-1]
+        boxes = detections_from_msg(frame.detections).usable(
+            *size, parameters.max_detections).bboxes_xyxy
+        depths_m = depths_from_msg(
+            frame.depth, frame.image.header.frame_id,
+            camera_from_msg(frame.camera_info, size, parameters.rectified), boxes,
+            frame.depth_camera_info, state.camera_from_depth)
+        known_m = depths_m[np.isfinite(depths_m)]
+        report.add(what, State.PASS, f'of {len(known_m)} of {len(boxes)} boxes' + (
+            f', {known_m.min():.1f} to {known_m.max():.1f} m' if len(known_m) else ''))
+
+
 def _check_request(node: Doctor, parameters: RelocalizerParameters,
                    localizer: FrameLocalizer | None, frame: Frame | None, report: Report) -> None:
     """Localize with a frame as a request does: how long each stage takes, and the verdict."""
@@ -343,6 +365,9 @@ def _check_request(node: Doctor, parameters: RelocalizerParameters,
         deadline = time.monotonic() + parameters.tf_timeout_s
         states = [(one, node.robot.at(one.image.header, parameters.of_camera(one.camera), deadline,
                                       one.depth_frame)) for one in (frame, *frame.beside)]
+        if parameters.depth_transport != 'none':
+            for one, state in states:
+                _check_depth(one, state, parameters, report)
         times = StageTimes('waiting', time.monotonic())
         localized = node.worker.run(partial(
             localizer.localize, frame, parameters, states[0][1], times, math.inf, states[1:]))

@@ -206,7 +206,7 @@ class FrameLocalizer:
             f'{len(frames)} maps, frames {", ".join(frames)}'
         keyframes = '' if self._keyframes is None else f'{len(self._keyframes)} keyframes, '
         return (f'{len(self._map)} landmarks in {where}, {keyframes}'
-                f'{self._options.matching}_{self._options.algorithm}')
+                f'matching {self._options.matching}, algorithm {self._options.algorithm}')
 
     def reloaded(self, node: Node, parameters: RelocalizerParameters) -> 'FrameLocalizer':
         """Return a localizer for the map as it is now; the encoder stays the same.

@@ -42,6 +42,8 @@ _SERVICE = 'relocalize_fields'
 _DISCOVERY_S = 2.0
 # What the relocalizer knows is reported within this time.
 _ON_DIAGNOSTICS_S = 1.5
+# A person who waits is told so again after this time.
+_AGAIN_S = 5.0
 # Between looks of a robot that does not turn.
 _PAUSE_S = 1.0
 # What an answer may take on its way beyond the relocalizer's own limit.
@@ -189,7 +191,7 @@ class WakeUp(Node):
         self._began_at = time.monotonic()
         self._options = options
         self._interrupted = interrupted
-        self._said: dict[str, str] = {}
+        self._said: dict[str, tuple[str, float]] = {}
 
     def run(self) -> Outcome:
         """Look until a pose is accepted or time is up; end a turn under way in any case.
@@ -231,7 +233,7 @@ class WakeUp(Node):
         while True:
             problem = self._problem()
             if self._elapsed_s > _DISCOVERY_S:
-                self._say('waiting', problem)
+                self._say('waiting', problem, _AGAIN_S)
             if not problem or self._is_time_up:
                 return problem
             self._spin()
@@ -300,11 +302,16 @@ class WakeUp(Node):
     def _is_time_up(self) -> bool:
         return self._elapsed_s > self._options.timeout_s
 
-    def _say(self, topic: str, text: str) -> None:
-        """Print a text once, until it changes."""
-        if text and self._said.get(topic) != text:
-            print(f'{topic}: {text}', flush=True)
-        self._said[topic] = text
+    def _say(self, topic: str, text: str, again_s: float = math.inf) -> None:
+        """Print a text when it changes, and again after some time."""
+        said, said_at = self._said.get(topic, ('', -math.inf))
+        elapsed_s = self._elapsed_s
+        if text == said and elapsed_s - said_at < again_s:
+            return
+        if text:
+            still = f'still {topic} [{elapsed_s:.0f} s]' if text == said else topic
+            print(f'{still}: {text}', flush=True)
+        self._said[topic] = text, elapsed_s
 
     def _wait(self, condition: Callable[[], bool], patience_s: float) -> bool:
         """Process callbacks until a condition holds, for some time at most."""

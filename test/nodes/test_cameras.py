@@ -105,6 +105,19 @@ def test_a_watch_looks_with_the_first_camera_alone(start, tester, surroundings_m
     assert not any(tester.count_subscribers(f'/{name}/image') for name in NAMES[1:])
 
 
+def test_the_doctor_looks_at_each_camera(four_cameras, start):
+    _, ask = four_cameras
+    doctor = start('cli.doctor', '--timeout', 4)
+    ask(working=NAMES[1:])
+    while doctor.alive:
+        ask(working=NAMES[1:])
+    found = {tuple(line.split()[:2]) for line in doctor.output().splitlines()}
+    for name in NAMES:
+        state = 'fail' if name == NAMES[0] else 'pass'
+        assert {(f'{name}/camera', state), (f'{name}/calibration', state)} <= found
+    assert {('detector', 'pass'), ('time', 'pass')} <= found
+
+
 def test_a_mount_that_contradicts_the_others_is_named(four_cameras):
     process, ask = four_cameras
     turned = make_transform(Rotation.from_euler('y', 60.0, degrees=True).as_matrix(), np.zeros(3))

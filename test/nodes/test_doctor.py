@@ -111,11 +111,13 @@ def test_a_whole_robot_passes_and_nothing_is_handed_over(own_relocalizer, examin
     ('calibration', 'no camera_info on', {'change': without(1)}, {}),
     ('calibration', 'K: ', {'change': uncalibrated}, {}),
     ('clock', 'synchronize the clocks', {'late_s': 100.0}, {}),
+    ('clock', 'nobody publishes /clock', {}, {'use_sim_time': True}),
     ('tf', 'set base_from_camera', {}, {'base_from_camera': [0.0] * 7}),  # with and without tf2
     ('odometry', 'the robot moves at 1.00 m/s', {'speed_m_s': 1.0}, {}),
     ('vertical', 'no message of /imu', {}, {'gravity': 'imu'}),
     ('detector', 'no detections on /detections', {'change': without(2)}, {}),
     ('detector', 'no class of the map is among its sofa', {'change': of_another_detector}, {}),
+    ('depth', 'none within depth_tolerance_s', {}, {'depth_transport': 'raw'}),
     ('localizer', 'nobody publishes /nowhere: start the localizer', {},
      {'localizer_pose': 'nowhere'}),
     ('time', 'raise timeout_s', {'detection_s': 0.5}, {'timeout_s': 0.1})])

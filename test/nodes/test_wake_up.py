@@ -190,6 +190,7 @@ def test_each_thing_that_is_missing_has_its_message(start, end, tester, room_map
     process = start('cli.wake_up', '--timeout', 60, '--ros-args', '-r', '__ns:=/bare')
     process.wait_for_output(
         'waiting: nothing serves /bare/relocalizer/relocalize_fields: start the ')
+    process.wait_for_output('still waiting [7 s]: nothing serves /bare/relocalizer/reloc')
     start('nodes.relocalizer', '--ros-args', '-r', '__ns:=/bare',
           parameters=class_matching(room_map))
     image, info, detections = make_frame()
