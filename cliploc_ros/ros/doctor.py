@@ -186,6 +186,9 @@ def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
     after, frame, why = time.monotonic(), None, ''
     try:
         frame = node.frames.next_frame(after, after + patience_s)
+        while parameters.depth_transport != 'none' and frame.depth is None:
+            # depth may be discovered later than the image
+            frame = node.frames.next_frame(time.monotonic(), after + patience_s)
     except NoFrameError as error:
         why = str(error)
     silent = {name: text for name, text in node.frames.unheard(after).items()
@@ -344,13 +347,12 @@ def _check_depth(frame: Frame, state: RobotState, parameters: RelocalizerParamet
                           f'{parameters.depth_tolerance_s:g} s: remap depth, start its publisher, '
                           'or set depth_transport to none')
     with report.failing(what):
-        size = image_from_msg(frame.image).shape[1::-1]
+        height, width = image_from_msg(frame.image).shape[:2]
+        camera = camera_from_msg(frame.camera_info, (width, height), parameters.rectified)
         boxes = detections_from_msg(frame.detections).usable(
-            *size, parameters.max_detections).bboxes_xyxy
-        depths_m = depths_from_msg(
-            frame.depth, frame.image.header.frame_id,
-            camera_from_msg(frame.camera_info, size, parameters.rectified), boxes,
-            frame.depth_camera_info, state.camera_from_depth)
+            width, height, parameters.max_detections).bboxes_xyxy
+        depths_m = depths_from_msg(frame.depth, frame.image.header.frame_id, camera, boxes,
+                                   frame.depth_camera_info, state.camera_from_depth)
         known_m = depths_m[np.isfinite(depths_m)]
         report.add(what, State.PASS, f'of {len(known_m)} of {len(boxes)} boxes' + (
             f', {known_m.min():.1f} to {known_m.max():.1f} m' if len(known_m) else ''))

@@ -93,6 +93,8 @@ class Desk:
     def show_mode(self, person: str, mode: str) -> None:
         """Take the mode of a person's page, '' for a closed one; coverage is for the mode test."""
         self._modes[person] = mode
+        if not mode:
+            del self._modes[person]
         self.places.set_wanted('test' in self._modes.values())
 
     def _do_slowly(self, name: str) -> None:

@@ -207,10 +207,13 @@ def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | 
         return pages[0].desk.picture(path) if pages else None
 
     async def talk(connection: Any, person: str) -> None:
-        if pages:
-            await pages[0].board.serve(
-                connection, lambda message: pages[0].desk.do(person, message))
-            pages[0].desk.show_mode(person, '')
+        if not pages:
+            return
+        desk = pages[0].desk
+        try:
+            await pages[0].board.serve(connection, lambda message: desk.do(person, message))
+        finally:
+            desk.show_mode(person, '')
 
     with gate.guard(answer, talk), redirect_stdout(io.StringIO()):  # viser prints another URL
         server = viser.ViserServer(host, port, verbose=False)

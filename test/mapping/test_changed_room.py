@@ -111,7 +111,8 @@ def test_a_recording_of_another_place_leaves_the_map_alone(tmp_path, capsys):
     assert update(tmp_path) == 1
     assert 'does not belong to this map' in capsys.readouterr().err
     assert (tmp_path / 'map.yaml').read_bytes() == before
-    assert not (tmp_path / 'report.json').exists()
+    report = json.loads((tmp_path / 'report.json').read_text())
+    assert 'does not belong to this map' in report['failure']
 
 
 @pytest.mark.parametrize(('text', 'message'), [

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Depth of an RGB-D camera at the relocalizer: right, wrong, late, and none."""
 
+import re
 import struct
 
 import cv2
@@ -97,6 +98,15 @@ def test_depth_counts_and_a_recorded_request_keeps_it(own_relocalizer, tester, d
 def test_compressed_depth(own_relocalizer, depth_camera):
     own_relocalizer(depth_transport='compressed', algorithm='auto')
     ask_until(depth_camera, compressed(make_frame(), depth_image()), ', depth of 12 objects')
+
+
+def test_the_doctor_looks_at_depth(own_relocalizer, depth_camera, start):
+    own_relocalizer(depth_transport='raw')
+    doctor = start('cli.doctor', '--relocalizer', '/relocalizer', '--timeout', 4)
+    while doctor.alive:
+        depth_camera(message(make_frame(), depth_image()))
+    assert re.search(r'^depth +pass +of 12 of 12 boxes, \d\.\d to \d\.\d m$', doctor.output(),
+                     re.MULTILINE)
 
 
 @pytest.mark.parametrize(('given', 'said'), [

@@ -87,7 +87,8 @@ class Camera:
 @pytest.fixture
 def node():
     """A node of the default context, as ManagedNode makes it, spun in a thread of its own."""
-    if not rclpy.ok():
+    is_first = not rclpy.ok()  # test/nodes has its own
+    if is_first:
         rclpy.init()
     made = Answering()
     executor = SingleThreadedExecutor()
@@ -105,6 +106,8 @@ def node():
     executor.shutdown()
     made.worker.stop()
     made.destroy_node()
+    if is_first:
+        rclpy.try_shutdown()
 
 
 @pytest.fixture

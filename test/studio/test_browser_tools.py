@@ -97,6 +97,7 @@ def test_the_camera_of_a_view_is_named(chromium, path):
                     camera_rows=np.arange(len(views)) % 2)
     studio = Studio(Document(path), Recording(views))
     with person_at(chromium, studio) as (person, server):
+        person.page.get_by_text('checked 60 landmarks').wait_for()
         for view, name, one in ((0, 'front', camera), (1, 'back', small), (2, 'front', camera)):
             person.show_view(studio, view)
             person.page.get_by_text(f'view {view} camera {name}').wait_for()
