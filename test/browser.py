@@ -77,6 +77,9 @@ class Person:
         self.page.get_by_role('option').filter(has_text=re.compile(f'^{landmark_id} ')).click()
         wait_for(lambda: document.selection == (landmark_id,), 'the selection')
 
+    def wait_for_card(self, landmark_id):
+        self.page.locator('#card').get_by_text(landmark_id, exact=True).wait_for()
+
     def show_view(self, studio, view):
         self.page.evaluate(f"send('view', {{view: {view}}})")
         wait_for(lambda: studio.view == view, 'the view')

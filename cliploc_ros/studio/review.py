@@ -70,17 +70,17 @@ class Review:
 
     def check(self) -> str:
         """Judge all landmarks; once more after a complete review, a new one begins."""
-        selection = self._document.selection
         self._judge()
         landmarks = self._document.landmarks
-        if self._order and all(self.decision(key) for key in landmarks):
+        begins_anew = self._order and all(self.decision(key) for key in landmarks)
+        if begins_anew:
             self._document.apply(edits.mark(landmarks, landmarks, 'review', decision=''))
         self._order = tuple(self._checks)
         serious = sum(one.severity >= SERIOUS for one in self._checks.values())
         source = '' if self.has_boxes else ' by the map alone: there are no boxes of a recording'
         what = f'checked {len(self._order)} landmarks{source}: {serious} with a serious fault'
         # what a person has chosen meanwhile stays
-        return self._go_on('', what) if self._document.selection == selection else what
+        return what if self._document.selection and not begins_anew else self._go_on('', what)
 
     def accept(self) -> str:
         """Accept the selection as it is, whatever the check says, and go on."""

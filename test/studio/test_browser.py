@@ -139,10 +139,11 @@ def test_a_text_stays_with_its_landmark(person, studio):
     """Another landmark is selected while the field of the label has the focus."""
     document = studio.document
     person.select(document, 'mug_1')
+    person.wait_for_card('mug_1')
     person.page.keyboard.press('e')
     before = document.landmarks
     document.select(['mug_2'])
-    person.page.locator('#card').get_by_text('mug_2', exact=True).wait_for()
+    person.wait_for_card('mug_2')
     assert person.field('Label').input_value() == before['mug_2'].label
     person.page.keyboard.press('Enter')
     person.page.keyboard.press('h')

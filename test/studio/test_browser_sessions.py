@@ -67,13 +67,14 @@ def test_the_worst_landmarks_by_keys(chromium, path):
         wait_for(lambda: review.counts()['deleted'] == 0, 'undo')
         key = max(review.order, key=lambda key: review.check_of(key).support or 0)
         document.select([key])
-        page.locator('#card').get_by_text(key, exact=True).wait_for()
+        person.wait_for_card(key)
         page.keyboard.press('f')
         page.get_by_text(f'{key} seen from one side only').first.wait_for()  # not fitted
         here, = document.selection
         page.keyboard.press('n')
         wait_for(lambda: document.selection != (here,), 'N')
         here, = document.selection
+        person.wait_for_card(here)
         label = person.field('Label')
         label.fill('')
         label.press_sequentially('a new can', delay=20)

@@ -23,6 +23,8 @@ const shares = {review: 0.6, edit: 0.5, create: 0.72, test: 0.5};
 // ---- to and from the server
 
 function send(name, values = {}) {
+  // A view that a person chooses stays when the selection's views are found later.
+  if (name === 'view' && state.selection?.one) followed = state.selection.one.id;
   if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify({do: name, ...values}));
 }
 
