@@ -78,7 +78,7 @@ const note = text => text ? el('p', {className: 'note'}, text) : null;
 // A text or numbers; what a person types is left alone until it is sent. Numbers are shown rounded,
 // and those that are not typed stay as exact as they were.
 function field(name, values, apply, {isText = false, isOff = false, list = '', of = ''} = {}) {
-  const shown = values.map(value => isText ? value : String(Number(value.toFixed(3))));
+  const shown = values.map(value => isText ? value : String(Number(value.toFixed(name === 'Angles' ? 1 : 3))));
   const inputs = values.map((value, place) => el('input', {
     type: isText ? 'text' : 'number', step: 'any', value: shown[place], title: value, disabled: isOff, 'data-of': of,
     'aria-label': name + (values.length > 1 ? ` ${'xyz'[place]}` : ''),
