@@ -70,8 +70,8 @@ def needs_pytorch(what: str, otherwise: str = '') -> Iterator[None]:
     except ModuleNotFoundError as error:
         raise ModelError(
             f"{error.name} is not installed, and {what} needs it: carry the folder of 'prepare "
-            "--cache-dir' here from a machine with the extra 'models', or install that extra"
-            f'{otherwise}, see doc/install.md') from error
+            "--cache-dir' here from a machine with the extra 'models', or install that extra "
+            f'(script/setup models){otherwise}, see doc/install.md') from error
 
 
 def count_threads() -> int:

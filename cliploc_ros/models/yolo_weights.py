@@ -91,7 +91,7 @@ def resolve_published(given: str, cache_dir: str, option: str) -> Path:
     if (folder / name).exists():
         check_weights_file(folder / name)
         return folder / name
-    with needs_pytorch(f'{name}, which is not in {folder},'):
+    with needs_pytorch(f'{name}, which is neither a file here nor in {folder},'):
         _refuse_code(folder / name)
     from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES, attempt_download_asset
 

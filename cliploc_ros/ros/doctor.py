@@ -333,8 +333,7 @@ def _check_detections(parameters: RelocalizerParameters, localizer: FrameLocaliz
         misspelt = misspelt_classes(localizer.landmark_map.class_ids)
         if names := ', '.join(f"'{name}'{hint}" for name, hint in misspelt.items()
                               if name not in found.class_ids):
-            return report.add('detector', State.FAIL, 'it does not have the class of the map '
-                              f'{names}: correct class_id in the map')
+            text += f'; classes of the map: {names}'
     report.add('detector', State.PASS, text)
 
 

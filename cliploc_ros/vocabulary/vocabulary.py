@@ -28,8 +28,8 @@ _A_BEFORE_VOWEL = re.compile(r'\b(a)(?= (?:[aeio]|u(?!ni|se)))', re.IGNORECASE)
 Rules = Mapping[str, Sequence[str]]
 _FOLDER = Path(__file__).parent
 _GENERAL = 'general'
-# Of the letters of a class, taken for another one that is misspelt. A guess: chair and charr.
-_ALIKE = 0.8
+# Of the letters of a class, taken for another one that is misspelt. A guess: book and bokk.
+_ALIKE = 0.75
 
 
 def expand_phrases(rules: Rules) -> tuple[str, ...]:

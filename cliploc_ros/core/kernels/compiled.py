@@ -157,9 +157,15 @@ class KernelCache(NullCache):
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep machine code for the types of arguments."""
-        if not data.library.has_dynamic_globals:
-            name, outdated = self._file_names(sig, data.codegen)
-            KERNEL_FOLDERS.store(name, dumps(data._reduce()), outdated)
+        if data.library.has_dynamic_globals:
+            return
+        name, outdated = self._file_names(sig, data.codegen)
+        try:
+            content = dumps(data._reduce())
+        except RuntimeError as error:
+            # there is no code: llvmlite lost an interruption that came in its callback
+            raise KeyboardInterrupt from error
+        KERNEL_FOLDERS.store(name, content, outdated)
 
     def _file_names(self, sig: Any, codegen: Any) -> tuple[str, str]:
         """Return the name of the file, and a pattern of the names it had with other sources."""

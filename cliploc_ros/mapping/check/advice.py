@@ -92,7 +92,7 @@ def _on_corrections(report: CheckReport) -> Iterator[Advice]:
              if one.is_significant]
     if not found:
         return
-    what = {'intrinsics': 'calibrate the camera',
+    what = {'intrinsics': 'calibrate the camera and map again',
             'mount': 'measure how the camera is mounted on the robot',
             'stamps': 'check the clock and the delay of the images'}
     best = max(found, key=lambda one: one.explained)
@@ -106,7 +106,9 @@ def _on_corrections(report: CheckReport) -> Iterator[Advice]:
     then = f'; after that, {" and ".join(what[one] for one in left)}' if left else ''
     if follow:
         then += f'; only if that was right, look at the {" and the ".join(follow)}'
-    yield Advice(f'{what[cause]}: the boxes fit better if you change {", ".join(numbers)}{then}')
+    place = ' in its camera_info or camera file' if cause == 'intrinsics' else ''
+    yield Advice(f'{what[cause]}: the boxes fit better if you change {", ".join(numbers)}{place}'
+                 f'{then}')
 
 
 def _on_misled(report: CheckReport) -> Iterator[Advice]:
@@ -114,8 +116,8 @@ def _on_misled(report: CheckReport) -> Iterator[Advice]:
              if not any(_takes_for(one, pair) for pair in report.look_alikes)]
     for one in sorted(wrong, key=lambda one: -(one.error_m or 0.0))[:_MOST_MISLED]:
         yield Advice(f'a robot at {_place(one.position)} looking {_heading(one)} would be misled '
-                     f'by {one.error_m:.1f} m: raise min_confidence, or map more distinct objects '
-                     'there', view=one)
+                     f'by {one.error_m:.1f} m: raise the parameter min_confidence, or map more '
+                     'distinct objects there', view=one)
     if len(wrong) > _MOST_MISLED:
         yield Advice(f'and {len(wrong) - _MOST_MISLED} more views that mislead')
 

@@ -139,7 +139,9 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
             overlaps=tuple((ids[other], one.distance) for other, one in others))
         faults = [(1.5, f'is the same object as {ids[other]}: delete one of them')
                   for other, one in others if one.is_duplicate]
-        if hint := misspelt.get(classes[row]):
+        if (hint := misspelt.get(classes[row])) and witness is None:
+            faults.append((1.0, f"may have a misspelt class: '{classes[row]}'{hint}"))
+        elif hint:
             faults.append((1.6, f"has the class '{classes[row]}', which the detector does not "
                                 f'have{hint}: correct its class_id'))
         if not faults:

@@ -24,8 +24,8 @@ _HELP = """\
 usage: ros2 run cliploc_ros {name} --ros-args [--params-file FILE] [-p NAME:=VALUE] [-r OLD:=NEW]
 
 {about}
-parameters, each with its default and meaning:
-  $(ros2 pkg prefix --share cliploc_ros)/config/{name}.yaml
+parameters, each with its default and meaning: config/{name}.yaml in
+  install/share/cliploc_ros, or with ROS in $(ros2 pkg prefix --share cliploc_ros)
 
 ros2 launch cliploc_ros relocalization.launch.py starts detector and relocalizer together."""
 
