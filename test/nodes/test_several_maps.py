@@ -80,7 +80,7 @@ def test_maps_change_while_the_node_runs(own_relocalizer, tester, floors):
     assert tester.set_parameter('map_files', ['']).successful
     assert tester.set_parameter('map_file', first).successful
     assert reload_map(tester).message.startswith(
-        "loaded: 12 landmarks in frame 'floor_0', class_bf; map ")
+        "loaded: 12 landmarks in frame 'floor_0', matching class, algorithm bf; map ")
     assert not tester.relocalize(frame).success
 
 

@@ -72,7 +72,7 @@ def test_a_perfect_view_gives_the_true_pose(localizer, values):
     assert found.accepted and distance_m < 0.05 and angle_deg < 1.0
     assert list(times.ms) == ['waiting', 'decoding', 'search']
     assert landmark_map.frame_id == 'map'
-    assert localizer.description == "12 landmarks in frame 'map', class_bf"
+    assert localizer.description == "12 landmarks in frame 'map', matching class, algorithm bf"
 
 
 def test_a_rectified_image_is_measured_with_p(localizer, values):
