@@ -87,7 +87,7 @@ def test_options_hold_from_the_next_frame_on(localizer, values):
     assert localize(localizer, make_frame(), values).accepted
     assert not localize(localizer, make_frame(), replace(values, min_confidence=1.0)).accepted
     found = localize(localizer, make_frame(), replace(values, algorithm='ransac'))
-    assert found.accepted and localizer.description.endswith('class_ransac')
+    assert found.accepted and localizer.description.endswith('matching class, algorithm ransac')
 
 
 def test_more_detections_than_allowed_are_not_searched(localizer, values):
