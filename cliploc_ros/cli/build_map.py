@@ -177,11 +177,13 @@ def build(options: argparse.Namespace) -> int:
 @contextmanager
 def _reporting_failure(path: Path | None) -> Iterator[None]:
     """Make a report of a MappingError: why there is no map, and what was left out of it."""
+    from cliploc_ros.mapping.building import NothingFoundError
+
     try:
         yield
     except MappingError as error:
-        left_out = [asdict(one) for one in getattr(error, 'left_out', ())]
-        _write_report(path, {'failure': str(error), 'left_out': left_out})
+        left_out = error.left_out if isinstance(error, NothingFoundError) else ()
+        _write_report(path, {'failure': str(error), 'left_out': [asdict(one) for one in left_out]})
         raise
 
 

@@ -260,10 +260,11 @@ def _notes_on_maps(options: argparse.Namespace) -> list[str]:
 
     if options.queries is not None:
         return []
-    images, sources = source_of(options).resolve(), {
-        file: found.source for file in options.map if (found := load_recording(file)) is not None}
+    images = source_of(options).resolve()
     return [f'note: {file} was built from these images ({images}): expect less on others'
-            for file, one in sources.items() if one is not None and one.resolve() == images]
+            for file in options.map
+            if (recording := load_recording(file)) is not None
+            and recording.source is not None and recording.source.resolve() == images]
 
 
 def _watch(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:

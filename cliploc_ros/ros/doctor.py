@@ -31,7 +31,12 @@ from cliploc_ros.messages import (
 )
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
-from cliploc_ros.ros.frame_localizer import FrameLocalizer, keyframes_path, load_localizer
+from cliploc_ros.ros.frame_localizer import (
+    FrameLocalizer,
+    keyframes_path,
+    load_localizer,
+    read_frame,
+)
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import (
     LINGER_S,
@@ -333,7 +338,7 @@ def _check_detections(parameters: RelocalizerParameters, localizer: FrameLocaliz
         misspelt = misspelt_classes(localizer.landmark_map.class_ids)
         if names := ', '.join(f"'{name}'{hint}" for name, hint in misspelt.items()
                               if name not in found.class_ids):
-            text += f'; classes of the map: {names}'
+            text += f'; the map has the class {names}'
     report.add('detector', State.PASS, text)
 
 
@@ -346,14 +351,12 @@ def _check_depth(frame: Frame, state: RobotState, parameters: RelocalizerParamet
                           f'{parameters.depth_tolerance_s:g} s: remap depth, start its publisher, '
                           'or set depth_transport to none')
     with report.failing(what):
-        height, width = image_from_msg(frame.image).shape[:2]
-        camera = camera_from_msg(frame.camera_info, (width, height), parameters.rectified)
-        boxes = detections_from_msg(frame.detections).usable(
-            width, height, parameters.max_detections).bboxes_xyxy
-        depths_m = depths_from_msg(frame.depth, frame.image.header.frame_id, camera, boxes,
-                                   frame.depth_camera_info, state.camera_from_depth)
+        _, camera, detections = read_frame(frame, parameters)
+        depths_m = depths_from_msg(
+            frame.depth, frame.image.header.frame_id, camera, detections.bboxes_xyxy,
+            frame.depth_camera_info, state.camera_from_depth)
         known_m = depths_m[np.isfinite(depths_m)]
-        report.add(what, State.PASS, f'of {len(known_m)} of {len(boxes)} boxes' + (
+        report.add(what, State.PASS, f'of {len(known_m)} of {len(depths_m)} boxes' + (
             f', {known_m.min():.1f} to {known_m.max():.1f} m' if len(known_m) else ''))
 
 

@@ -42,7 +42,7 @@ from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.occupancy_grid import OccupancyGrid, read_occupancy_grid
 from cliploc_ros.core.map.similarities import Similarities, split_similarities
-from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization, in_its_map
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -301,12 +301,7 @@ class FrameLocalizer:
     def _observed(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
                   by_odometry: bool) -> tuple[NDArray[np.uint8], Observation]:
         """Return the image of a frame, and what was detected in it, without crops."""
-        image = image_from_msg(frame.image)
-        height, width = image.shape[:2]
-        camera = camera_from_msg(frame.camera_info, (width, height), parameters.rectified)
-        detections = detections_from_msg(
-            frame.detections, parse_class_map(parameters.class_map)).usable(
-                width, height, parameters.max_detections)
+        image, camera, detections = read_frame(frame, parameters)
         place, odom_from_camera = state.place, None
         if not by_odometry:
             odom_from_camera = invert_transform(state.camera_from_base)
@@ -422,6 +417,16 @@ def load_localizer(node: Node, parameters: RelocalizerParameters) -> FrameLocali
     return FrameLocalizer(landmark_map, observer, relocalizer, options, device, map_hash,
                           load_keyframes(parameters, landmark_map),
                           load_grid(parameters, landmark_map))
+
+
+def read_frame(frame: Frame, parameters: RelocalizerParameters
+               ) -> tuple[NDArray[np.uint8], Camera, Detections]:
+    """Return image, camera and usable detections of a frame; CliplocError: one is invalid."""
+    image = image_from_msg(frame.image)
+    height, width = image.shape[:2]
+    camera = camera_from_msg(frame.camera_info, (width, height), parameters.rectified)
+    detections = detections_from_msg(frame.detections, parse_class_map(parameters.class_map))
+    return image, camera, detections.usable(width, height, parameters.max_detections)
 
 
 def _in_its_map(found: Relocalization, landmark_map: LandmarkMap, seen: Observation

@@ -91,10 +91,11 @@ class Desk:
             self._look(person, name)
 
     def show_mode(self, person: str, mode: str) -> None:
-        """Take the mode of a person's page, '' for a closed one; coverage is for the mode test."""
-        self._modes[person] = mode
-        if not mode:
-            del self._modes[person]
+        """Take the mode of a person's page, '' once it is closed; only test shows coverage."""
+        if mode:
+            self._modes[person] = mode
+        else:
+            self._modes.pop(person, None)
         self.places.set_wanted('test' in self._modes.values())
 
     def _do_slowly(self, name: str) -> None:
@@ -380,9 +381,11 @@ def _numbers(message: Message, name: str, count: int) -> NDArray[np.float64]:
     return values
 
 
-def _texts(message: Message, name: str) -> list[str]:
-    """Return texts of a message, none where it lacks them; EditError: they are no list."""
-    values = message.get(name, [])
+def _texts(message: Message, name: str) -> list[str] | None:
+    """Return texts of a message, None where it lacks them; EditError: they are no list."""
+    values = message.get(name)
+    if values is None:
+        return None
     if not isinstance(values, list):
         raise EditError(f'{name}: {values!r:.60} is no list')
     return list(map(str, values))

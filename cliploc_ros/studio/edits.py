@@ -87,7 +87,7 @@ def change_from_json(tree: Any, looks: Mapping[str, Look]) -> Change:
     try:
         what = tree['what']
         before, after = ({key: None if one is None else
-                          Landmark(dict(one['fields']), Marks.from_json(one['marks']),
+                          Landmark(dict(one['fields']), Marks.from_json(one.get('marks')),
                                    looks.get(str(one.get('look'))))
                           for key, one in tree[side].items()} for side in ('before', 'after'))
     except (KeyError, TypeError, AttributeError) as error:
@@ -176,8 +176,8 @@ def delete(landmarks: Landmarks, landmark_ids: Iterable[str]) -> Change:
 
 def mark(landmarks: Landmarks, landmark_ids: Iterable[str], what: str, **marks: Any) -> Change:
     """Set marks of landmarks, locked ones included."""
-    after = {key: replace(one, marks=replace(one.marks, **marks))
-             for key in landmark_ids if (one := _get(landmarks, key))}
+    chosen = {key: _get(landmarks, key) for key in landmark_ids}
+    after = {key: replace(one, marks=replace(one.marks, **marks)) for key, one in chosen.items()}
     return _change_of(f'{what} {", ".join(after)}'[:80], landmarks, after)
 
 

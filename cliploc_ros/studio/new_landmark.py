@@ -25,7 +25,7 @@ _DEPTHS_M = np.geomspace(0.4, 12.0, 24)
 _SAME_IOU = 0.5
 # A view of the next box is this far from those of the other ones, if there is one [deg].
 _GOOD_ANGLE_DEG = 45.0
-# A person who asks once more saw no object there: the next view is this far from it [deg].
+# Asking again means that the last view did not help: views this near to it are skipped [deg].
 _OTHER_ANGLE_DEG = 10.0
 
 

@@ -14,15 +14,13 @@ from cliploc_ros.mapping.check.landmark_faults import (
     check_landmarks,
     find_map_overlaps,
 )
+from cliploc_ros.mapping.check.report import SERIOUS
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.edits import EditError
 from cliploc_ros.studio.landmark import map_of
 from cliploc_ros.studio.recording import Recording
-
-#: Faults from here on are serious.
-SERIOUS = 1.0
 
 
 class Review:
@@ -62,7 +60,7 @@ class Review:
 
     def counts(self) -> dict[str, int]:
         """Return the number of landmarks in the queue, 0 before it, and of each decision."""
-        found = [self.decision(key) for key in self.order if self._order]
+        found = [self.decision(key) for key in self.order] if self._order else []
         return {'total': len(found), **{name: found.count(name)
                                         for name in ('accepted', 'fixed', 'deleted')}}
 
@@ -71,10 +69,11 @@ class Review:
     def check(self) -> str:
         """Judge all landmarks; once more after a complete review, a new one begins."""
         self._judge()
-        landmarks = self._document.landmarks
-        begins_anew = self._order and all(self.decision(key) for key in landmarks)
-        if begins_anew:
-            self._document.apply(edits.mark(landmarks, landmarks, 'review', decision=''))
+        with self._document.lock:
+            landmarks = self._document.landmarks
+            begins_anew = self._order and all(self.decision(key) for key in landmarks)
+            if begins_anew:
+                self._document.apply(edits.mark(landmarks, landmarks, 'review', decision=''))
         self._order = tuple(self._checks)
         serious = sum(one.severity >= SERIOUS for one in self._checks.values())
         source = '' if self.has_boxes else ' by the map alone: there are no boxes of a recording'

@@ -173,24 +173,26 @@ class Studio:
         self.document.apply(edits.delete(self.document.landmarks, ids))
         return f'deleted {", ".join(ids)}'
 
-    def toggle_lock(self, landmark_ids: Sequence[str] = ()) -> str:
+    def toggle_lock(self, landmark_ids: Sequence[str] | None = None) -> str:
         """Lock landmarks, by default the selection; unlock them if all are locked."""
-        ids, landmarks = self._known(landmark_ids), self.document.landmarks
-        are_locked = all(landmarks[key].marks.is_locked for key in ids)
-        self.document.apply(edits.mark(landmarks, ids, 'unlock' if are_locked else 'lock',
-                                       is_locked=not are_locked))
-        return f'{"unlocked" if are_locked else "locked"} {", ".join(ids)}'
+        return self._toggle(landmark_ids, 'is_locked', ('lock', 'locked'), ('unlock', 'unlocked'))
 
-    def toggle_hidden(self, landmark_ids: Sequence[str] = ()) -> str:
+    def toggle_hidden(self, landmark_ids: Sequence[str] | None = None) -> str:
         """Hide landmarks, by default the selection; show them if all are hidden."""
-        ids, landmarks = self._known(landmark_ids), self.document.landmarks
-        are_hidden = all(landmarks[key].marks.is_hidden for key in ids)
-        self.document.apply(edits.mark(landmarks, ids, 'show' if are_hidden else 'hide',
-                                       is_hidden=not are_hidden))
-        return f'{"showed" if are_hidden else "hid"} {", ".join(ids)}'
+        return self._toggle(landmark_ids, 'is_hidden', ('hide', 'hid'), ('show', 'showed'))
 
-    def _known(self, landmark_ids: Sequence[str]) -> Sequence[str]:
-        return [key for key in landmark_ids if key in self.document.landmarks] or self._selected()
+    def _toggle(self, landmark_ids: Sequence[str] | None, name: str, on: tuple[str, str],
+                off: tuple[str, str]) -> str:
+        """Set a mark, or clear it where all have it; a verb and its past for each."""
+        ids, landmarks = landmark_ids, self.document.landmarks
+        if ids is None:
+            ids = self._selected()
+        if not ids:
+            raise EditError('name a landmark, or select one')
+        have_it = all(getattr(landmarks[key].marks, name) for key in ids if key in landmarks)
+        verb, past = off if have_it else on
+        self.document.apply(edits.mark(landmarks, ids, verb, **{name: not have_it}))
+        return f'{past} {", ".join(ids)}'
 
     def split(self) -> str:
         """Split the selected landmark along its longest axis, and select both halves."""

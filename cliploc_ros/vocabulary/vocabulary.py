@@ -5,7 +5,7 @@
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
@@ -28,8 +28,10 @@ _A_BEFORE_VOWEL = re.compile(r'\b(a)(?= (?:[aeio]|u(?!ni|se)))', re.IGNORECASE)
 Rules = Mapping[str, Sequence[str]]
 _FOLDER = Path(__file__).parent
 _GENERAL = 'general'
-# Of the letters of a class, taken for another one that is misspelt. A guess: book and bokk.
+# Share of the letters that a misspelt class has in common with the right one. A guess: bokk, book.
 _ALIKE = 0.75
+# More pairs of classes take seconds to compare.
+_MOST_PAIRS = 100_000
 
 
 def expand_phrases(rules: Rules) -> tuple[str, ...]:
@@ -126,16 +128,20 @@ def shipped_classes() -> tuple[str, ...]:
     return tuple(_shipped('coco.yaml'))
 
 
-def misspelt_classes(class_ids: Sequence[str]) -> dict[str, str]:
+def misspelt_classes(class_ids: Sequence[str], of_detector: Iterable[str] | None = None
+                     ) -> dict[str, str]:
     """Return the classes of a map that look misspelt, each with a hint of the right one.
 
-    A class of one landmark that the shipped vocabulary lacks, and that is nearly one of those or
-    of several landmarks.
+    They are unknown, and nearly a known one. Without the classes of the detector, those of the
+    shipped vocabulary and of several landmarks are known. With too many classes, none is returned.
     """
     counts = Counter(class_ids)
-    known = {*shipped_classes(), *(name for name, count in counts.items() if count > 1)}
-    return {name: hint for name in counts
-            if name not in known and (hint := did_you_mean(name, known, alike=_ALIKE))}
+    known = {*of_detector} if of_detector is not None else {
+        *shipped_classes(), *(name for name, count in counts.items() if count > 1)}
+    unknown = [name for name in counts if name not in known]
+    if len(unknown) * len(known) > _MOST_PAIRS:
+        return {}
+    return {name: hint for name in unknown if (hint := did_you_mean(name, known, alike=_ALIKE))}
 
 
 def shipped_phrases(name: str) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ import yaml
 
 from cliploc_ros.cli.evaluate import main
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
+from cliploc_ros.datasets.map_recording import MapRecording, save_recording
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.datasets.tum import read_tum_trajectory
 from cliploc_ros.evaluation.methods import PAPER_METHODS
@@ -276,6 +277,19 @@ def test_detector_and_clip_run_once(walk, evaluated_bag, evaluate_here, caplog):
     assert done.returncode == 0
     assert 'recording again' in caplog.text
     assert results_of(walk / 'again') == results_of(walk / 'once_more')
+
+
+def test_a_map_of_the_same_images_is_noted(walk, evaluated_bag, evaluate_here):
+    own = walk / 'own.yaml'
+    shutil.copy(ASSETS / 'map.yaml', own)
+    cache, = walk.glob('bag.cliploc-*.npz')
+    given = ('--no-clip', '--model', ASSETS / 'yolo.pt', '--map', own, '--methods', 'class_bf',
+             '--trials', 1, '--no-figures')
+    for source, is_noted in (('bag', True), ('tum', False)):
+        save_recording(own, MapRecording(cache, walk / source))
+        done = evaluate_here('--bag', walk / 'bag', *given, '--out', walk / f'on_{source}')
+        assert done.returncode == 0, done.stderr
+        assert ('was built from these images' in done.stdout) is is_noted
 
 
 def test_no_ros_is_needed(files, tmp_path):

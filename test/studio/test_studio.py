@@ -295,7 +295,8 @@ def test_the_page_is_for_this_machine_only(tmp_path):
     ({'do': 'edit'}, "'edit' lacks 'field'"), ({'do': 'edit', 'field': 'label'}, "lacks 'value'"),
     ({'do': 'edit', 'field': [], 'value': [0, 0, 0]}, 'no field'),
     ({'do': 'create', 'label': ''}, "lacks 'class_id'"), ({'do': 'select'}, "lacks 'id'"),
-    ({'do': 'hide', 'ids': 3}, 'ids: 3 is no list'),
+    ({'do': 'hide', 'ids': 3}, 'ids: 3 is no list'), ({'do': 'hide', 'ids': []}, 'name a landm'),
+    ({'do': 'lock', 'ids': ['gone']}, "no landmark 'gone'"), ({'do': 'lock'}, 'locked mug_1'),
     ({'do': 'hide', 'ids': ['mug_2']}, 'hid mug_2'),
     ({'do': 'edit', 'field': 'class_id', 'value': 'cup'}, "mug_1: class 'cup'")])
 def test_the_log_answers_a_message_of_the_page(studio, message, answer, caplog):

@@ -4,6 +4,7 @@
 
 import importlib.util
 import re
+import time
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from cliploc_ros.vocabulary.vocabulary import (
     MOST_PHRASES,
     expand_phrases,
     load_vocabulary,
+    misspelt_classes,
     shipped_classes,
 )
 
@@ -154,3 +156,14 @@ def test_each_shipped_class_has_phrases_and_a_users_come_first(tmp_path):
     counts = [len(vocabulary.phrases(name)) for name in shipped_classes()]
     assert len(counts) == 80
     assert all(0 < count < MOST_PHRASES for count in counts)
+
+
+def test_classes_that_look_misspelt_have_a_hint():
+    assert misspelt_classes(['bokk', 'book', 'zebu', 'zebu']) == {
+        'bokk': " (did you mean 'book'?)"}
+    assert misspelt_classes(['forklft', 'cart'], ['forklift', 'cart']) == {
+        'forklft': " (did you mean 'forklift'?)"}
+    assert misspelt_classes([]) == {}
+    started = time.monotonic()
+    assert misspelt_classes([f'thing {number}' for number in range(100_000)]) == {}
+    assert time.monotonic() - started < 10.0

@@ -129,10 +129,11 @@ def _on_spans(report: CheckReport) -> Iterator[Advice]:
     for run in refused_spans(report.recording.trials):
         if len(run) < _MIN_SPAN:
             continue
-        if same := [side for side in sides if _is_one_side(side[0], run)]:
-            same[0].append(run)
-        else:
+        same = next((side for side in sides if _is_one_side(side[0], run)), None)
+        if same is None:
             sides.append([run])
+        else:
+            same.append(run)
     for side in sides[:_MOST_OF_A_KIND]:
         run = side[0]
         seen, halfway = int(np.median([one.landmarks for one in run])), run[len(run) // 2]

@@ -3,7 +3,7 @@
 """Each landmark of a map: how well a recording supports it, and its faults."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import did_you_mean
 from cliploc_ros.mapping.association import associate, close_pairs, seen_apart
 from cliploc_ros.mapping.evidence import Evidence, gather_evidence
 from cliploc_ros.mapping.fitting import fit_landmarks
@@ -26,6 +25,8 @@ from cliploc_ros.vocabulary.vocabulary import misspelt_classes
 # object, unless they are farther apart than the second distance and frames show both at once.
 # Guesses: build_map merges below 0.8 if the boxes agree.
 _OVERLAP_DISTANCE, _SAME_PLACE_DISTANCE = 0.5, 0.3
+# A class has so many words at most to be looked for in labels.
+_MOST_WORDS = 3
 # A thinner landmark was seen from one side, or is a sheet: boxes tell little of its position.
 _MIN_THINNESS = 0.05
 # A landmark is missing if this number of frames should show it and none does.
@@ -123,10 +124,8 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
         partners[one.first].append((one.second, one))
         partners[one.second].append((one.first, one))
     supports = [one.support for one in landmark_map.details]
-    # without a recording, a class may be a detector's that is not known here
-    misspelt = misspelt_classes(classes) if witness is None else {
-        name: did_you_mean(name, witness.class_names)
-        for name in {*classes} - {*witness.class_names}}
+    misspelt = misspelt_classes(classes, None if witness is None else witness.class_names)
+    by_words = {tuple(_words(name)): name for name in sorted(set(classes), reverse=True)}
     weights = np.array(supports if all(supports) else [], dtype=np.float64)
     checks = []
     for row, others in enumerate(partners):
@@ -139,10 +138,10 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
             overlaps=tuple((ids[other], one.distance) for other, one in others))
         faults = [(1.5, f'is the same object as {ids[other]}: delete one of them')
                   for other, one in others if one.is_duplicate]
-        if (hint := misspelt.get(classes[row])) and witness is None:
-            faults.append((1.0, f"may have a misspelt class: '{classes[row]}'{hint}"))
-        elif hint:
-            faults.append((1.6, f"has the class '{classes[row]}', which the detector does not "
+        if hint := misspelt.get(classes[row]):
+            faults.append((1.0, f"may have a misspelt class: '{classes[row]}'{hint}")
+                          if witness is None else
+                          (1.6, f"has the class '{classes[row]}', which the detector does not "
                                 f'have{hint}: correct its class_id'))
         if not faults:
             faults += _support_faults(check, float(np.linalg.norm(semi_axes)), options)
@@ -152,7 +151,7 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
         if check.thinness < _MIN_THINNESS:
             faults.append((0.3, f'is a sheet: its axes have the ratio {check.thinness:.3f}; '
                                 'record it from another side, or give it thickness'))
-        if other := _class_of_label(check.label, check.class_id, classes):
+        if other := _class_of_label(check.label, check.class_id, by_words):
             faults.append((0.6, f"is labelled '{check.label:.60}', a {other} by that, and has the "
                                 f'class {check.class_id}: correct the wrong one'))
         faults.sort(key=lambda one: -one[0])
@@ -164,14 +163,27 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
         -one.severity, 1.0 if one.seen_ratio is None else one.seen_ratio))
 
 
-def _class_of_label(label: str, class_id: str, classes: Iterable[str]) -> str | None:
-    """Return the class that a label names, if it is another one and the label names no other."""
-    def is_named(text: str) -> bool:
-        return re.search(rf'\b{re.escape(text.casefold())}(e?s)?\b', label.casefold()) is not None
+def _words(text: str) -> list[str]:
+    return re.findall(r'\w+', text.casefold())
 
-    if any(word.casefold() in label.casefold() for word in class_id.split()):
+
+def _class_of_label(label: str, class_id: str, by_words: Mapping[tuple[str, ...], str]
+                    ) -> str | None:
+    """Return a class that a label names, in singular or plural, unless it names its own, too.
+
+    `by_words` has the classes of the map by their words.
+    """
+    if any(word in label.casefold() for word in _words(class_id)):
         return None
-    return next((one for one in sorted(set(classes)) if is_named(one)), None)
+    words = _words(label)
+    for start in range(len(words)):
+        for end in range(start + 1, min(start + _MOST_WORDS, len(words)) + 1):
+            *first, last = words[start:end]
+            for ending in ('', 's', 'es'):
+                if last.endswith(ending) and (
+                        other := by_words.get((*first, last.removesuffix(ending)))):
+                    return other
+    return None
 
 
 def _support(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> dict[str, Any]:

@@ -77,10 +77,11 @@ const note = text => text ? el('p', {className: 'note'}, text) : null;
 
 // A text or numbers; what a person types is left alone until it is sent. Numbers are shown rounded,
 // and those that are not typed stay as exact as they were.
-function field(name, values, apply, {isText = false, isOff = false, list = '', of = ''} = {}) {
-  const shown = values.map(value => isText ? value : String(Number(value.toFixed(name === 'Angles' ? 1 : 3))));
+function field(name, values, apply, {isText = false, isOff = false, digits = 3, list = '', of = ''} = {}) {
+  const shown = values.map(value => isText ? value : String(Number(value.toFixed(digits))));
   const inputs = values.map((value, place) => el('input', {
-    type: isText ? 'text' : 'number', step: 'any', value: shown[place], title: value, disabled: isOff, 'data-of': of,
+    type: isText ? 'text' : 'number', step: 'any', value: shown[place], title: value,
+    disabled: isOff, 'data-of': of,
     'aria-label': name + (values.length > 1 ? ` ${'xyz'[place]}` : ''),
     onchange: () => apply(isText ? inputs[0].value : inputs.map(
       (one, row) => one.value === shown[row] ? values[row] : Number(one.value))),
@@ -211,7 +212,7 @@ function showCard() {
     field('Class', [one.class_id], set('class_id'), {isText: true, list: 'classes', ...off}),
     ...(mode !== 'edit' ? [] : [
       field('Position', one.center, set('center'), off),
-      field('Angles', one.angles, set('angles'), off),
+      field('Angles', one.angles, set('angles'), {...off, digits: 1}),
       field('Semi-axes', one.semi_axes, set('semi_axes'), off)])]);
 }
 
@@ -565,7 +566,11 @@ for (const one of document.querySelectorAll('[data-icon]')) {
 for (const one of document.querySelectorAll('[data-do]')) {
   one.addEventListener('click', () => { send(one.dataset.do); $('menu').open = false; });
 }
-$('show_all').onclick = () => { send('hide', {ids: state.rows.filter(row => row[4]).map(row => row[0])}); $('menu').open = false; };
+$('show_all').onclick = () => {
+  const hidden = state.rows.filter(row => row[4]).map(row => row[0]);
+  if (hidden.length) send('hide', {ids: hidden});
+  $('menu').open = false;
+};
 $('help').onclick = () => { $('menu').open = false; showKeys(); };
 $('keys').onclick = () => $('keys').close();
 $('find').oninput = showRows;
