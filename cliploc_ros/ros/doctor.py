@@ -356,8 +356,10 @@ def _check_depth(frame: Frame, state: RobotState, parameters: RelocalizerParamet
             frame.depth, frame.image.header.frame_id, camera, detections.bboxes_xyxy,
             frame.depth_camera_info, state.camera_from_depth)
         known_m = depths_m[np.isfinite(depths_m)]
-        report.add(what, State.PASS, f'of {len(known_m)} of {len(depths_m)} boxes' + (
-            f', {known_m.min():.1f} to {known_m.max():.1f} m' if len(known_m) else ''))
+        if not len(known_m):
+            return report.skip(what, f'none of {len(depths_m)} boxes has depth')
+        report.add(what, State.PASS, f'of {len(known_m)} of {len(depths_m)} boxes, '
+                                     f'{known_m.min():.1f} to {known_m.max():.1f} m')
 
 
 def _check_request(node: Doctor, parameters: RelocalizerParameters,

@@ -100,13 +100,17 @@ def test_compressed_depth(own_relocalizer, depth_camera):
     ask_until(depth_camera, compressed(make_frame(), depth_image()), ', depth of 12 objects')
 
 
-def test_the_doctor_looks_at_depth(own_relocalizer, depth_camera, start):
+@pytest.mark.parametrize(('depths', 'encoding', 'said'), [
+    (depth_image(), '16UC1', r'pass +of 12 of 12 boxes, \d\.\d to \d\.\d m'),
+    (0.0 * depth_image(), '16UC1', 'not checked +none of 12 boxes has depth'),
+    (np.nan * depth_image(), '32FC1', 'not checked +none of 12 boxes has depth'),
+    (depth_image()[:, ::2], '16UC1', 'fail +depth has 320x480 px, the image 640x480.*')])
+def test_the_doctor_looks_at_depth(own_relocalizer, depth_camera, start, depths, encoding, said):
     own_relocalizer(depth_transport='raw')
     doctor = start('cli.doctor', '--relocalizer', '/relocalizer', '--timeout', 4)
     while doctor.alive:
-        depth_camera(message(make_frame(), depth_image()))
-    assert re.search(r'^depth +pass +of 12 of 12 boxes, \d\.\d to \d\.\d m$', doctor.output(),
-                     re.MULTILINE)
+        depth_camera(message(make_frame(), depths, encoding))
+    assert re.search(f'^depth +{said}$', doctor.output(), re.MULTILINE), doctor.output()
 
 
 @pytest.mark.parametrize(('given', 'said'), [
