@@ -9,6 +9,7 @@ import re
 import select
 import signal
 import sys
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import metadata
@@ -19,6 +20,8 @@ from cliploc_ros.errors import CliplocError, OptionsError
 
 #: The shell's exit code of a command that Ctrl-C ended.
 EXIT_INTERRUPTED = 130
+# poll() counts milliseconds in 32 bits.
+_LONGEST_WAIT_S = 2e6
 
 
 def run_main(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int],
@@ -207,12 +210,13 @@ class Interruption:
 
     Not a threading.Event: a signal may come while its thread holds the lock of the event, in a
     wait or in the handler of another signal, and the handler would wait for that lock for ever.
-    It lasts as long as its process.
+    While it catches signals, it lasts as long as its process.
     """
 
     def __init__(self) -> None:
         self._happened = False
         self._descriptor = os.eventfd(0, os.EFD_CLOEXEC)
+        weakref.finalize(self, os.close, self._descriptor)
 
     def catch(self, *numbers: signal.Signals) -> None:
         """Set the flag on these signals from now on."""
@@ -230,7 +234,9 @@ class Interruption:
 
     def wait(self, timeout_s: float) -> bool:
         """Wait until the flag is set, or until the time-out; return whether it is set."""
-        select.select([self._descriptor], [], [], max(0.0, timeout_s))
+        poll = select.poll()  # select() takes no descriptor above 1023
+        poll.register(self._descriptor, select.POLLIN)
+        poll.poll(1e3 * min(max(0.0, timeout_s), _LONGEST_WAIT_S))
         return self._happened
 
 

@@ -2,15 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """A flag that signals set, at any moment."""
 
+import os
+import resource
 import signal
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
 from cliploc_ros.command import Interruption
 
 ALARMS = 300
+OPEN = Path('/proc/self/fd')
 
 
 @pytest.fixture
@@ -43,6 +47,24 @@ def test_a_wait_ends_with_the_signal_or_with_its_time(alarm):
     assert interruption.wait(60.0)
     assert interruption.wait(60.0)
     assert time.monotonic() - start < 30.0
+
+
+def test_a_process_with_many_files_waits_and_drops_its_own():
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, 2048), hard))
+    many = [os.dup(0) for _ in range(1100)]
+    try:
+        interruption = Interruption()
+        assert not interruption.wait(0.01)
+        interruption.set()
+        assert interruption.wait(1e12)
+        count = len([*OPEN.iterdir()])
+        del interruption
+        assert len([*OPEN.iterdir()]) == count - 1
+    finally:
+        for descriptor in many:
+            os.close(descriptor)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_another_thread_may_set_it():
