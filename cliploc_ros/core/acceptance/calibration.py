@@ -68,6 +68,7 @@ class Places(NamedTuple):
 
     likeness: float
     unlabelled: float
+    turned: float
 
 
 class Prior(NamedTuple):

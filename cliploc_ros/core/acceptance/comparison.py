@@ -32,7 +32,7 @@ from cliploc_ros.core.acceptance.contenders import (
     unrefined,
 )
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, compare_motion, signs_of
-from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
+from cliploc_ros.core.acceptance.look_alikes import find_twins, lead_over_twin, turned_about_axis
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.mirror import chance_not_mirrored
 from cliploc_ros.core.acceptance.prior import walls_against
@@ -45,7 +45,7 @@ from cliploc_ros.core.fit.finalists import (
     matches_of,
     meetings_of,
 )
-from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER
+from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, SAME_PLACE
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.map.joined_map import Place, place_of
@@ -337,23 +337,34 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
     twin apart as far as they cover it.
     """
     best, (low, high) = compared.contenders[0], joined.options.height_range_m
-    matched = np.array(sorted({one.landmark for found in best.matches for one in found}),
-                       dtype=np.int64)
-    found, are_rooms = find_twins(joined.landmark_map, best.pose, matched,
+    twins, are_rooms = find_twins(joined.landmark_map, best.pose, best.landmarks,
                                   compared.poses[~compared.leading])
+    turned = turned_about_axis(joined.landmark_map, best.pose, best.landmarks)
+    found = np.concatenate([twins, turned])
+    is_turn, is_room = np.arange(len(found)) >= len(twins), np.zeros(len(found), dtype=np.bool_)
+    is_room[:len(twins)] = are_rooms
     inside = (low <= found[:, 2, 3]) & (found[:, 2, 3] <= high)
-    twins = [refined(joined, unrefined(pose)) for pose in found[inside]]
-    poses = np.array([best.pose, *(one.map_from_camera for one in twins)])
-    # a twin that refinement moved back to the leading pose is no other place
-    others = np.nonzero(~SAME_ANSWER.agreeing(poses)[0])[0]
+    places = [refined(joined, unrefined(pose)) for pose in found[inside]]
+    poses = np.array([best.pose, *(one.map_from_camera for one in places)])
+    # a place that refinement moved back to the leading pose is no other one
+    others = _first_of_each(poses, ~SAME_ANSWER.agreeing(poses)[0])
     if len(others) == 0:
         return 1.0, None
-    supports = supports_of(joined, poses[others],
-                           [matches_of(joined.rig, twins[row - 1]) for row in others])
-    leads = best.prior - joined.prior_odds(poses[others]) + _leads_of_points(
-        compared, poses[others], are_rooms[inside][others - 1], recognizer)
-    chance, likeliest = chance_distinct(best.support, supports, leads)
-    return chance, place_of(joined.landmark_map, poses[others][likeliest])
+    is_turn, is_room = is_turn[inside][others - 1], is_room[inside][others - 1]
+    rivals = contenders_of(joined, [places[row - 1] for row in others], [True] * len(others))
+    leads = best.prior - np.array([one.prior for one in rivals]) + _leads_of_points(
+        compared, poses[others], is_room, recognizer)
+    leads += [CALIBRATION.places.turned * (best.odds - one.odds) if is_turned
+              else lead_over_twin(best.support, one.support)
+              for one, is_turned in zip(rivals, is_turn, strict=True)]
+    chance = float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum()))
+    return chance, place_of(joined.landmark_map, poses[others][int(np.argmin(leads))])
+
+
+def _first_of_each(poses: NDArray[np.float64], eligible: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the eligible rows of poses (m, 4, 4) at whose place no such row is before them."""
+    agreeing = SAME_PLACE.agreeing(poses) & eligible
+    return np.nonzero(eligible & ~np.tril(agreeing, -1).any(axis=1))[0]
 
 
 def _leads_of_points(compared: Comparison, twins: NDArray[np.float64],

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.support import Support
@@ -40,6 +41,12 @@ _NEAR_M = (0.6, 0.45, 0.3)
 # The share was chosen between a desk of 39 landmarks (TUM fr3) that repeats .36 of them by chance,
 # and two halls (seeds 1004 and 1006) that mislead and repeat .39 and .38.
 _LEAST_LANDMARKS, _LEAST_SHARE, _LEAST_MATCHED = 4, 0.38, 0.4
+# Of the objects of a pose, the share that a twin explains: below the first number the places differ,
+# above the second number they are alike.
+_ALIKE = (0.4, 0.55)
+# The share of the matched landmarks that must lie on an axis, and turns about it [rad].
+_LEAST_ON_AXIS, _TURNS = 0.5, np.radians([45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0])
+_UP = np.array([0.0, 0.0, 1.0])
 # The most twins of a pose, and poses of the search whose places are compared.
 _TWINS, _OTHERS = 3, 5
 _NOBODY, _NOWHERE = np.empty(0, dtype=np.int64), np.empty((0, 4, 4))
@@ -135,18 +142,61 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
     return alike.moves @ map_from_camera, alike.are_rooms
 
 
-def chance_distinct(its: Support, twins: Sequence[Support], leads: NDArray[np.float64]
-                    ) -> tuple[float, int]:
-    """Return the probability that a pose is not mistaken for one at a place that looks alike.
+def turned_about_axis(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
+                      matched: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return a camera pose turned about an axis that most matched landmarks share (m, 4, 4).
 
-    The second value is the row of the likeliest of the m poses at such places, one at least, whose
-    supports the twins are. Leads (m,) are the log odds by which keyframes prefer the pose to each.
+    Landmarks on one axis fix all but the turn about it: the camera sees the same from all around.
+    The axis is upright, through one of the landmarks, or fitted to all. There is no such pose
+    where fewer than half of the landmarks reach to either axis.
+
+    Parameters
+    ----------
+    map_from_camera : ndarray (4, 4)
+    matched : ndarray (n,) of int
+        Landmarks that the pose explains detections with.
+    """
+    if len(matched) < 2:
+        return _NOWHERE
+    centers, radii = landmark_map.centers[matched], landmark_map.semi_axes[matched].mean(axis=1)
+    middle = centers.mean(axis=0)
+    line = np.linalg.svd(centers - middle)[2][0]
+    found = []
+    for axis, points in ((_UP, centers), (line, middle[None])):
+        offsets = centers - points[:, None]
+        offsets -= (offsets @ axis)[..., None] * axis
+        share = np.linalg.norm(offsets, axis=2) <= radii
+        best = int(np.argmax(share.sum(axis=1)))
+        if share[best].mean() >= _LEAST_ON_AXIS:
+            turns = Rotation.from_rotvec(_TURNS[:, None] * axis).as_matrix()
+            moves = np.tile(np.eye(4), (len(turns), 1, 1))
+            moves[:, :3, :3] = turns
+            moves[:, :3, 3] = points[best] - turns @ points[best]
+            found.append(moves @ map_from_camera)
+    return np.concatenate(found) if found else _NOWHERE
+
+
+def lead_over_twin(its: Support, twin: Support) -> float:
+    """Return the log odds of a pose against a twin, by the objects.
+
+    Labels tell objects apart that both poses explain. An object that one of them lacks says as
+    much as its label, as long as both places share few objects. Where they share most of them, the
+    place is out of date or the other one was furnished like it: then all labels are alike, and
+    the object says little.
     """
     terms = CALIBRATION.places
-    leads = leads + [terms.likeness * (its.likeness - one.likeness)
-                     + terms.unlabelled * (its.unlabelled - one.unlabelled) for one in twins]
-    return (float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum())),
-            int(np.argmin(leads)))
+    common = its.shown.keys() & twin.shown.keys()
+    explained = sum(float(row[0]) for row in its.shown.values())
+    share = sum(float(its.shown[one][0]) for one in common) / max(explained, 1e-9)
+    alike = float(np.clip((share - _ALIKE[0]) / (_ALIKE[1] - _ALIKE[0]), 0.0, 1.0))
+    lead = 0.0
+    for sign, mine in ((1.0, its.shown), (-1.0, twin.shown)):
+        for one, row in mine.items():
+            own = terms.likeness * row[3] + terms.unlabelled * row[5]
+            further = own if one in common else \
+                (1.0 - alike) * own + alike * min(own, terms.unlabelled * row[0])
+            lead += sign * further
+    return lead
 
 
 def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray[np.float64]:
