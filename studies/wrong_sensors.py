@@ -184,8 +184,9 @@ CONVENTIONS: tuple[Callable[..., tuple[NDArray[np.float64], NDArray[np.float64]]
     lambda low, high, size: (low, high - low),  # corner and sides
     lambda low, high, size: (low / size, high / size),  # shares of the image
     lambda low, high, size: (low[:, ::-1], high[:, ::-1]),  # rows before columns
-    lambda low, high, size: (low - 0.5 * high, low + 0.5 * high),  # corners taken for centre, sides
-    lambda low, high, size: (low, low + high))  # corners taken for corner, sides
+    # corners taken for centre and sides, and for corner and sides
+    lambda low, high, size: (low - 0.5 * high, low + 0.5 * high),
+    lambda low, high, size: (low, low + high))
 
 
 def of_convention(queries: Sequence[Query], number: float) -> tuple[Query, ...]:

@@ -48,7 +48,7 @@ from studies.acceptance.searches import (
     make_search,
     tasks_of,
 )
-from studies.acceptance.troubles import CURVES, FAMILIES, TROUBLES, exchange_landmarks
+from studies.acceptance.troubles import BY_LABELS, CURVES, FAMILIES, TROUBLES, exchange_landmarks
 from studies.reports import draw_judged, table
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
@@ -133,24 +133,23 @@ def _families(options: argparse.Namespace) -> None:
     names = [name for name in FAMILIES if any(text in name for text in options.only)]
     if not names:
         raise OptionsError('nothing to test: --only must name a family')
-    recorded = chosen_places(options) if options.queries else []
-    searched = RelocalizerOptions(matching=options.matching)
     tasks = []
     for name in names:
+        searched = RelocalizerOptions(matching=options.matching or (
+            'hybrid' if name in BY_LABELS else 'class'))
         kinds = FAMILIES[name].kinds
         worlds = ceil(options.requests / (_QUERIES * len(kinds)))
+        recorded = chosen_places(options) if options.queries and 'room' in kinds else []
         places = [*recorded, *(Simulated(kind, options.first_seed + number)
-                               for kind in kinds for number in range(worlds))]
-        tasks += [task._replace(seed=task.seed + task.place.seed)
-                  for task in tasks_of(places, searched, [name])]
+                               for number in range(worlds) for kind in kinds)]
+        tasks += tasks_of(places, searched, [name])
         if FAMILIES[name].in_order:
-            few = [*recorded, *(one for one in places if isinstance(one, Simulated)
-                                and one.seed < options.first_seed + ceil(worlds / GROUP_SIZE))]
-            tasks += [task._replace(seed=task.seed + task.place.seed, in_order=True)
+            few = places[:len(recorded) + ceil(worlds / GROUP_SIZE) * len(kinds)]
+            tasks += [task._replace(in_order=options.requests)
                       for task in tasks_of(few, searched, [name])]
+    tasks = [task._replace(seed=task.seed + task.place.seed) for task in tasks]
     found: list[Outcome] = run_all(make_search, tasks, 'searches', options.workers)
-    for by in (('trouble', 'level', 'place', 'mode', 'looks'), ('trouble', 'looks', 'mode'),
-               ('trouble',)):
+    for by in (('trouble', 'level', 'mode', 'looks'), ('trouble', 'place'), ('trouble',)):
         print(false_table(found, by), end='\n\n')
 
 
@@ -248,13 +247,15 @@ def run(arguments: Sequence[str] | None = None) -> int:
                         help='troubles whose name contains one of these')
     families = add('families', _families, 'false accepts where many objects share an error')
     add_arguments(families, first_seed=2000)
+    families.set_defaults(frames='main')
     families.add_argument('--requests', type=positive_int, default=200, metavar='N',
                           help='at each level of a family, in each mode, about (%(default)s)')
     families.add_argument('--quick', dest='requests', action='store_const', const=24,
                           help='few requests')
     families.add_argument('--only', nargs='+', default=[''], metavar='TEXT',
                           help='families whose name contains one of these')
-    families.add_argument('--matching', choices=fit.MATCHINGS, default='class')
+    families.add_argument('--matching', choices=fit.MATCHINGS,
+                          help='(by labels for changed maps, else by classes)')
     priors = add('priors', _priors, 'what regions and walls known before add, right and wrong')
     add_arguments(priors, worlds=20, first_seed=1100)
     robustness = add('robustness', _robustness, 'success and false accepts over growing troubles',

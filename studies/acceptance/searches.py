@@ -47,7 +47,7 @@ class Task(NamedTuple):
     trouble: str = 'none'
     level: float = 0.0
     seed: int = SEED  # of the sensors and of the trouble
-    in_order: bool = False  # all frames, by one localizer
+    in_order: int = 0  # the most frames that one localizer gets in order; 0: the queries, alone
 
 
 class Outcome(NamedTuple):
@@ -78,19 +78,20 @@ def search(task: Task) -> list[Outcome]:
         return []
     trouble = _CHANGES[task.trouble]
     asked = place._replace(is_main=[True] * len(place.frames)) if task.in_order else place
-    landmark_map, queries = trouble.change(
-        place.landmark_map, asked.ask(task.mode, task.seed), task.level,
-        np.random.default_rng(task.seed))
+    queries = asked.ask(task.mode, task.seed)
+    step = ceil(len(queries) / (task.in_order or len(queries)))
+    landmark_map, changed = trouble.change(place.landmark_map, queries[::step], task.level,
+                                           np.random.default_rng(task.seed))
     options = place.options(task.mode, task.options)
     options = replace(options, k=min(options.k, len(landmark_map)))
     outcome = partial(Outcome, task.place.name, task.mode, options.matching, task.trouble,
                       task.level)
     if task.in_order:
-        return _looks(landmark_map, options, queries, outcome)
+        return _looks(landmark_map, options, changed, outcome)
     return [outcome(one.error_m is not None and one.error_m < RIGHT_M, one.accepted,
                     one.confidence, inf if one.error_m is None else one.error_m,
                     inf if one.nees is None else one.nees)
-            for one in run_trial(landmark_map, Method(AUTO, options), 0, queries)]
+            for one in run_trial(landmark_map, Method(AUTO, options), 0, changed)]
 
 
 def _looks(landmark_map: LandmarkMap, options: RelocalizerOptions, queries: Sequence[Query],
