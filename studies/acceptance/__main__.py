@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import closing
 from itertools import product
-from math import ceil
+from math import ceil, inf
 from pathlib import Path
 from typing import Any
 
@@ -133,23 +133,25 @@ def _families(options: argparse.Namespace) -> None:
     names = [name for name in FAMILIES if any(text in name for text in options.only)]
     if not names:
         raise OptionsError('nothing to test: --only must name a family')
+    share = ceil(options.requests / (1 + len(options.queries)))
     tasks = []
     for name in names:
+        family = FAMILIES[name]
         searched = RelocalizerOptions(matching=options.matching or (
-            'hybrid' if name in BY_LABELS else 'class'))
-        kinds = FAMILIES[name].kinds
-        worlds = ceil(options.requests / (_QUERIES * len(kinds)))
-        recorded = chosen_places(options) if options.queries and 'room' in kinds else []
-        places = [*recorded, *(Simulated(kind, options.first_seed + number)
-                               for number in range(worlds) for kind in kinds)]
-        tasks += tasks_of(places, searched, [name])
-        if FAMILIES[name].in_order:
-            few = places[:len(recorded) + ceil(worlds / GROUP_SIZE) * len(kinds)]
-            tasks += [task._replace(in_order=options.requests)
-                      for task in tasks_of(few, searched, [name])]
-    tasks = [task._replace(seed=task.seed + task.place.seed) for task in tasks]
+            'hybrid' if name in BY_LABELS else 'class'), time_budget_s=inf)
+        recorded = chosen_places(options) if options.queries and 'room' in family.kinds else []
+        worlds = [Simulated(kind, options.first_seed + number)
+                  for number in range(ceil(share / (_QUERIES * len(family.kinds))))
+                  for kind in family.kinds]
+        tasks += [task for task in tasks_of([*recorded, *worlds], searched, [name])
+                  if task.mode == ONE or not family.in_order]
+        if family.in_order:
+            few = worlds[:ceil(share / (_QUERIES * GROUP_SIZE))]
+            tasks += [task._replace(in_order=True)
+                      for task in tasks_of([*recorded, *few], searched, [name])]
+    tasks = [task._replace(seed=task.seed + task.place.seed, most=share) for task in tasks]
     found: list[Outcome] = run_all(make_search, tasks, 'searches', options.workers)
-    for by in (('trouble', 'level', 'mode', 'looks'), ('trouble', 'place'), ('trouble',)):
+    for by in (('trouble', 'level', 'mode', 'looks'), ('trouble', 'place'), ('trouble', 'looks')):
         print(false_table(found, by), end='\n\n')
 
 
@@ -247,7 +249,6 @@ def run(arguments: Sequence[str] | None = None) -> int:
                         help='troubles whose name contains one of these')
     families = add('families', _families, 'false accepts where many objects share an error')
     add_arguments(families, first_seed=2000)
-    families.set_defaults(frames='main')
     families.add_argument('--requests', type=positive_int, default=200, metavar='N',
                           help='at each level of a family, in each mode, about (%(default)s)')
     families.add_argument('--quick', dest='requests', action='store_const', const=24,
