@@ -21,6 +21,8 @@ from studies.worlds.things import (
 
 # How far another thing is from one on each axis [m], and from which semi-axis on none is: guesses.
 _ASIDE_M, _LARGE_M = 0.4, 0.5
+# What detectors take a vase with flowers, or a part of it, for.
+_CONFUSED = ('book', 'vase', 'potted plant', 'bottle', 'cup', 'book', 'book')
 
 
 class Place(NamedTuple):
@@ -115,6 +117,44 @@ def two_rooms(rng: np.random.Generator) -> Place:
     return Place(2.0 * one.width + gap, one.depth, [*one.things, *twin, *own[0], *moved])
 
 
+def arrangement(rng: np.random.Generator) -> Place:
+    """Return a room with one table, and things about its axis that are mapped several times.
+
+    A detector takes each for several classes, so that landmarks of these stand in one another.
+    """
+    size = rng.uniform(4.0, 6.0)
+    table, *things = _table(rng, 0.5 * size, 0.5 * size, 0)
+    for _ in range(_some(rng, 2, 5)):
+        u, v = 0.2 * rng.normal(size=2)
+        spot = _beside(table, 'vase', u, v, rng, _new_model(rng))
+        things += [spot._replace(name=name, x=spot.x + 0.04 * rng.normal(),
+                                 y=spot.y + 0.04 * rng.normal(), z=0.74 + TYPICAL[name][2])
+                   for name in map(str, rng.choice(_CONFUSED, _some(rng, 1, 5)))]
+    for name in map(str, rng.choice(('dining table', 'chair', 'bench'), _some(rng, 0, 3))):
+        things.append(table._replace(name=name, x=table.x + 0.1 * rng.normal(),
+                                     y=table.y + 0.1 * rng.normal()))
+    return Place(size, size, [table, *things])
+
+
+def row(rng: np.random.Generator) -> Place:
+    """Return things on one line: a shelf, or what stands along a corridor."""
+    length, on_floor = rng.uniform(3.0, 8.0), rng.random() < 0.5
+    count = _some(rng, 5, 13)
+    height = rng.choice((0.5, 0.9, 1.3))
+    things = [Thing(name, length * (number + rng.uniform(0.2, 0.8)) / count,
+                    1.5 + 0.03 * rng.normal(), TYPICAL[name][3] if on_floor else height,
+                    0.1 * rng.normal(), _new_model(rng))
+              for number, name in enumerate(map(str, rng.choice(
+                  FURNITURE if on_floor else ON_SHELVES, count)))]
+    return Place(length, 3.0, things)
+
+
+def one_desk(rng: np.random.Generator) -> Place:
+    """Return a desk with its usual things, and one or two of furniture."""
+    things = _desk(rng, 2.0, 2.0, rng.uniform(0.0, np.pi), rng.uniform(0.3, 0.9))
+    return Place(4.0, 4.0, things + _scattered(rng, FURNITURE, _some(rng, 0, 3), 4.0, 4.0))
+
+
 def denser(place: Place, density: int, rng: np.random.Generator) -> Place:
     """Return a place with more things, of classes that COCO lacks: `density` times as many.
 
@@ -133,7 +173,8 @@ def denser(place: Place, density: int, rng: np.random.Generator) -> Place:
 #: All kinds of places, by name.
 KINDS: dict[str, Callable[[np.random.Generator], Place]] = {
     'room': room, 'office': office, 'shop': shop, 'corridor': corridor, 'hall': hall,
-    'bare room': bare_room, 'two rooms': two_rooms}
+    'bare room': bare_room, 'two rooms': two_rooms, 'arrangement': arrangement, 'row': row,
+    'one desk': one_desk}
 
 
 def _some(rng: np.random.Generator, least: int, limit: int) -> int:
