@@ -68,6 +68,7 @@ class Places(NamedTuple):
 
     likeness: float
     unlabelled: float
+    aged: float
     turned: float
 
 
@@ -117,6 +118,7 @@ class Looking(NamedTuple):
     unexplained: float
     missed: float
     away: float
+    aged: float
     turned: float
     crowd: float
     least: float

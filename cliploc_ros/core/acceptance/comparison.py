@@ -28,7 +28,6 @@ from cliploc_ros.core.acceptance.contenders import (
     JoinedFrames,
     contenders_of,
     refined,
-    supports_of,
     unrefined,
 )
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, compare_motion, signs_of
@@ -42,7 +41,6 @@ from cliploc_ros.core.fit.finalists import (
     Finalist,
     covariance_of,
     first_of_each_place,
-    matches_of,
     meetings_of,
 )
 from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, SAME_PLACE
@@ -337,26 +335,26 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
     twin apart as far as they cover it.
     """
     best, (low, high) = compared.contenders[0], joined.options.height_range_m
-    twins, are_rooms = find_twins(joined.landmark_map, best.pose, best.landmarks,
-                                  compared.poses[~compared.leading])
+    twins, alike = find_twins(joined.landmark_map, best.pose, best.landmarks,
+                              compared.poses[~compared.leading])
     turned = turned_about_axis(joined.landmark_map, best.pose, best.landmarks)
     found = np.concatenate([twins, turned])
-    is_turn, is_room = np.arange(len(found)) >= len(twins), np.zeros(len(found), dtype=np.bool_)
-    is_room[:len(twins)] = are_rooms
-    inside = (low <= found[:, 2, 3]) & (found[:, 2, 3] <= high)
-    places = [refined(joined, unrefined(pose)) for pose in found[inside]]
+    rooms, shares = (np.append(of_twins, np.zeros(len(turned)))
+                     for of_twins in (alike.are_rooms, alike.shares))
+    inside = np.nonzero((low <= found[:, 2, 3]) & (found[:, 2, 3] <= high))[0]
+    places = [refined(joined, unrefined(found[row])) for row in inside]
     poses = np.array([best.pose, *(one.map_from_camera for one in places)])
     # a place that refinement moved back to the leading pose is no other one
     others = _first_of_each(poses, ~SAME_ANSWER.agreeing(poses)[0])
     if len(others) == 0:
         return 1.0, None
-    is_turn, is_room = is_turn[inside][others - 1], is_room[inside][others - 1]
+    rows = inside[others - 1]
     rivals = contenders_of(joined, [places[row - 1] for row in others], [True] * len(others))
     leads = best.prior - np.array([one.prior for one in rivals]) + _leads_of_points(
-        compared, poses[others], is_room, recognizer)
-    leads += [CALIBRATION.places.turned * (best.odds - one.odds) if is_turned
-              else lead_over_twin(best.support, one.support)
-              for one, is_turned in zip(rivals, is_turn, strict=True)]
+        compared, poses[others], rooms[rows] > 0, recognizer)
+    leads += [lead_over_twin(best.support, one.support, shares[row]) if row < len(twins)
+              else CALIBRATION.places.turned * (best.odds - one.odds)
+              for one, row in zip(rivals, rows, strict=True)]
     chance = float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum()))
     return chance, place_of(joined.landmark_map, poses[others][int(np.argmin(leads))])
 

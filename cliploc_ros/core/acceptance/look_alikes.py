@@ -12,7 +12,7 @@ places apart, and where there are none, the number of objects does to some degre
 logit of its own, with these two terms only, weighs such poses.
 """
 
-from collections.abc import Sequence
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -41,9 +41,11 @@ _NEAR_M = (0.6, 0.45, 0.3)
 # The share was chosen between a desk of 39 landmarks (TUM fr3) that repeats .36 of them by chance,
 # and two halls (seeds 1004 and 1006) that mislead and repeat .39 and .38.
 _LEAST_LANDMARKS, _LEAST_SHARE, _LEAST_MATCHED = 4, 0.38, 0.4
-# Of the objects of a pose, the share that a twin explains: below the first number the places differ,
-# above the second number they are alike.
-_ALIKE = (0.4, 0.55)
+# Two places differ where they share less than the first number, and are alike from the second one
+# on: share of the objects that a pose explains, and of the landmarks around it.
+_ALIKE, _ALIKE_AROUND = (0.3, 0.45), (0.45, 0.6)
+# Columns of Support.shown.
+_COUNT, _LIKENESS, _UNLABELLED = 0, 3, 5
 # The share of the matched landmarks that must lie on an axis, and turns about it [rad].
 _LEAST_ON_AXIS, _TURNS = 0.5, np.radians([45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0])
 _UP = np.array([0.0, 0.0, 1.0])
@@ -61,6 +63,11 @@ class Alike(NamedTuple):
     #: (m, r): the landmark of its class at the same spot of the other place, where found
     others: NDArray[np.int64]
     found: NDArray[np.bool_]  #: (m, r)
+
+    @property
+    def shares(self) -> NDArray[np.float64]:
+        """Return the share of the landmarks that is found at each place (m,)."""
+        return np.asarray(self.found.mean(axis=1))
 
     @property
     def are_rooms(self) -> NDArray[np.bool_]:
@@ -115,7 +122,7 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
 
 def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
                matched: NDArray[np.int64], others: NDArray[np.float64]
-               ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+               ) -> tuple[NDArray[np.float64], Alike]:
     """Return where a camera would be at the places that look most like that of a pose.
 
     Parameters
@@ -130,8 +137,8 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
     -------
     poses : ndarray (m, 4, 4)
         At most 3, the place that is most alike first.
-    are_rooms : ndarray (m,) of bool
-        See Alike.are_rooms.
+    alike : Alike
+        These places.
     """
     position = map_from_camera[:3, 3]
     moves = others[:_OTHERS] @ invert_transform(map_from_camera)
@@ -139,7 +146,7 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
     upright = _upright_moves(np.arctan2(moves[:, 1, 0], moves[:, 0, 0]), position,
                              moves[:, :3, :3] @ position + moves[:, :3, 3])
     alike = find_alike(landmark_map, position, matched, upright)
-    return alike.moves @ map_from_camera, alike.are_rooms
+    return alike.moves @ map_from_camera, alike
 
 
 def turned_about_axis(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
@@ -176,27 +183,33 @@ def turned_about_axis(landmark_map: LandmarkMap, map_from_camera: NDArray[np.flo
     return np.concatenate(found) if found else _NOWHERE
 
 
-def lead_over_twin(its: Support, twin: Support) -> float:
-    """Return the log odds of a pose against a twin, by the objects.
+def lead_over_twin(its: Support, twin: Support, place_share: float = 0.0) -> float:
+    """Return the log odds by which objects prefer a pose to one at a place that looks alike.
 
-    Labels tell objects apart that both poses explain. An object that one of them lacks says as
-    much as its label, as long as both places share few objects. Where they share most of them, the
-    place is out of date or the other one was furnished like it: then all labels are alike, and
-    the object says little.
+    Labels tell objects apart that both poses explain. An object that only one pose explains counts
+    as its label says, where the places share few objects. Where they share many, one of both is
+    out of date, or was furnished like the other: that one cause explains all such objects.
+
+    Parameters
+    ----------
+    place_share : float
+        Share of the landmarks around the pose that the other place has, too.
     """
     terms = CALIBRATION.places
     common = its.shown.keys() & twin.shown.keys()
-    explained = sum(float(row[0]) for row in its.shown.values())
-    share = sum(float(its.shown[one][0]) for one in common) / max(explained, 1e-9)
-    alike = float(np.clip((share - _ALIKE[0]) / (_ALIKE[1] - _ALIKE[0]), 0.0, 1.0))
-    lead = 0.0
-    for sign, mine in ((1.0, its.shown), (-1.0, twin.shown)):
-        for one, row in mine.items():
-            own = terms.likeness * row[3] + terms.unlabelled * row[5]
-            further = own if one in common else \
-                (1.0 - alike) * own + alike * min(own, terms.unlabelled * row[0])
-            lead += sign * further
-    return lead
+    lead, counts, further = 0.0, 0.0, 0.0
+    for sign, shown in ((1.0, its.shown), (-1.0, twin.shown)):
+        for one, row in shown.items():
+            said = sign * (terms.likeness * row[_LIKENESS] + terms.unlabelled * row[_UNLABELLED])
+            if one in common:
+                lead += said
+            else:
+                further, counts = further + said, counts + sign * row[_COUNT]
+    share = sum(its.shown[one][_COUNT] for one in common) / max(its.inliers, 1e-9)
+    alike = max(float(np.interp(share, _ALIKE, (0.0, 1.0))),
+                float(np.interp(place_share, _ALIKE_AROUND, (0.0, 1.0))))
+    most = min(abs(further), terms.unlabelled * abs(counts), terms.aged)
+    return lead + (1.0 - alike) * further + alike * math.copysign(most, further)
 
 
 def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -75,8 +75,8 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
     Frames that show the same object share the error of its shape in the map, so their agreement is
     no more evidence than one of them: the object counts with their mean.
     """
-    rows: dict[int, list[NDArray[np.float64]]] = {}  # by object: maps have duplicates
-    shown: dict[tuple[int, int], NDArray[np.float64]] = {}
+    # by object: maps have duplicates
+    rows: dict[int, dict[tuple[int, int], NDArray[np.float64]]] = {}
     unexplained = 0.0
     for number, (frame, map_from_camera, found) in enumerate(zip(
             frames, map_from_cameras, matches, strict=True)):
@@ -86,13 +86,15 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
             weights = 1.0 / frame.same[np.ix_(seen, seen)].sum(axis=1)
             for match, row in zip(distinct, weights[:, None] * _contributions(
                     landmark_map, frame, map_from_camera, distinct), strict=True):
-                rows.setdefault(int(landmark_map.objects[match.landmark]), []).append(row)
-                shown[number, match.detection] = row
+                rows.setdefault(int(landmark_map.objects[match.landmark]), {})[
+                    number, match.detection] = row
         unexplained += _unexplained(landmark_map, frame, [match.detection for match in found])
     if not rows:
         return Support()
-    total = np.sum([np.mean(of_object, axis=0) for of_object in rows.values()], axis=0)
-    views_of_each = sum(map(len, rows.values())) / len(rows)
+    shown = {one: row / len(of_object) for of_object in rows.values()
+             for one, row in of_object.items()}
+    total = np.sum([*shown.values()], axis=0)
+    views_of_each = len(shown) / len(rows)
     return Support(*map(float, [*total[:-1], unexplained / views_of_each, total[-1]]), shown)
 
 
