@@ -224,7 +224,7 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
     distinct, twin = _distinct(joined, compared, recognizer)
     by_points = _by_points(joined, compared)
     return Evidence(
-        best.support.inliers, float(compared.likely[0]), by_points=by_points,
+        round(best.support.inliers), float(compared.likely[0]), by_points=by_points,
         rival=_rival(joined, compared), distinct=distinct,
         place=place_of(joined.landmark_map, compared.poses[0]).position,
         twin=twin and twin.position, twin_map=twin.name if twin else '',
@@ -282,7 +282,7 @@ def _not_mirrored(joined: JoinedFrames, compared: Comparison, by_points: float) 
     best, options = compared.by_objects, joined.options
     if (best is None or not options.refine or by_points >= options.min_confidence
             or compared.likely[0] < options.min_confidence
-            or best.support.inliers < options.min_inliers):
+            or round(best.support.inliers) < options.min_inliers):
         return 1.0
     return chance_not_mirrored(joined, best)
 
@@ -339,8 +339,8 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
                               compared.poses[~compared.leading])
     turned = turned_about_axis(joined.landmark_map, best.pose, best.landmarks)
     found = np.concatenate([twins, turned])
-    rooms, shares = (np.append(of_twins, np.zeros(len(turned)))
-                     for of_twins in (alike.are_rooms, alike.shares))
+    none = np.zeros(len(turned))
+    rooms, shares = np.append(alike.are_rooms, none > 0.0), np.append(alike.shares, none)
     inside = np.nonzero((low <= found[:, 2, 3]) & (found[:, 2, 3] <= high))[0]
     places = [refined(joined, unrefined(found[row])) for row in inside]
     poses = np.array([best.pose, *(one.map_from_camera for one in places)])
@@ -350,11 +350,11 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
         return 1.0, None
     rows = inside[others - 1]
     rivals = contenders_of(joined, [places[row - 1] for row in others], [True] * len(others))
-    leads = best.prior - np.array([one.prior for one in rivals]) + _leads_of_points(
-        compared, poses[others], rooms[rows] > 0, recognizer)
-    leads += [lead_over_twin(best.support, one.support, shares[row]) if row < len(twins)
-              else CALIBRATION.places.turned * (best.odds - one.odds)
-              for one, row in zip(rivals, rows, strict=True)]
+    leads = _leads_of_points(compared, poses[others], rooms[rows], recognizer)
+    for number, (rival, row) in enumerate(zip(rivals, rows, strict=True)):
+        by_objects = lead_over_twin(best.support, rival.support, float(shares[row])) \
+            if row < len(twins) else CALIBRATION.places.turned * (best.odds - rival.odds)
+        leads[number] += best.prior - rival.prior + by_objects
     chance = float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum()))
     return chance, place_of(joined.landmark_map, poses[others][int(np.argmin(leads))])
 

@@ -67,7 +67,7 @@ class Alike(NamedTuple):
     @property
     def shares(self) -> NDArray[np.float64]:
         """Return the share of the landmarks that is found at each place (m,)."""
-        return np.asarray(self.found.mean(axis=1))
+        return np.asarray(self.found.sum(axis=1) / max(1, len(self.landmarks)))
 
     @property
     def are_rooms(self) -> NDArray[np.bool_]:
@@ -111,7 +111,9 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
     shares = found.mean(axis=1)
     alike = shares >= _LEAST_SHARE
     if len(matched):
-        alike &= found[:, :len(matched)].mean(axis=1) >= _LEAST_MATCHED
+        # what the image shows may have moved at a place that is alike all around
+        alike &= ((found[:, :len(matched)].mean(axis=1) >= _LEAST_MATCHED)
+                  | (shares >= _ALIKE_AROUND[1]))
     ends = np.einsum('nij,rj->nri', moves[:, :3, :3], landmark_map.centers[rows])
     misses = np.linalg.norm(ends + moves[:, None, :3, 3] - landmark_map.centers[others], axis=2)
     order = np.lexsort([(misses * found).sum(axis=1), -shares])

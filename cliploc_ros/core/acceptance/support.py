@@ -3,7 +3,7 @@
 """The support of a pose: what in the frames speaks for it, and what speaks against it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -30,9 +30,10 @@ _EDGE_DEVIATION = (0.2, 0.003)
 
 @dataclass(frozen=True)
 class Support:
-    """The support of a pose; each object counts once."""
+    """The support of a pose; each thing counts once."""
 
-    inliers: float = 0  #: Number of objects that are where the map has them
+    #: Number of things that are where the map has them: boxes that overlap show one thing
+    inliers: float = 0.0
     score: float = 0.0  #: Sum of their IoUs
     #: How far the edges of their boxes are from the outlines: Cauchy's robust sum
     misfit: float = 0.0
@@ -49,9 +50,11 @@ class Support:
     unexplained: float = 0.0
     #: Log odds of their depths, against those of objects that are somewhere else
     depth: float = 0.0
-    #: Of each detection that shows an object, (frame, row): what it adds to the fields (7,)
-    shown: Mapping[tuple[int, int], NDArray[np.float64]] = field(default_factory=dict,
-                                                                 compare=False, repr=False)
+    _: KW_ONLY
+    #: Of each detection that shows an object, (frame, row): what it adds (7,) to inliers, score,
+    #: misfit, likeness, rarity, unlabelled and depth
+    shown: Mapping[tuple[int, int], NDArray[np.float64]] = field(
+        default_factory=dict, compare=False, repr=False)
 
 
 class ComparedFrame(NamedTuple):
@@ -71,7 +74,9 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
             map_from_cameras: NDArray[np.float64], matches: Sequence[Sequence[Match]]) -> Support:
     """Return the support of a pose in F frames, seen from map_from_cameras (F, 4, 4).
 
-    Several boxes on one landmark, or several landmarks behind one box, count as the best of them.
+    Several boxes on one landmark count as the best of them, and boxes that overlap share the
+    weight of one. So do boxes that no landmark explains; a box of an explained thing does not
+    count.
     Frames that show the same object share the error of its shape in the map, so their agreement is
     no more evidence than one of them: the object counts with their mean.
     """
@@ -95,7 +100,8 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
              for one, row in of_object.items()}
     total = np.sum([*shown.values()], axis=0)
     views_of_each = len(shown) / len(rows)
-    return Support(*map(float, [*total[:-1], unexplained / views_of_each, total[-1]]), shown)
+    return Support(*map(float, [*total[:-1], unexplained / views_of_each, total[-1]]),
+                   shown=shown)
 
 
 def _unexplained(landmark_map: LandmarkMap, frame: ComparedFrame, matched: list[int]) -> float:
