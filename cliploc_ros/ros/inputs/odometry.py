@@ -26,6 +26,7 @@ from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription, Listener
+from cliploc_ros.ros.inputs.time_jumps import stamp_problem
 from cliploc_ros.units import NS_PER_S
 
 _UNIT_TOLERANCE = 0.01
@@ -40,8 +41,8 @@ _SLACK = np.array([SAME_SPOT.distance_m, np.radians(SAME_SPOT.angle_deg)])
 # A robot is not faster than this [1/s] where nothing tells its speed. It changes its speed by less
 # than this [1/s^2], which lasts no longer (guesses: no change of a Jackal at 5 Hz is excluded).
 _FASTEST, _CHANGE, _CHANGE_S = np.array([3.0, 3.0]), np.array([3.0, 8.0]), 0.5
-# A twist that missed at most this share of at least so much motion is right; what happened long ago
-# counts less.
+# A twist is right that misses at most this share of a motion, at least so much; what happened long
+# ago counts less.
 _MISSED_SHARE, _LEAST_MOTION, _MOST_MOTION = 0.25, np.array([0.3, 0.5]), np.array([4.0, 6.0])
 _NO_TWIST = np.zeros((2, 3))
 # Odometry is silent after this many of its usual periods, or of a slow source's where it has just
@@ -176,8 +177,8 @@ class OdometryWindow:
         before = after if after.stamp_ns == stamp_ns else self._poses[row - 1]
         if after.stamp_ns - before.stamp_ns > LONG_NS:
             return None
-        far_m, turned_rad = np.max([_lengths(_step(newest, one)) for one in (before, after)], axis=0)
-        return float(far_m), math.degrees(turned_rad)
+        ways = [_lengths(_step(newest, one)) for one in (before, after)]
+        return float(max(way[0] for way in ways)), math.degrees(max(way[1] for way in ways))
 
     def way_at(self, stamp_ns: int) -> float:
         """Return the way driven since this run began until an instant [m], to a few centimetres.
@@ -299,10 +300,11 @@ def _is_explained(poses: Sequence[_Pose], pose: _Pose, trusted: NDArray[np.bool_
         change = pose.twist - newest.twist
         most = _CHANGE * gap_s / 4
         change *= (most / np.maximum(_lengths(change), most))[:, None]
-        ends = [_driven(twist, gap_s) for twist in (newest.twist, newest.twist + change)]
+        first = _driven(newest.twist, gap_s)
+        last = _driven(newest.twist + change, gap_s)
         by_twist = _lies_between(
-            step, *ends, _SLACK + _CHANGE * gap_s * min(gap_s, _CHANGE_S) / 8
-            + _MISSED_SHARE * _lengths(ends[0] + ends[1]) / 2)
+            step, first, last, _SLACK + _CHANGE * gap_s * min(gap_s, _CHANGE_S) / 8
+            + _MISSED_SHARE * _lengths(first + last) / 2)
     return bool(np.where(trusted & (not is_silence), by_twist, by_poses).all())
 
 
@@ -343,6 +345,8 @@ class OdometrySource(Listener):
         self._newest: Odometry | None = None
         self._newest_at = 0.0
         self._frames = ('', '')
+        #: What is wrong with the stamp of the newest message, and what to do; empty if nothing is.
+        self.problem = ''
         self._on_restart: list[Callable[[int], None]] = []
 
     @property
@@ -371,7 +375,7 @@ class OdometrySource(Listener):
     def forget(self) -> None:
         """Forget what was heard: poses that follow belong to another run."""
         with self._heard:
-            self._newest = None
+            self._newest, self.problem = None, ''
             self._window.clear()
 
     def take(self, msg: Odometry) -> None:
@@ -386,8 +390,13 @@ class OdometrySource(Listener):
             if frames != self._frames:
                 self._window.clear()
                 self._frames = frames
-            self._window.add(at_ns, np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]),
-                             np.array([[v.x, v.y, v.z], [w.x, w.y, w.z]]))
+            if why := stamp_problem(msg.header.stamp):
+                self.problem = f'the stamp of {self.topic} {why}: its driver must stamp each pose'
+            else:
+                self.problem = ''
+                self._window.add(
+                    at_ns, np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]),
+                    np.array([[v.x, v.y, v.z], [w.x, w.y, w.z]]))
             has_restarted = had_poses and self._window.run != run
             self._heard.notify_all()
         if has_restarted:
@@ -476,6 +485,8 @@ class OdometrySource(Listener):
         with self._heard:
             if self._window.is_ahead(at_ns):
                 self._heard.wait_for(lambda: not self._window.is_ahead(at_ns), _PATIENCE_S)
+            if self.problem:
+                raise NoOdometryError(self.problem)
             odom_from_body = self._window.pose_at(at_ns)
             run, body_frame = self._window.run, self._frames[1]
             way_m = self._window.way_at(at_ns)
