@@ -135,6 +135,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         """Report the inputs, the last verdict and the device."""
         parameters = self.settings.values
         self._frames.examine(health, parameters.stale_after_s)
+        self._robot.examine(health)
         health.values |= {'frames skipped while busy': self._newest.dropped,
                           'last verdict': self._last_verdict, **self._verdicts,
                           **self._counters.values(),

@@ -49,6 +49,7 @@ from cliploc_ros.ros.inputs.frame_source import (
 from cliploc_ros.ros.inputs.rig import frames_of
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
+from cliploc_ros.ros.inputs.time_jumps import stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health, StageTimes, in_words
 from cliploc_ros.ros.node.executor import NodeExecutor
 from cliploc_ros.ros.node.lifecycle import ManagedNode
@@ -253,7 +254,9 @@ def _check_camera(node: Doctor, parameters: RelocalizerParameters, name: str,
             size = image_from_msg(image).shape[1::-1]
             report.add(camera, State.PASS, f'{size[0]} x {size[1]} px, frame '
                                            f"'{image.header.frame_id}'")
-        report.judge(clock, _doubt_of_clock(node, lag_s),
+        why = stamp_problem(image.header.stamp)
+        report.judge(clock, f"the images' stamp {why}: their driver must stamp each"
+                     if why else _doubt_of_clock(node, lag_s),
                      f'images come {1e3 * lag_s:.0f} ms after their stamps')
     if info is None:
         return report.add(calibration, State.FAIL,

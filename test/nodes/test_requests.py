@@ -129,7 +129,7 @@ def test_between_requests_nothing_is_listened_to(relocalizer, tester):
 
 
 def test_frames_out_of_order_and_time_going_back(relocalizer, tester):
-    for stamp_s in (50.0, 10.0, 3600.0, 0.0):
+    for stamp_s in (50.0, 10.0, 3600.0, 0.1):
         assert tester.relocalize(make_frame(stamp_s=stamp_s)).success
     newer, older = make_frame(stamp_s=80.0), make_frame(stamp_s=70.0)
     future = tester.ask()
