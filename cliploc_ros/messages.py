@@ -7,7 +7,8 @@ No field of a message is taken for valid.
 
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import cv2
@@ -15,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.camera_faults import Fault, camera_faults
+from cliploc_ros.core.geometry.transforms import is_rigid, make_transform, rotation_angle_deg
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import CameraError, ImageError, OptionsError
 
@@ -27,6 +30,16 @@ _MAX_PIXELS = 2**26
 _DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
 _DEPTH_HEADER = struct.Struct('<iff')  # of compressedDepth: format, and two parameters of floats
 _PNG, _JPEG = b'\x89PNG\r\n\x1a\n', b'\xff\xd8'
+# Elements of K that should be 0 may have this share of the focal length: they are not used.
+_MOST_SKEW = 0.005
+_ROTATION_TOLERANCE = 0.01
+# Rectification turns a raw image by this before poses are off by more than their deviations [deg].
+_MOST_TURN_DEG = 1.0
+# Ratio of focal lengths, and distance of principal points in sizes of the image, of P and K:
+# without distortion they are equal, else P shows more or less of the image.
+_AS_K, _NEAR_K = (0.98, 1.02, 0.02), (0.2, 1.7, 0.3)
+# Baseline of a stereo pair that moves poses [m].
+_MOST_BESIDE_M = 0.02
 # The markers of JPEG that are followed by the size of the image.
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
@@ -57,6 +70,7 @@ class CameraInfoMessage(Protocol):
     distortion_model: str
     k: Sequence[float]
     d: Sequence[float]
+    r: Sequence[float]
     p: Sequence[float]
     binning_x: int
     binning_y: int
@@ -195,17 +209,99 @@ def camera_from_msg(msg: CameraInfoMessage, image_size: tuple[int, int], rectifi
         The values are invalid, or they are for another image size.
     """
     _check_image_size(msg, image_size)
-    name, matrix = ('P', msg.p) if rectified else ('K', msg.k)
-    fx, fy, cx, cy = (matrix[0], matrix[5], matrix[2], matrix[6]) if rectified else (
-        matrix[0], matrix[4], matrix[2], matrix[5])
+    name, matrix = ('P', _left_of_p(msg)) if rectified else ('K', np.reshape(msg.k, (3, 3)))
     distortion = () if rectified else tuple(map(float, msg.d))
     columns, rows = _binning(msg)
+    (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
     try:
-        return Camera(*image_size, float(fx) / columns, float(fy) / rows,
-                      (float(cx) - msg.roi.x_offset) / columns,
-                      (float(cy) - msg.roi.y_offset) / rows, msg.distortion_model, distortion)
+        return Camera(*image_size, fx / columns, fy / rows, (cx - msg.roi.x_offset) / columns,
+                      (cy - msg.roi.y_offset) / rows,
+                      '' if rectified else msg.distortion_model, distortion)
     except CameraError as error:
         raise CameraError(f'camera_info: {name}: {error}') from error
+
+
+def faults_of_camera_info(msg: CameraInfoMessage, camera: Camera, rectified: bool
+                          ) -> list[Fault]:
+    """Return what contradicts itself in a message, or is implausible; the certain faults first.
+
+    `camera` is the camera of the image that camera_from_msg makes of the message.
+    """
+    columns, rows = _binning(msg)
+    offsets = np.array([msg.roi.x_offset, msg.roi.y_offset])
+    matrix, projection = np.reshape(msg.k, (3, 3)), np.reshape(msg.p, (3, 4))
+    used, name = (_left_of_p(msg), 'P') if rectified else (matrix, 'K')
+    # a part of the sensor has any principal point, and the whole sensor has not
+    sensor = replace(
+        camera, width=msg.width or offsets[0] + (msg.roi.width or columns * camera.width),
+        height=msg.height or offsets[1] + (msg.roi.height or rows * camera.height),
+        fx=columns * camera.fx, fy=rows * camera.fy, cx=columns * camera.cx + offsets[0],
+        cy=rows * camera.cy + offsets[1])
+    faults = list(camera_faults(sensor))
+    deviations = [[_MOST_SKEW * sensor.fx] * 3, [_MOST_SKEW * sensor.fy] * 3, [1e-3] * 3]
+    if not (np.abs(used - sensor.matrix) <= deviations).all():
+        faults.insert(0, Fault(
+            f'{np.round(used, 3).tolist()} is not of the form [fx 0 cx, 0 fy cy, 0 0 1]: is it '
+            'transposed? Skew is not supported', True))
+    faults = [fault._replace(text=f'{name}: {fault.text}') for fault in faults]
+    doubts = [*_doubts_of_rotation(np.reshape(msg.r, (3, 3)), rectified),
+              *_doubts_of_projection(projection, matrix, sensor, rectified)]
+    return [fault._replace(text=f'camera_info: {fault.text}')
+            for fault in (*faults, *(Fault(text, False) for text in doubts))]
+
+
+def check_faults(faults: Iterable[Fault]) -> list[str]:
+    """Return the doubtful faults in words; CameraError: one of them is certain."""
+    doubts = []
+    for fault in faults:
+        if fault.is_certain:
+            raise CameraError(fault.text)
+        doubts.append(fault.text)
+    return doubts
+
+
+def _left_of_p(msg: CameraInfoMessage) -> NDArray[np.float64]:
+    return np.reshape(msg.p, (3, 4))[:, :3]
+
+
+def _doubts_of_rotation(rotation: NDArray[np.float64], rectified: bool) -> list[str]:
+    """Return what is unusual about R (3, 3); zeros stand for no rectification."""
+    if not np.any(rotation):
+        return []
+    if not is_rigid(make_transform(rotation, np.zeros(3)), _ROTATION_TOLERANCE):
+        return ['R is no rotation: set it to the identity']
+    turn_deg = rotation_angle_deg(rotation)
+    return [] if rectified or turn_deg <= _MOST_TURN_DEG else [
+        f'R turns rectified images by {turn_deg:.3g} degrees, and the coordinate frame is theirs: '
+        'use them, with rectified true']
+
+
+def _doubts_of_projection(projection: NDArray[np.float64], matrix: NDArray[np.float64],
+                          sensor: Camera, rectified: bool) -> list[str]:
+    """Return how P (3, 4) contradicts K (3, 3), or itself; zeros stand for no P."""
+    if not np.any(projection):
+        return []
+    focal_px = projection[0, 0]
+    if not (np.isfinite(projection).all() and focal_px > 0.0 and projection[1, 1] > 0.0
+            and abs(projection[0, 1]) <= _MOST_SKEW * focal_px and projection[1, 0] == 0.0
+            and (projection[2] == (0.0, 0.0, 1.0, 0.0)).all()):
+        return ['P is not of the form [fx 0 cx Tx, 0 fy cy Ty, 0 0 1 0]: set it to that of K']
+    doubts = []
+    if matrix[0, 0] > 0.0 and matrix[1, 1] > 0.0:
+        ratios = np.diag(projection)[:2] / np.diag(matrix)[:2]
+        moved = (projection[:2, 2] - matrix[:2, 2]) / (sensor.width, sensor.height)
+        is_same = sensor.is_pinhole and not rectified
+        low, high, far = _AS_K if is_same else _NEAR_K
+        if not (low <= ratios.min() and ratios.max() <= high and np.abs(moved).max() <= far):
+            doubts.append(
+                f'P has focal lengths {projection[0, 0]:g} and {projection[1, 1]:g} and principal '
+                f'point ({projection[0, 2]:g}, {projection[1, 2]:g}) px, K {matrix[0, 0]:g} and '
+                f'{matrix[1, 1]:g} and ({matrix[0, 2]:g}, {matrix[1, 2]:g}): is one of them of '
+                'another resolution?')
+    if (beside_m := float(np.linalg.norm(projection[:2, 3])) / focal_px) > _MOST_BESIDE_M:
+        doubts.append(f'P is of the second camera of a stereo pair, {beside_m:.2g} m beside the '
+                      'first: the coordinate frame must be its own')
+    return doubts
 
 
 def _binning(msg: CameraInfoMessage) -> tuple[int, int]:

@@ -119,7 +119,7 @@ def depths_from_msg(msg: Any, image_frame: str, camera: Camera, bboxes_xyxy: NDA
                 f"'{image_frame}', without {'tf' if camera_info else 'depth_camera_info'} between "
                 'them: publish that, or depth registered to the image')
         seen_by = camera_from_msg(camera_info, (width, height), False)
-        if any(seen_by.distortion):
+        if not seen_by.is_pinhole:
             raise ImageError('depth is distorted, by its camera_info: publish it rectified')
         own = DepthCamera(seen_by.fx, seen_by.fy, seen_by.cx, seen_by.cy, color_from_depth)
     elif abs(width * camera.height / (height * camera.width) - 1.0) > _SAME_ASPECT:

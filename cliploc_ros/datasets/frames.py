@@ -245,7 +245,7 @@ def undistorted(image_rgb: NDArray[np.uint8], camera: Camera, pinhole: Camera | 
     It is black where the camera saw nothing.
     """
     pinhole = pinhole or camera.pinhole
-    if pinhole == camera.pinhole and not any(camera.distortion):
+    if pinhole == camera.pinhole and camera.is_pinhole:
         return image_rgb
     # a large image has a coarser grid of places, and those between: a lens is smooth
     step = max(1, math.isqrt(pinhole.width * pinhole.height // _MOST_PLACES))

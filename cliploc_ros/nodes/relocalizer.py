@@ -146,6 +146,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._watcher.examine(health)
         localizer = self._pipeline.localizer  # once: a cleanup may drop it meanwhile
         if localizer is not None:
+            for fault in localizer.faults:
+                (health.fail if fault.is_certain else health.warn)(fault.text)
             keyframes = localizer.keyframes
             if keyframes is not None:
                 health.values |= {'keyframes': len(keyframes), 'keyframes file': keyframes.file,

@@ -61,6 +61,7 @@ class Frame:
     camera: str = ''  #: Name of its camera; empty for the only one
     beside: tuple['Frame', ...] = ()  #: Those of other cameras at this instant
     left_out: tuple[str, ...] = ()  #: Names of the cameras without a frame of this instant
+    image_topic: str = ''  #: Resolved name of the topic of the image
 
     @property
     def depth_frame(self) -> str:
@@ -325,7 +326,7 @@ class FrameSource:
             frame = Frame(image, complete['camera_info'][0], detections, received_at,
                           max(received_at, detected_at),
                           self._depth_at(stamp_ns(image.header.stamp)), self._depth_camera_info,
-                          self._camera)
+                          self._camera, image_topic=self.image_topic)
             self._newest = frame
             self.changed.notify_all()
         self._on_frame(frame)
