@@ -38,6 +38,7 @@ _MOST_TURN_DEG = 1.0
 # Ratio of focal lengths, and distance of principal points in sizes of the image, of P and K:
 # without distortion they are equal, else P shows more or less of the image.
 _AS_K, _NEAR_K = (0.98, 1.02, 0.02), (0.2, 1.7, 0.3)
+_TIMES_K = 1.2  # where they should be equal, this ratio is of another image
 # Baseline of a stereo pair that moves poses [m].
 _MOST_BESIDE_M = 0.02
 # The markers of JPEG that are followed by the size of the image.
@@ -244,8 +245,12 @@ def faults_of_camera_info(msg: CameraInfoMessage, camera: Camera, rectified: boo
             f'{np.round(used, 3).tolist()} is not of the form [fx 0 cx, 0 fy cy, 0 0 1]: is it '
             'transposed? Skew is not supported', True))
     faults = [fault._replace(text=f'{name}: {fault.text}') for fault in faults]
+    if (contradiction := _contradiction(projection, matrix, sensor, rectified)) is not None:
+        faults.append(contradiction)
+    if contradiction is not None and len(faults) > 1:  # a doubt that two signs share is certain
+        faults = [fault._replace(is_certain=True) for fault in faults]
     doubts = [*_doubts_of_rotation(np.reshape(msg.r, (3, 3)), rectified),
-              *_doubts_of_projection(projection, matrix, sensor, rectified)]
+              *_doubts_of_projection(projection)]
     return [fault._replace(text=f'camera_info: {fault.text}')
             for fault in (*faults, *(Fault(text, False) for text in doubts))]
 
@@ -276,9 +281,27 @@ def _doubts_of_rotation(rotation: NDArray[np.float64], rectified: bool) -> list[
         'use them, with rectified true']
 
 
-def _doubts_of_projection(projection: NDArray[np.float64], matrix: NDArray[np.float64],
-                          sensor: Camera, rectified: bool) -> list[str]:
-    """Return how P (3, 4) contradicts K (3, 3), or itself; zeros stand for no P."""
+def _contradiction(projection: NDArray[np.float64], matrix: NDArray[np.float64], sensor: Camera,
+                   rectified: bool) -> Fault | None:
+    """Return that P (3, 4) and K (3, 3) are of different images, where both are given."""
+    focal_px, of_k = np.diag(projection)[:2], np.diag(matrix)[:2]
+    if not ((focal_px > 0.0).all() and (of_k > 0.0).all()):
+        return None
+    is_same = sensor.is_pinhole and not rectified
+    low, high, far = _AS_K if is_same else _NEAR_K
+    ratios = focal_px / of_k
+    moved = np.abs(projection[:2, 2] - matrix[:2, 2]) / (sensor.width, sensor.height)
+    if low <= ratios.min() and ratios.max() <= high and moved.max() <= far:
+        return None
+    return Fault(
+        'P has focal lengths {:g} and {:g} and principal point ({:g}, {:g}) px, K {:g} and '
+        '{:g} and ({:g}, {:g}): is one of them of another resolution?'.format(
+            *focal_px, *projection[:2, 2], *of_k, *matrix[:2, 2]),
+        is_same and not 1.0 / _TIMES_K <= ratios.min() <= ratios.max() <= _TIMES_K)
+
+
+def _doubts_of_projection(projection: NDArray[np.float64]) -> list[str]:
+    """Return what is unusual about P (3, 4); zeros stand for no P."""
     if not np.any(projection):
         return []
     focal_px = projection[0, 0]
@@ -286,22 +309,10 @@ def _doubts_of_projection(projection: NDArray[np.float64], matrix: NDArray[np.fl
             and abs(projection[0, 1]) <= _MOST_SKEW * focal_px and projection[1, 0] == 0.0
             and (projection[2] == (0.0, 0.0, 1.0, 0.0)).all()):
         return ['P is not of the form [fx 0 cx Tx, 0 fy cy Ty, 0 0 1 0]: set it to that of K']
-    doubts = []
-    if matrix[0, 0] > 0.0 and matrix[1, 1] > 0.0:
-        ratios = np.diag(projection)[:2] / np.diag(matrix)[:2]
-        moved = (projection[:2, 2] - matrix[:2, 2]) / (sensor.width, sensor.height)
-        is_same = sensor.is_pinhole and not rectified
-        low, high, far = _AS_K if is_same else _NEAR_K
-        if not (low <= ratios.min() and ratios.max() <= high and np.abs(moved).max() <= far):
-            doubts.append(
-                f'P has focal lengths {projection[0, 0]:g} and {projection[1, 1]:g} and principal '
-                f'point ({projection[0, 2]:g}, {projection[1, 2]:g}) px, K {matrix[0, 0]:g} and '
-                f'{matrix[1, 1]:g} and ({matrix[0, 2]:g}, {matrix[1, 2]:g}): is one of them of '
-                'another resolution?')
-    if (beside_m := float(np.linalg.norm(projection[:2, 3])) / focal_px) > _MOST_BESIDE_M:
-        doubts.append(f'P is of the second camera of a stereo pair, {beside_m:.2g} m beside the '
-                      'first: the coordinate frame must be its own')
-    return doubts
+    beside_m = float(np.linalg.norm(projection[:2, 3])) / focal_px
+    return [] if beside_m <= _MOST_BESIDE_M else [
+        f'P is of the second camera of a stereo pair, {beside_m:.2g} m beside the first: the '
+        'coordinate frame must be its own']
 
 
 def _binning(msg: CameraInfoMessage) -> tuple[int, int]:
