@@ -6,8 +6,9 @@ No field of a message is taken for valid.
 """
 
 import math
+import re
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -16,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.camera_faults import Fault, camera_faults
-from cliploc_ros.core.geometry.transforms import is_rigid, make_transform, rotation_angle_deg
+from cliploc_ros.core.geometry.camera_faults import Fault, calibration_faults
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import CameraError, ImageError, OptionsError
 
@@ -30,17 +30,6 @@ _MAX_PIXELS = 2**26
 _DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
 _DEPTH_HEADER = struct.Struct('<iff')  # of compressedDepth: format, and two parameters of floats
 _PNG, _JPEG = b'\x89PNG\r\n\x1a\n', b'\xff\xd8'
-# Elements of K that should be 0 may have this share of the focal length: they are not used.
-_MOST_SKEW = 0.005
-_ROTATION_TOLERANCE = 0.01
-# Rectification turns a raw image by this before poses are off by more than their deviations [deg].
-_MOST_TURN_DEG = 1.0
-# Ratio of focal lengths, and distance of principal points in sizes of the image, of P and K:
-# without distortion they are equal, else P shows more or less of the image.
-_AS_K, _NEAR_K = (0.98, 1.02, 0.02), (0.2, 1.7, 0.3)
-_TIMES_K = 1.2  # where they should be equal, this ratio is of another image
-# Baseline of a stereo pair that moves poses [m].
-_MOST_BESIDE_M = 0.02
 # The markers of JPEG that are followed by the size of the image.
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
@@ -228,91 +217,50 @@ def faults_of_camera_info(msg: CameraInfoMessage, camera: Camera, rectified: boo
 
     `camera` is the camera of the image that camera_from_msg makes of the message.
     """
-    columns, rows = _binning(msg)
-    offsets = np.array([msg.roi.x_offset, msg.roi.y_offset])
-    matrix, projection = np.reshape(msg.k, (3, 3)), np.reshape(msg.p, (3, 4))
-    used, name = (_left_of_p(msg), 'P') if rectified else (matrix, 'K')
+    (columns, rows), roi = _binning(msg), msg.roi
     # a part of the sensor has any principal point, and the whole sensor has not
     sensor = replace(
-        camera, width=msg.width or offsets[0] + (msg.roi.width or columns * camera.width),
-        height=msg.height or offsets[1] + (msg.roi.height or rows * camera.height),
-        fx=columns * camera.fx, fy=rows * camera.fy, cx=columns * camera.cx + offsets[0],
-        cy=rows * camera.cy + offsets[1])
-    faults = list(camera_faults(sensor))
-    deviations = [[_MOST_SKEW * sensor.fx] * 3, [_MOST_SKEW * sensor.fy] * 3, [1e-3] * 3]
-    if not (np.abs(used - sensor.matrix) <= deviations).all():
-        faults.insert(0, Fault(
-            f'{np.round(used, 3).tolist()} is not of the form [fx 0 cx, 0 fy cy, 0 0 1]: is it '
-            'transposed? Skew is not supported', True))
-    faults = [fault._replace(text=f'{name}: {fault.text}') for fault in faults]
-    if (contradiction := _contradiction(projection, matrix, sensor, rectified)) is not None:
-        faults.append(contradiction)
-    if contradiction is not None and len(faults) > 1:  # a doubt that two signs share is certain
-        faults = [fault._replace(is_certain=True) for fault in faults]
-    doubts = [*_doubts_of_rotation(np.reshape(msg.r, (3, 3)), rectified),
-              *_doubts_of_projection(projection)]
+        camera, width=msg.width or roi.x_offset + (roi.width or columns * camera.width),
+        height=msg.height or roi.y_offset + (roi.height or rows * camera.height),
+        fx=columns * camera.fx, fy=rows * camera.fy, cx=columns * camera.cx + roi.x_offset,
+        cy=rows * camera.cy + roi.y_offset)
+    k, r, p = (np.reshape(matrix, (3, -1)) for matrix in (msg.k, msg.r, msg.p))
     return [fault._replace(text=f'camera_info: {fault.text}')
-            for fault in (*faults, *(Fault(text, False) for text in doubts))]
+            for fault in calibration_faults(sensor, k, r, p, rectified)]
 
 
-def check_faults(faults: Iterable[Fault]) -> list[str]:
-    """Return the doubtful faults in words; CameraError: one of them is certain."""
-    doubts = []
-    for fault in faults:
-        if fault.is_certain:
-            raise CameraError(fault.text)
-        doubts.append(fault.text)
-    return doubts
+def faults_of_headers(image: str, camera_info: str, detections: str = '') -> list[Fault]:
+    """Return which messages are of another coordinate frame than their image; '' is unknown.
+
+    Boxes of another camera are certainly wrong. Simulators and drivers are known that name
+    camera_info and image differently.
+    """
+    return [Fault(f"{what} is of the coordinate frame '{other}', its image of '{image}': is it of "
+                  "another camera? publish it with the image's header", is_certain)
+            for what, other, is_certain in (('detections', detections, True),
+                                            ('camera_info', camera_info, False))
+            if other and image and other.strip('/') != image.strip('/')]
+
+
+def doubt_of_rectified(image_topic: str, rectified: bool,
+                       msg: CameraInfoMessage | None = None) -> list[Fault]:
+    """Return whether images are probably rectified though they are read as raw, or the reverse.
+
+    Not where the camera_info `msg` makes no difference between the two.
+    """
+    sounds_rectified = re.search('[/_]rect(?!.*raw)', image_topic) is not None
+    sounds_raw = image_topic.endswith(('/image_raw', '/image_raw/compressed'))
+    is_same = msg is not None and msg.distortion_model != 'equidistant' and not any(msg.d) and \
+        np.array_equal(_left_of_p(msg), np.reshape(msg.k, (3, 3)))
+    if is_same or not (sounds_raw if rectified else sounds_rectified):
+        return []
+    sounds, is_set = ('raw', 'true') if rectified else ('rectified', 'false')
+    return [Fault(f'{image_topic} sounds {sounds}, but the parameter rectified is {is_set}: poses '
+                  'would be wrong by the distortion of the lens', False)]
 
 
 def _left_of_p(msg: CameraInfoMessage) -> NDArray[np.float64]:
     return np.reshape(msg.p, (3, 4))[:, :3]
-
-
-def _doubts_of_rotation(rotation: NDArray[np.float64], rectified: bool) -> list[str]:
-    """Return what is unusual about R (3, 3); zeros stand for no rectification."""
-    if not np.any(rotation):
-        return []
-    if not is_rigid(make_transform(rotation, np.zeros(3)), _ROTATION_TOLERANCE):
-        return ['R is no rotation: set it to the identity']
-    turn_deg = rotation_angle_deg(rotation)
-    return [] if rectified or turn_deg <= _MOST_TURN_DEG else [
-        f'R turns rectified images by {turn_deg:.3g} degrees, and the coordinate frame is theirs: '
-        'use them, with rectified true']
-
-
-def _contradiction(projection: NDArray[np.float64], matrix: NDArray[np.float64], sensor: Camera,
-                   rectified: bool) -> Fault | None:
-    """Return that P (3, 4) and K (3, 3) are of different images, where both are given."""
-    focal_px, of_k = np.diag(projection)[:2], np.diag(matrix)[:2]
-    if not ((focal_px > 0.0).all() and (of_k > 0.0).all()):
-        return None
-    is_same = sensor.is_pinhole and not rectified
-    low, high, far = _AS_K if is_same else _NEAR_K
-    ratios = focal_px / of_k
-    moved = np.abs(projection[:2, 2] - matrix[:2, 2]) / (sensor.width, sensor.height)
-    if low <= ratios.min() and ratios.max() <= high and moved.max() <= far:
-        return None
-    return Fault(
-        'P has focal lengths {:g} and {:g} and principal point ({:g}, {:g}) px, K {:g} and '
-        '{:g} and ({:g}, {:g}): is one of them of another resolution?'.format(
-            *focal_px, *projection[:2, 2], *of_k, *matrix[:2, 2]),
-        is_same and not 1.0 / _TIMES_K <= ratios.min() <= ratios.max() <= _TIMES_K)
-
-
-def _doubts_of_projection(projection: NDArray[np.float64]) -> list[str]:
-    """Return what is unusual about P (3, 4); zeros stand for no P."""
-    if not np.any(projection):
-        return []
-    focal_px = projection[0, 0]
-    if not (np.isfinite(projection).all() and focal_px > 0.0 and projection[1, 1] > 0.0
-            and abs(projection[0, 1]) <= _MOST_SKEW * focal_px and projection[1, 0] == 0.0
-            and (projection[2] == (0.0, 0.0, 1.0, 0.0)).all()):
-        return ['P is not of the form [fx 0 cx Tx, 0 fy cy Ty, 0 0 1 0]: set it to that of K']
-    beside_m = float(np.linalg.norm(projection[:2, 3])) / focal_px
-    return [] if beside_m <= _MOST_BESIDE_M else [
-        f'P is of the second camera of a stereo pair, {beside_m:.2g} m beside the first: the '
-        'coordinate frame must be its own']
 
 
 def _binning(msg: CameraInfoMessage) -> tuple[int, int]:

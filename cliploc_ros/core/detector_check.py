@@ -45,12 +45,15 @@ class DetectorCheck:
     ----------
     by_class : bool
         Classes are matched, so that they have to be those of the map.
+    frames : int, optional
+        How many frames are remembered; None: all.
     """
 
-    def __init__(self, landmark_map: LandmarkMap, by_class: bool) -> None:
+    def __init__(self, landmark_map: LandmarkMap, by_class: bool,
+                 frames: int | None = _MOST_FRAMES) -> None:
         self._known = landmark_map.classes.numbers
         self._by_class = by_class
-        self._frames: deque[_Tally] = deque(maxlen=_MOST_FRAMES)
+        self._frames: deque[_Tally] = deque(maxlen=frames)
 
     def add(self, given: Detections, usable: Detections) -> None:
         """Take in the detections of a frame, and those of them that are used."""

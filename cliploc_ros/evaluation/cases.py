@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry.camera_faults import check_faults
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import (
     ImageRecognizer,
@@ -33,7 +34,6 @@ from cliploc_ros.datasets.depth import depths_from_msg
 from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
 from cliploc_ros.messages import (
     camera_from_msg,
-    check_faults,
     detections_from_msg,
     faults_of_camera_info,
     image_from_msg,

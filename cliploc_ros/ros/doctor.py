@@ -28,7 +28,9 @@ from cliploc_ros.errors import CliplocError
 from cliploc_ros.messages import (
     camera_from_msg,
     detections_from_msg,
+    doubt_of_rectified,
     faults_of_camera_info,
+    faults_of_headers,
     image_from_msg,
     parse_class_map,
 )
@@ -41,7 +43,7 @@ from cliploc_ros.ros.frame_localizer import (
     read_frame,
 )
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
-from cliploc_ros.ros.inputs.frame_faults import faults_of_axes, faults_of_headers
+from cliploc_ros.ros.inputs.frame_faults import faults_of_axes
 from cliploc_ros.ros.inputs.frame_source import (
     LINGER_S,
     Frame,
@@ -57,11 +59,7 @@ from cliploc_ros.ros.node.diagnostics import Health, StageTimes, in_words
 from cliploc_ros.ros.node.executor import NodeExecutor
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.outputs.handoff import HandOff
-from cliploc_ros.ros.parameters import (
-    DetectorParameters,
-    RelocalizerParameters,
-    doubt_of_rectified,
-)
+from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 from cliploc_ros.ros.request import time_is_up
 from cliploc_ros.ros.running import NotRunningError, ask, parameters_of_files
 from cliploc_ros.units import NS_PER_S
@@ -263,12 +261,12 @@ def _check_camera(node: Doctor, parameters: RelocalizerParameters, name: str,
     with report.failing(calibration):
         found = camera_from_msg(info, size or (info.width, info.height), parameters.rectified)
         lens = 'rectified' if parameters.rectified else info.distortion_model or 'no distortion'
-        doubt = doubt_of_rectified(node.resolve_topic_name(of_camera(name, 'image')), parameters,
-                                   info)
-        faults = [*faults_of_camera_info(info, found, parameters.rectified), *faults_of_headers(
-            '' if image is None else image.header.frame_id, info.header.frame_id)]
-        report.judge(calibration, '; '.join([*(fault.text for fault in faults),
-                                             *([doubt] if doubt else [])]),
+        faults = [*faults_of_camera_info(info, found, parameters.rectified),
+                  *faults_of_headers('' if image is None else image.header.frame_id,
+                                     info.header.frame_id),
+                  *doubt_of_rectified(node.resolve_topic_name(of_camera(name, 'image')),
+                                      parameters.rectified, info)]
+        report.judge(calibration, '; '.join(fault.text for fault in faults),
                      f'{fields_of_view(found)[0]:.0f} degrees wide, {lens}')
 
 
@@ -299,7 +297,7 @@ def _check_place(node: Doctor, parameters: RelocalizerParameters, image: Any, pa
             base_from_camera = invert_transform(mount)
             up_deg = math.degrees(math.asin(float(np.clip(base_from_camera[2, 2], -1.0, 1.0))))
             report.judge('tf', '; '.join(fault.text for fault in faults_of_axes(
-                image.frame_id, mount[:3, 2])), f'the camera is {base_from_camera[2, 3]:.2f} m '
+                image.frame_id, mount)), f'the camera is {base_from_camera[2, 3]:.2f} m '
                 f"above '{base}' and looks {up_deg:+.0f} degrees up")
         elif parameters.require_localizer:
             report.add('tf', State.FAIL, 'base_frame is empty: initialpose would carry the pose '

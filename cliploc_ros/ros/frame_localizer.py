@@ -5,7 +5,8 @@
 import logging
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +19,7 @@ from rclpy.node import Node
 from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.detector_check import DetectorCheck
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.camera_faults import Fault
+from cliploc_ros.core.geometry.camera_faults import Fault, check_faults
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.kernels.compiled import KERNEL_FOLDERS
 from cliploc_ros.core.keyframes.layer import (
@@ -54,7 +55,6 @@ from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.messages import (
     camera_from_msg,
-    check_faults,
     detections_from_msg,
     image_from_msg,
     parse_class_map,
@@ -63,7 +63,7 @@ from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.observer import ObservedCrops, Observer
 from cliploc_ros.models.profiles import with_encoder
 from cliploc_ros.ros.conversions import stamp_ns
-from cliploc_ros.ros.inputs.frame_faults import faults_of_frame
+from cliploc_ros.ros.inputs.frame_faults import faults_of_axes, faults_of_frame
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.prior import Known
 from cliploc_ros.ros.inputs.robot_state import RobotState
@@ -278,6 +278,10 @@ class FrameLocalizer:
         seen = localizer.observation
         assert seen is not None
         compared = int((seen.similarity_rows >= 0).sum())
+        if found.accepted and parameters.base_frame and found.map_from_camera is not None:
+            with self._keeping(frame.camera):
+                check_faults(faults_of_axes(frame.image.header.frame_id, state.camera_from_base,
+                                            found.map_from_camera))
         is_cut = not found.accepted and self._observer is not None and compared < len(detections)
         for_filter = localizer.covariance_for_filter(found) \
             if found.accepted and parameters.mode == 'continuous' else found.covariance
@@ -315,13 +319,11 @@ class FrameLocalizer:
     def _observed(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
                   by_odometry: bool) -> tuple[NDArray[np.uint8], Observation]:
         """Return the image of a frame, and what was detected in it, without crops."""
-        try:
+        with self._keeping(frame.camera):
             image, camera, given = read_frame(frame, parameters)
-            doubts = check_faults(faults_of_frame(frame, camera, parameters, state))
-        except CliplocError as error:
-            self._faults[frame.camera] = [Fault(str(error), True)]
-            raise
-        self._faults[frame.camera] = [Fault(doubt, False) for doubt in doubts]
+            faults = faults_of_frame(frame, camera, parameters, state)
+            check_faults(faults)
+        self._faults[frame.camera] = faults
         detections = given.usable(camera.width, camera.height, parameters.max_detections)
         self._detector.add(given, detections)
         place, odom_from_camera = state.place, None
@@ -334,6 +336,15 @@ class FrameLocalizer:
             camera_name=frame.camera, up_in_camera=state.up_in_camera,
             depths=self._depths(frame, camera, detections.bboxes_xyxy, state.camera_from_depth),
             odom_from_camera=odom_from_camera, odom_way_m=0.0 if place is None else place.way_m)
+
+    @contextmanager
+    def _keeping(self, camera: str) -> Iterator[None]:
+        """Keep a CliplocError as a fault of a camera."""
+        try:
+            yield
+        except CliplocError as error:
+            self._faults[camera] = [Fault(str(error), True)]
+            raise
 
     def _explained(self, found: Relocalization) -> Relocalization:
         """Return a result whose refusal also names what is wrong with the newest frames."""

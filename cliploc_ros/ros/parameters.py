@@ -17,7 +17,7 @@ from cliploc_ros.core.options import (
     RelocalizerOptions,
 )
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.messages import CameraInfoMessage, parse_class_map
+from cliploc_ros.messages import parse_class_map
 from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES
 from cliploc_ros.ros.conversions import DETECTION_TYPES
@@ -302,27 +302,3 @@ class RelocalizerParameters(CommonParameters):
             height_range_m=(low, high) if low != high else (-math.inf, math.inf),
             time_budget_s=self.time_budget_ms / 1e3 if self.algorithm == 'auto'
             else _SEARCH_SHARE * self.timeout_s)
-
-
-def doubt_of_rectified(image_topic: str, parameters: RelocalizerParameters,
-                       camera_info: CameraInfoMessage | None = None) -> str:
-    """Return that images are probably rectified though a parameter says no, or not though yes.
-
-    Empty where that is not so, or where camera_info makes no difference between the two.
-    """
-    sounds_rectified = re.search('[/_]rect(?!.*raw)', image_topic) is not None
-    sounds_raw = image_topic.endswith(('/image_raw', '/image_raw/compressed'))
-    if not (sounds_raw if parameters.rectified else sounds_rectified):
-        return ''
-    if camera_info is not None and camera_info.distortion_model != 'equidistant' and not any(
-            camera_info.d) and _same_matrices(camera_info):
-        return ''
-    sounds, is_set = ('raw', 'true') if parameters.rectified else ('rectified', 'false')
-    return (f'{image_topic} sounds {sounds}, but the parameter rectified is {is_set}: poses would '
-            'be wrong by the distortion of the lens')
-
-
-def _same_matrices(camera_info: CameraInfoMessage) -> bool:
-    """Return whether P has the intrinsics of K."""
-    return tuple(camera_info.k[:6]) == tuple(
-        camera_info.p[place] for place in (0, 1, 2, 4, 5, 6))

@@ -8,10 +8,16 @@ from scene import CAMERA
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, RegionOfInterest
 
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.observation import OPTICAL_FROM_BODY
 from cliploc_ros.errors import CameraError
-from cliploc_ros.messages import camera_from_msg, faults_of_camera_info
-from cliploc_ros.ros.inputs.frame_faults import faults_of_axes, faults_of_headers
-from cliploc_ros.ros.parameters import RelocalizerParameters, doubt_of_rectified
+from cliploc_ros.messages import (
+    camera_from_msg,
+    doubt_of_rectified,
+    faults_of_camera_info,
+    faults_of_headers,
+)
+from cliploc_ros.ros.inputs.frame_faults import faults_of_axes
 
 SIZE = (CAMERA.width, CAMERA.height)
 K = [500.0, 0.0, 320.0, 0.0, 500.0, 240.0, 0.0, 0.0, 1.0]
@@ -140,12 +146,15 @@ def test_messages_of_another_coordinate_frame(frames, certain):
 
 @pytest.mark.parametrize('tilt_deg', [-40.0, -20.0, 0.0, 30.0])
 def test_a_body_frame_in_place_of_an_optical_one(tilt_deg):
-    """The vertical in a camera that looks down or up, in both conventions."""
-    body = Rotation.from_euler('y', tilt_deg, degrees=True).inv().apply([0.0, 0.0, 1.0])
-    optical = np.array([-body[1], -body[2], body[0]])
-    assert [fault.is_certain for fault in faults_of_axes('camera_link', body)] == [True]
-    assert [fault.is_certain for fault in faults_of_axes('camera_optical_frame', body)] == [False]
-    assert faults_of_axes('camera_link', optical) == []
+    """The pose of a camera on a robot tells whether it looks at the ceiling."""
+    base_from_body = make_transform(
+        Rotation.from_euler('ZY', [70.0, tilt_deg], degrees=True).as_matrix(), np.zeros(3))
+    base_from_optical = base_from_body @ invert_transform(OPTICAL_FROM_BODY)
+    assert faults_of_axes('camera', invert_transform(base_from_optical)) == []
+    mount = invert_transform(base_from_body)
+    assert [[fault.is_certain for fault in faults_of_axes('camera', mount, map_from_camera)]
+            for map_from_camera in (None, base_from_body, base_from_optical)] == [
+                [False], [False], [True]]
 
 
 @pytest.mark.parametrize(('topic', 'rectified', 'changes', 'is_doubted'), [
@@ -157,6 +166,5 @@ def test_a_body_frame_in_place_of_an_optical_one(tilt_deg):
     ('/camera/image_raw/compressed', True, BARREL, True), ('/camera/image', True, BARREL, False)])
 def test_images_that_sound_rectified_or_raw(topic, rectified, changes, is_doubted):
     fields = {'distortion_model': 'plumb_bob', 'd': [0.0] * 5, 'k': K, 'p': P} | changes
-    found = doubt_of_rectified(topic, RelocalizerParameters(rectified=rectified),
-                               CameraInfo(**fields))
+    found = doubt_of_rectified(topic, rectified, CameraInfo(**fields))
     assert bool(found) == is_doubted
