@@ -32,7 +32,7 @@ _MOST_TURN_DEG = 1.0
 # Ratio of focal lengths, and distance of principal points in sizes of the image, of P and K:
 # without distortion they are equal, else P shows more or less of the image.
 _AS_K, _NEAR_K = (0.98, 1.02, 0.02), (0.2, 1.7, 0.3)
-_TIMES_K = 1.2  # where they should be equal, this ratio is of another image
+_TIMES_K, _AS_SCALED = 1.2, 0.1  # another lens, or the same one scaled
 # Baseline of a stereo pair that moves poses [m].
 _MOST_BESIDE_M = 0.02
 _CACHED = 64
@@ -67,7 +67,8 @@ def calibration_faults(sensor: Camera, k: NDArray[np.float64], r: NDArray[np.flo
     faults = [fault._replace(text=f'{name}: {fault.text}') for fault in faults]
     if (contradiction := _contradiction(p, k, sensor, rectified)) is not None:
         faults.append(contradiction)
-    if contradiction is not None and len(faults) > 1:  # a doubt that two signs share is certain
+    # either doubt alone may be harmless
+    if contradiction is not None and len(faults) > 1:
         faults = [fault._replace(is_certain=True) for fault in faults]
     return [*faults, *(Fault(text, False) for text in (
         *_doubts_of_rotation(r, rectified), *_doubts_of_projection(p)))]
@@ -164,17 +165,20 @@ def _contradiction(projection: NDArray[np.float64], matrix: NDArray[np.float64],
     focal_px, of_k = np.diag(projection)[:2], np.diag(matrix)[:2]
     if not ((focal_px > 0.0).all() and (of_k > 0.0).all()):
         return None
-    is_same = sensor.is_pinhole and not rectified
-    low, high, far = _AS_K if is_same else _NEAR_K
+    should_equal = sensor.is_pinhole and not rectified
+    low, high, far = _AS_K if should_equal else _NEAR_K
     ratios = focal_px / of_k
     moved = np.abs(projection[:2, 2] - matrix[:2, 2]) / (sensor.width, sensor.height)
     if low <= ratios.min() and ratios.max() <= high and moved.max() <= far:
         return None
+    # P of another resolution is scaled as a whole; then K may be right
+    scaled = np.allclose(projection[:2, 2] / ratios, matrix[:2, 2], rtol=_AS_SCALED)
     return Fault(
         'P has focal lengths {:g} and {:g} and principal point ({:g}, {:g}) px, K {:g} and '
         '{:g} and ({:g}, {:g}): is one of them of another resolution?'.format(
             *focal_px, *projection[:2, 2], *of_k, *matrix[:2, 2]),
-        is_same and not 1.0 / _TIMES_K <= ratios.min() <= ratios.max() <= _TIMES_K)
+        should_equal and not scaled and not 1.0 / _TIMES_K <= ratios.min() <= ratios.max()
+        <= _TIMES_K)
 
 
 def _doubts_of_projection(projection: NDArray[np.float64]) -> list[str]:
