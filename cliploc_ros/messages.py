@@ -242,21 +242,23 @@ def faults_of_headers(image: str, camera_info: str, detections: str = '') -> lis
             if other and image and other.strip('/') != image.strip('/')]
 
 
-def doubt_of_rectified(image_topic: str, rectified: bool,
-                       msg: CameraInfoMessage | None = None) -> list[Fault]:
+def faults_of_rectified(image_topic: str, rectified: bool,
+                        msg: CameraInfoMessage | None = None) -> list[Fault]:
     """Return whether images are probably rectified though they are read as raw, or the reverse.
 
-    Not where the camera_info `msg` makes no difference between the two.
+    Not where the camera_info `msg` makes no difference between the two. The names of image_proc,
+    image_rect and image_rect_color, are certain where it does.
     """
-    sounds_rectified = re.search('[/_]rect(?!.*raw)', image_topic) is not None
-    sounds_raw = image_topic.endswith(('/image_raw', '/image_raw/compressed'))
+    name = image_topic.removesuffix('/compressed')
+    sounds = 'raw' if name.endswith('/image_raw') else \
+        'rectified' if re.search('[/_]rect(?!.*raw)', name) else ''
     is_same = msg is not None and msg.distortion_model != 'equidistant' and not any(msg.d) and \
         np.array_equal(_left_of_p(msg), np.reshape(msg.k, (3, 3)))
-    if is_same or not (sounds_raw if rectified else sounds_rectified):
+    if is_same or sounds != ('raw' if rectified else 'rectified'):
         return []
-    sounds, is_set = ('raw', 'true') if rectified else ('rectified', 'false')
-    return [Fault(f'{image_topic} sounds {sounds}, but the parameter rectified is {is_set}: poses '
-                  'would be wrong by the distortion of the lens', False)]
+    return [Fault(f'{image_topic} sounds {sounds}, but the parameter rectified is '
+                  f'{str(rectified).lower()}: poses would be wrong by the distortion of the lens',
+                  msg is not None and '/image_rect' in name)]
 
 
 def _left_of_p(msg: CameraInfoMessage) -> NDArray[np.float64]:

@@ -25,9 +25,9 @@ from cliploc_ros.errors import CliplocError, DatasetError
 from cliploc_ros.messages import (
     camera_from_msg,
     depth_counts_from_msg,
-    doubt_of_rectified,
     faults_of_camera_info,
     faults_of_headers,
+    faults_of_rectified,
     image_from_msg,
 )
 from cliploc_ros.units import NS_PER_S
@@ -125,11 +125,18 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
 
 
 def _notes(reader: BagReader, topics: BagTopics) -> tuple[str, ...]:
-    """Return what is unusual about the camera of a recording, by its first messages."""
+    """Return what is unusual about the camera of a recording, by its first messages.
+
+    DatasetError: its images are certainly rectified, and read as raw.
+    """
     image, info = (reader.deserialize(next(reader.messages([topic])))
                    for topic in (topics.image, topics.camera_info))
     faults = [*faults_of_headers(image.header.frame_id, info.header.frame_id),
-              *doubt_of_rectified(topics.image, topics.rectified, info)]
+              *faults_of_rectified(topics.image, topics.rectified, info)]
+    try:
+        check_faults(faults)
+    except CliplocError as error:
+        raise DatasetError(f'{reader.path}: {error}') from error
     with suppress(CliplocError):  # who decodes the image says so
         size = image_from_msg(image).shape[1::-1]
         faults += faults_of_camera_info(info, camera_from_msg(info, size, topics.rectified),

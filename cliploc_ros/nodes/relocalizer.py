@@ -14,7 +14,7 @@ from diagnostic_msgs.srv import SelfTest
 from std_srvs.srv import Empty, Trigger
 
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.messages import doubt_of_rectified
+from cliploc_ros.messages import faults_of_rectified
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, RequestCounters, Verdict, answer_msg
 from cliploc_ros.ros.case_recorder import CaseRecorder
@@ -105,7 +105,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._pipeline.open()
         self._frames.open()
         self._watcher.open()
-        for doubt in doubt_of_rectified(self._frames.image_topic, parameters.rectified):
+        for doubt in faults_of_rectified(self._frames.image_topic, parameters.rectified):
             self.get_logger().warning(doubt.text)
 
     def close(self) -> None:

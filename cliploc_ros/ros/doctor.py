@@ -28,9 +28,9 @@ from cliploc_ros.errors import CliplocError
 from cliploc_ros.messages import (
     camera_from_msg,
     detections_from_msg,
-    doubt_of_rectified,
     faults_of_camera_info,
     faults_of_headers,
+    faults_of_rectified,
     image_from_msg,
     parse_class_map,
 )
@@ -264,7 +264,7 @@ def _check_camera(node: Doctor, parameters: RelocalizerParameters, name: str,
         faults = [*faults_of_camera_info(info, found, parameters.rectified),
                   *faults_of_headers('' if image is None else image.header.frame_id,
                                      info.header.frame_id),
-                  *doubt_of_rectified(node.resolve_topic_name(of_camera(name, 'image')),
+                  *faults_of_rectified(node.resolve_topic_name(of_camera(name, 'image')),
                                       parameters.rectified, info)]
         report.judge(calibration, '; '.join(fault.text for fault in faults),
                      f'{fields_of_view(found)[0]:.0f} degrees wide, {lens}')

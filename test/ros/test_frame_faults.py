@@ -13,9 +13,9 @@ from cliploc_ros.core.observation import OPTICAL_FROM_BODY
 from cliploc_ros.errors import CameraError
 from cliploc_ros.messages import (
     camera_from_msg,
-    doubt_of_rectified,
     faults_of_camera_info,
     faults_of_headers,
+    faults_of_rectified,
 )
 from cliploc_ros.ros.inputs.frame_faults import faults_of_axes
 
@@ -158,14 +158,17 @@ def test_a_body_frame_in_place_of_an_optical_one(tilt_deg):
                 [False], [False], [True]]
 
 
-@pytest.mark.parametrize(('topic', 'rectified', 'changes', 'is_doubted'), [
-    ('/camera/image_rect', False, BARREL, True), ('/camera/image_rect_color', False, BARREL, True),
-    ('/camera/image_rect', False, {}, False),  # nothing to rectify
-    ('/camera/image_rect', False, RIGHT, True), ('/camera/image_rect', False, FISHEYE, True),
-    ('/camera/image_rect', True, BARREL, False), ('/camera/image_raw', False, BARREL, False),
-    ('/infra1/image_rect_raw', False, {}, False), ('/camera/image_raw', True, BARREL, True),
-    ('/camera/image_raw/compressed', True, BARREL, True), ('/camera/image', True, BARREL, False)])
-def test_images_that_sound_rectified_or_raw(topic, rectified, changes, is_doubted):
+@pytest.mark.parametrize(('topic', 'rectified', 'changes', 'certain'), [
+    ('/camera/image_rect', False, BARREL, [True]),
+    ('/camera/image_rect_color/compressed', False, BARREL, [True]),
+    ('/camera/image_rect', False, {}, []),  # nothing to rectify
+    ('/camera/image_rect', False, RIGHT, [True]), ('/camera/image_rect', False, FISHEYE, [True]),
+    ('/rect/image', False, BARREL, [False]), ('/camera/image_rect', True, BARREL, []),
+    ('/camera/image_raw', False, BARREL, []), ('/infra1/image_rect_raw', False, {}, []),
+    ('/camera/image_raw', True, BARREL, [False]), ('/camera/image_raw', True, {}, []),
+    ('/camera/image_raw/compressed', True, BARREL, [False]),
+    ('/camera/image', True, BARREL, [])])
+def test_images_that_sound_rectified_or_raw(topic, rectified, changes, certain):
     fields = {'distortion_model': 'plumb_bob', 'd': [0.0] * 5, 'k': K, 'p': P} | changes
-    found = doubt_of_rectified(topic, rectified, CameraInfo(**fields))
-    assert bool(found) == is_doubted
+    found = faults_of_rectified(topic, rectified, CameraInfo(**fields))
+    assert [fault.is_certain for fault in found] == certain

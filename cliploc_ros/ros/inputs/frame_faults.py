@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.camera_faults import Fault
 from cliploc_ros.messages import (
-    doubt_of_rectified,
     faults_of_camera_info,
     faults_of_headers,
+    faults_of_rectified,
 )
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
@@ -29,7 +29,7 @@ def faults_of_frame(frame: Frame, camera: Camera, parameters: RelocalizerParamet
     image, info = frame.image.header.frame_id, frame.camera_info
     return [*faults_of_headers(image, info.header.frame_id, frame.detections.header.frame_id),
             *faults_of_camera_info(info, camera, parameters.rectified),
-            *doubt_of_rectified(frame.image_topic, parameters.rectified, info),
+            *faults_of_rectified(frame.image_topic, parameters.rectified, info),
             *(faults_of_axes(image, state.camera_from_base)
               if parameters.base_frame not in ('', image) else [])]
 
