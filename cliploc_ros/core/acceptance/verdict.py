@@ -48,6 +48,8 @@ class RefusalKind(StrEnum):
     OBSTRUCTED = auto()
     #: The time of the request ended before a frame was localized.
     TIME_UP = auto()
+    #: The map has none of the detector's classes, or no score or box is usable.
+    WRONG_DETECTIONS = auto()
 
 
 class Refusal(NamedTuple):

@@ -68,6 +68,7 @@ class Frame:
     camera: str = ''  #: Name of its camera; empty for the only one
     beside: tuple['Frame', ...] = ()  #: Those of other cameras at this instant
     left_out: tuple[str, ...] = ()  #: Names of the cameras without a frame of this instant
+    image_topic: str = ''  #: Resolved name of the topic of the image
 
     @property
     def depth_frame(self) -> str:
@@ -351,7 +352,7 @@ class FrameSource:
                 self._unsure = Frame(
                     image, complete['camera_info'][0], detections, received_at,
                     max(received_at, detected_at), self._depth_at(at_ns),
-                    self._depth_camera_info, self._camera)
+                    self._depth_camera_info, self._camera, image_topic=self.image_topic)
             frame = self._unsure
             if frame is None or not self._is_sure(stamp_ns(frame.image.header.stamp)):
                 return
