@@ -27,10 +27,8 @@ from studies.acceptance.fit import best_recall
 from studies.acceptance.places import SEED, AnyPlace, Place
 from studies.acceptance.priors import PRIORS
 from studies.acceptance.troubles import CURVES, FAMILIES, TROUBLES
-from studies.reports import interval, table
+from studies.reports import FAR_DEG, FAR_M, interval, table
 
-#: Errors of poses that lead a robot astray, though they may be within the limit of a false accept.
-FAR_M, FAR_DEG = 0.5, 20.0
 #: More queries than any place has.
 MANY = 1_000_000
 #: Looks of one localizer before it can tell that its camera is wrong.

@@ -22,7 +22,7 @@ from studies.worlds.things import (
 # How far another thing is from one on each axis [m], and from which semi-axis on none is: guesses.
 _ASIDE_M, _LARGE_M = 0.4, 0.5
 # What detectors take a vase with flowers, or a part of it, for.
-_CONFUSED = ('book', 'vase', 'potted plant', 'bottle', 'cup', 'book', 'book')
+_CONFUSED = ('book', 'vase', 'potted plant', 'bottle', 'cup', 'book', 'book', 'chair')
 
 
 class Place(NamedTuple):
@@ -31,6 +31,7 @@ class Place(NamedTuple):
     width: float
     depth: float
     things: Sequence[Thing]
+    focus: tuple[float, float, float] | None = None  #: Where robots look from all sides [m]
 
 
 def room(rng: np.random.Generator) -> Place:
@@ -118,41 +119,38 @@ def two_rooms(rng: np.random.Generator) -> Place:
 
 
 def arrangement(rng: np.random.Generator) -> Place:
-    """Return a room with one table, and things about its axis that are mapped several times.
+    """Return a room with a table, and a robot that looks at what stands on it from all sides.
 
-    A detector takes each for several classes, so that landmarks of these stand in one another.
+    A detector takes these things, or parts of them, for several classes.
     """
     size = rng.uniform(4.0, 6.0)
     table, *things = _table(rng, 0.5 * size, 0.5 * size, 0)
-    for _ in range(_some(rng, 2, 5)):
-        u, v = 0.2 * rng.normal(size=2)
-        spot = _beside(table, 'vase', u, v, rng, _new_model(rng))
-        things += [spot._replace(name=name, x=spot.x + 0.04 * rng.normal(),
-                                 y=spot.y + 0.04 * rng.normal(), z=0.74 + TYPICAL[name][2])
-                   for name in map(str, rng.choice(_CONFUSED, _some(rng, 1, 5)))]
-    for name in map(str, rng.choice(('dining table', 'chair', 'bench'), _some(rng, 0, 3))):
-        things.append(table._replace(name=name, x=table.x + 0.1 * rng.normal(),
-                                     y=table.y + 0.1 * rng.normal()))
-    return Place(size, size, [table, *things])
+    for whole in range(1, _some(rng, 2, 4)):
+        x, y = (table.x, table.y) + 0.1 * rng.normal(size=2)
+        things += [Thing(name, x + 0.03 * rng.normal(), y + 0.03 * rng.normal(),
+                         rng.uniform(0.8, 1.2), rng.uniform(0.0, np.pi), _new_model(rng), whole)
+                   for name in map(str, rng.choice(_CONFUSED, _some(rng, 2, 7)))]
+    things += _scattered(rng, FURNITURE, _some(rng, 0, 3), size, size)
+    return Place(size, size, [table, *things], (table.x, table.y, 0.9))
 
 
 def row(rng: np.random.Generator) -> Place:
     """Return things on one line: a shelf, or what stands along a corridor."""
-    length, on_floor = rng.uniform(3.0, 8.0), rng.random() < 0.5
-    count = _some(rng, 5, 13)
-    height = rng.choice((0.5, 0.9, 1.3))
+    length, on_floor = rng.uniform(2.0, 5.0), rng.random() < 0.5
+    count, height = _some(rng, 5, 13), float(rng.choice((0.5, 0.9, 1.3)))
     things = [Thing(name, length * (number + rng.uniform(0.2, 0.8)) / count,
                     1.5 + 0.03 * rng.normal(), TYPICAL[name][3] if on_floor else height,
                     0.1 * rng.normal(), _new_model(rng))
               for number, name in enumerate(map(str, rng.choice(
                   FURNITURE if on_floor else ON_SHELVES, count)))]
-    return Place(length, 3.0, things)
+    return Place(length, 3.0, things, (0.5 * length, 1.5, height))
 
 
 def one_desk(rng: np.random.Generator) -> Place:
     """Return a desk with its usual things, and one or two of furniture."""
     things = _desk(rng, 2.0, 2.0, rng.uniform(0.0, np.pi), rng.uniform(0.3, 0.9))
-    return Place(4.0, 4.0, things + _scattered(rng, FURNITURE, _some(rng, 0, 3), 4.0, 4.0))
+    things += _scattered(rng, FURNITURE, _some(rng, 0, 3), 4.0, 4.0)
+    return Place(4.0, 4.0, things, (2.0, 2.0, 0.8))
 
 
 def denser(place: Place, density: int, rng: np.random.Generator) -> Place:

@@ -11,6 +11,8 @@ import pytest
 
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.core.map.occupancy_grid import OCCUPIED, UNKNOWN
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.simulation import sensors
 from studies import wrong_sensors
@@ -163,6 +165,90 @@ def test_odometry_is_scaled(queries):
     for own, long in zip(steps(before), steps(after), strict=True):
         own_m, own_deg = pose_error(np.eye(4), own)
         assert pose_error(np.eye(4), long) == pytest.approx((1.2 * own_m, 1.2 * own_deg))
+
+
+@pytest.mark.parametrize(('change', 'level', 'expected'), [
+    (wrong_sensors.middle_crop, 300.0, (12.5, 125.0, 137.5, 150.0)),
+    (wrong_sensors.scaled_boxes, 0.5, (50.0, 100.0, 150.0, 120.0)),
+    (wrong_sensors.shifted_boxes, 0.05, (132.0, 200.0, 332.0, 240.0)),
+    (wrong_sensors.turned_boxes, 90.0, (240.0, 100.0, 280.0, 300.0)),
+    (wrong_sensors.turned_boxes, 180.0, (340.0, 240.0, 540.0, 280.0)),
+    (wrong_sensors.mirrored_boxes, 0.0, (340.0, 200.0, 540.0, 240.0)),
+    (wrong_sensors.mirrored_boxes, 1.0, (100.0, 240.0, 300.0, 280.0)),
+    (wrong_sensors.of_convention, 0.0, (200.0, 220.0, 200.0, 40.0)),
+    (wrong_sensors.of_convention, 1.0, (100.0, 200.0, 200.0, 40.0)),
+    (wrong_sensors.of_convention, 2.0, (0.15625, 5 / 12, 0.46875, 0.5)),
+    (wrong_sensors.of_convention, 3.0, (200.0, 100.0, 240.0, 300.0)),
+    (wrong_sensors.of_convention, 4.0, (-50.0, 80.0, 250.0, 320.0)),
+    (wrong_sensors.of_convention, 5.0, (100.0, 200.0, 400.0, 440.0))])
+def test_boxes_are_of_another_image_or_convention(queries, change, level, expected):
+    box = Detections(np.array([[100.0, 200.0, 300.0, 240.0]]), ('cup',), np.ones(1))
+    asked = replace(queries[0], neighbours=(), observation=replace(
+        queries[0].observation, detections=box))
+    found, = change([asked], level)[0].observation.detections.bboxes_xyxy
+    assert tuple(found) == pytest.approx(expected)
+
+
+def test_a_fisheye_bends_boxes_towards_the_middle(queries):
+    camera = queries[0].observation.camera
+    edges = camera.cx - camera.fx, camera.cy - 10.0, camera.cx, camera.cy + 10.0
+    asked = replace(queries[0], neighbours=(), observation=replace(
+        queries[0].observation, detections=Detections(np.array([edges]), ('cup',), np.ones(1))))
+    found, = wrong_sensors.fisheye_boxes([asked], 0.0)[0].observation.detections.bboxes_xyxy
+    assert found[0] == pytest.approx(camera.cx - np.pi / 4 * camera.fx)
+    assert found[2] == pytest.approx(camera.cx)
+
+
+def test_landmarks_and_boxes_come_again_under_other_classes(changed, room, questions):
+    doubled, asked = changed(troubles.confuse_landmarks, 1)
+    count = len(room)
+    assert doubled.class_ids[:count] == room.class_ids
+    assert all(one != other for one, other in zip(room.class_ids, doubled.class_ids[count:],
+                                                  strict=True))
+    assert np.linalg.norm(doubled.centers[count:] - room.centers, axis=1).max() < 0.2
+    before, after = (sum(len(one.observation.detections) for one in its)
+                     for its in (questions, asked))
+    assert 1.5 * before < after < 1.9 * before
+    assert all(one.observation.similarities.shape == (len(one.observation.detections), 2 * count)
+               for one in asked)
+
+
+@pytest.mark.parametrize(('share', 'is_own'), [(0.5, True), (-0.5, False)])
+def test_one_of_two_equal_rooms_is_out_of_date(changed, room, questions, share, is_own):
+    aged, asked = changed(troubles.add_aged_twin, share)
+    count = len(room)
+    kept = [[one for one in aged.landmark_ids if one.endswith('_copy') == copied]
+            for copied in (False, True)]
+    assert len(kept[is_own]) == count, 'the other room is as it was'
+    assert len(kept[not is_own]) == count - round(0.5 * count) // 2
+    assert 0 < len(asked) <= len(questions)
+    assert asked[0].observation.similarities.shape[1] == len(aged)
+
+
+def test_half_of_the_map_moves_together(changed, room):
+    moved = changed(troubles.FAMILIES['C half of the map moved by [m]'].change, 0.5)[0]
+    steps = np.linalg.norm(moved.centers - room.centers, axis=1)
+    assert np.unique(steps.round(9)).tolist() == [0.0, 0.5]
+    assert (steps > 0.25).sum() == len(room) // 2
+
+
+def test_every_pose_at_an_unmapped_desk_is_wrong():
+    outcomes = search(Task(Simulated('one desk', 1000), 'one image',
+                           RelocalizerOptions(matching='class'), 'A unmapped desk'))
+    assert len(outcomes) == 4
+    assert not any(one.right for one in outcomes)
+
+
+def test_a_family_counts_false_accepts_alone_and_in_order(capsys):
+    assert run(['families', '--requests', '8', '--only', 'K scaled']) == 0
+    *_, last = capsys.readouterr().out.strip().split('\n\n')
+    rows = [row.strip('| ').split(' | ')[1:6] for row in last.splitlines()[2:]]
+    assert [row[0] for row in rows] == ['alone', 'first five', 'later']
+    # two levels; a mode alone, two modes in order: 12 worlds' queries, and 7 images of one world
+    assert [int(row[1]) for row in rows] == [24, 20, 8]
+    for row in rows:
+        requests, right, accepted, false = map(int, row[1:])
+        assert false <= accepted <= requests and right <= requests
 
 
 def test_the_table_counts_each_request_once(capsys):
