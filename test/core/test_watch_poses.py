@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
@@ -21,13 +22,15 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.belief import Belief
 from cliploc_ros.core.watch.evidence import by_vertical
-from cliploc_ros.core.watch.expectation import expect
+from cliploc_ros.core.watch.expectation import Expected, expect
+from cliploc_ros.core.watch.missing import Missing
 from cliploc_ros.core.watch.watch import Watch, WatchState
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 
 CAMERA = Camera(640, 480, 400.0, 400.0, 320.0, 240.0)
 SIDE_M, COUNT = 6.0, 40
+TERMS = CALIBRATION.watch
 
 
 @pytest.fixture(scope='module')
@@ -168,6 +171,32 @@ def test_a_standing_robot_learns_little_from_more_of_the_same():
     assert 0.05 < belief.probability < 0.5
 
 
+NOTHING = Detections(np.empty((0, 4)), (), np.empty(0))
+
+
+def test_looks_that_say_the_opposite_are_no_repetitions():
+    weights = []
+    for odds in (-3.0, 3.0):
+        belief, seen = Belief(), Observation(CAMERA, NOTHING, odom_from_camera=np.eye(4))
+        assert belief.add(seen, 3.0, is_full=True) == 1.0
+        weights.append(belief.add(seen, odds, is_full=True))
+    assert weights == pytest.approx([1.0 - TERMS.correlated * np.exp(-6.0 / TERMS.most),
+                                     1.0 - TERMS.correlated])
+
+
+@pytest.mark.parametrize(('way_m', 'time_s'), [(100.0, 0), (0.0, 100), (50.0, 200)])
+def test_the_way_and_the_time_make_a_sure_watch_unsure(way_m, time_s):
+    belief, after = Belief(), moved(np.eye(4), way_m, 0.0)
+    seen = Observation(CAMERA, NOTHING, odom_from_camera=np.eye(4))
+    belief.wait(seen, np.eye(4))
+    belief.add(seen, 3.0, is_full=True)
+    before = belief.probability
+    belief.wait(replace(seen, stamp_ns=time_s * NS_PER_S, odom_from_camera=after), after)
+    left = np.exp(-TERMS.lost_per_m * way_m - TERMS.lost_per_s * time_s)
+    assert belief.probability - 0.5 == pytest.approx(left * (before - 0.5))
+    assert not belief.has_jumped
+
+
 def test_without_odometry_the_watch_learns_more_slowly(room):
     chances = []
     for odom in (True, False):
@@ -265,3 +294,22 @@ def test_what_an_image_should_show():
     assert found.in_sight.tolist() == [True, True]
     # no shown landmark is beside it: a wall may hide it
     assert not expect(some, CAMERA, pose_at(0, 0, 0), np.empty(0, dtype=int)).in_sight.any()
+
+
+@pytest.mark.parametrize(('yaw_deg', 'side'), [(0, 4), (44, 4), (46, 5), (181, 0), (-1, 3)])
+def test_the_side_of_a_landmark_is_that_from_which_the_camera_looks(yaw_deg, side):
+    ahead = [2 * np.cos(np.radians(yaw_deg)), 2 * np.sin(np.radians(yaw_deg)), 1]
+    found = expect(things(ahead), CAMERA, pose_at(0, 0, yaw_deg), np.array([0]))
+    assert found.sides.tolist() == [side]
+
+
+@pytest.mark.parametrize(('side', 'is_missing'), [(2, True), (3, True), (1, True), (4, False),
+                                                  (6, False)])
+def test_a_landmark_is_missed_only_from_where_it_was_seen(side, is_missing):
+    """A television does not show from behind."""
+    missing, yes = Missing(things((3, 0, 1))), np.array([True])
+    for _ in range(10):
+        missing.add(Expected(np.array([0]), yes, yes, np.array([2])), 1.0)
+    for _ in range(20):
+        missing.add(Expected(np.array([0]), ~yes, yes, np.array([side])), 1.0)
+    assert missing.named() == [0] * is_missing
