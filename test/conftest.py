@@ -5,6 +5,7 @@
 import faulthandler
 import importlib.util
 import os
+import re
 import shutil
 import signal
 import socket
@@ -53,6 +54,17 @@ def reserve_ros_domain() -> tuple[int, socket.socket]:
 
 def pytest_addoption(parser):
     parser.addoption('--no-skips', action='store_true', help='a skipped test fails the run')
+    parser.addoption('--quick', action='store_true',
+                     help='leave out the tests that are marked full or clock, and import none of '
+                          'the files that are marked full')
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Leave out a file that is marked full: it may import what is not installed."""
+    if config.getoption('--quick') and collection_path.suffix == '.py' and re.search(
+            r'^pytestmark = .*mark\.full\b', collection_path.read_text(), re.MULTILINE):
+        return True
+    return None
 
 
 def pytest_configure(config):
@@ -72,6 +84,11 @@ def pytest_configure(config):
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config, items):
     """Deselect tests that need a missing module; sort the rest by expected duration."""
+    if config.getoption('--quick'):
+        slow = [item for item in items
+                if item.get_closest_marker('full') or item.get_closest_marker('clock')]
+        config.hook.pytest_deselected(items=slow)
+        items[:] = [item for item in items if item not in slow]
     left_out = [item for item in items if missing_module(item)]
     for item in left_out:
         config.stash[NOT_RUN].setdefault(missing_module(item), []).append(item.nodeid)

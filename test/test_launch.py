@@ -13,6 +13,8 @@ import pytest
 from cliploc_ros.cli.wake_up import make_parser
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
+pytestmark = pytest.mark.full
+
 LAUNCH = Path(__file__).resolve().parents[1] / 'launch'
 POLICY = LAUNCH.parent / 'config/security_policy.xml'
 DOCUMENTS = [LAUNCH.parent / 'README.md', *sorted((LAUNCH.parent / 'doc').glob('*.md'))]

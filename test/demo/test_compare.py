@@ -20,6 +20,8 @@ from demo_world.class_growth import METHODS as GROWTH_METHODS
 from demo_world.class_growth import plot
 from demo_world.compare import score_clip
 
+pytestmark = pytest.mark.full
+
 PROJECT = Path(__file__).resolve().parents[2]
 
 

@@ -35,6 +35,8 @@ from demo_world.trajectories import (
 )
 from demo_world.worlds import find_worlds, hold_out
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope='module')
 def room():

@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from clusters import kill_a_worker, local_cluster
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
@@ -92,7 +91,10 @@ def test_a_dead_worker_costs_its_part_only(results, room, questions, methods):
     assert sum(map(len, parts)) == len(results)
 
 
+@pytest.mark.full
 def test_on_dask_with_a_dead_worker(results, room, questions, methods):
+    from clusters import kill_a_worker, local_cluster  # needs Dask
+
     parts = []
     with local_cluster() as cluster:
         def kill_one(part):

@@ -23,6 +23,8 @@ from cliploc_ros.models.clip_towers import read_state_dict
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.images import crop_bounds
 
+pytestmark = pytest.mark.full
+
 LABELS = ['a red mug', 'keyboard', 'a red mug', 'a stack of books beside the monitor', '']
 BBOXES = np.array([
     [100.0, 50, 300, 250], [0, 0, 640, 480], [-40, -30, 90.5, 60.2], [600.1, 10, 900, 470.9],

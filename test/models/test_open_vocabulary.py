@@ -30,6 +30,8 @@ from cliploc_ros.models.yolo_detector import YoloDetector
 from cliploc_ros.models.yolo_weights import load_yolo
 from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions, describe
 
+pytestmark = pytest.mark.full
+
 PROJECT = Path(__file__).resolve().parents[2]
 THREE = prompts_of_names('mug, office chair, potted plant')
 

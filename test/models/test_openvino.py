@@ -27,6 +27,8 @@ from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_detector import YoloDetector
 from cliploc_ros.models.yolo_weights import load_yolo
 
+pytestmark = pytest.mark.full
+
 PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'cliploc_ros/demo/assets'
 rng = np.random.default_rng(2)

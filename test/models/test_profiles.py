@@ -11,6 +11,8 @@ from cliploc_ros.models.profiles import PROFILES, resolve_profile, with_detector
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_weights import import_ultralytics
 
+pytestmark = pytest.mark.full
+
 UNNAMED = ClipOptions(model='', pretrained='', device='cpu')
 
 

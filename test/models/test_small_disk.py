@@ -6,8 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from clip_reference import SMALL_CONFIG
 from disks import small_disk
+
+pytestmark = pytest.mark.full
 
 PROJECT = Path(__file__).resolve().parents[2]
 PRELUDE = f"""

@@ -2,8 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Memory of CLIP's first start and of a start with a warm cache."""
 
+import pytest
+
 from cliploc_ros.models.clip_weights import ClipOptions
 from studies.speed.startup import KINDS, format_results, measure_startup
+
+pytestmark = pytest.mark.full
 
 
 def test_a_warm_start_leaves_the_text_tower_out(large_clip, tmp_path):

@@ -17,6 +17,8 @@ from cliploc_ros.models.files import fingerprint_file
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_detector import YoloDetector
 
+pytestmark = pytest.mark.full
+
 
 def options(model: str, file: object, tmp_path: Path, **changes) -> ClipOptions:
     return ClipOptions(model, str(file), device='cpu', cache_dir=str(tmp_path),

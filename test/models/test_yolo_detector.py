@@ -18,6 +18,8 @@ from cliploc_ros.errors import ImageError, ModelError, OptionsError
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_detector import YoloDetector
 
+pytestmark = pytest.mark.full
+
 PROJECT = Path(__file__).resolve().parents[2]
 
 

@@ -21,6 +21,8 @@ from tester import class_matching, make_frame, transform_of
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Detections
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope='module')
 def checkpoint(tmp_path_factory):

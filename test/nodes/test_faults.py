@@ -18,6 +18,8 @@ from tester import class_matching, make_frame
 
 from cliploc_ros.ros.conversions import stamp_ns
 
+pytestmark = pytest.mark.full
+
 ASSETS = PROJECT / 'cliploc_ros/demo/assets'
 # How long the fast camera runs [s]; a minute shows more than a test run has time for.
 FAST_CAMERA_S = float(os.environ.get('CLIPLOC_FAST_CAMERA_S', '8'))

@@ -12,7 +12,6 @@ import pytest
 from diagnostic_msgs.msg import KeyValue
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from open_weights import write_open_yolo, write_tower
 from processes import PROJECT
 from scene import make_room, write_map
 from tester import class_matching, make_frame
@@ -90,6 +89,7 @@ def with_networks(name, folder):
             'clip_pretrained': ASSETS / 'clip.safetensors', 'cache_dir': folder}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize('name', ['detector', 'relocalizer'])
 def test_many_transitions_in_any_order_leak_nothing(manage, tmp_path, name):
     process, manager = manage(name, fresh=True, **with_networks(name, tmp_path))
@@ -139,6 +139,7 @@ def test_shutdown_works_from_every_state(manage, room_map, state):
     assert process.alive
 
 
+@pytest.mark.full
 def test_sigterm_while_weights_load(start, tmp_path):
     for name in ('detector', 'relocalizer'):
         process = start(f'nodes.{name}', fresh=True, parameters=with_networks(name, tmp_path))
@@ -231,6 +232,7 @@ def test_who_takes_over_a_node_that_started_itself_is_its_manager(own_relocalize
     manager.close()
 
 
+@pytest.mark.full
 def test_a_detector_mends_itself_when_its_weights_come(start, tester, tmp_path):
     weights = tmp_path / 'yolo.pt'
     process = start('nodes.detector', parameters={'model': weights})
@@ -256,7 +258,10 @@ def test_an_inactive_detector_costs_nothing(manage, tester):
     assert share < 0.05
 
 
+@pytest.mark.full
 def test_a_detector_looks_for_what_its_map_names_when_it_is_configured(manage, tester, tmp_path):
+    from open_weights import write_open_yolo, write_tower  # needs PyTorch
+
     """A YOLO-World with random weights: which classes it reports, not where they are."""
     parameters = {'model': write_open_yolo(tmp_path / 'world.pt', 'yolov8n-worldv2.yaml'),
                   'vocabulary': 'map', 'map_file': tmp_path / 'map.yaml', 'conf': 0.0,

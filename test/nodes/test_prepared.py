@@ -14,6 +14,8 @@ from without_pytorch import hide_pytorch
 
 from cliploc_ros.demo import ASSETS
 
+pytestmark = pytest.mark.full
+
 # A network of its own: the loopback interface and no route.
 OFFLINE = ('unshare', '--map-root-user', '--net', 'sh', '-c', 'ip link set lo up && exec "$@"',
            'sh')

@@ -23,6 +23,8 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.ros.conversions import detections_to_msg
 
+pytestmark = pytest.mark.full
+
 #: So many by default. 2,000 take 13 minutes, and need -o faulthandler_timeout=0.
 REQUESTS = int(os.environ.get('CLIPLOC_SOAK_REQUESTS', '40'))
 PERIOD_S, INSTANTS = 1 / 30, 30

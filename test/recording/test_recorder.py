@@ -14,7 +14,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from clusters import killing_a_worker, local_cluster
 
 from cliploc_ros.cli.build_map import main
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
@@ -154,7 +153,10 @@ def test_two_workers_say_the_same(recorded, by_two_workers):
     assert_equal(load_recorded(by_two_workers / 'tum.npz'), load_recorded(recorded))
 
 
+@pytest.mark.full
 def test_dask_makes_the_same_map_although_a_worker_dies(walk, by_two_workers, tmp_path):
+    from clusters import killing_a_worker, local_cluster  # needs Dask
+
     journal = tmp_path / '.tum.npz.unfinished'
     with local_cluster() as cluster, killing_a_worker(
             cluster, lambda: journal.exists() and journal.stat().st_size > 15_000) as killed:

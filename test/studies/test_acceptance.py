@@ -18,6 +18,8 @@ from studies.acceptance.__main__ import run, run_all
 from studies.acceptance.places import ALL, FIVE, MODES, ONE, Halved, Simulated
 from studies.acceptance.searches import Outcome, acceptance_table
 
+pytestmark = pytest.mark.full
+
 
 def cells(line):
     return [one.strip() for one in line.strip('|').split('|')]

@@ -14,6 +14,8 @@ from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.evaluation.trials import make_queries
 from studies import blame
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope='module')
 def right(shared_data):

@@ -26,6 +26,8 @@ from studies.keyframes.cases import (
 from studies.keyframes.fit import Row, chance, fit, left_out, report
 from studies.keyframes.judge import Outcome, table
 
+pytestmark = pytest.mark.full
+
 RNG = partial(np.random.default_rng, 1)
 BLACK = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
 # Brighter from left to right in red, from top to bottom in green.

@@ -12,6 +12,8 @@ from cliploc_ros.evaluation.trials import make_queries
 from studies.acceptance.looks import LOOKS, Answer, growth_tables, retry
 from studies.acceptance.troubles import exchange_landmarks
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope='module')
 def office(shared_data):

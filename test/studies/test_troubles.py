@@ -19,6 +19,8 @@ from studies.acceptance.__main__ import run
 from studies.acceptance.places import Simulated
 from studies.acceptance.searches import Task, draw_curves, search
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope='module')
 def questions(room, recording):

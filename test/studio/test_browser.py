@@ -17,7 +17,8 @@ from cliploc_ros.studio.images import outlines_of
 from cliploc_ros.studio.viewpoint import overview
 
 # Software rendering needs an idle machine.
-pytestmark = [pytest.mark.clock, pytest.mark.needs('viser', 'playwright', 'chromium')]
+pytestmark = [pytest.mark.full, pytest.mark.clock,
+              pytest.mark.needs('viser', 'playwright', 'chromium')]
 
 
 def test_select_type_relabel_undo_save_reload(person, studio, path):

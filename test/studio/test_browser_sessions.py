@@ -25,7 +25,8 @@ from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.recording import Recording
 from cliploc_ros.studio.studio import Studio
 
-pytestmark = [pytest.mark.clock, pytest.mark.needs('viser', 'playwright', 'chromium')]
+pytestmark = [pytest.mark.full, pytest.mark.clock,
+              pytest.mark.needs('viser', 'playwright', 'chromium')]
 
 PROJECT = Path(__file__).parents[2]
 
