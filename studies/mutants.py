@@ -18,6 +18,7 @@ A fault that a test notices which fails without it, too, does not count: the tes
 import argparse
 import ast
 import copy
+import gc
 import os
 import pickle
 import random
@@ -28,15 +29,20 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from functools import cache
 from importlib.machinery import SourceFileLoader
+from itertools import pairwise
 from pathlib import Path
-from types import CodeType
-from typing import Any, NamedTuple
+from statistics import median
+from types import CodeType, FunctionType
+from typing import Any, NamedTuple, NoReturn
 
 import pytest
+from _pytest.runner import runtestprotocol
 
 from cliploc_ros.command import run_command
 
@@ -49,6 +55,7 @@ _SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.And: ast.Or,
     ast.Or: ast.And, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd}
 _QUIET = ('-q', '-x', '-p', 'no:cacheprovider', '-p', 'no:rerunfailures', '-p', 'no:xdist')
+_LOGS = re.compile(r'(self\._?)?([\w.]+\.get_)?log(ger)?(\(\))?\.(debug|info|warning|error)\(')
 # A test with a fault may take so much longer [s], and a fault may cost this time in all.
 _PATIENCE_S, _MOST_S = 20.0, 60.0
 
@@ -69,6 +76,7 @@ class Mutant(NamedTuple):
     what: str
     lines: tuple[int, ...]  #: Those of its statement; a test that runs one of them runs it
     names: tuple[str, ...]  #: Where it runs at import: names that it defines
+    function: tuple[str, int] | None  #: Name and first line of the outermost function around it
     is_compiled: bool  #: Whether numba compiles it
 
 
@@ -102,61 +110,65 @@ class _Site(NamedTuple):
 
     parent: ast.AST
     field: str
-    index: int | None
+    row: int | None
     node: Any
     what: str
     new: ast.AST
     statement: ast.stmt
-    function: ast.AST | None
+    function: ast.FunctionDef | None  #: The outermost one around it
 
     def put(self) -> None:
         """Plant the fault."""
         new = ast.copy_location(self.new, self.node)
-        if self.index is None:
+        if self.row is None:
             setattr(self.parent, self.field, new)
         else:
-            getattr(self.parent, self.field)[self.index] = new
+            getattr(self.parent, self.field)[self.row] = new
 
     def as_mutant(self, file: str, number: int) -> Mutant:
         one = self.statement
         body = getattr(one, 'body', None)  # of a compound statement the head alone counts
         last = body[0].lineno - 1 if body else one.end_lineno or one.lineno
         names: tuple[str, ...] = ()
-        if isinstance(one, ast.FunctionDef):  # a default
-            names = (one.name,)
-        elif self.function is None:
-            names = tuple(node.id for node in ast.walk(one)
-                          if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store))
-        return Mutant(file, self.node.lineno, number, self.what,
-                      tuple(range(one.lineno, max(one.lineno, last) + 1)), names,
-                      isinstance(self.function, ast.FunctionDef) and any(
-                          isinstance(each, ast.Name) and each.id == 'compiled'
-                          for each in self.function.decorator_list))
+        if self.function is None:
+            names = (one.name,) if isinstance(one, ast.FunctionDef) else tuple(
+                node.id for node in ast.walk(one)
+                if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store))
+        decorators = self.function.decorator_list if self.function else []
+        return Mutant(
+            file, self.node.lineno, number, self.what,
+            tuple(range(one.lineno, max(one.lineno, last) + 1)), names,
+            None if self.function is None else (self.function.name, min(
+                [self.function.lineno, *(each.lineno for each in decorators)])),
+            any(isinstance(each, ast.Name) and each.id == 'compiled' for each in decorators))
 
 
 def _sites(tree: ast.Module) -> list[_Site]:
     return list(_walk(tree, None, None))
 
 
-def _walk(parent: ast.AST, statement: ast.stmt | None, function: ast.AST | None
+def _walk(parent: ast.AST, statement: ast.stmt | None, function: ast.FunctionDef | None
           ) -> Iterator[_Site]:
-    """Yield the sites below a node. Annotations, messages, types and documents have none."""
+    """Yield the sites below a node. Annotations, messages, logs and documents have none."""
     for field, value in ast.iter_fields(parent):
         if field in ('annotation', 'returns', 'decorator_list', 'type_params', 'type_comment'):
             continue
+        around = function
+        if function is None and field == 'body' and isinstance(parent, ast.FunctionDef):
+            around = parent
         for index, node in enumerate(value if isinstance(value, list) else [value]):
             if not isinstance(node, ast.AST) or isinstance(
                     node, (ast.JoinedStr, ast.Raise, ast.Assert, ast.Import, ast.ImportFrom)):
                 continue
-            if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            if isinstance(node, ast.Expr) and (isinstance(node.value, ast.Constant)
+                                               or _LOGS.match(ast.unparse(node))):
                 continue
             within = node if isinstance(node, ast.stmt) else statement
             for what, new in _changes(node, parent, field):
                 assert within is not None
                 yield _Site(parent, field, index if isinstance(value, list) else None, node, what,
-                            new, within, function)
-            inside = node if isinstance(node, (ast.FunctionDef, ast.Lambda)) else function
-            yield from _walk(node, within, inside)
+                            new, within, around)
+            yield from _walk(node, within, around)
 
 
 def _changes(node: ast.AST, parent: ast.AST, field: str) -> Iterator[tuple[str, ast.AST]]:
@@ -328,19 +340,28 @@ class Tests:
                 self._of_line[line].add(name)
 
     def of(self, mutant: Mutant) -> list[str]:
-        """Return the tests that can notice a fault, the quickest first, as time allows."""
+        """Return the tests that can notice a fault, as time allows: the quickest files first."""
         lines = [(mutant.file, line) for line in mutant.lines]
         if mutant.names:
             word = re.compile(rf'\b({"|".join(mutant.names)})\b')
             lines = [(file, number) for file, text in _sources() for number, line in text
                      if word.search(line)]
-        found = set().union(*(self._of_line.get(line, set()) for line in lines))
-        chosen, left = [], _MOST_S
-        for name in sorted(found, key=lambda name: self.records[name].seconds):
-            left -= self.records[name].seconds + 0.02
+        found = set[str]().union(*(self._of_line.get(line, set()) for line in lines))
+        by_file = defaultdict(list)
+        for name in found:
+            by_file[name.split('::')[0]].append(name)
+        files = sorted(by_file.values(), key=lambda names: median(map(self.seconds, names)))
+        chosen: list[str] = []
+        left = _MOST_S
+        for name in (name for names in files for name in sorted(names, key=self.seconds)):
+            left -= self.seconds(name) + 0.01
             if left > 0.0 or not chosen:
                 chosen.append(name)
         return chosen
+
+    def seconds(self, name: str) -> float:
+        """Return how long a test takes."""
+        return self.records[name].seconds
 
     def leave_out(self, name: str) -> None:
         """Forget a test that fails without a fault."""
@@ -352,6 +373,124 @@ class Tests:
 def _sources() -> list[tuple[str, list[tuple[int, str]]]]:
     return [(str(path.relative_to(PROJECT)), list(enumerate(path.read_text().splitlines(), 1)))
             for path in sorted((PROJECT / PACKAGE).rglob('*.py'))]
+
+
+class Judge:
+    """Tries faults, each in a child of this process.
+
+    Faults in functions meet tests that are collected already: as a plugin of pytest, this takes
+    the place of the loop over the tests. A fault in a line that runs at import meets a new pytest.
+    """
+
+    def __init__(self, mutants: Sequence[Mutant], tests: Tests, workers: int) -> None:
+        self.outcomes: list[Outcome] = []
+        self._waiting: list[tuple[Mutant, str]] = [(one, '') for one in reversed(mutants)]
+        self._tests, self._workers = tests, workers
+        self._is_sound: dict[str, bool] = {}
+        self._items: dict[str, Any] = {}
+
+    def pytest_runtestloop(self, session: Any) -> bool:
+        """Run tests against faults instead of running them once."""
+        self._items = {item.nodeid: item for item in session.items}
+        self.run()
+        return True
+
+    def run(self) -> None:
+        """Try all faults."""
+        with selectors.DefaultSelector() as running:
+            while self._waiting or running.get_map():
+                while self._waiting and len(running.get_map()) < self._workers:
+                    self._begin(running)
+                ready = {key.fd for key, _ in running.select(1.0)}
+                for key in list(running.get_map().values()):
+                    is_late = time.monotonic() > key.data.ends_at
+                    if key.fd in ready or is_late:
+                        running.unregister(key.fd)
+                        os.close(key.fd)
+                        self._take(key.data, _finish(key.data, is_late and key.fd not in ready))
+
+    def _begin(self, running: selectors.BaseSelector) -> None:
+        mutant, alone = self._waiting.pop()
+        names = [alone] if alone else self._tests.of(mutant)
+        if self._items:
+            names = [name for name in names if name in self._items]
+        if not names:
+            self.outcomes.append(Outcome(mutant, 0))
+            return
+        folder = Path(tempfile.mkdtemp(prefix='mutant-'))
+        allowed = _PATIENCE_S + 4.0 * sum(self._tests.seconds(name) for name in names)
+        pid = os.fork()
+        if not pid:
+            _be_child(folder, lambda: self._try(None if alone else mutant, names, folder))
+        running.register(os.pidfd_open(pid), selectors.EVENT_READ, _Job(
+            mutant, names, bool(alone), folder, pid, time.monotonic() + allowed))
+
+    def _try(self, mutant: Mutant | None, names: list[str], folder: Path) -> int:
+        """Run tests in this process, a child; return whether one fails."""
+        if not self._items:
+            if mutant is not None:
+                _plant_at_import(mutant)
+            return int(pytest.main([*_QUIET, '--basetemp', str(folder / 'tmp'), *names],
+                                   [_Failures(folder / 'failed')]))
+        if mutant is not None:
+            _plant(mutant)
+        items = [self._items[name] for name in names]
+        items[0].config._tmp_path_factory._basetemp = folder / 'tmp'
+        (folder / 'tmp').mkdir()
+        for item, following in pairwise([*items, None]):
+            if any(one.failed for one in runtestprotocol(item, log=False, nextitem=following)):
+                (folder / 'failed').write_text(item.nodeid)
+                return 1
+        return 0
+
+    def _take(self, job: '_Job', killer: str) -> None:
+        if job.is_check:
+            self._is_sound[job.names[0]] = not killer
+            if killer:
+                self._tests.leave_out(job.names[0])
+            self._waiting.append((job.mutant, ''))
+        elif killer in self._tests.records and killer not in self._is_sound:
+            self._waiting.append((job.mutant, killer))
+        else:
+            self.outcomes.append(Outcome(job.mutant, len(job.names), killer))
+            if len(self.outcomes) % 50 == 0:
+                print(f'{len(self.outcomes)} tried', file=sys.stderr, flush=True)
+
+
+class _Job(NamedTuple):
+    mutant: Mutant
+    names: list[str]
+    is_check: bool  #: Without the fault
+    folder: Path
+    pid: int
+    ends_at: float
+
+
+def _be_child(folder: Path, work: Callable[[], int]) -> NoReturn:
+    code = 2
+    try:
+        os.setpgid(0, 0)
+        with (folder / 'log').open('w') as log:
+            os.dup2(log.fileno(), 1)
+            os.dup2(log.fileno(), 2)
+        code = work()
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(code)
+
+
+def _finish(job: _Job, is_late: bool) -> str:
+    """End a job; return the test that failed, 'time', an exit code, or ''."""
+    if is_late:
+        os.kill(job.pid, signal.SIGKILL)
+    status = os.waitstatus_to_exitcode(os.waitpid(job.pid, 0)[1])
+    with suppress(ProcessLookupError):  # what its tests started
+        os.killpg(job.pid, signal.SIGKILL)
+    failed = job.folder / 'failed'
+    killer = 'time' if is_late else failed.read_text() if failed.exists() else ''
+    shutil.rmtree(job.folder, ignore_errors=True)
+    return killer or (f'exit code {status}' if status else '')
 
 
 class _Failures:
@@ -368,103 +507,67 @@ class _Failures:
         self.pytest_runtest_logreport(report)
 
 
-def _run_tests(mutant: Mutant | None, names: Sequence[str], is_plain: bool, folder: Path) -> None:
-    """Run tests against a fault in this process, a child; end it."""
-    code = 1
-    try:
-        os.setpgid(0, 0)
-        with (folder / 'log').open('w') as log:
-            os.dup2(log.fileno(), 1)
-            os.dup2(log.fileno(), 2)
-        if mutant is not None:
-            _plant(planted(mutant)[0], mutant)
-        if is_plain:
-            _plain_kernels()
-        code = int(pytest.main([*_QUIET, '--basetemp', str(folder / 'tmp'), *names],
-                               [_Failures(folder / 'failed')]))
-    finally:
-        os._exit(code)
-
-
-def _plant(code: CodeType, mutant: Mutant) -> None:
-    name = mutant.file.removesuffix('.py').removesuffix('/__init__').replace('/', '.')
+def _plant_at_import(mutant: Mutant) -> None:
+    """Give a module that is not imported yet the code with a fault."""
+    code, name = planted(mutant)[0], mutant.file.removesuffix('.py').removesuffix('/__init__')
     get_code = SourceFileLoader.get_code
 
     def get(self: SourceFileLoader, fullname: str) -> CodeType | None:
-        return code if fullname == name else get_code(self, fullname)
+        return code if fullname == name.replace('/', '.') else get_code(self, fullname)
     SourceFileLoader.get_code = get  # type: ignore[method-assign,assignment]
 
 
-class _Job(NamedTuple):
-    mutant: Mutant | None
-    names: list[str]
-    is_plain: bool
-    folder: Path
-    pid: int
-    ends_at: float
+def _plant(mutant: Mutant) -> None:
+    """Give a function the code with a fault."""
+    assert mutant.function is not None
+    faulty = next(one for one in _codes_of(planted(mutant)[0])
+                  if (one.co_name, one.co_firstlineno) == mutant.function)
+    file = str(PROJECT / mutant.file)
+    for one in gc.get_objects():
+        if isinstance(one, FunctionType) and one.__code__.co_filename == file and (
+                one.__code__.co_name, one.__code__.co_firstlineno) == mutant.function:
+            one.__code__ = faulty
 
 
-def _start(mutant: Mutant | None, names: list[str], is_plain: bool, tests: Tests) -> _Job:
-    folder = Path(tempfile.mkdtemp(prefix='mutant-'))
-    allowed = _PATIENCE_S + 4.0 * sum(tests.records[name].seconds for name in names)
-    pid = os.fork()
-    if not pid:
-        _run_tests(mutant, names, is_plain, folder)
-    return _Job(mutant, names, is_plain, folder, pid, time.monotonic() + allowed)
-
-
-def _finish(job: _Job, is_late: bool) -> str:
-    """End a job; return the test that failed, 'time', or ''."""
-    if is_late:
-        os.killpg(job.pid, signal.SIGKILL)
-    status = os.waitstatus_to_exitcode(os.waitpid(job.pid, 0)[1])
-    failed = job.folder / 'failed'
-    killer = 'time' if is_late else failed.read_text() if failed.exists() else ''
-    shutil.rmtree(job.folder, ignore_errors=True)
-    return killer or (f'exit code {status}' if status else '')
+def _codes_of(code: CodeType) -> Iterator[CodeType]:
+    yield code
+    for one in code.co_consts:
+        if isinstance(one, CodeType):
+            yield from _codes_of(one)
 
 
 def judge(mutants: Sequence[Mutant], workers: int) -> list[Outcome]:
-    """Return the outcome of each fault, tried in several processes at a time."""
+    """Return the outcome of each fault. Kernels are judged in a process of their own."""
+    kernels = [one for one in mutants if one.is_compiled]
+    others = [one for one in mutants if not one.is_compiled]
+    outcomes = []
+    if kernels:
+        pid = os.fork()
+        if not pid:
+            _be_child(RECORDS, lambda: _judge_kernels(kernels, workers))
+        os.waitpid(pid, 0)
+        outcomes += pickle.loads((RECORDS / 'kernels.pickle').read_bytes())
     import hypothesis, numba, scipy.optimize, scipy.spatial, scipy.stats, yaml  # noqa: E401,F401,I001
 
-    tests = {False: Tests('compiled'), True: Tests('plain')}
-    waiting: list[Mutant | tuple[Mutant, str]] = list(reversed(mutants))
-    outcomes, is_sound = [], dict.fromkeys(('time', 'collection'), True)
-    with selectors.DefaultSelector() as running:
-        while waiting or running.get_map():
-            while waiting and len(running.get_map()) < workers:
-                one = waiting.pop()
-                mutant, names = (one, []) if isinstance(one, Mutant) else (None, [one[1]])
-                owner = one if isinstance(one, Mutant) else one[0]
-                known = tests[owner.is_compiled]
-                names = names or known.of(owner)
-                if not names:
-                    outcomes.append(Outcome(owner, 0))
-                    continue
-                job = _start(mutant, names, owner.is_compiled, known)
-                running.register(os.pidfd_open(job.pid), selectors.EVENT_READ, (owner, job))
-            ready = {key.fd for key, _ in running.select(1.0)}
-            for key in list(running.get_map().values()):
-                owner, job = key.data
-                is_late = time.monotonic() > job.ends_at and key.fd not in ready
-                if key.fd not in ready and not is_late:
-                    continue
-                running.unregister(key.fd)
-                os.close(key.fd)  # type: ignore[arg-type]
-                killer, known = _finish(job, is_late), tests[owner.is_compiled]
-                if job.mutant is None:  # a test alone
-                    is_sound[job.names[0]] = not killer
-                    if killer:
-                        known.leave_out(job.names[0])
-                    waiting.append(owner)
-                elif killer in known.records and killer not in is_sound:
-                    waiting.append((owner, killer))
-                else:
-                    outcomes.append(Outcome(owner, len(job.names), killer))
-                    if sys.stderr.isatty() or len(outcomes) % 20 == 0:
-                        print(f'{len(outcomes)} of {len(mutants)}', file=sys.stderr, flush=True)
-    return outcomes
+    tests = Tests('compiled')
+    at_import = Judge([one for one in others if one.function is None], tests, workers)
+    at_import.run()
+    return outcomes + at_import.outcomes + _judge_functions(
+        [one for one in others if one.function is not None], tests, workers)
+
+
+def _judge_kernels(mutants: Sequence[Mutant], workers: int) -> int:
+    _plain_kernels()
+    _write('kernels', _judge_functions(mutants, Tests('plain'), workers))
+    return 0
+
+
+def _judge_functions(mutants: Sequence[Mutant], tests: Tests, workers: int) -> list[Outcome]:
+    judge, files = Judge(mutants, tests, workers), {
+        name.split('::')[0] for one in mutants for name in tests.of(one)}
+    if files:
+        pytest.main([*_QUIET, '-s', *sorted(files)], [judge])
+    return judge.outcomes + [Outcome(one, 0) for one in mutants if not files]
 
 
 # ---- the report ---------------------------------------------------------------------------------
