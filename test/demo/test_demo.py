@@ -16,10 +16,7 @@ import numpy as np
 import pytest
 import yaml
 
-from cliploc_ros.cli.demo import main
-
 PROJECT = Path(__file__).resolve().parents[2]
-ASSETS = PROJECT / 'cliploc_ros' / 'demo' / 'assets'
 
 WAKE_UPS = 10
 PATIENCE_S = 300.0
@@ -174,33 +171,3 @@ def test_no_process_outlives_it(executables, tmp_path, number, expected):
     while any(Path(f'/proc/{node}').exists() for node in nodes):
         assert time.monotonic() < deadline, 'a node lives on'
         time.sleep(0.05)
-
-
-@pytest.mark.parametrize(('arguments', 'named'), [
-    (['--assets', '/nowhere'], '/nowhere/sequence is missing'),
-    (['--cameras', '4', '--assets', '/nowhere'], '/nowhere/rig/mounts.json cannot be read'),
-    (['--kidnapped', '--assets', '/nowhere'], '/nowhere/sequence is missing'),
-    (['--method', 'class_prosac'], "algorithm 'prosac'"),
-    (['--method', 'telepathy'], "'telepathy' is none of"),
-    (['--out', '/proc/demo'], '--out /proc/demo'),
-    (['--map', '--assets', '/nowhere'], '/nowhere/sequence is missing'),
-    (['--map', '--method', 'class_bf'], '--method class_bf'),
-])
-def test_bad_input_is_named_in_one_line(run_here, tmp_path, arguments, named):
-    done = run_here(main, '--out', tmp_path, *arguments)
-    assert done.returncode == 1, done.stdout
-    assert done.stderr.startswith('error: ')
-    assert named in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-
-
-def test_weights_that_do_not_load_are_named(executables, tmp_path):
-    for name in ('sequence', 'map.yaml'):
-        (tmp_path / name).symlink_to(ASSETS / name)
-    (tmp_path / 'yolo.pt').write_text('no weights')
-    code, _, errors = run(executables, '--assets', tmp_path, '--method', 'class_ransac',
-                          '--out', tmp_path / 'out')
-    assert code == 1
-    assert errors.startswith('error: the detector does not become ready')
-    assert str(tmp_path / 'yolo.pt') in errors
-    assert 'Traceback' not in errors

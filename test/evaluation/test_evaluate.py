@@ -292,15 +292,6 @@ def test_a_map_of_the_same_images_is_noted(walk, evaluated_bag, evaluate_here):
         assert ('was built from these images' in done.stdout) is is_noted
 
 
-def test_no_ros_is_needed(files, tmp_path):
-    arguments = small(files, '--methods', 'auto', '--workers', 1, '--out', tmp_path)
-    code = ('import sys; from cliploc_ros.cli.evaluate import main; '
-            f'code = main({[*map(str, arguments)]!r}); '
-            "assert 'rclpy' not in sys.modules and 'torch' not in sys.modules; sys.exit(code)")
-    assert subprocess.run([sys.executable, '-c', code], cwd=PROJECT, check=False,
-                          timeout=TIMEOUT_S).returncode == 0
-
-
 def changed(files, tmp_path, **arrays):
     """A copy of the query file with some arrays changed, or left out where None."""
     with np.load(files / 'queries.npz') as content:
@@ -308,52 +299,6 @@ def changed(files, tmp_path, **arrays):
     path = tmp_path / 'changed.npz'
     np.savez(path, **{name: array for name, array in everything.items() if array is not None})
     return path
-
-
-@pytest.mark.parametrize(('arrays', 'named'), [
-    ({'scores': None}, 'array scores is missing'),
-    ({'scores': np.ones(3)}, 'array scores has shape'),
-    ({'boxes_xyxy': 'nan'}, 'array boxes_xyxy is not finite in row 2'),
-    ({'landmark_ids': np.array([f'other_{i}' for i in range(12)])}, 'which the map does not know'),
-    ({'similarities': 'short'}, 'array similarities has shape'),
-])
-def test_bad_query_files_are_named(files, tmp_path, arrays, named, evaluate_here):
-    with np.load(files / 'queries.npz') as content:
-        for name, value in arrays.items():
-            if isinstance(value, str):
-                array = content[name].copy()
-                array[2, 0] = np.nan
-                arrays = {name: array if value == 'nan' else array[:, :3]}
-    path = changed(files, tmp_path, **arrays)
-    assert_error(evaluate_here('--queries', path, '--map', files / 'map.yaml', '--out', tmp_path),
-                 'changed.npz', named)
-
-
-@pytest.mark.parametrize(('arguments', 'named'), [
-    (('--image', '/camera'), 'has no topic /camera; it has /image (sensor_msgs'),
-    (('--ground-truth', '/image'), '/image is of type sensor_msgs/msg/Image, not'),
-    (('--body-from-camera', *'0000000'), 'x y z and a unit quaternion'),
-    (('--clip-model', 'ViT-L-15'), 'ViT-L-15'), (('--model', '/nowhere.pt'), '/nowhere.pt'),
-    (('--save-queries', '/nowhere/q.npz'), '/nowhere/q.npz'),
-])
-def test_bad_bags_and_options_are_named(walk, tmp_path, arguments, named, evaluate_here):
-    assert_error(evaluate_here('--bag', walk / 'bag', *NETWORKS, *METHODS, *arguments, '--out',
-                               tmp_path), named)
-
-
-@pytest.mark.parametrize(('arguments', 'named'), [
-    (('--queries', '/nowhere.npz'), '/nowhere.npz'), (('--bag', '/nowhere'), '/nowhere'),
-    (('--tum', '/nowhere'), '/nowhere')])
-def test_missing_input_is_named(files, tmp_path, arguments, named, evaluate_here):
-    assert_error(evaluate_here(*arguments, '--map', files / 'map.yaml', '--out', tmp_path), named)
-
-
-@pytest.mark.parametrize(('arguments', 'named'), [
-    (('--methods', 'best'), "'best' is none of"), (('--iterations', 0), 'iterations: 0'),
-    (('--out', '/proc/x'), '--out /proc/x'), (('--map', '/nowhere.yaml'), '/nowhere.yaml'),
-    (('--save-queries', 'q.npz'), '--save-queries needs')])
-def test_bad_options_are_named(files, tmp_path, arguments, named, evaluate_here):
-    assert_error(evaluate_here(*small(files, '--out', tmp_path, *arguments)), named)
 
 
 def test_a_full_disk_leaves_nothing_half_written(files, tmp_path):

@@ -77,23 +77,6 @@ def test_damaged_file_is_ignored_and_replaced(cache, damage, caplog):
     assert np.array_equal(cache.load(KEY, LABELS, 16), unit_rows(3))
 
 
-@pytest.mark.parametrize('rows', [
-    unit_rows(2), unit_rows(3) * 2, unit_rows(3).astype(np.float64),
-    np.full((3, 16), np.nan, np.float32), unit_rows(3)[:, :8]])
-def test_wrong_embeddings_are_ignored(cache, rows, caplog):
-    cache.store(KEY, LABELS, rows)
-    assert cache.load(KEY, LABELS, 16) is None
-    assert 'not unit rows' in caplog.text
-
-
-def test_a_file_in_the_way_costs_only_the_cache(tmp_path, caplog):
-    (tmp_path / 'labels').write_text('in the way')
-    cache = LabelCache(tmp_path / 'labels')
-    cache.store(KEY, LABELS, unit_rows(3))
-    assert cache.load(KEY, LABELS, 16) is None
-    assert 'not cached' in caplog.text
-
-
 def test_a_full_disk_costs_only_the_cache(tmp_path):
     # A limit on the size of files gives the error of write() that a full disk gives.
     code = f"""
@@ -193,10 +176,6 @@ def test_each_label_is_encoded_once_and_parts_change_nothing(monkeypatch):
     assert max(map(len, asked[1:])) == 16
     assert list(chain(*asked[1:])) == asked[0] == sorted(set(asked[0]))
     assert np.linalg.norm(whole, axis=1) == pytest.approx(1.0, abs=1e-6)
-
-
-def test_no_labels():
-    assert mixed_rows([], encode, 3).shape == (0, 3)
 
 
 def test_a_label_beside_the_list_counts_like_the_best():

@@ -73,25 +73,3 @@ def test_a_moving_robot_is_not_reset(relocalizer, tester, updates, odom, speeds)
     tester.wait(lambda: tester.poses, 'the pose itself')
     assert not tester.initial_poses
     assert not updates
-
-
-def test_odometry_that_says_nothing_is_not_taken_for_rest(relocalizer, tester, odom):
-    answer = odom()
-    assert not answer.success
-    assert 'the robot may be moving' in answer.message
-
-
-def test_without_amcl_and_odometry_the_answer_comes_at_once(relocalizer, tester):
-    tester.wait(lambda: not tester.count_publishers('/odom'), 'the odometry to be gone')
-    answer = tester.relocalize(make_frame())
-    assert answer.success
-    tester.wait(lambda: tester.initial_poses, 'an initial pose')
-    assert 'nobody publishes /odom: the robot is taken to rest' in relocalizer.output()
-
-
-def test_an_image_from_the_future_gives_no_pose_from_there(relocalizer, tester):
-    tomorrow_s = time.time() + 86400
-    assert tester.relocalize(make_frame(stamp_s=tomorrow_s)).success
-    tester.wait(lambda: tester.initial_poses and tester.poses, 'the poses')
-    assert tester.poses[0].header.stamp.sec == int(tomorrow_s)
-    assert abs(tester.initial_poses[0].header.stamp.sec - time.time()) < 60.0

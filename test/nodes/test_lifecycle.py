@@ -129,16 +129,6 @@ def test_sigterm_ends_a_node_in_every_state(manage, room_map, name, state):
     assert 'Traceback' not in process.output()
 
 
-@pytest.mark.parametrize('state', WAY_TO)
-def test_shutdown_works_from_every_state(manage, room_map, state):
-    process, manager = manage('relocalizer', **class_matching(room_map))
-    manager.do(*WAY_TO[state])
-    assert manager.change(SHUTDOWN_IDS[state])
-    assert manager.state == 'finalized'
-    assert not manager.change(IDS['configure'])
-    assert process.alive
-
-
 @pytest.mark.full
 def test_sigterm_while_weights_load(start, tmp_path):
     for name in ('detector', 'relocalizer'):

@@ -135,17 +135,6 @@ def test_continuous_mode_joins_frames(own_relocalizer, tester, robot):
     assert not tester.initial_poses
 
 
-def test_a_request_that_goes_on_ends_with_the_node(own_relocalizer, tester, robot):
-    process = own_relocalizer(**PARAMETERS)
-    future = tester.ask()
-    wait_for(lambda: len(tester.hypotheses) > 2 or future.done(), 'some refusals',
-             work=lambda: robot.step(0.0, lambda odometry, now_s: None))
-    assert not future.done(), future.result().message
-    code, seconds = process.stop()
-    assert code == 0 and seconds < 2.0, process.output()
-    assert 'Traceback' not in process.output()
-
-
 def test_a_recorded_turn_replays_with_its_odometry(own_relocalizer, tester, robot, room_map,
                                                    tmp_path):
     own_relocalizer(record_folder=tmp_path, **PARAMETERS)
@@ -185,16 +174,6 @@ def test_a_robot_that_turns_wakes_up(looking, tester, robot):
     assert np.linalg.norm(error[:3]) < 0.05 and np.linalg.norm(error[3:]) < np.radians(1.0)
     assert error @ np.linalg.solve(covariance, error) < chi2.ppf(0.95, 6)
     assert np.sqrt(np.diag(covariance)[:3]).max() < 0.5
-
-
-def test_requests_that_go_on_do_so_together(looking, tester, robot):
-    futures = [tester.ask() for _ in range(6)]
-    wait_for(lambda: all(future.done() for future in futures), 'answers',
-             work=lambda: robot.step(20.0, lambda odometry, now_s: None))
-    assert all(future.result().success for future in futures)
-    tester.wait(lambda: tester.initial_poses, 'an initial pose')
-    assert len(tester.initial_poses) <= 3
-    tester.wait(lambda: tester.listened_to() == 0, 'the subscriptions to end')
 
 
 def test_a_robot_that_stands_is_refused_in_the_end(looking, tester, robot):
@@ -255,10 +234,3 @@ def test_bad_odometry_does_no_harm(looking, tester, robot, change):
         tester.wait(lambda: tester.poses, 'the pose')
         error = error_of(tester.poses[-1], 20.0)
         assert np.linalg.norm(error[:3]) < 0.1 and np.linalg.norm(error[3:]) < np.radians(2.0)
-
-
-def test_frames_can_be_kept_apart(looking, tester, robot):
-    assert tester.set_parameter('fuse_frames', 1).successful
-    answer = robot.ask(20.0)
-    assert tester.set_parameter('fuse_frames', 5).successful
-    assert not answer.success and ' frames in ' not in answer.message

@@ -68,14 +68,6 @@ def test_a_pose_that_is_lost_comes_again(amcl, node, tester, deaf):
     assert ends_of(localizer) == [*['lost'] * deaf, 'took']
 
 
-def test_a_localizer_that_subscribes_late_gets_the_pose(amcl, node, tester):
-    """Others subscribe already, as RViz may."""
-    localizer = amcl(late_s=1.5)
-    answer = tester.relocalize(make_frame())
-    assert answer.success, answer.message
-    assert ends_of(localizer) == ['subscribed', 'took']
-
-
 def why_not_taken(tester, stamp_s=100.0):
     """Request the pose; return why the localizer has not taken it."""
     tester.set_parameter('timeout_s', TIMEOUT_S)
@@ -128,14 +120,6 @@ def test_a_localizer_of_another_map_is_named(amcl, node, tester):
     tester.localizer.is_on, tester.localizer.frame = True, 'floor_2'
     assert why_not_taken(tester) == \
         "/amcl_pose is in frame 'floor_2', the pose in 'map': correct the map's frame_id"
-
-
-def test_no_localizer_is_reset_by_a_refusal(amcl, node, tester):
-    localizer = amcl()
-    assert tester.set_parameter('min_inliers', 999).successful
-    answer = tester.relocalize(make_frame())
-    assert answer.message.startswith('refused: ')
-    assert ends_of(localizer) == []
 
 
 def test_a_robot_whose_localizer_shows_no_pose_needs_a_subscriber(own_relocalizer, tester):

@@ -7,12 +7,10 @@ import time
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from processes import wait_for
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Bool, Header, String
 from std_srvs.srv import Trigger
-from test_lifecycle import Manager
 from tester import RELIABLE, transform_of
 from watched import MOUNT, Robot, stamp
 
@@ -185,23 +183,6 @@ def test_what_is_missing_is_named_and_not_taken_for_lost(watch, fault, text):
     assert text in watched.message
 
 
-def test_a_localizer_that_shows_nan_is_named(watch):
-    watched = watch()
-    watched.until_state('localized')
-    watched.robot.error_m = float('nan')
-    watched.until_reason('/amcl_pose shows a pose with NaN')
-    assert watched.states[-1] == 'uncertain'
-
-
-def test_two_localizers_are_named(watch, tester):
-    watched = watch()
-    watched.until_state('localized')
-    second = tester.create_publisher(PoseWithCovarianceStamped, 'amcl_pose', LATCHED)
-    watched.until_reason('2 publishers of /amcl_pose (tester, tester): stop all but one')
-    tester.destroy_publisher(second)
-    watched.until_state('localized')
-
-
 def test_a_localizer_that_falls_silent_while_the_robot_drives_is_named(watch):
     watched = watch()
     watched.until_state('localized')
@@ -226,13 +207,6 @@ def test_without_odometry_a_fresh_pose_will_do(watch):
     watched.until_reason('and odom does not tell the way since: publish odom')
 
 
-def test_a_camera_at_1_hz_will_do(watch):
-    watched = watch()
-    watched.robot.image_every = 20
-    watched.until_state('localized')
-    assert set(watched.looks(3)) == {'localized'}
-
-
 def test_a_localizer_that_jumps_is_another_statement(watch):
     """Of the pose before, nothing counts."""
     watched = watch()
@@ -244,20 +218,6 @@ def test_a_localizer_that_jumps_is_another_statement(watch):
     watched.until_state('lost')
     watched.robot.map_from_odom = right
     watched.until_state('localized')
-
-
-def test_a_node_that_is_deactivated_says_nothing_more(watch, tester):
-    watched = watch()
-    watched.until_state('localized')
-    manager = Manager(tester, 'relocalizer')
-    for _ in range(3):
-        manager.do('deactivate')
-        watched.until(lambda: watched.states[-1] == 'uncertain', 'uncertain')
-        said = len(watched.states)
-        tester.wait(lambda: tester.listened_to() == 0, 'it to rest')
-        assert len(watched.states) == said and watched.flags[-1] is False
-        manager.do('activate')
-        watched.until_state('localized')
 
 
 def test_a_map_that_is_read_again_is_watched_anew(watch, tester):

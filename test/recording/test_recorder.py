@@ -19,11 +19,9 @@ from cliploc_ros.cli.build_map import main
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.datasets.frames import Frames
 from cliploc_ros.datasets.observations import load_recorded
-from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.recording.recorder import (
-    EVERY_FRAME,
     KeyframeFilter,
     KeyframeOptions,
     RecordingOptions,
@@ -267,13 +265,3 @@ def test_keyframes_by_distance_angle_and_pose():
     assert [is_keyframe(place, place, one) for place, one in enumerate(walk)] == [
         False, True, False, True, False, False, True, False, True]
     assert (is_keyframe.asked, is_keyframe.without_pose, is_keyframe.keyframes) == (9, 2, 4)
-
-
-def test_every_frame():
-    is_keyframe = KeyframeFilter(EVERY_FRAME)
-    assert [is_keyframe(0, 0, one) for one in (pose(), pose(), None)] == [True, True, False]
-
-
-def test_impossible_keyframes():
-    with pytest.raises(OptionsError, match='give 0 or more'):
-        KeyframeOptions(-0.1, 5.0)

@@ -125,33 +125,6 @@ def test_boxes_are_drawn_dragged_and_linked(person, studio):
              'the zoom')
 
 
-def test_hide_and_lock_by_the_rows(person, studio):
-    document = studio.document
-    person.find('mug_2')
-    person.row('mug_2').hover()
-    person.page.get_by_label('Hide mug_2').click()
-    wait_for(lambda: 'mug_2' not in studio.shown(), 'hiding')
-    person.page.get_by_label('Lock mug_2').click()
-    wait_for(lambda: document.landmarks['mug_2'].marks.is_locked, 'the lock')
-    assert document.is_saved, 'the file holds neither'
-
-
-def test_a_text_stays_with_its_landmark(person, studio):
-    """Another landmark is selected while the field of the label has the focus."""
-    document = studio.document
-    person.select(document, 'mug_1')
-    person.wait_for_card('mug_1')
-    person.page.keyboard.press('e')
-    before = document.landmarks
-    document.select(['mug_2'])
-    person.wait_for_card('mug_2')
-    assert person.field('Label').input_value() == before['mug_2'].label
-    person.page.keyboard.press('Enter')
-    person.page.keyboard.press('h')
-    person.page.get_by_text('hid mug_2').wait_for()
-    assert document.to_undo == 'hide mug_2', 'the only edit'
-
-
 def test_the_gizmo_is_dragged(chromium, studio):
     """The landmark follows, along the axis that was grabbed; one undo takes all of it back."""
     person = Person(chromium, studio.url, has_scene=True)

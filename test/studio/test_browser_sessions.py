@@ -17,10 +17,8 @@ import yaml
 from browser import Person, wait_for
 from studio_map import ASSETS, demo_studio, open_page, person_at
 
-from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.simulation.detector import guess_detector
-from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.recording import Recording
 from cliploc_ros.studio.studio import Studio
@@ -83,26 +81,6 @@ def test_the_worst_landmarks_by_keys(chromium, path):
         label.press('Enter')
         wait_for(lambda: document.landmarks[here].label == 'a new can', 'the label')
         assert not review.decision(here) and len(document.landmarks) == 60
-
-
-def test_another_program_changes_the_file(person, studio, path):
-    """Saving asks; overwriting keeps this map, reloading takes the other one; undo takes back."""
-    document, page = studio.document, person.page
-    document.apply(edits.relabel(document.landmarks, ['mug_2'], 'mine'))
-    theirs = path.read_text().replace('a green mug with brown dots', 'theirs')
-    for button, label in (('Overwrite it', 'mine'), ('Reload it', 'theirs')):
-        path.write_text(theirs)
-        person.click('Save')
-        page.get_by_text('another program changed').first.wait_for()
-        assert path.read_text() == theirs
-        person.picture(f'conflict_{label}')
-        person.click(re.compile(f'^{button}'))
-        wait_for(lambda label=label: document.landmarks['mug_2'].label == label
-                 and document.is_saved, button)
-        page.get_by_role('button', name=button).wait_for(state='hidden')
-        assert LandmarkMap.from_file(path).labels[1] == label
-    page.keyboard.press('Control+z')
-    wait_for(lambda: document.landmarks['mug_2'].label == 'mine', 'undo')
 
 
 def test_a_token_opens_the_page_from_elsewhere(chromium, path):
