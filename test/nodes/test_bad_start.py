@@ -30,7 +30,7 @@ def test_bad_parameters_at_start_up(own_relocalizer, tester, parameters, reason)
 
 def test_a_mended_parameter_mends_the_node(own_relocalizer, tester):
     own_relocalizer(expect='[ERROR]', algorithm='luck')
-    assert 'ros2 param set relocalizer algorithm' in tester.answer(tester.ask()).message
+    assert not tester.answer(tester.ask()).success
     assert tester.set_parameter('algorithm', 'bf').successful
     assert tester.relocalize(make_frame()).success
 
@@ -39,6 +39,6 @@ def test_a_mended_map_mends_the_node(own_relocalizer, tester, room_map, tmp_path
     path = tmp_path / 'map.yaml'
     path.write_text(room_map.read_text().replace('semi_axes', 'half_axes'))
     own_relocalizer(expect='unknown field: half_axes', map_file=path)
-    assert 'unknown field: half_axes' in tester.answer(tester.ask()).message
+    assert not tester.answer(tester.ask()).success
     path.write_text(room_map.read_text())
     assert tester.relocalize(make_frame()).success

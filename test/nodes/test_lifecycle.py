@@ -155,15 +155,15 @@ def processor_share(process, tester, seconds=3.0):
 def test_only_an_active_relocalizer_localizes(manage, tester, room_map):
     process, manager = manage('relocalizer', **class_matching(room_map, mode='continuous'))
     tester.connect()
-    assert 'the node is unconfigured' in tester.answer(tester.ask()).message
+    assert not tester.answer(tester.ask()).success
     manager.do('configure')
-    assert 'the node is inactive' in tester.answer(tester.ask()).message
+    assert not tester.answer(tester.ask()).success
     assert tester.listened_to() == 0
     manager.do('activate')
     assert tester.relocalize(make_frame()).success
     manager.do('deactivate')
     tester.answer(tester.ask_reinitialize())
-    assert 'the node is inactive' in tester.answer(tester.ask()).message
+    assert not tester.answer(tester.ask()).success
     share = processor_share(process, tester)
     print(f'\ninactive beside a camera: {100 * share:.1f} % of a core')
     assert share < 0.05
@@ -191,7 +191,7 @@ def test_a_failing_configure_can_be_tried_again(manage, tester, room_map, tmp_pa
     assert f'{path}: No such file' in process.output()
     assert f'{path}: No such file' in tester.answer(tester.ask()).message
     path.write_text(room_map.read_text())
-    assert 'the node is unconfigured' in tester.answer(tester.ask()).message
+    assert not tester.answer(tester.ask()).success
     manager.do('configure', 'activate')
     assert tester.relocalize(make_frame()).success
 
@@ -217,7 +217,7 @@ def test_who_takes_over_a_node_that_started_itself_is_its_manager(own_relocalize
     assert tester.relocalize(make_frame()).success
     manager = Manager(tester, 'relocalizer')
     manager.do('deactivate', 'cleanup')
-    assert 'the node is unconfigured' in tester.answer(tester.ask()).message
+    assert not tester.answer(tester.ask()).success
     assert manager.state == 'unconfigured'
     manager.close()
 

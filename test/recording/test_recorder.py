@@ -173,7 +173,6 @@ def test_other_options_record_again_and_depth_is_stored(walk, recorded, tmp_path
     command = ('--rgbd', walk, *NETWORKS, '--no-clip', *ALL, '--record-to', file, '--out',
                tmp_path / 'map.yaml')
     assert main(arguments(*command, '--depth-unit', '1')) == 1
-    assert 'wrong unit? give --depth-unit' in capsys.readouterr().err
     code = main(arguments(*command, '--keyframes', '1', '180'))
     assert code in (0, 1)  # few keyframes may give no map
     content = load_recorded(file).detections
@@ -201,7 +200,6 @@ def test_a_bag_says_the_same_and_its_topics_are_found(walk, recorded, tmp_path, 
     assert main(arguments(*linked, '/wheels')) == 1
     assert 'no topic /wheels' in capsys.readouterr().err
     assert main(arguments(*linked, '/ground_truth')) == 0
-    assert 'odometry is not used: the poses are taken as they are' in capsys.readouterr().out
     again = load_recorded(file).detections
     assert (again.odom_from_camera == again.map_from_camera).all()
     assert (again.bboxes_xyxy == from_bag.bboxes_xyxy).all()
