@@ -140,6 +140,7 @@ def test_the_other_commands_run(built, monkeypatch):
             assert layer_path('other.yaml').exists() != ('--no-keyframe-layer' in arguments)
 
 
+@pytest.mark.full
 @BOTH
 def test_the_nodes_answer_as_the_page_says(built, monkeypatch):
     folder, _, parameters, _ = built

@@ -174,6 +174,7 @@ def test_start_offset_sends_what_is_latched_first(tmp_path, listener):
     assert [offset_ms(data) for data in listener.received['/map']] == [0, 100, 5000, 5050]
 
 
+@pytest.mark.full
 def test_loop_goes_on_until_stopped(tmp_path, listener, start):
     bag = write_poses(tmp_path / 'bag', [0, 50, 100])
     listener.listen('/pose', PoseStamped)
@@ -248,6 +249,7 @@ def test_recording_broken_in_the_middle(tmp_path):
     assert done.stderr.splitlines()[-1].startswith(f'error: {tmp_path / "bag"}: cannot be read')
 
 
+@pytest.mark.full
 def test_without_ros_help_works_and_the_rest_says_why(tmp_path):
     program = (
         "import sys; sys.modules['rclpy'] = None\n"

@@ -105,6 +105,7 @@ def test_the_page_shows_all_and_says_what_it_does_not(finished):
     assert str(out / 'index.html') in output
 
 
+@pytest.mark.full
 @pytest.mark.skipif(shutil.which('rviz2') is not None, reason='RViz is there, and would open')
 def test_without_rviz_it_says_so_and_goes_on(finished):
     assert 'RViz (rviz2) is not installed' in finished[1]
@@ -120,6 +121,7 @@ def mapped(executables, tmp_path_factory):
     return out, output
 
 
+@pytest.mark.full
 def test_the_built_map_holds_the_room(mapped):
     limits = yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['demo']['built_map']
     found, objects, false, offset_cm = map(float, re.search(
@@ -130,6 +132,7 @@ def test_the_built_map_holds_the_room(mapped):
     assert offset_cm / 100 <= limits['center_offset_m']
 
 
+@pytest.mark.full
 def test_it_localizes_in_the_built_map_and_in_the_true_one(mapped):
     limits = yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['demo']['built_map']
     success = {name: (float(quarter), int(wrong)) for name, quarter, wrong in re.findall(
@@ -140,6 +143,7 @@ def test_it_localizes_in_the_built_map_and_in_the_true_one(mapped):
     assert '1 wake-ups: ' in mapped[1]
 
 
+@pytest.mark.full
 def test_the_page_shows_the_built_map(mapped):
     out, output = mapped
     page = (out / 'index.html').read_text()
@@ -154,6 +158,7 @@ def children(pid):
     return [int(child) for child in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(('number', 'expected'), [
     (signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)])
 def test_no_process_outlives_it(executables, tmp_path, number, expected):

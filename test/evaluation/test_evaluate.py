@@ -172,6 +172,7 @@ def long_run(files, tmp_path_factory):
     return arguments, results_of(whole)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGKILL])
 def test_broken_off_and_resumed(long_run, tmp_path, number, evaluate_here):
     arguments, whole = long_run
@@ -206,6 +207,7 @@ def test_broken_off_and_resumed(long_run, tmp_path, number, evaluate_here):
     print(f'\nstopped after {done} parts, then resumed')
 
 
+@pytest.mark.full
 def test_a_scheduler_that_is_not_there(files, tmp_path, evaluate_here):
     arguments = small(files, '--scheduler', 'nonsense', '--out', tmp_path)
     assert_error(evaluate_here(*arguments), 'no Dask scheduler answers at nonsense')
@@ -301,6 +303,7 @@ def changed(files, tmp_path, **arrays):
     return path
 
 
+@pytest.mark.full
 def test_a_full_disk_leaves_nothing_half_written(files, tmp_path):
     def allow_small_files():
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

@@ -154,6 +154,7 @@ def test_a_camera_that_is_late_or_silent_is_left_out_and_named(four_cameras, wor
     assert 'Traceback' not in process.output()
 
 
+@pytest.mark.full
 def test_one_detector_serves_all_cameras_in_turn(start, tester):
     """With one network: images of one instant, more of them than it can look at."""
     process = start('nodes.detector', parameters={

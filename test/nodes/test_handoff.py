@@ -10,6 +10,8 @@ from nav_msgs.msg import Odometry
 from std_srvs.srv import Empty
 from tester import make_frame
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture
 def updates(tester):

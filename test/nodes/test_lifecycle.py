@@ -113,6 +113,7 @@ def test_many_transitions_in_any_order_leak_nothing(manage, tmp_path, name):
     assert 'Traceback' not in process.output()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize('state', [*WAY_TO, 'finalized'])
 @pytest.mark.parametrize('name', ['detector', 'relocalizer'])
 def test_sigterm_ends_a_node_in_every_state(manage, room_map, name, state):
@@ -234,6 +235,7 @@ def test_a_detector_mends_itself_when_its_weights_come(start, tester, tmp_path):
         tester.feed_until(lambda: detected, [make_frame()[0]], 'detections')
 
 
+@pytest.mark.full
 def test_an_inactive_detector_costs_nothing(manage, tester):
     process, manager = manage('detector', **with_networks('detector', ''))
     with tester.hearing_detections() as detected:

@@ -135,6 +135,7 @@ def test_continuous_mode_joins_frames(own_relocalizer, tester, robot):
     assert not tester.initial_poses
 
 
+@pytest.mark.full
 def test_a_recorded_turn_replays_with_its_odometry(own_relocalizer, tester, robot, room_map,
                                                    tmp_path):
     own_relocalizer(record_folder=tmp_path, **PARAMETERS)
@@ -176,6 +177,7 @@ def test_a_robot_that_turns_wakes_up(looking, tester, robot):
     assert np.sqrt(np.diag(covariance)[:3]).max() < 0.5
 
 
+@pytest.mark.full
 def test_a_robot_that_stands_is_refused_in_the_end(looking, tester, robot):
     assert tester.set_parameter('timeout_s', 2.0).successful
     start = time.monotonic()
@@ -188,6 +190,7 @@ def test_a_robot_that_stands_is_refused_in_the_end(looking, tester, robot):
     assert not tester.poses and not tester.initial_poses
 
 
+@pytest.mark.full
 def test_a_robot_that_stops_in_time_is_handed_over(looking, tester, robot):
     def drive_on(odometry, now_s):
         odometry.twist.twist.angular.z = 0.0 if tester.poses else 2.0

@@ -100,6 +100,7 @@ def test_the_mount_moves_the_pose_and_its_covariance(own_relocalizer, tester):
     np.testing.assert_allclose(of_base, moved, rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize('signal_number', [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize('asked', [False, True])
 def test_signals_end_the_node(own_relocalizer, tester, signal_number, asked):

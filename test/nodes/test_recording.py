@@ -19,6 +19,8 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.intrinsics import PRESETS
 from cliploc_ros.datasets.tum import read_tum
 
+pytestmark = pytest.mark.full
+
 FRAMES = 17
 
 

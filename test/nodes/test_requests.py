@@ -8,6 +8,7 @@ import sys
 import time
 
 import numpy as np
+import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from diagnostic_msgs.srv import SelfTest
 from processes import PROJECT
@@ -91,6 +92,7 @@ def test_the_navigation_stacks_own_service_wakes_up_too(relocalizer, tester):
     tester.wait(lambda: tester.initial_poses, 'an initial pose')
 
 
+@pytest.mark.full
 def test_between_requests_nothing_is_listened_to(relocalizer, tester):
     assert tester.relocalize(make_frame()).success
     tester.wait(lambda: tester.listened_to() == 0, 'the subscriptions to end')

@@ -193,6 +193,7 @@ def test_invalid_poses_are_left_out(live, tester):
     tester.destroy_publisher(publisher)
 
 
+@pytest.mark.full
 def test_a_relocalizer_that_is_stopped_or_killed_and_starts_again(live, own_relocalizer, tester):
     for number, text in ((signal.SIGINT, None), (signal.SIGKILL, 'has not reported')):
         process = own_relocalizer(timeout_s=60.0)
@@ -212,6 +213,7 @@ def test_a_relocalizer_that_is_stopped_or_killed_and_starts_again(live, own_relo
     assert str(outcome[0]).startswith('accepted')
 
 
+@pytest.mark.full
 def test_the_studio_ends_while_a_request_waits(own_relocalizer):
     own_relocalizer(timeout_s=60.0)
     with follow_relocalizer('relocalizer') as live:
@@ -228,6 +230,7 @@ def test_names_that_are_none(name):
         pass
 
 
+@pytest.mark.full
 @pytest.mark.needs('viser')
 def test_the_executable_follows_and_ends_on_ctrl_c(own_relocalizer, start, tmp_path):
     own_relocalizer()
@@ -238,6 +241,7 @@ def test_the_executable_follows_and_ends_on_ctrl_c(own_relocalizer, start, tmp_p
     assert 'Traceback' not in process.output() and 'error' not in process.output()
 
 
+@pytest.mark.full
 @pytest.mark.needs('viser')
 def test_without_ros_the_studio_runs_and_says_what_is_missing(tmp_path):
     """Its core imports no ROS; --ros names what to source."""

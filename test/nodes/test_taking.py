@@ -81,6 +81,7 @@ def why_not_taken(tester, stamp_s=100.0):
     return found[1]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGSTOP])
 def test_a_localizer_that_has_died_or_hangs_takes_no_pose(amcl, node, tester, number):
     """DDS takes it for alive: 20 s after its death, and while it hangs."""

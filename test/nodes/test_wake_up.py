@@ -161,6 +161,7 @@ def test_a_server_that_refuses_every_turn(relocalizer, wake_up_until, serve_spin
     assert spinner.yaw == 0.0
 
 
+@pytest.mark.full
 @pytest.mark.needs('nav2_msgs')
 def test_an_interrupt_stops_the_robot(relocalizer, start, end, tester, serve_spin):
     spinner = serve_spin('hang')
@@ -184,6 +185,7 @@ def test_a_relocalizer_that_does_not_watch_is_named(relocalizer, start, end):
         'the relocalizer does not watch: set its parameter watch to tf or amcl_pose\n')
 
 
+@pytest.mark.full
 def test_each_thing_that_is_missing_has_its_message(start, end, tester, room_map):
     process = start('cli.wake_up', '--timeout', 60, '--ros-args', '-r', '__ns:=/bare')
     process.wait_for_output(
@@ -224,6 +226,7 @@ def test_without_a_relocalizer_it_is_not_ready(start, end):
         'or name it with --relocalizer or a namespace\n')
 
 
+@pytest.mark.full
 def test_a_relocalizer_that_is_killed_during_a_request(start, end, tester, room_map):
     relocalizer = start('nodes.relocalizer', '--ros-args', '-r', 'relocalizer:__node:=brief',
                         parameters=class_matching(room_map, timeout_s=60.0))
@@ -236,6 +239,7 @@ def test_a_relocalizer_that_is_killed_during_a_request(start, end, tester, room_
                      'its machine is overloaded; start it again if it died', process.output())
 
 
+@pytest.mark.full
 def test_a_wake_up_that_is_killed_leaves_a_relocalizer_that_answers(relocalizer, start, tester):
     process = start('cli.wake_up')
     tester.wait(lambda: tester.images.get_subscription_count() == 1, 'the request')

@@ -156,6 +156,7 @@ def test_without_a_watch_nothing_is_published_or_listened_to(own_relocalizer, te
         'its subscriptions')
 
 
+@pytest.mark.full
 def test_a_lost_robot_without_a_pose_is_not_requested_again_and_again(watch):
     watched = watch(on_lost='relocalize', min_inliers=999)
     watched.until_state('localized')
@@ -169,6 +170,7 @@ def test_a_lost_robot_without_a_pose_is_not_requested_again_and_again(watch):
     assert not watched.tester.initial_poses
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(('fault', 'text'), [
     ({'has_localizer': False}, 'no pose heard on /amcl_pose yet: AMCL shows one once'),
     ({'frame_id': 'floor_2'}, "the localizer's pose is in frame 'floor_2', the map in 'map'"),
@@ -183,6 +185,7 @@ def test_what_is_missing_is_named_and_not_taken_for_lost(watch, fault, text):
     assert text in watched.message
 
 
+@pytest.mark.full
 def test_a_localizer_that_falls_silent_while_the_robot_drives_is_named(watch):
     watched = watch()
     watched.until_state('localized')
@@ -191,6 +194,7 @@ def test_a_localizer_that_falls_silent_while_the_robot_drives_is_named(watch):
     assert watched.states[-1] == 'uncertain'
 
 
+@pytest.mark.full
 def test_images_that_stop_end_in_uncertain(watch):
     watched = watch()
     watched.until_state('localized')
@@ -199,6 +203,7 @@ def test_images_that_stop_end_in_uncertain(watch):
     assert watched.states[-1] == 'uncertain'
 
 
+@pytest.mark.full
 def test_without_odometry_a_fresh_pose_will_do(watch):
     watched = watch()
     watched.robot.has_odom = False
@@ -207,6 +212,7 @@ def test_without_odometry_a_fresh_pose_will_do(watch):
     watched.until_reason('and odom does not tell the way since: publish odom')
 
 
+@pytest.mark.full
 def test_a_localizer_that_jumps_is_another_statement(watch):
     """Of the pose before, nothing counts."""
     watched = watch()
@@ -220,6 +226,7 @@ def test_a_localizer_that_jumps_is_another_statement(watch):
     watched.until_state('localized')
 
 
+@pytest.mark.full
 def test_a_map_that_is_read_again_is_watched_anew(watch, tester):
     watched = watch()
     watched.until_state('localized')
@@ -230,6 +237,7 @@ def test_a_map_that_is_read_again_is_watched_anew(watch, tester):
     watched.until_state('localized')
 
 
+@pytest.mark.full
 def test_requests_are_answered_as_ever_and_begin_the_watch_again(watch, tester):
     watched = watch()
     watched.until_state('localized')
@@ -241,6 +249,7 @@ def test_requests_are_answered_as_ever_and_begin_the_watch_again(watch, tester):
     watched.until_state('localized')
 
 
+@pytest.mark.full
 def test_between_looks_nothing_listens_to_images(watch, tester):
     """A detector rests there."""
     watched = watch(watch_period_s=5.0)
@@ -250,6 +259,7 @@ def test_between_looks_nothing_listens_to_images(watch, tester):
     watched.looks(1)
 
 
+@pytest.mark.full
 def test_time_that_jumps_back_begins_the_watch_again(watch, tester):
     """Transforms and poses from before do not count; nobody is lost by that."""
     clock = tester.create_publisher(Clock, '/clock', RELIABLE)
@@ -266,6 +276,7 @@ def test_time_that_jumps_back_begins_the_watch_again(watch, tester):
     tester.destroy_publisher(clock)
 
 
+@pytest.mark.full
 def test_wake_up_goes_on_and_wakes_a_lost_robot_up_again(watch, start):
     """The robot drives on for a while, and nothing is done until it stands."""
     watched = watch()

@@ -117,6 +117,7 @@ def test_observations_lie_next_to_the_recording(walk, recorded, capsys):
         line for line in third if 'center' in line]
 
 
+@pytest.mark.full
 def test_killed_and_resumed(walk, recorded, tmp_path, capsys):
     file = tmp_path / 'resumed.npz'
     command = arguments('--tum', walk, *NETWORKS, *CLIP, *ALL, '--record-to', file, '--out',
@@ -147,6 +148,7 @@ def by_two_workers(walk, tmp_path_factory):
     return folder
 
 
+@pytest.mark.full
 def test_two_workers_say_the_same(recorded, by_two_workers):
     assert_equal(load_recorded(by_two_workers / 'tum.npz'), load_recorded(recorded))
 
