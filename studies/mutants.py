@@ -57,7 +57,7 @@ _SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
 _QUIET = ('-q', '-x', '-p', 'no:cacheprovider', '-p', 'no:rerunfailures', '-p', 'no:xdist')
 _LOGS = re.compile(r'(self\._?)?([\w.]+\.get_)?log(ger)?(\(\))?\.(debug|info|warning|error)\(')
 # A test with a fault may take so much longer [s], and a fault may cost this time in all.
-_PATIENCE_S, _MOST_S = 20.0, 60.0
+_PATIENCE_S, _MOST_S = 60.0, 20.0
 
 
 class Record(NamedTuple):
@@ -340,7 +340,10 @@ class Tests:
                 self._of_line[line].add(name)
 
     def of(self, mutant: Mutant) -> list[str]:
-        """Return the tests that can notice a fault, as time allows: the quickest files first."""
+        """Return the tests that can notice a fault, as time allows.
+
+        The files whose tests run the fewest lines come first: they say most about each.
+        """
         lines = [(mutant.file, line) for line in mutant.lines]
         if mutant.names:
             word = re.compile(rf'\b({"|".join(mutant.names)})\b')
@@ -350,7 +353,8 @@ class Tests:
         by_file = defaultdict(list)
         for name in found:
             by_file[name.split('::')[0]].append(name)
-        files = sorted(by_file.values(), key=lambda names: median(map(self.seconds, names)))
+        files = sorted(by_file.values(), key=lambda names: median(
+            len(self.records[name].lines) for name in names))
         chosen: list[str] = []
         left = _MOST_S
         for name in (name for names in files for name in sorted(names, key=self.seconds)):
@@ -615,7 +619,8 @@ def main() -> int:
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = parser.add_subparsers(required=True)
     part = parts.add_parser('record', help='note which lines tests run')
-    part.add_argument('tests', nargs='+', help='arguments of pytest, such as test/core --quick')
+    part.add_argument('tests', nargs=argparse.REMAINDER,
+                      help='arguments of pytest, such as test/core')
     part.add_argument('--plain', type=float, default=0.0, metavar='S',
                       help='kernels are not compiled; tests that take longer are left out')
     part.set_defaults(run=record)
@@ -626,9 +631,7 @@ def main() -> int:
     part.add_argument('--workers', type=int, default=2)
     part.add_argument('--only', default='', help='faults in FILE or FILE:LINE alone')
     part.set_defaults(run=run)
-    arguments, others = parser.parse_known_args()
-    if others and 'tests' in arguments:
-        arguments.tests += others
+    arguments = parser.parse_args()
     return run_command(lambda: int(arguments.run(arguments)))
 
 

@@ -51,7 +51,8 @@ def extras() -> dict[str, list[str]]:
 
 def test_extras_are_what_the_tests_run_with(extras):
     """Each has the versions of script/requirements*.txt, with an upper bound."""
-    required = ''.join(read(f'script/requirements{part}.txt') for part in ('', '-models', '-test'))
+    required = ''.join(read(f'script/requirements{part}.txt')
+                       for part in ('', '-models', '-test', '-all'))
     assert {one for extra in extras.values() for one in extra} <= set(required.splitlines())
     assert all('<' in one or '==' in one for one in extras['all'])
 
