@@ -20,8 +20,8 @@ import pytest
 
 PROJECT = Path(__file__).resolve().parents[1]
 SHARED_DATA = PROJECT.parent / 'shared' / 'data'
-# pytest-xdist hands whole files to its workers in this order. The folders with long files come
-# first, so that all workers end at about the same time.
+# The order of the folders. pytest-xdist gives each worker an equal run of tests; who is done takes
+# half of what another has left.
 LONGEST_FIRST = ('nodes', 'demo', 'models', 'studies', 'evaluation', 'mapping', 'cli', 'core')
 # A fixture, or a test, that takes longer hangs. The longest take a minute on a busy machine, and
 # several in a niced process, which gets a tenth of a core there.
@@ -144,13 +144,6 @@ def pytest_sessionfinish(session, exitstatus):
     if config.getoption('--no-skips') and count(reporter, 'skipped'):
         reporter.write_line('\nskipped tests fail this run (--no-skips)', red=True)
         session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config, log):
-    from crash_proof import CrashProofScheduling  # pytest-xdist may be missing
-
-    return CrashProofScheduling(config, log)
 
 
 @pytest.hookimpl(optionalhook=True)

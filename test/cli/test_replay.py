@@ -136,16 +136,6 @@ def test_clock_runs_with_the_messages(tmp_path, listener):
     assert set(np.diff(stamps_ns) % (20 * MS)) == {0}
 
 
-def test_clock_of_the_recording_gives_way(tmp_path):
-    with BagWriter(tmp_path / 'bag') as bag:
-        bag.add_topic('/clock', 'rosgraph_msgs/msg/Clock')
-        bag.add_topic('/pose', bag_messages.POSE)
-        bag.write('/pose', 1, bag_messages.pose_message(1, 'world', np.eye(4)))
-        bag.write('/clock', 2, bytes([0, 1, 0, 0]) + bytes(8))
-    done = run('replay', tmp_path / 'bag', '--clock')
-    assert 'published 1 messages on 1 topics' in done.stdout
-
-
 def test_names_and_selection(tmp_path, listener):
     topics = dict.fromkeys(('/a', '/b', '/c', '/d'), RECORDED_QOS)
     bag = write_poses(tmp_path / 'bag', [0, 20], topics)

@@ -6,7 +6,6 @@ import os
 import pickle
 import subprocess
 import sys
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
@@ -128,16 +127,6 @@ def test_the_longest_unused_files_go(cache):
     assert cache.load(KEY, ['label 39'], 16) is not None
 
 
-def test_what_killed_writers_left_is_cleared(cache):
-    file = stored_file(cache)
-    old, young = file.with_name(f'.1.{file.name}'), file.with_name(f'.2.{file.name}')
-    old.touch()
-    young.touch()
-    os.utime(old, (0, 0))
-    cache.store(KEY, ['another'], unit_rows(1))
-    assert not old.exists() and young.exists()
-
-
 # ---- several labels of a landmark make one embedding
 
 AXES = {'a': [1.0, 0, 0], 'b': [0, 1.0, 0], 'c': [0, 0.6, 0.8]}
@@ -216,12 +205,3 @@ def test_each_class_is_encoded_once(clip, caplog):
     np.testing.assert_array_equal(again['can'], more['can'])
     np.testing.assert_array_equal(again['mug'], found['mug'])
     assert embed_phrases(weights, clip, {}) == {}
-
-
-def test_without_a_place_for_the_cache_phrases_are_encoded_all_the_same(clip, tmp_path, caplog):
-    file = tmp_path / 'file'
-    file.write_text('')
-    nowhere = replace(clip, cache_dir=str(file / 'cache'))
-    found = embed_phrases(resolve_clip_weights(nowhere), nowhere, PHRASES)
-    assert found['mug'].shape == (2, 128)
-    assert 'are not cached' in caplog.text

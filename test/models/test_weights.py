@@ -69,24 +69,6 @@ def test_weights_of_another_clip(small_clip, tmp_path):
     assert 'does not hold the weights' in text
 
 
-@pytest.mark.parametrize(('name', 'text', 'complaint'), [
-    ('own_model', '', 'cannot be read as JSON'),
-    ('own_model', '{"embed_dim": 12', 'cannot be read as JSON'),
-    ('own_model', '[1, 2]', 'lacks embed_dim, vision_cfg, text_cfg'),
-    ('own_model', '{"embed_dim": 12, "text_cfg": {}}', 'lacks vision_cfg'),
-    ('nowhere', None, 'does not exist'),
-    ('ViT-B-32', '{"embed_dim": 8, "vision_cfg": {}, "text_cfg": {}}',
-     "another model of the name 'ViT-B-32': rename"),
-])
-def test_model_configs_that_cannot_be_used_are_named(tmp_path, name, text, complaint):
-    config, weights = tmp_path / f'{name}.json', tmp_path / 'own.safetensors'
-    weights.write_bytes(b'x' * 100)
-    if text is not None:
-        config.write_text(text)
-    found = refusal(options(str(config), weights, tmp_path))
-    assert complaint in found and str(config) in found
-
-
 class Hostile:
     """Runs a command when it is unpickled."""
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The document of the map studio: edits, undo, saving and the journal; no browser."""
 
-import json
 from contextlib import suppress
 
 import numpy as np
@@ -117,26 +116,6 @@ def test_unknown_fields_stay_and_the_relocalizer_refuses_them(path):
         LandmarkMap.from_file(path)
 
 
-@pytest.mark.parametrize('text', [
-    '/**: {ros__parameters: {map: {frame_id: m, landmarks: {a: {label: x, class_id: c, center: '
-    '[0, 0, 0], semi_axes: [1, 1, 1], orientation: [0, 0, 0, 1], note: "é"}}}}}',
-    json.dumps({'/**': {'ros__parameters': {'map': {'frame_id': 'm', 'landmarks': {
-        'a': {'label': 'x', 'class_id': 'c', 'center': [0, 0, 0], 'semi_axes': [1, 1, 1],
-              'orientation': [0, 0, 0, 1], 'note': 'é'}}}}}}, indent=1)])
-def test_maps_in_braces(tmp_path, text):
-    path = tmp_path / 'map.yaml'
-    path.write_text(text)
-    document = Document(path)
-    document.apply(edits.create(document.landmarks, 'two', 'c', np.ones(3), np.eye(3)))
-    document.apply(edits.delete(document.landmarks, ['a']))
-    document.apply(edits.create(document.landmarks, 'three', 'c', np.ones(3), np.eye(3)))
-    document.undo()
-    document.undo()
-    document.save()
-    tree = read_parameter_file(path)['/**']['ros__parameters']['map']['landmarks']
-    assert list(tree) == ['a', 'c_1'] and tree['a']['note'] == 'é'
-
-
 def test_every_edit_is_undone_and_done_again(document):
     states = [document.landmarks]
     for edit in (lambda all: edits.move(all, 'cup_1', [9, 9, 9]),
@@ -161,17 +140,6 @@ def test_every_edit_is_undone_and_done_again(document):
         assert document.redo()
         assert document.landmarks == state
     assert not document.redo()
-
-
-def test_a_drag_is_one_edit(document):
-    for x in range(5):
-        document.apply(edits.move(document.landmarks, 'cup_1', [x, 0, 0]), gesture='drag 1')
-    document.apply(edits.move(document.landmarks, 'cup_1', [7, 0, 0]), gesture='drag 2')
-    document.undo()
-    assert document.landmarks['cup_1'].center.tolist() == [4, 0, 0]
-    document.undo()
-    assert document.landmarks['cup_1'].center.tolist() == [1, 2, 0.5]
-    assert not document.undo()
 
 
 @pytest.mark.parametrize(('edit', 'message'), [

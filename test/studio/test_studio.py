@@ -128,52 +128,6 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
     assert counts['accepted'] + counts['fixed'] + counts['deleted'] == counts['total'] == total
 
 
-def test_a_landmark_whose_duplicate_is_deleted_is_none(office):
-    document, review = office.document, office.review
-    twin = document.landmarks['book_2']
-    document.apply(edits.create(document.landmarks, 'a twin', 'book', twin.center + 0.01,
-                                twin.basis))
-    review.check()
-    assert 'same object' in review.check_of('book_2').faults[0]
-    document.select([list(document.landmarks)[-1]])
-    review.delete()
-    assert not any('same object' in text for text in review.check_of('book_2').faults)
-
-
-def test_the_review_goes_on_where_it_was(office):
-    """After a restart, too; what is new joins the queue; undo takes a decision back."""
-    document, review = office.document, office.review
-    review.check()
-    first, = document.selection
-    review.accept()
-    again = Studio(document, office.recording)
-    again.review.check()
-    assert again.review.decision(first) == 'accepted' and document.selection != (first,)
-    twin = document.landmarks[first]
-    document.apply(edits.create(document.landmarks, 'a twin', 'cup', twin.center + 1.0,
-                                twin.basis))
-    counts = again.review.counts()
-    assert counts['total'] == len(document.landmarks) and counts['accepted'] == 1
-    assert list(document.landmarks)[-1] == again.review.order[-1] == again.rows()[-1].landmark_id
-    document.undo()
-    document.undo()
-    assert not again.review.decision(first)
-
-
-def test_without_a_recording_the_studio_says_what_is_missing(tmp_path):
-    studio = Studio(Document(tmp_path / 'map.yaml'))
-    for action in (studio.refit_all, studio.relocalize_all, lambda: studio.image(0)):
-        with pytest.raises(EditError, match='--observations'):
-            action()
-    for action in (studio.delete, studio.merge, studio.split, studio.toggle_lock):
-        with pytest.raises(EditError, match='select'):
-            action()
-    with pytest.raises(EditError, match='no landmarks'):
-        studio.review.check()
-    assert studio.rows() == [] and studio.phrases() == ()
-    studio.document.close()
-
-
 def test_a_box_of_the_detector_is_taken(office):
     view = int(np.argmax(np.diff(office.recording.detections.frame_offsets)))
     boxes = office.recording.boxes_in_view(view)
