@@ -392,10 +392,16 @@ class Judge:
         self._tests, self._workers = tests, workers
         self._is_sound: dict[str, bool] = {}
         self._items: dict[str, Any] = {}
+        self._functions: dict[tuple[str, str, int], list[FunctionType]] = defaultdict(list)
 
     def pytest_runtestloop(self, session: Any) -> bool:
         """Run tests against faults instead of running them once."""
         self._items = {item.nodeid: item for item in session.items}
+        for one in gc.get_objects():
+            if isinstance(one, FunctionType):
+                code = one.__code__
+                self._functions[code.co_filename, code.co_name, code.co_firstlineno].append(one)
+        gc.freeze()  # children share what they do not change
         self.run()
         return True
 
@@ -437,7 +443,7 @@ class Judge:
             return int(pytest.main([*_QUIET, '--basetemp', str(folder / 'tmp'), *names],
                                    [_Failures(folder / 'failed')]))
         if mutant is not None:
-            _plant(mutant)
+            self._plant(mutant)
         items = [self._items[name] for name in names]
         items[0].config._tmp_path_factory._basetemp = folder / 'tmp'
         (folder / 'tmp').mkdir()
@@ -446,6 +452,14 @@ class Judge:
                 (folder / 'failed').write_text(item.nodeid)
                 return 1
         return 0
+
+    def _plant(self, mutant: Mutant) -> None:
+        """Give a function the code with a fault."""
+        assert mutant.function is not None
+        faulty = next(one for one in _codes_of(planted(mutant)[0])
+                      if (one.co_name, one.co_firstlineno) == mutant.function)
+        for function in self._functions[str(PROJECT / mutant.file), *mutant.function]:
+            function.__code__ = faulty
 
     def _take(self, job: '_Job', killer: str) -> None:
         if job.is_check:
@@ -457,7 +471,7 @@ class Judge:
             self._waiting.append((job.mutant, killer))
         else:
             self.outcomes.append(Outcome(job.mutant, len(job.names), killer))
-            if len(self.outcomes) % 50 == 0:
+            if len(self.outcomes) % 10 == 0:
                 print(f'{len(self.outcomes)} tried', file=sys.stderr, flush=True)
 
 
@@ -519,18 +533,6 @@ def _plant_at_import(mutant: Mutant) -> None:
     def get(self: SourceFileLoader, fullname: str) -> CodeType | None:
         return code if fullname == name.replace('/', '.') else get_code(self, fullname)
     SourceFileLoader.get_code = get  # type: ignore[method-assign,assignment]
-
-
-def _plant(mutant: Mutant) -> None:
-    """Give a function the code with a fault."""
-    assert mutant.function is not None
-    faulty = next(one for one in _codes_of(planted(mutant)[0])
-                  if (one.co_name, one.co_firstlineno) == mutant.function)
-    file = str(PROJECT / mutant.file)
-    for one in gc.get_objects():
-        if isinstance(one, FunctionType) and one.__code__.co_filename == file and (
-                one.__code__.co_name, one.__code__.co_firstlineno) == mutant.function:
-            one.__code__ = faulty
 
 
 def _codes_of(code: CodeType) -> Iterator[CodeType]:
