@@ -55,6 +55,8 @@ _SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.And: ast.Or,
     ast.Or: ast.And, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd}
 _QUIET = ('-q', '-x', '-p', 'no:cacheprovider', '-p', 'no:rerunfailures', '-p', 'no:xdist')
+# Calls whose arguments may be exchanged, or whose exchange no type checker lets pass.
+_ALIKE = re.compile(r'(^|\.)(max|min|maximum|minimum|hypot|logaddexp|isinstance|cast)$')
 _LOGS = re.compile(r'(self\._?)?([\w.]+\.get_)?log(ger)?(\(\))?\.(debug|info|warning|error)\(')
 # A test with a fault may take so much longer [s], and a fault may cost this time in all.
 _PATIENCE_S, _MOST_S = 60.0, 20.0
@@ -63,7 +65,7 @@ _PATIENCE_S, _MOST_S = 60.0, 20.0
 class Record(NamedTuple):
     """What a test ran."""
 
-    seconds: float
+    seconds: float  #: Of processor time, of this process
     lines: frozenset[tuple[str, int]]  #: File, relative to the project, and line
 
 
@@ -198,8 +200,8 @@ def _changes(node: ast.AST, parent: ast.AST, field: str) -> Iterator[tuple[str, 
         case ast.Constant(value=float() as value):
             yield f'{value} is {1.3 * value or 1.0:g}', ast.Constant(1.3 * value or 1.0)
         case ast.Call(args=[first, second, *others], func=function) if not any(
-                isinstance(one, ast.Starred) for one in node.args) and not (
-                isinstance(function, ast.Name) and function.id in ('isinstance', 'cast')):
+                isinstance(one, ast.Starred) for one in node.args) and not _ALIKE.search(
+                ast.unparse(function)):
             yield 'arguments exchanged', _with(node, args=[second, first, *others])
 
 
@@ -276,7 +278,7 @@ class Recorder:
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: Any) -> Iterator[None]:
         """Note the lines of a test that passes."""
-        self._lines, self._failed, start = set(), False, time.perf_counter()
+        self._lines, self._failed, start = set(), False, time.process_time()
         sys.monitoring.restart_events()
         if self._most_s:
             signal.signal(signal.SIGVTALRM, _end_test)
@@ -285,7 +287,7 @@ class Recorder:
         signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
         if not self._failed:
             shared = (self._of_fixtures.get(name, set()) for name in item.fixturenames)
-            self.records[item.nodeid] = Record(time.perf_counter() - start,
+            self.records[item.nodeid] = Record(time.process_time() - start,
                                                frozenset(self._lines.union(*shared)))
         return result
 

@@ -20,10 +20,11 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.watch.alignment import align, look_at
 from cliploc_ros.core.watch.belief import Belief
-from cliploc_ros.core.watch.evidence import by_vertical
+from cliploc_ros.core.watch.evidence import by_vertical, measure
 from cliploc_ros.core.watch.expectation import Expected, expect
-from cliploc_ros.core.watch.missing import Missing
+from cliploc_ros.core.watch.missing import Missing, _Record
 from cliploc_ros.core.watch.watch import Watch, WatchState
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
@@ -313,3 +314,45 @@ def test_a_landmark_is_missed_only_from_where_it_was_seen(side, is_missing):
     for _ in range(20):
         missing.add(Expected(np.array([0]), ~yes, yes, np.array([side])), 1.0)
     assert missing.named() == [0] * is_missing
+
+
+def test_a_look_counts_what_it_explains_and_what_it_does_not(room):
+    options, pose = RelocalizerOptions(matching='class'), drive(1)[0]
+    seen = see(room, pose)
+    count, others = len(seen.detections), np.array([[300.0, 5, 310, 15], [400, 5, 410, 15]])
+    for known, class_ids in ((2, ('a', 'b')), (1, ('a', 'unknown')), (0, ('other', 'unknown'))):
+        more = Detections(np.concatenate([seen.detections.bboxes_xyxy, others]),
+                          (*seen.detections.class_ids, *class_ids), np.full(count + 2, 0.9))
+        evidence, expected = measure(align(look_at(room, replace(seen, detections=more), options),
+                                           pose))
+        assert (evidence.known, evidence.matched, evidence.unexplained) == (
+            count + known, count, known)
+        assert evidence.expected == len(expected.landmarks) >= 3
+        assert evidence.missed == int((~expected.was_seen).sum())
+        assert evidence.away_m < 0.01 and evidence.away_deg < 0.2
+    gone, _ = measure(align(look_at(room, replace(seen, detections=seen.detections.select(
+        np.arange(1, count))), options), pose))
+    assert (gone.known, gone.matched, gone.unexplained) == (count - 1, count - 1, 0)
+
+
+def test_a_pose_that_is_off_is_aligned_with_what_is_seen(room):
+    options, pose = RelocalizerOptions(matching='class'), drive(1)[0]
+    away = measure(align(look_at(room, see(room, pose), options), moved(pose, 0.2, 0.1)))[0]
+    assert away.away_m == pytest.approx(np.hypot(0.2, 0.1), abs=0.06)
+
+
+@pytest.mark.parametrize(('similarities', 'matching'), [(False, 'class'), (True, 'hybrid')])
+def test_without_similarities_a_look_matches_by_class(room, similarities, matching):
+    seen = see(room, drive(1)[0])
+    if similarities:
+        seen = replace(seen, similarities=np.zeros((len(seen.detections), COUNT)))
+    assert look_at(room, seen, RelocalizerOptions()).options.matching == matching
+
+
+@pytest.mark.parametrize(('record', 'gone'), [
+    (_Record(), 0.05), (_Record(misses=1.0), 1 / 6), (_Record(misses=2.0), 0.05 * 0.95 / (
+        0.05 * 0.95 + 0.25 * 1.75 / 4)), (_Record(found=1.0, misses=1.0), 0.05 / (
+            0.05 + 0.75 / 4)), (_Record(missed=1.0, misses=1.0), 0.05 / (0.05 + 1.75 / 4))])
+def test_each_miss_makes_a_landmark_less_likely_to_be_there(record, gone):
+    """In numbers: looks find three of four landmarks, 3 looks before any, 5 % are gone."""
+    assert record.gone(0.75) == pytest.approx(gone)
