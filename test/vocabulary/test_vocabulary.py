@@ -56,6 +56,7 @@ def test_rules_that_cannot_be_used(rules, message):
         expand_phrases(rules)
 
 
+@pytest.mark.full
 def test_all_coco_classes_are_shipped():
     file = Path(importlib.util.find_spec('ultralytics').origin).parent / 'cfg/datasets/coco.yaml'
     names = yaml.safe_load(file.read_text(encoding='utf-8'))['names'].values()
