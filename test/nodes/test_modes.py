@@ -42,15 +42,6 @@ def test_compressed_images(own_relocalizer, tester):
     assert tester.relocalize((good, info, detections)).success
 
 
-@pytest.mark.parametrize(('rectified', 'warned'), [(False, True), (True, False)])
-def test_a_rectified_image_taken_for_a_raw_one_is_warned_of(own_relocalizer, tester, rectified,
-                                                            warned):
-    process = own_relocalizer('--ros-args', '-r', 'image:=camera/image_rect', rectified=rectified,
-                              timeout_s=0.5)
-    tester.answer(tester.ask())  # by now it is active
-    assert ('/camera/image_rect sounds rectified' in process.output()) == warned
-
-
 def test_any_detector_will_do(own_relocalizer, tester):
     """Another publisher, with names of its own for the classes, and turned boxes."""
     names = {'a': 'class/0', 'b': 'Beta', 'c': 'gamma ray'}

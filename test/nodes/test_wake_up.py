@@ -237,11 +237,3 @@ def test_a_relocalizer_that_is_killed_during_a_request(start, end, tester, room_
     assert end(process) == NOT_READY
     assert re.search(r'look 1 \[\d+\.\d s\]: /brief has been silent for \d s: it died, or '
                      'its machine is overloaded; start it again if it died', process.output())
-
-
-@pytest.mark.full
-def test_a_wake_up_that_is_killed_leaves_a_relocalizer_that_answers(relocalizer, start, tester):
-    process = start('cli.wake_up')
-    tester.wait(lambda: tester.images.get_subscription_count() == 1, 'the request')
-    process.stop(signal.SIGKILL)
-    assert tester.relocalize(make_frame()).success
