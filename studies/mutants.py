@@ -291,6 +291,10 @@ class Recorder:
                                                frozenset(self._lines.union(*shared)))
         return result
 
+    def pytest_sessionfinish(self) -> None:
+        """Note no more lines."""
+        sys.monitoring.free_tool_id(sys.monitoring.PROFILER_ID)
+
     def pytest_runtest_logreport(self, report: Any) -> None:
         """Note a failure."""
         self._failed |= not report.passed
