@@ -226,6 +226,7 @@ def test_bad_odometry_is_named(room, walk):
         relocalizer.relocalize([first] * (MAX_FRAMES + 1))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize('case', ['nothing', 'vertical_1_deg'])
 def test_five_real_frames(case, office_map, queries, thresholds):
     """The 52 queries with their neighbours, 1 cm and 0.5 degrees of noise a step and axis."""

@@ -32,6 +32,7 @@ def pose_difference(estimate, truth):
     return np.concatenate([truth[:3, 3] - estimate[:3, 3], turn])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize('iterations', [500, 10000])
 def test_accepted_poses_are_right_and_their_covariances_true(iterations, office_map, queries,
                                                              observe, thresholds):
@@ -285,6 +286,7 @@ def garbage(rng, kind):
     return boxes
 
 
+@pytest.mark.full
 @pytest.mark.parametrize('kind', ['random boxes', 'nearly one box', 'repeated boxes',
                                   'the whole image'])
 def test_garbage_is_never_accepted(kind, office_map, rng):

@@ -110,6 +110,7 @@ def test_no_pose_is_its_own_look_alike(office, knows_vertical):
             assert np.linalg.norm(one - other) > 0.9
 
 
+@pytest.mark.full
 def test_mirror_images_are_refused(office):
     landmark_map, queries = office
     relocalizer = Relocalizer(landmark_map, replace(OPTIONS, matching='class'))

@@ -154,20 +154,7 @@ def test_a_camera_that_is_late_or_silent_is_left_out_and_named(four_cameras, wor
     assert 'Traceback' not in process.output()
 
 
-@pytest.mark.parametrize(('given', 'named'), [
-    ({'cameras': ['left', 'left'], 'base_frame': 'base_link'}, 'cameras: a name is given twice'),
-    ({'cameras': ['left', 'right']}, 'cameras: needs base_frame'),
-    ({'cameras': ['left', 'the right']}, "cameras: 'the right' is no namespace of topics"),
-    ({'cameras': [f'camera_{number}' for number in range(11)], 'base_frame': 'base_link'},
-     'cameras: 11 are more than 10'),
-    ({'cameras': ['left', 'right'], 'base_frame': 'base_link',
-      'base_from_camera': BASE_FROM_CAMERA[:21]}, 'base_from_camera: needs 7 numbers'),
-    ({'mount_deviation': [-1.0, 0.0]}, 'mount_deviation: needs two numbers of 0 or more'),
-])
-def test_parameters_that_do_not_fit_are_named(own_relocalizer, given, named):
-    own_relocalizer(expect=named, **given)
-
-
+@pytest.mark.full
 def test_one_detector_serves_all_cameras_in_turn(start, tester):
     """With one network: images of one instant, more of them than it can look at."""
     process = start('nodes.detector', parameters={

@@ -19,6 +19,8 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.intrinsics import PRESETS
 from cliploc_ros.datasets.tum import read_tum
 
+pytestmark = pytest.mark.full
+
 FRAMES = 17
 
 
@@ -142,15 +144,3 @@ def test_the_detector_works_only_while_something_listens(shared_data, start, tes
     code, seconds = detector.stop()
     assert code == 0
     assert seconds < 2.0
-
-
-@pytest.mark.parametrize(('model', 'reason'), [
-    ('/nowhere/yolo.pt', '/nowhere/yolo.pt'), ('yolov9000.pt', 'neither a file here nor'),
-    (__file__, 'test_recording.py')])
-def test_a_detector_without_weights_says_so_and_lives(start, tester, model, reason):
-    detector = start('nodes.detector', parameters={'model': model})
-    detector.wait_for_output('[ERROR]')
-    assert reason in detector.output()
-    assert 'Traceback' not in detector.output()
-    assert detector.alive
-    assert detector.stop()[0] == 0

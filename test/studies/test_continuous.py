@@ -3,9 +3,12 @@
 """A filter that takes each of successive answers for an independent measurement."""
 
 import numpy as np
+import pytest
 
 from cliploc_ros.core.localizer import succeed
 from studies.covariance.continuous import COVARIANCES, Filter, walk_squares
+
+pytestmark = pytest.mark.full
 
 OWN = np.diag([0.04, 0.01, 0.02, 0.001, 0.002, 0.003])
 HERE = np.eye(4)

@@ -5,6 +5,7 @@
 import re
 
 import numpy as np
+import pytest
 
 from studies.sensors import (
     accelerometer_rows,
@@ -13,6 +14,8 @@ from studies.sensors import (
     topics_table,
     vertical_rows,
 )
+
+pytestmark = pytest.mark.full
 
 
 def numbers(row):
