@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The numbers that decide whether a pose is accepted: calibration.yaml, a tuple a section."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -139,6 +140,8 @@ class Calibration(NamedTuple):
     """All sections; calibration.yaml says what each number means."""
 
     objects: Objects
+    #: Share of each class among the things of any building; classes that are missing are rare
+    common: Mapping[str, float]
     keyframes: Keyframes
     genuine: Genuine
     attitude: Attitude
@@ -153,9 +156,10 @@ class Calibration(NamedTuple):
 def load_calibration(path: Path = FILE) -> Calibration:
     """Read the numbers; a missing or unknown one is a defect of the installation."""
     sections: dict[str, Any] = yaml.safe_load(path.read_text())
-    return Calibration(**{
-        name: kind(**{term: entry['value'] for term, entry in sections[name]['terms'].items()})
-        for name, kind in Calibration.__annotations__.items()})
+    values = {name: {term: entry['value'] for term, entry in sections[name]['terms'].items()}
+              for name in Calibration._fields}
+    return Calibration(**{name: values[name] if name == 'common' else kind(**values[name])
+                          for name, kind in Calibration.__annotations__.items()})
 
 
 #: The installed numbers.

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.depth import depth_errors, depth_odds
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
@@ -40,9 +41,9 @@ class Support:
     #: How much more similar their crops are to the labels of their landmarks than to the map's
     #: labels on average, in standard deviations, summed
     likeness: float = 0.0
-    #: Summed over the objects that have a class of their landmark: the logarithm of the map's
-    #: number of landmarks for each landmark of this class. A rare class is matched by chance less
-    #: often than a common one. A class that the detector takes the landmark for at times counts
+    #: Summed over the objects that have a class of their landmark: the logarithm of the number of
+    #: things for each thing of this class, in the map or in any building. A rare class is matched
+    #: by chance less often than a common one. A class that the detector takes the landmark for at times counts
     #: by its share, see ClassIndex.shares.
     rarity: float = 0.0
     unlabelled: float = 0.0  #: Number of the objects that were matched by class alone
@@ -130,9 +131,11 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
             - means) / np.maximum(deviations, 1e-6)
     index = landmark_map.classes
     classes = index.classes_of(frame.class_ids)[detections]
+    # a class that is rare in the map may be common in the place where the camera is
+    common = np.array([CALIBRATION.common.get(frame.class_ids[row], 0.0) for row in detections])
     # 0 if the class of a detection is none of its landmark
-    rarities = index.shares(landmarks, classes) * -np.log(
-        np.maximum(index.sizes_of(classes), 1) / len(landmark_map))
+    rarities = index.shares(landmarks, classes) * -np.log(np.maximum(
+        np.maximum(index.sizes_of(classes), 1) / len(landmark_map), common))
     return np.column_stack([
         np.ones(len(matches)), [match.iou for match in matches],
         _misfits(frame.scene, map_from_camera, detections, landmarks,
