@@ -156,10 +156,10 @@ class Calibration(NamedTuple):
 def load_calibration(path: Path = FILE) -> Calibration:
     """Read the numbers; a missing or unknown one is a defect of the installation."""
     sections: dict[str, Any] = yaml.safe_load(path.read_text())
-    values = {name: {term: entry['value'] for term, entry in sections[name]['terms'].items()}
-              for name in Calibration._fields}
-    return Calibration(**{name: values[name] if name == 'common' else kind(**values[name])
-                          for name, kind in Calibration.__annotations__.items()})
+    kinds: dict[str, Any] = Calibration.__annotations__ | {'common': dict}
+    return Calibration(**{
+        name: kind(**{term: entry['value'] for term, entry in sections[name]['terms'].items()})
+        for name, kind in kinds.items()})
 
 
 #: The installed numbers.

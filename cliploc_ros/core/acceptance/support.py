@@ -24,6 +24,8 @@ from cliploc_ros.core.search.scene import Scene
 
 # Boxes whose IoU is below the first number show two things, above the second number one thing.
 _ONE_THING_IOU = (0.4, 0.8)
+# No image reaches further [px].
+_FAR_PX = 1e6
 # Deviation of a box's edge on the plane z = 1: a share of the box's mean semi-axis, plus a floor.
 # .2 of the semi-axis is .1 of the mean side. The calibration is fitted with these values.
 _EDGE_DEVIATION = (0.2, 0.003)
@@ -43,8 +45,8 @@ class Support:
     likeness: float = 0.0
     #: Summed over the objects that have a class of their landmark: the logarithm of the number of
     #: things for each thing of this class, in the map or in any building. A rare class is matched
-    #: by chance less often than a common one. A class that the detector takes the landmark for at times counts
-    #: by its share, see ClassIndex.shares.
+    #: by chance less often than a common one. A class that the detector takes the landmark for at
+    #: times counts by its share, see ClassIndex.shares.
     rarity: float = 0.0
     unlabelled: float = 0.0  #: Number of the objects that were matched by class alone
     #: Number of other detected objects of the map's classes, which no landmark explains
@@ -154,8 +156,9 @@ def _each_object_once(matches: Sequence[Match], objects: NDArray[np.int64]) -> l
 
 def one_thing(bboxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return to what degree each two of n boxes show one thing (n, n), 0 to 1."""
-    low = np.maximum(bboxes_xyxy[:, None, :2], bboxes_xyxy[:, :2])
-    high = np.minimum(bboxes_xyxy[:, None, 2:], bboxes_xyxy[:, 2:])
+    boxes = np.clip(np.nan_to_num(bboxes_xyxy), -_FAR_PX, _FAR_PX)
+    low = np.maximum(boxes[:, None, :2], boxes[:, :2])
+    high = np.minimum(boxes[:, None, 2:], boxes[:, 2:])
     shared = np.maximum(high - low, 0.0).prod(axis=2)
     areas = np.diag(shared)
     ious = shared / np.maximum(areas[:, None] + areas - shared, 1e-12)
