@@ -210,6 +210,15 @@ def test_a_localizer_that_falls_silent_while_the_robot_drives_is_named(watch):
     assert watched.states[-1] == 'uncertain'
 
 
+def test_stamps_that_are_no_time_end_in_uncertain(watch):
+    watched = watch()
+    watched.until_state('localized')
+    watched.robot.clock = lambda: 0.0
+    watched.until_reason('the stamp of the images on /image is 0: ')
+    assert watched.states[-1] == 'uncertain'
+    assert 'the stamp of /odom is 0: ' in watched.message
+
+
 def test_images_that_stop_end_in_uncertain(watch):
     watched = watch()
     watched.until_state('localized')
