@@ -106,8 +106,8 @@ def test_labels_tell_places_apart_and_what_one_place_lacks_does_not():
     assert lead_over_twin(pose, pose) == pytest.approx(0.0)
     assert lead_over_twin(pose, shown([1] * 6, [0.0] * 6)) > 4.0
     # the twin lacks two of the objects: as much as one place of two that is out of date
-    assert 0.0 < lead_over_twin(pose, shown([1] * 4, [2.0] * 4)) < 1.3
+    assert 0.0 < lead_over_twin(pose, shown([1] * 4, [2.0] * 4)) < 1.4
     # a pose elsewhere that explains one of them: each of the others counts as its label says
     assert lead_over_twin(pose, shown([1], [2.0])) == pytest.approx(5 * 0.88, abs=0.01)
     # the same, but the landmarks around are alike: what the image shows has moved
-    assert lead_over_twin(pose, shown([1], [2.0]), 0.7) < 1.3
+    assert lead_over_twin(pose, shown([1], [2.0]), 0.7) < 1.4

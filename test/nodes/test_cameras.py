@@ -20,6 +20,8 @@ from cliploc_ros.ros.conversions import detections_to_msg
 
 BASE_FROM_CAMERA = [float(number) for mount in MOUNTS for number in (
     *mount[:3, 3], *Rotation.from_matrix(mount[:3, :3]).as_quat())]
+# The clock of a camera that has none [s].
+NEVER = 1000.0
 
 
 @pytest.fixture(scope='module')
@@ -50,7 +52,8 @@ def four_cameras(start, tester, surroundings_map, tmp_path):
                 continue
             header = Header(frame_id=f'{name}_optical')
             nanoseconds = round(number * 1e8) + 10**12 - round(late_s.get(name, 0.0) * 1e9)
-            header.stamp.sec, header.stamp.nanosec = divmod(nanoseconds, 10**9)
+            if late_s.get(name) != NEVER:
+                header.stamp.sec, header.stamp.nanosec = divmod(nanoseconds, 10**9)
             for msg in (
                     CameraInfo(header=header, width=CAMERA.width, height=CAMERA.height,
                                k=CAMERA.matrix.ravel(), distortion_model='plumb_bob',
@@ -145,8 +148,8 @@ def test_a_recorded_request_of_four_cameras_replays(four_cameras, tester, surrou
 
 
 @pytest.mark.parametrize(('working', 'late_s'), [
-    (NAMES[1:], {}), (NAMES[:-1], {}), (NAMES, {'back': 1.0})],
-    ids=['first silent', 'last silent', 'one late'])
+    (NAMES[1:], {}), (NAMES[:-1], {}), (NAMES, {'back': 1.0}), (NAMES, {'left': NEVER})],
+    ids=['first silent', 'last silent', 'one late', 'one without stamps'])
 def test_a_camera_that_is_late_or_silent_is_left_out_and_named(four_cameras, working, late_s):
     process, ask = four_cameras
     missing = next(iter(late_s), None) or next(one for one in NAMES if one not in working)

@@ -169,6 +169,16 @@ def test_a_lost_robot_without_a_pose_is_not_requested_again_and_again(watch):
 
 
 @pytest.mark.full
+def test_stamps_that_are_no_time_end_in_uncertain(watch):
+    watched = watch()
+    watched.until_state('localized')
+    watched.robot.clock = lambda: 0.0
+    watched.until_reason('the stamp of the images on /image is 0: ')
+    assert watched.states[-1] == 'uncertain'
+    assert 'the stamp of /odom is 0: ' in watched.message
+
+
+@pytest.mark.full
 def test_a_map_that_is_read_again_is_watched_anew(watch, tester):
     watched = watch()
     watched.until_state('localized')

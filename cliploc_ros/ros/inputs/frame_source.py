@@ -341,7 +341,7 @@ class FrameSource:
                 self._static_info = msg if stamp_problem(msg.header.stamp) else None
                 if self._static_info is not None:
                     return
-            elif not self._is_named(name, msg, at_ns):
+            elif not self._is_named(name, msg, received_at):
                 return
             if name == 'image' and self._static_info is not None:
                 self._pairing.add('camera_info', at_ns, (self._static_info, received_at), 0)
@@ -360,18 +360,19 @@ class FrameSource:
             self.changed.notify_all()
         self._on_frame(frame)
 
-    def _is_named(self, name: str, msg: Any, at_ns: int) -> bool:
+    def _is_named(self, name: str, msg: Any, received_at: float) -> bool:
         """Return whether an image or detections have a stamp of their own."""
         if name == 'image':
-            self._lag_s = (self._node.get_clock().now().nanoseconds - at_ns) / NS_PER_S
+            self._lag_s = (self._node.get_clock().now().nanoseconds
+                           - stamp_ns(msg.header.stamp)) / NS_PER_S
             content = msg.header.frame_id, len(msg.data), bytes(
                 memoryview(msg.data)[::1 + len(msg.data) // _SAMPLE])
-            is_named = self._stamps[name].add(msg.header.stamp, content)
+            is_named = self._stamps[name].add(msg.header.stamp, content, received_at)
         else:
             boxes = [one.bbox for one in msg.detections]
             is_named = self._stamps[name].add(msg.header.stamp, np.array(
                 [(one.center.position.x, one.center.position.y, one.size_x, one.size_y)
-                 for one in boxes]).tobytes())
+                 for one in boxes]).tobytes(), received_at)
         if not is_named:
             self._unsure = None
         return is_named

@@ -25,6 +25,8 @@ _MAX_DISORDER_NS = NS_PER_S
 _SHOWN = 3
 # Ten seconds of a camera at 30 Hz.
 _REMEMBERED = 300
+# Messages come so evenly after their stamps; what comes otherwise is of another clock (a guess).
+_UNEVEN_S = 0.5
 
 
 class TimeJumpError(CliplocError):
@@ -111,7 +113,7 @@ class MessageStamps:
         self.problem = ''
         # Of each stamp the last message, and how often that came.
         self._known: dict[int, tuple[int, int]] = {}
-        self._own = 0
+        self._own, self._lag_s = 0, math.nan
 
     @property
     def are_own(self) -> bool:
@@ -122,10 +124,11 @@ class MessageStamps:
         """Return whether the same message came again and again with a stamp [ns]."""
         return self._known.get(at_ns, (0, 0))[1] >= _SHOWN
 
-    def add(self, stamp: Time, content: Hashable) -> bool:
+    def add(self, stamp: Time, content: Hashable, received_at: float) -> bool:
         """Take in a stamp and what tells its message from others; return whether it names it.
 
-        After a stamp that does not, so does none until some in a row are right.
+        After a stamp that does not, so does none until some in a row are right. The message
+        arrived at `received_at` (monotonic clock) [s].
         """
         at_ns, message, why = stamp_ns(stamp), hash(content), stamp_problem(stamp)
         if not why:
@@ -133,7 +136,9 @@ class MessageStamps:
             if known != message:
                 times, why = 0, f'is {at_ns / NS_PER_S:.6f} on several of them'
             self._known[at_ns] = message, times + 1
-            self._own += not times
+            former_s, self._lag_s = self._lag_s, received_at - at_ns / NS_PER_S
+            is_even = abs(self._lag_s - former_s) <= _UNEVEN_S
+            self._own = (self._own if is_even else 0) + (not times)
             if len(self._known) > _REMEMBERED:
                 del self._known[next(iter(self._known))]
         if why or self.is_repeated(at_ns):
