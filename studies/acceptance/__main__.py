@@ -133,23 +133,23 @@ def _families(options: argparse.Namespace) -> None:
     names = [name for name in FAMILIES if any(text in name for text in options.only)]
     if not names:
         raise OptionsError('nothing to test: --only must name a family')
-    share = ceil(options.requests / (1 + len(options.queries)))
-    tasks = []
+    tasks: list[Task] = []
     for name in names:
         family = FAMILIES[name]
         searched = RelocalizerOptions(matching=options.matching or (
             'hybrid' if name in BY_LABELS else 'class'), time_budget_s=inf)
         recorded = chosen_places(options) if options.queries and 'room' in family.kinds else []
+        share = ceil(options.requests / (1 + len(recorded)))
         worlds = [Simulated(kind, options.first_seed + number)
                   for number in range(ceil(share / (_QUERIES * len(family.kinds))))
                   for kind in family.kinds]
-        tasks += [task for task in tasks_of([*recorded, *worlds], searched, [name])
-                  if task.mode == ONE or not family.in_order]
+        own = [task for task in tasks_of([*recorded, *worlds], searched, [name])
+               if task.mode == ONE or not family.in_order]
         if family.in_order:
             few = worlds[:ceil(share / (_QUERIES * GROUP_SIZE))]
-            tasks += [task._replace(in_order=True)
-                      for task in tasks_of([*recorded, *few], searched, [name])]
-    tasks = [task._replace(seed=task.seed + task.place.seed, most=share) for task in tasks]
+            own += [task._replace(in_order=True)
+                    for task in tasks_of([*recorded, *few], searched, [name])]
+        tasks += [task._replace(seed=task.seed + task.place.seed, most=share) for task in own]
     found: list[Outcome] = run_all(make_search, tasks, 'searches', options.workers)
     for by in (('trouble', 'level', 'mode', 'looks'), ('trouble', 'place'), ('trouble', 'looks')):
         print(false_table(found, by), end='\n\n')

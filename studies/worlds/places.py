@@ -125,9 +125,10 @@ def arrangement(rng: np.random.Generator) -> Place:
     """
     size = rng.uniform(4.0, 6.0)
     table, *things = _table(rng, 0.5 * size, 0.5 * size, 0)
+    spread = rng.uniform((0.0, 0.01), (0.15, 0.05))
     for whole in range(1, _some(rng, 2, 4)):
-        x, y = (table.x, table.y) + 0.1 * rng.normal(size=2)
-        things += [Thing(name, x + 0.03 * rng.normal(), y + 0.03 * rng.normal(),
+        x, y = (table.x, table.y) + spread[0] * rng.normal(size=2)
+        things += [Thing(name, x + spread[1] * rng.normal(), y + spread[1] * rng.normal(),
                          rng.uniform(0.8, 1.2), rng.uniform(0.0, np.pi), _new_model(rng), whole)
                    for name in map(str, rng.choice(_CONFUSED, _some(rng, 2, 7)))]
     things += _scattered(rng, FURNITURE, _some(rng, 0, 3), size, size)
