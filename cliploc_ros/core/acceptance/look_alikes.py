@@ -6,10 +6,13 @@ A camera sees the same at two places whose landmarks a turn about the vertical a
 each other. Such twins of the best pose are found in the map, so they count as rivals even if the
 search met one of the places only. `check_map` lists the places of a map that have twins.
 
+Landmarks on one axis look the same from all around it. So the pose turned about an axis that most
+matched landmarks share is such a place, too.
+
 Two poses at places that look alike explain the same detections. Which of them matches one object
 more, or fits better, then says little: maps lack objects, and objects move. Labels tell the
-places apart, and where there are none, the number of objects does to some degree. A conditional
-logit of its own, with these two terms only, weighs such poses.
+places apart. All objects that only one of the places explains have one cause: that one of them is
+out of date. So they count together, not each.
 """
 
 import math
