@@ -272,7 +272,7 @@ class FrameLocalizer:
         found = localizer.localize(
             observation, run, parameters.fuse_frames, parameters.fuse_window_s, crops, recognizer,
             [replace(one, stamp_ns=observation.stamp_ns) for one in others])
-        for name in localizer.mounts.wrong:
+        for name in localizer.cameras.wrong_mounts:
             self._note(f'what {name} sees does not fit the other cameras: check its mount, '
                        'camera_info and image')
         seen = localizer.observation

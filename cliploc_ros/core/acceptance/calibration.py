@@ -102,6 +102,20 @@ class SuccessiveLooks(NamedTuple):
     drift_deg: float
 
 
+class SystematicErrors(NamedTuple):
+    """Errors of a camera and its boxes, and when they are too large."""
+
+    wrong: float
+    sure: float
+    view: float
+    focal: float
+    aspect: float
+    point: float
+    calibrated: float
+    corner: float
+    size: float
+
+
 class Spread(NamedTuple):
     """How covariances count."""
 
@@ -149,6 +163,7 @@ class Calibration(NamedTuple):
     prior: Prior
     search: Search
     looks: SuccessiveLooks
+    camera: SystematicErrors
     covariance: Spread
     watch: Looking
 

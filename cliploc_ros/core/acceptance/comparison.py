@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.acceptance.camera_check import CALIBRATED
 from cliploc_ros.core.acceptance.confidence import (
     chance_by_points,
     confidences,
@@ -110,6 +111,13 @@ class Comparison(NamedTuple):
                      if near and one.recognized is None), None)
 
     @property
+    def by_boxes(self) -> Contender | None:
+        """Return by_objects if its boxes decide where the pose is; None if points do."""
+        place = None if self.by_keyframes is None else self.by_keyframes.recognized
+        return self.by_objects if place is None or (
+            place.inliers < CALIBRATION.keyframes.good_covariance) else None
+
+    @property
     def by_keyframes(self) -> Contender | None:
         """Return the best contender of the leading place that keyframes propose."""
         return next((one for one, near in zip(self.contenders, self.leading, strict=True)
@@ -193,7 +201,7 @@ def pose_of(joined: JoinedFrames, compared: Comparison
     if by_objects is not None:
         covariance = covariance_of(joined.frames, joined.rig, by_objects.finalist,
                                    by_objects.matches, joined.landmark_map.shared_sigmas,
-                                   joined.options.mount_deviation)
+                                   joined.options.mount_deviation, CALIBRATED)
         if by_objects.finalist.information is not None:
             others = [one for one in compared.contenders if one.recognized is None]
             others.sort(key=lambda one: one is not by_objects)
