@@ -39,12 +39,14 @@ _MAX_LATE_NS, _MOST_LATE = NS_PER_S, 5
 # For moves [m] and turns [rad]. Wheels that slip, poses that tremble and stamps are off by less.
 _SLACK = np.array([SAME_SPOT.distance_m, np.radians(SAME_SPOT.angle_deg)])
 # A robot is not faster than this [1/s] where nothing tells its speed. It changes its speed by less
-# than this [1/s^2], which lasts no longer (guesses: no change of a Jackal at 5 Hz is excluded).
+# than this [1/s^2], which lasts no longer [s]; where a twist tells its speed, by less than the last
+# (guesses: no run of a Husky ends at 5 Hz or more, see python -m studies.sensors).
 _FASTEST, _CHANGE, _CHANGE_S = np.array([3.0, 3.0]), np.array([3.0, 8.0]), 0.5
-# A twist is right that misses at most this share of a motion, at least so much; what happened long
-# ago counts less.
+_TWIST_CHANGE = np.array([3.0, 4.0])
+# Twists fit that miss at most this share of a motion, at least so much; what happened long ago
+# counts less.
 _MISSED_SHARE, _LEAST_MOTION, _MOST_MOTION = 0.25, np.array([0.3, 0.5]), np.array([4.0, 6.0])
-_NO_TWIST = np.zeros((2, 3))
+_NO_TWIST, _MOST_TWIST = np.zeros((2, 3)), 1e3
 # Odometry is silent after this many of its usual periods, or of a slow source's where it has just
 # begun (guesses).
 _MOST_PERIODS, _SLOW_NS = 3.25, NS_PER_S
@@ -146,7 +148,7 @@ class OdometryWindow:
                 or np.abs(position).max() > _FARTHEST_M:
             return False
         pose = _Pose(stamp_ns, transform_from_pose(position, quat_xyzw),
-                     twist if np.isfinite(twist).all() else _NO_TWIST)
+                     twist if (np.abs(twist) < _MOST_TWIST).all() else _NO_TWIST)
         poses = self._poses
         self._late = self._late + 1 if poses and stamp_ns < poses[-1].stamp_ns else 0
         row = bisect_left(poses, stamp_ns, key=lambda one: one.stamp_ns)
@@ -230,12 +232,13 @@ class OdometryWindow:
         poses = self._poses
         if row < len(poses) and poses[row].stamp_ns == pose.stamp_ns:
             return bool((_lengths(_step(poses[row], pose)) <= _SLACK).all())
-        trusted = (self._motion >= _LEAST_MOTION) & (self._missed <= _MISSED_SHARE * self._motion)
+        twists_fit = (self._motion >= _LEAST_MOTION) & (
+            self._missed <= _MISSED_SHARE * self._motion)
         if row == len(poses):
-            return _is_explained(poses, pose, trusted)
+            return _is_explained(poses, pose, twists_fit)
         before = poses[:row]
-        return ((not before or _is_explained(before, pose, trusted))
-                and _is_explained([*before, pose], poses[row], trusted))
+        return ((not before or _is_explained(before, pose, twists_fit))
+                and _is_explained([*before, pose], poses[row], twists_fit))
 
     def _learn(self, pose: _Pose) -> None:
         """Take in how well the twists explain the way to the next pose."""
@@ -269,43 +272,52 @@ def _lengths(step: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([math.hypot(*step[0]), math.hypot(*step[1])])
 
 
-def _is_explained(poses: Sequence[_Pose], pose: _Pose, trusted: NDArray[np.bool_]) -> bool:
+def _is_explained(poses: Sequence[_Pose], pose: _Pose, twists_fit: NDArray[np.bool_]) -> bool:
     """Return whether a robot can have moved from the newest of some poses to a later one.
 
-    Many drivers leave the twist empty, or fill it with something else. Where it was right in this
-    run, which `trusted` (2,) says of moves and turns, the robot moved by it; else it went on as
-    its poses did, or stopped.
+    Many drivers leave the twist empty, or fill it with something else. Where it fits the poses of
+    this run, which `twists_fit` (2,) says of moves and turns, the robot moved by it; else it went
+    on as its poses did, or stopped.
 
     After a silence nothing but the latter counts, for a driver may have restarted at another
-    origin, which a robot could have reached by driving; after a long silence, the robot has to
-    stand where it was.
+    origin, which a robot could have reached by driving.
+    """
+    is_silence = _is_silence(poses, pose.stamp_ns - poses[-1].stamp_ns)
+    return bool(np.where(twists_fit & (not is_silence), _explained_by_twists(poses[-1], pose),
+                         _explained_by_poses(poses, pose, is_silence)).all())
+
+
+def _explained_by_twists(newest: _Pose, pose: _Pose) -> NDArray[np.bool_]:
+    """Return whether a move and a turn (2,) are those of a speed between two twists."""
+    gap_s = (pose.stamp_ns - newest.stamp_ns) / NS_PER_S
+    change, most = pose.twist - newest.twist, _TWIST_CHANGE * gap_s
+    # a driver that restarts may take its jump for a speed
+    change *= (most / np.maximum(_lengths(change), most))[:, None]
+    first, last = _driven(newest.twist, gap_s), _driven(newest.twist + change, gap_s)
+    return _lies_between(_step(newest, pose), first, last,
+                         _SLACK + _TWIST_CHANGE * gap_s * min(gap_s, _CHANGE_S) / 8
+                         + _MISSED_SHARE * _lengths(first + last) / 2)
+
+
+def _explained_by_poses(poses: Sequence[_Pose], pose: _Pose, is_silence: bool
+                        ) -> NDArray[np.bool_]:
+    """Return whether a move and a turn (2,) are those of a robot that goes on or stops.
+
+    After a long silence, the robot has to stand where it was.
     """
     newest = poses[-1]
-    gap_s, step = (pose.stamp_ns - newest.stamp_ns) / NS_PER_S, _step(newest, pose)
-    by_poses = by_twist = np.zeros(2, dtype=np.bool_)
-    is_silence = _is_silence(poses, pose.stamp_ns - newest.stamp_ns)
-    if is_silence or not trusted.all():
-        row = bisect_right(poses, newest.stamp_ns - MOMENT_NS, key=lambda one: one.stamp_ns)
-        before = poses[max(row - 1, 0)]
-        moment_s = (newest.stamp_ns - before.stamp_ns) / NS_PER_S
-        slack = _CHANGE * gap_s * min((moment_s + gap_s) / 2, _CHANGE_S)
-        if not row:  # the run has just begun
-            slack = _FASTEST * gap_s
-        speed = -_step(newest, before) / moment_s if moment_s else _NO_TWIST
-        if is_silence:
-            slack, speed = np.zeros(2), speed if gap_s <= LONG_NS / NS_PER_S else _NO_TWIST
-        by_poses = _lies_between(step, _driven(speed, gap_s, moment_s), _NO_TWIST, _SLACK + slack)
-    if not is_silence and trusted.any():
-        # a driver that restarts may take its jump for a speed
-        change = pose.twist - newest.twist
-        most = _CHANGE * gap_s / 4
-        change *= (most / np.maximum(_lengths(change), most))[:, None]
-        first = _driven(newest.twist, gap_s)
-        last = _driven(newest.twist + change, gap_s)
-        by_twist = _lies_between(
-            step, first, last, _SLACK + _CHANGE * gap_s * min(gap_s, _CHANGE_S) / 8
-            + _MISSED_SHARE * _lengths(first + last) / 2)
-    return bool(np.where(trusted & (not is_silence), by_twist, by_poses).all())
+    gap_s = (pose.stamp_ns - newest.stamp_ns) / NS_PER_S
+    row = bisect_right(poses, newest.stamp_ns - MOMENT_NS, key=lambda one: one.stamp_ns)
+    before = poses[max(row - 1, 0)]
+    moment_s = (newest.stamp_ns - before.stamp_ns) / NS_PER_S
+    speed = -_step(newest, before) / moment_s if moment_s else _NO_TWIST
+    slack = _CHANGE * gap_s * min((moment_s + gap_s) / 2, _CHANGE_S)
+    if is_silence:
+        slack, speed = np.zeros(2), speed if gap_s <= LONG_NS / NS_PER_S else _NO_TWIST
+    elif not row:  # the run has just begun: two poses at hand tell no speed
+        slack, speed = _FASTEST * gap_s, _NO_TWIST
+    return _lies_between(_step(newest, pose), _driven(speed, gap_s, moment_s), _NO_TWIST,
+                         _SLACK + slack)
 
 
 def _lies_between(step: NDArray[np.float64], one: NDArray[np.float64],
