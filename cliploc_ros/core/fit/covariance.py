@@ -295,8 +295,9 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
         common += _shared_noise(of_objects, shared[fit.numbers])
     gradients = _sums(np.einsum('mei,me->mi', fit.jacobian, fit.weights * fit.residuals),
                       fit.objects, len(fit.sigmas))
-    return np.asarray(matched + _sandwich(information, common) + wrong_share * _change_without_each(
-        information - of_objects, noise - noise_of_objects, gradients, matched))
+    without_each = _change_without_each(information - of_objects, noise - noise_of_objects,
+                                        gradients, matched)
+    return np.asarray(matched + _sandwich(information, common) + wrong_share * without_each)
 
 
 def moves_by_camera(rig: Rig, rotation: NDArray[np.float64], translation: NDArray[np.float64],
