@@ -36,13 +36,13 @@ class Robot:
         now = time.time()
         frame = self.change(*make_frame(stamp_s=now - self.late_s))
         self._tester.publish(frame[:2])
-        time.sleep(self.detection_s)
-        self._tester.publish(frame[2:])
         odometry = Odometry(child_frame_id='base_link')
         odometry.header.frame_id = 'odom'
         odometry.header.stamp = make_frame(stamp_s=now)[0].header.stamp
         odometry.twist.twist.linear.x = self.speed_m_s
         self._odometry.publish(odometry)
+        time.sleep(self.detection_s)  # of the detector: odometry does not wait for it
+        self._tester.publish(frame[2:])
         for _ in range(3):
             self._tester.spin()
 
