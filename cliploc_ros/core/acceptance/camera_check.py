@@ -72,7 +72,7 @@ _PRIOR_SQUARE, _PRIOR_RESIDUALS = 1.0, 6.0
 # An edge that is nearer to the border of the image is cut by it [px].
 _BORDER_PX = 2.0
 _MOST_VIEWS = 60
-# Log odds of looks at a right camera: three of four single looks are below, see studies/camera.py.
+# Log odds of looks at a right camera: three of four single looks are below.
 _FITS = -1.0
 # A camera_info with intrinsics that differ by less is the same: an autofocus moves.
 _SAME_CAMERA = 0.01
