@@ -110,7 +110,7 @@ def test_a_localizer_that_jumps_is_noticed(bag, tmp_path, capsys):
     assert found['area_under_roc'] > 0.95
     for name in ('watch_timeline', 'watch_roc'):
         assert (tmp_path / f'{name}.png').stat().st_size > 10_000
-    assert found['every_look'][3]['state'] == 'localized'
+    assert 'localized' in {one['state'] for one in found['every_look'][2:7]}
     assert found['every_look'][-1]['error_m'] == pytest.approx(2.0, abs=0.1)
 
 

@@ -25,8 +25,8 @@ _MAX_DISORDER_NS = NS_PER_S
 _SHOWN = 3
 # Ten seconds of a camera at 30 Hz.
 _REMEMBERED = 300
-# Messages come so evenly after their stamps, also in simulations and bags that run at another rate;
-# what comes otherwise is of another clock (a guess).
+# Messages come so evenly after their stamps, also where a simulation or a bag runs at another
+# rate; what comes otherwise is of another clock (a guess).
 _UNEVEN_S = 5.0
 
 
