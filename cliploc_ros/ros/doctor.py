@@ -203,8 +203,8 @@ def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
         _check_camera(node, parameters, name, silent, report)
     name = node.cameras[0] if frame is None else frame.camera
     if name in node.images:
-        _check_place(node, parameters.of_camera(name), node.images[name][0].header, patience_s,
-                     report)
+        image = node.images[name][0] if frame is None else frame.image
+        _check_place(node, parameters.of_camera(name), image.header, patience_s, report)
     else:
         report.skip('tf, odometry', 'need an image')
     if silent.keys() & {of_camera(name, 'image'), of_camera(name, 'camera_info')}:

@@ -38,11 +38,11 @@ _MAX_GAP_NS = NS_PER_S // 2
 _MAX_LATE_NS, _MOST_LATE = NS_PER_S, 5
 # For moves [m] and turns [rad]. Wheels that slip, poses that tremble and stamps are off by less.
 _SLACK = np.array([SAME_SPOT.distance_m, np.radians(SAME_SPOT.angle_deg)])
-# A robot is not faster than this [1/s] where nothing tells its speed. It changes its speed by
-# less than this [1/s^2], which lasts no longer [s]; where a twist tells its speed, by less than
-# the last (guesses: no run of a Husky ends at 5 Hz or more, see python -m studies.sensors).
-_FASTEST, _CHANGE, _CHANGE_S = np.array([3.0, 3.0]), np.array([3.0, 8.0]), 0.5
-_TWIST_CHANGE = np.array([3.0, 4.0])
+# A robot is not faster than this [1/s] where nothing tells its speed. It changes its speed by less
+# than this [1/s^2], and between two twists by less than this; a change lasts no longer [s].
+# Guesses: no run of a Husky ends at 5 Hz or more, see python -m studies.sensors.
+_FASTEST, _CHANGE = np.array([3.0, 3.0]), np.array([3.0, 8.0])
+_TWIST_CHANGE, _CHANGE_S = np.array([3.0, 4.0]), 0.5
 # Twists fit that miss at most this share of a motion, at least so much; what happened long ago
 # counts less.
 _MISSED_SHARE, _LEAST_MOTION, _MOST_MOTION = 0.25, np.array([0.3, 0.5]), np.array([4.0, 6.0])

@@ -21,8 +21,8 @@ _MAX_AHEAD_NS = NS_PER_S // 5
 # DDS keeps the order of a publisher: a stamp that is older by more than this is a jump (a guess).
 _MAX_DISORDER_NS = NS_PER_S
 # So many messages in a row with a stamp of their own show that each has one: stamps in whole
-# seconds differ at times, too.
-_SHOWN = 3
+# seconds differ at times, too. The same message comes again twice, as relays send it, or more.
+_SHOWN, _REPEATED = 3, 2
 # Ten seconds of a camera at 30 Hz.
 _REMEMBERED = 300
 # Messages come so evenly after their stamps, also where a simulation or a bag runs at another
@@ -122,8 +122,8 @@ class MessageStamps:
         return self._own >= _SHOWN
 
     def is_repeated(self, at_ns: int) -> bool:
-        """Return whether the same message came again and again with a stamp [ns]."""
-        return self._known.get(at_ns, (0, 0))[1] >= _SHOWN
+        """Return whether the same message came again with a stamp [ns]."""
+        return self._known.get(at_ns, (0, 0))[1] >= _REPEATED
 
     def add(self, stamp: Time, content: Hashable, received_at: float) -> bool:
         """Take in a stamp and what tells its message from others; return whether it names it.
@@ -131,7 +131,7 @@ class MessageStamps:
         After a stamp that does not, so does none until some in a row are right. The message
         arrived at `received_at` (monotonic clock) [s].
         """
-        at_ns, message, why = stamp_ns(stamp), hash(content), stamp_problem(stamp)
+        at_ns, message, why, times = stamp_ns(stamp), hash(content), stamp_problem(stamp), 0
         if not why:
             known, times = self._known.pop(at_ns, (message, 0))
             if known != message:
@@ -142,7 +142,7 @@ class MessageStamps:
             self._own = (self._own if is_even else 0) + (not times)
             if len(self._known) > _REMEMBERED:
                 del self._known[next(iter(self._known))]
-        if why or self.is_repeated(at_ns):
+        if why or times >= _REPEATED:
             self._own = 0
         if why:
             self.problem = why
