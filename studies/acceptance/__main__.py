@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import closing
 from itertools import product
-from math import ceil, inf
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +137,7 @@ def _families(options: argparse.Namespace) -> None:
     for name in names:
         family = FAMILIES[name]
         searched = RelocalizerOptions(matching=options.matching or (
-            'hybrid' if name in BY_LABELS else 'class'), time_budget_s=inf)
+            'hybrid' if name in BY_LABELS else 'class'))
         recorded = chosen_places(options) if options.queries and 'room' in family.kinds else []
         share = ceil(options.requests / (1 + len(recorded)))
         worlds = [Simulated(kind, options.first_seed + number)

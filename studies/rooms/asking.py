@@ -153,8 +153,7 @@ def _outcome(task: Task, asked: str, query: Query, way: str, known: str,
     observation = known_of(query.observation, known)
     if way == KEYFRAMES:
         observation = replace(observation, detections=_NO_BOXES, depths=None)
-    relocalizer = Relocalizer(landmark_map, RelocalizerOptions(
-        matching='class', time_budget_s=inf))  # a busy processor changes no table
+    relocalizer = Relocalizer(landmark_map, RelocalizerOptions(matching='class'))
     recognizer = None
     if way != OBJECTS and query.image is not None:
         recognizer = ImageRecognizer(keyframes, query.image.features, query.image.camera)
