@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
+from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
@@ -197,6 +198,11 @@ class FrameLocalizer:
     def depth_scale(self) -> DepthScale:
         """Return what accepted poses say of the scale of depth."""
         return self._localizer.depth_scale
+
+    @property
+    def cameras(self) -> CameraCheck:
+        """Return what looks say of the cameras and their boxes."""
+        return self._localizer.cameras
 
     @property
     def description(self) -> str:
