@@ -383,7 +383,8 @@ class CameraCheck:
         """Return the log odds that each camera is wrong, for the diagnostics."""
         return {f'camera check {name}'.rstrip():
                 f'{record.odds.log_odds:+.1f} log odds that boxes or camera_info are wrong, by '
-                f'{len(record.views.poses)} views' for name, record in self._records.copy().items()}
+                f'{len(record.views.poses)} views'
+                for name, record in self._records.copy().items()}
 
     def add_instant(self, seen: Sequence[Observation], known: Sequence[int],
                     matched: Sequence[int]) -> None:
