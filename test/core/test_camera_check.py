@@ -174,10 +174,6 @@ def test_a_mended_camera_is_accepted_again(mended, rng):
     assert all(accepted if mended == 'camera_info' else accepted[LOOKS // 2:])
 
 
-def seen(boxes):
-    return Observation(CAMERA, Detections(boxes, ('a',) * len(boxes), np.full(len(boxes), 0.9)))
-
-
 def drawn(rng, count, low, high):
     """Boxes of objects that are anywhere, cut at a rectangle from low (2,) to high (2,)."""
     sides = rng.uniform(40.0, 160.0, (count, 2))
@@ -192,7 +188,7 @@ def drawn(rng, count, low, high):
 def test_boxes_end_at_the_border_of_their_image(low, high, is_other, rng):
     extent = Extent()
     for _ in range(8):
-        extent.add(seen(drawn(rng, 8, low, high)))
+        extent.add(drawn(rng, 8, low, high))
     evidence = extent.log_odds(CAMERA)
     assert evidence == CALIBRATION.camera.extent if is_other else evidence < 1.0
 
@@ -202,7 +198,7 @@ def test_a_view_that_stays_the_same_has_no_border(rng):
     corners = rng.uniform(100.0, 250.0, (8, 2))
     extent, boxes = Extent(), np.hstack([corners, corners + rng.uniform(40.0, 160.0, (8, 2))])
     for _ in range(50):
-        extent.add(seen(boxes + rng.normal(0.0, 0.5, boxes.shape)))
+        extent.add(boxes + rng.normal(0.0, 0.5, boxes.shape))
     assert extent.log_odds(CAMERA) < 1.0
 
 
@@ -217,7 +213,8 @@ def test_odds_are_those_of_gaussians():
         return np.exp(-0.5 * measured ** 2 / variance) / np.sqrt(variance)
     odds = odds_of(information, vector).odds
     focal = 2  # right, image, focal length, ...
-    assert odds[focal] - odds[0] == pytest.approx(np.log(density(0.5) / density(known.focal)))
+    assert odds[focal] - odds[0] == pytest.approx(np.log(
+        density(0.5) / density(known.focal)))
     # the other kinds have the focal length of a right camera, or that of a wrong one
     assert set(np.round(odds - odds[0], 6)) == set(np.round([0.0, odds[focal] - odds[0]], 6))
 

@@ -79,7 +79,7 @@ _MOST_VIEWS = 60
 _FITS = -2.0
 # A camera_info with intrinsics that differ by less is the same: an autofocus moves.
 _SAME_CAMERA = 0.01
-# Boxes to remember; those of one class that overlap by more are one box.
+# Boxes to remember; those that overlap by more are one box.
 _MOST_BOXES, _SAME_BOX_IOU = 200, 0.8
 # A line that cuts boxes is within the image if it is further from its border than this share.
 _INSIDE = 0.1
@@ -236,20 +236,15 @@ class Extent:
 
     def __init__(self) -> None:
         self._boxes = np.empty((0, 4))
-        self._classes = np.empty(0, dtype=np.str_)
 
-    def add(self, observation: Observation) -> None:
-        """Take in the boxes of a frame; those that were seen before count once."""
-        boxes = observation.detections.bboxes_xyxy
-        classes = np.array(observation.detections.class_ids, dtype=np.str_)
+    def add(self, boxes: NDArray[np.float64]) -> None:
+        """Take in the boxes (n, 4) of a frame; those that were seen before count once."""
         low = np.maximum(boxes[:, None, :2], self._boxes[:, :2])
         high = np.minimum(boxes[:, None, 2:], self._boxes[:, 2:])
         shared = np.maximum(high - low, 0.0).prod(axis=2)
         areas, known = ((one[:, 2:] - one[:, :2]).prod(axis=1) for one in (boxes, self._boxes))
-        is_new = ~((shared > _SAME_BOX_IOU * (areas[:, None] + known - shared))
-                   & (classes[:, None] == self._classes)).any(axis=1)
-        self._boxes = np.concatenate([self._boxes, boxes[is_new]])[-_MOST_BOXES:]
-        self._classes = np.concatenate([self._classes, classes[is_new]])[-_MOST_BOXES:]
+        is_known = (shared > _SAME_BOX_IOU * (areas[:, None] + known - shared)).any(axis=1)
+        self._boxes = np.concatenate([self._boxes, boxes[~is_known]])[-_MOST_BOXES:]
 
     @property
     def reach(self) -> NDArray[np.float64]:
@@ -262,16 +257,16 @@ class Extent:
         if not count:
             return 0.0
         # by how much each box reaches to the right, down, left and up
-        reaches, lengths = np.hstack([self._boxes[:, 2:], size - self._boxes[:, :2]]), [*size] * 2
-        lines = reaches.max(axis=0)
+        reaches = np.hstack([self._boxes[:, 2:], size - self._boxes[:, :2]])
+        lines, lengths = reaches.max(axis=0), np.tile(size, 2)
         # others that end at the same line, and the density of those that end near it
         ends = (reaches > lines - _BORDER_PX).sum(axis=0) - 1
-        near = (reaches > lines - _NEAR_SHARE * np.array(lengths)).sum(axis=0) - ends
+        near = (reaches > lines - _NEAR_SHARE * lengths).sum(axis=0) - ends
         density = np.maximum(_LEAST_DENSITY * count, near / _NEAR_SHARE) / lengths
-        is_inside = (lines < (1.0 - _INSIDE) * np.array(lengths)) & (ends > 0)
+        is_line = (lines < (1.0 - _INSIDE) * lengths) & (ends > 0)
         middles = (self._boxes[:, :2] + self._boxes[:, 2:]) / 2
         beyond = int(((middles < 0.0) | (middles > size)).any(axis=1).sum())
-        chances = [*np.where(is_inside, pdtrc(ends - 1, _BORDER_PX * density), 1.0),
+        chances = [*np.where(is_line, pdtrc(ends - 1, _BORDER_PX * density), 1.0),
                    float(bdtrc(beyond - 1, count, _BEYOND)) if beyond else 1.0]
         # a chance p is evidence of 1 / (2 sqrt(p)) at most (Vovk and Wang 2021)
         evidence = _log_mean(-0.5 * np.log(np.maximum(chances, 1e-99))) - math.log(2.0)
@@ -290,7 +285,7 @@ class _Record:
     def see(self, observation: Observation) -> None:
         """Take in the boxes of a frame, unless looks have verified the camera."""
         if self.by_looks > _FITS or self.by_extent > 0.0:
-            self.extent.add(observation)
+            self.extent.add(observation.detections.bboxes_xyxy)
             self.by_extent = self.extent.log_odds(self.camera)
             self.odds = self.views.odds(self.by_extent)
 
