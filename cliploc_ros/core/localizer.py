@@ -30,7 +30,6 @@ from scipy.stats import chi2
 from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.acceptance.looks import Look, Looks
-from cliploc_ros.core.acceptance.verdict import refusal
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import (
     SAME_VIEW,
@@ -288,9 +287,7 @@ class Localizer:
         for one in (*others, observation):
             self.cameras.see(one)
         found = self._localize(observation, run, limit, length_s, crops, recognizer, others)
-        if found.accepted or (found.evidence is not None and refusal(
-                found.evidence.with_right_camera, self._relocalizer.options) is None):
-            self.cameras.add(found.cameras)
+        self.cameras.add(found.cameras)
         if found.accepted and found.depth is not None:
             self.depth_scale.add(found.depth)
         if others and found.accepted and found.frame_matches:

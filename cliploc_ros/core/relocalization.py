@@ -59,7 +59,7 @@ class Relocalization:
     recognition: Recognition | None = None
     #: Whether the depths of the objects can be right; None without depth
     depth: DepthCheck | None = None
-    #: What the pose says of the cameras of its instant; nothing where it does not depend on boxes
+    #: What a pose that depends on boxes, and is accepted with right cameras, says of the cameras
     cameras: tuple[CameraLook, ...] = ()
 
     @property

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.camera_check import CameraCheck, looks_of
+from cliploc_ros.core.acceptance.camera_check import CameraCheck, CameraLook, looks_of
 from cliploc_ros.core.acceptance.comparison import (
     Comparison,
     compare,
@@ -164,9 +164,11 @@ class Relocalizer:
             return _nothing_found(frames, budget)
         pose, covariance = pose_of(joined, compared)
         evidence = evidence_of(joined, compared, covariance, looks, recognizer)
-        seen = looks_of(joined, compared.by_boxes.finalist) \
-            if compared.by_boxes is not None and self._options.refine else []
-        if seen:
+        seen: list[CameraLook] = []
+        if compared.by_boxes is not None and self._options.refine:
+            # an uncertain position may be the camera's fault
+            if refusal(replace(evidence, near=1.0), self._options) is None:
+                seen = looks_of(joined, compared.by_boxes.finalist)
             camera, fault = (cameras or CameraCheck()).judge(seen, covariance)
             evidence = replace(evidence, camera=camera, camera_fault=fault)
         refused = refusal(evidence, self._options)

@@ -150,6 +150,9 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
             if keyframes is not None:
                 health.values |= {'keyframes': len(keyframes), 'keyframes file': keyframes.file,
                                   'keyframes hash': keyframes.file_hash}
+            health.values |= localizer.cameras.values
+            for wrong in localizer.cameras.faults:
+                health.fail(f'{wrong}: check camera_info, and the pixels and corners of the boxes')
             if parameters.depth_transport != 'none':
                 health.values['depth scale'] = f'{localizer.depth_scale.ratio:.2f}'
             health.values |= {'map': localizer.description, 'map hash': localizer.map_hash,

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
+from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.detector_check import DetectorCheck
 from cliploc_ros.core.geometry.camera import Camera
@@ -211,6 +212,11 @@ class FrameLocalizer:
                   for name, faults in self._faults.copy().items() for fault in faults),
                 *(fault._replace(text=f'the detector: {fault.text}')
                   for fault in self._detector.faults)]
+
+    @property
+    def cameras(self) -> CameraCheck:
+        """Return what looks say of the cameras and their boxes."""
+        return self._localizer.cameras
 
     @property
     def description(self) -> str:

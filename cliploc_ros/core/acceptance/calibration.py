@@ -108,6 +108,7 @@ class SystematicErrors(NamedTuple):
     wrong: float
     sure: float
     view: float
+    extent: float
     focal: float
     aspect: float
     point: float

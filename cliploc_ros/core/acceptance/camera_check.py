@@ -34,12 +34,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import bdtrc, logsumexp, pdtrc
+from scipy.special import bdtrc, pdtrc
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.contenders import JoinedFrames
 from cliploc_ros.core.fit.camera_fit import ERRORS, fit_camera
-from cliploc_ros.core.fit.covariance import moves_by_camera, share_within
+from cliploc_ros.core.fit.covariance import moves_with_cameras, shares_within
 from cliploc_ros.core.fit.finalists import Finalist
 from cliploc_ros.core.fit.refinement import one_to_one
 from cliploc_ros.core.fit.verification import camera_pose, verify_rig
@@ -66,17 +66,20 @@ _OF_OTHER_PIXELS = np.array([name in ('image', 'principal point', 'stretched ima
                              for name in _KINDS])
 _DEVIATIONS = np.array([_RIGHT, *(np.where(np.isin(np.arange(ERRORS), errors), _WRONG, _RIGHT)
                                   for errors in _KINDS.values())])
+_LOG_DEVIATIONS = np.log(_DEVIATIONS).sum(axis=1)
+_WEIGHTS = np.array([1.0 - _TERMS.wrong, *[_TERMS.wrong / len(_KINDS)] * len(_KINDS)])
 _PRIORS = _DEVIATIONS[:, :, None] ** -2.0 * np.eye(ERRORS)
 # Mean square of the residuals before any is seen, and how many residuals this counts as.
 _PRIOR_SQUARE, _PRIOR_RESIDUALS = 1.0, 6.0
 # An edge that is nearer to the border of the image is cut by it [px].
 _BORDER_PX = 2.0
 _MOST_VIEWS = 60
-# Log odds of looks at a right camera: three of four single looks are below.
-_FITS = -1.0
+# Log odds of a right camera after two to five views; no single look at a wrong one had less on TUM
+# fr3, see studies/camera.py.
+_FITS = -2.0
 # A camera_info with intrinsics that differ by less is the same: an autofocus moves.
 _SAME_CAMERA = 0.01
-# Boxes to remember; those of one class that overlap by more are one box.
+# Boxes to remember; those that overlap by more are one box.
 _MOST_BOXES, _SAME_BOX_IOU = 200, 0.8
 # A line that cuts boxes is within the image if it is further from its border than this share.
 _INSIDE = 0.1
@@ -85,7 +88,6 @@ _INSIDE = 0.1
 _LEAST_DENSITY, _NEAR_SHARE = 4.0, 0.1
 # Share of boxes whose middle is beyond the image, by mistake.
 _BEYOND = 0.01
-_MOST_EXTENT = 8.0
 # A mount is wrong where accepted poses explain less than this share of what its camera saw, and
 # more than twice as much of what the others did. With four cameras among simulated objects, a
 # right mount has 1.0, one that is turned by 2 degrees .8, by 5 degrees .1, by more 0 to .1.
@@ -107,6 +109,12 @@ class CameraLook(NamedTuple):
     moves: NDArray[np.float64]
 
 
+def _log_mean(logs: NDArray[np.float64]) -> float:
+    """Return the logarithm of the mean of numbers, given their logarithms (n,)."""
+    most = float(logs.max())
+    return most + math.log(float(np.exp(logs - most).mean()))
+
+
 class CameraOdds(NamedTuple):
     """What is known of a camera: it is right, or wrong in one of k ways."""
 
@@ -117,7 +125,7 @@ class CameraOdds(NamedTuple):
     @property
     def log_odds(self) -> float:
         """Return the logarithm of the Bayes factor of a wrong camera against a right one."""
-        return float(logsumexp(self.odds[1:]) - math.log(len(self.odds) - 1) - self.odds[0])
+        return _log_mean(self.odds[1:]) - float(self.odds[0])
 
     @property
     def is_wrong(self) -> bool:
@@ -134,14 +142,12 @@ class CameraOdds(NamedTuple):
         moves : ndarray (3, 7)
             See CameraLook.
         """
-        count = len(self.odds)
-        weights = self.odds + np.log([1.0 - _TERMS.wrong,
-                                      *[_TERMS.wrong / (count - 1)] * (count - 1)])
-        weights = np.exp(weights - logsumexp(weights))
-        wider = np.tile(CALIBRATION.covariance.caution * covariance, (count, 1, 1))
-        wider[1:, :3, :3] += moves @ self.squares[1:] @ moves.T
-        near = np.array([share_within(RIGHT_M, one) for one in wider])
-        return float(weights @ near / near[0])
+        weights = np.exp(self.odds - self.odds.max()) * _WEIGHTS
+        wider = np.tile(CALIBRATION.covariance.caution * covariance[:3, :3],
+                        (len(weights), 1, 1))
+        wider[1:] += moves @ self.squares[1:] @ moves.T
+        near = shares_within(RIGHT_M, wider)
+        return float(weights @ near / (weights.sum() * near[0]))
 
 
 def odds_of(information: NDArray[np.float64], vector: NDArray[np.float64], extent: float = 0.0
@@ -157,8 +163,7 @@ def odds_of(information: NDArray[np.float64], vector: NDArray[np.float64], exten
     """
     covariances = np.linalg.inv(information + _PRIORS)
     means = covariances @ vector
-    odds = (0.5 * np.linalg.slogdet(covariances)[1] - np.log(_DEVIATIONS).sum(axis=1)
-            + 0.5 * means @ vector)
+    odds = 0.5 * (np.log(np.linalg.det(covariances)) + means @ vector) - _LOG_DEVIATIONS
     odds[1:] += extent * _OF_OTHER_PIXELS
     return CameraOdds(odds, means, covariances + means[:, :, None] * means[:, None])
 
@@ -168,9 +173,8 @@ def looks_of(joined: JoinedFrames, pose: Finalist) -> list[CameraLook]:
     inliers = one_to_one(joined.rig, verify_rig(joined.rig, pose.rotation, pose.translation),
                          pose.rotation, pose.translation)
     looks, last = [], joined.frames[-1].observation
+    moves = moves_with_cameras(joined.rig, inliers, pose.rotation, pose.translation)[:, :3]
     names = np.array([frame.observation.camera_name for frame in joined.frames])
-    moves = {name: moves_by_camera(joined.rig, pose.rotation, pose.translation, names == name)[:3]
-             for name in set(names.tolist())}
     for number, frame in enumerate(joined.frames):
         pairs = inliers.pairs[inliers.starts[number]:inliers.starts[number + 1]]
         vertical, seen = joined.rig.verticals[number], frame.observation
@@ -191,7 +195,8 @@ def looks_of(joined: JoinedFrames, pose: Finalist) -> list[CameraLook]:
         looks.append(CameraLook(
             seen.camera_name, seen.stamp_ns == last.stamp_ns,
             invert_transform(make_transform(rotation, translation)),
-            weight * information, weight * vector, moves[seen.camera_name]))
+            weight * information, weight * vector,
+            moves[names == seen.camera_name].sum(axis=0)))
     return looks
 
 
@@ -231,20 +236,15 @@ class Extent:
 
     def __init__(self) -> None:
         self._boxes = np.empty((0, 4))
-        self._classes = np.empty(0, dtype=np.str_)
 
-    def add(self, observation: Observation) -> None:
-        """Take in the boxes of a frame; those that were seen before count once."""
-        boxes = observation.detections.bboxes_xyxy
-        classes = np.array(observation.detections.class_ids, dtype=np.str_)
+    def add(self, boxes: NDArray[np.float64]) -> None:
+        """Take in the boxes (n, 4) of a frame; those that were seen before count once."""
         low = np.maximum(boxes[:, None, :2], self._boxes[:, :2])
         high = np.minimum(boxes[:, None, 2:], self._boxes[:, 2:])
         shared = np.maximum(high - low, 0.0).prod(axis=2)
         areas, known = ((one[:, 2:] - one[:, :2]).prod(axis=1) for one in (boxes, self._boxes))
-        is_new = ~((shared > _SAME_BOX_IOU * (areas[:, None] + known - shared))
-                   & (classes[:, None] == self._classes)).any(axis=1)
-        self._boxes = np.concatenate([self._boxes, boxes[is_new]])[-_MOST_BOXES:]
-        self._classes = np.concatenate([self._classes, classes[is_new]])[-_MOST_BOXES:]
+        is_known = (shared > _SAME_BOX_IOU * (areas[:, None] + known - shared)).any(axis=1)
+        self._boxes = np.concatenate([self._boxes, boxes[~is_known]])[-_MOST_BOXES:]
 
     @property
     def reach(self) -> NDArray[np.float64]:
@@ -253,36 +253,24 @@ class Extent:
 
     def log_odds(self, camera: Camera) -> float:
         """Return the log odds that the boxes are in the pixels of another image, 0 or more."""
-        size = np.array([camera.width, camera.height])
+        count, size = len(self._boxes), np.array([camera.width, camera.height])
+        if not count:
+            return 0.0
         # by how much each box reaches to the right, down, left and up
-        reaches = np.hstack([self._boxes[:, 2:], size - self._boxes[:, :2]]).T
-        chances = [self._chance_of_line(reach, length)
-                   for reach, length in zip(reaches, [*size, *size], strict=True)]
+        reaches = np.hstack([self._boxes[:, 2:], size - self._boxes[:, :2]])
+        lines, lengths = reaches.max(axis=0), np.tile(size, 2)
+        # others that end at the same line, and the density of those that end near it
+        ends = (reaches > lines - _BORDER_PX).sum(axis=0) - 1
+        near = (reaches > lines - _NEAR_SHARE * lengths).sum(axis=0) - ends
+        density = np.maximum(_LEAST_DENSITY * count, near / _NEAR_SHARE) / lengths
+        is_line = (lines < (1.0 - _INSIDE) * lengths) & (ends > 0)
         middles = (self._boxes[:, :2] + self._boxes[:, 2:]) / 2
         beyond = int(((middles < 0.0) | (middles > size)).any(axis=1).sum())
-        chances.append(float(bdtrc(beyond - 1, len(middles), _BEYOND)) if beyond else 1.0)
+        chances = [*np.where(is_line, pdtrc(ends - 1, _BORDER_PX * density), 1.0),
+                   float(bdtrc(beyond - 1, count, _BEYOND)) if beyond else 1.0]
         # a chance p is evidence of 1 / (2 sqrt(p)) at most (Vovk and Wang 2021)
-        evidence = logsumexp(-0.5 * np.log(chances)) - math.log(2 * len(chances))
-        return float(np.clip(evidence, 0.0, _MOST_EXTENT))
-
-    @staticmethod
-    def _chance_of_line(reaches: NDArray[np.float64], length: float) -> float:
-        """Return the chance that so many boxes end where the furthest does, far from the border.
-
-        Parameters
-        ----------
-        reaches : ndarray (n,)
-            Where the boxes end [px].
-        length : float
-            Of the image, in this direction [px].
-        """
-        line = reaches.max(initial=0.0)
-        ends = int((reaches > line - _BORDER_PX).sum()) - 1  # the furthest is there by definition
-        if line > (1.0 - _INSIDE) * length or ends < 1:
-            return 1.0
-        near = int((reaches > line - _NEAR_SHARE * length).sum()) - ends
-        density = max(_LEAST_DENSITY * len(reaches), near / _NEAR_SHARE) / length
-        return float(pdtrc(ends - 1, _BORDER_PX * density))
+        evidence = _log_mean(-0.5 * np.log(np.maximum(chances, 1e-99))) - math.log(2.0)
+        return float(np.clip(evidence, 0.0, _TERMS.extent))
 
 
 class _Record:
@@ -291,29 +279,42 @@ class _Record:
     def __init__(self, name: str, camera: Camera) -> None:
         self.name, self.camera = name, camera
         self.views, self.since, self.extent = Views(), Views(), Extent()
-        self.extent_odds = 0.0  # by the extent of its boxes
+        self.by_looks, self.by_extent = 0.0, 0.0  # log odds that the camera is wrong
+        self.odds = self.views.odds()  # by both
+
+    def see(self, observation: Observation) -> None:
+        """Take in the boxes of a frame, unless looks have verified the camera."""
+        if self.by_looks > _FITS or self.by_extent > 0.0:
+            self.extent.add(observation.detections.bboxes_xyxy)
+            self.by_extent = self.extent.log_odds(self.camera)
+            self.odds = self.views.odds(self.by_extent)
 
     def add(self, look: CameraLook) -> None:
         """Take in a look. Those after a camera was called wrong tell whether it was mended."""
-        known = self.views.odds()
-        if not known.is_wrong:
+        if self.by_looks <= _TERMS.sure:
             self.views, self.since = self.views.with_look(look), Views()
-            return
-        self.since = self.since.with_look(look)
-        # by how much they raise the odds of the errors that the looks before have shown
-        gain = self.views.joined(self.since).odds().log_odds - known.log_odds
-        if gain > _TERMS.view:
-            self.views, self.since = self.views.joined(self.since), Views()
-        elif (gain < -_TERMS.view and self.since.odds().log_odds < _FITS
-              and self.extent_odds < -_FITS):
-            self.views, self.since = self.since, Views()
+        else:
+            self.since = self.since.with_look(look)
+            # by how much they raise the odds of the errors that the looks before have shown
+            gain = self.views.joined(self.since).odds().log_odds - self.by_looks
+            if gain > _TERMS.view:
+                self.views, self.since = self.views.joined(self.since), Views()
+            elif (gain < -_TERMS.view and self.since.odds().log_odds < _FITS
+                  and self.by_extent < -_FITS):
+                self.views, self.since = self.since, Views()
+        self.odds, self.by_looks = self.views.odds(self.by_extent), self.views.odds().log_odds
+
+    @property
+    def fault(self) -> str:
+        """Return what is certainly wrong with the camera; empty if nothing is."""
+        return self.in_words(self.odds) if self.odds.is_wrong else ''
 
     def in_words(self, odds: CameraOdds) -> str:
         """Return the errors of a wrong camera in a line."""
         row = 1 + int(np.argmax(odds.odds[1:]))
         kind, (focal, aspect, *shift, across, along, size) = list(_KINDS)[row - 1], odds.means[row]
         one, where = self.camera, f'{self.name}: ' if self.name else ''
-        if self.extent_odds > 0.0 and _OF_OTHER_PIXELS[row - 1]:
+        if self.by_extent > _TERMS.view and _OF_OTHER_PIXELS[row - 1]:
             reach = self.extent.reach
             return (f'{where}boxes reach from ({reach[0]:.0f}, {reach[1]:.0f}) to '
                     f'({reach[2]:.0f}, {reach[3]:.0f}) of {one.width} x {one.height} px')
@@ -341,8 +342,7 @@ class CameraCheck:
         record = self._records.get(name)
         if record is None or not _is_same(record.camera, camera):
             record = self._records[name] = _Record(name, camera)
-        record.extent.add(observation)
-        record.extent_odds = record.extent.log_odds(camera)
+        record.see(observation)
 
     def add(self, looks: Sequence[CameraLook]) -> None:
         """Take in the looks of a pose that is accepted, or would be by a right camera."""
@@ -362,7 +362,7 @@ class CameraCheck:
             its_looks = [look for look in looks if look.camera_name == name]
             record = self._records.get(name)
             views = reduce(Views.with_look, its_looks, record.views if record else Views())
-            odds = views.odds(record.extent_odds if record else 0.0)
+            odds = views.odds(record.by_extent if record else 0.0)
             share = min(share, odds.share_near(covariance, its_looks[-1].moves))
             if record is not None and odds.is_wrong:
                 fault = record.in_words(odds)
@@ -371,12 +371,15 @@ class CameraCheck:
     @property
     def faults(self) -> list[str]:
         """Return what is wrong with cameras that are certainly wrong."""
-        found = []
-        for record in self._records.values():
-            odds = record.views.odds(record.extent_odds)
-            if odds.is_wrong:
-                found.append(record.in_words(odds))
-        return found
+        return [record.fault for record in self._records.copy().values() if record.fault]
+
+    @property
+    def values(self) -> dict[str, str]:
+        """Return the log odds that each camera is wrong, for the diagnostics."""
+        return {f'camera check {name}'.rstrip():
+                f'{record.odds.log_odds:+.1f} log odds that boxes or camera_info are wrong, by '
+                f'{len(record.views.poses)} views'
+                for name, record in self._records.copy().items()}
 
     def add_instant(self, seen: Sequence[Observation], known: Sequence[int],
                     matched: Sequence[int]) -> None:
@@ -404,8 +407,8 @@ class CameraCheck:
 
 def _is_same(one: Camera, other: Camera) -> bool:
     """Return whether intrinsics differ by little, as those of an autofocus do."""
-    if replace(one, fx=1.0, fy=1.0, cx=0.0, cy=0.0) != replace(other, fx=1.0, fy=1.0, cx=0.0,
-                                                                cy=0.0):
-        return False
+    if one == other:
+        return True
     changes = np.array([one.fx, one.fy, one.cx, one.cy]) - [other.fx, other.fy, other.cx, other.cy]
-    return bool(np.abs(changes).max() <= _SAME_CAMERA * one.fx)
+    return bool(np.abs(changes).max() <= _SAME_CAMERA * one.fx) and one == replace(
+        other, fx=one.fx, fy=one.fy, cx=one.cx, cy=one.cy)

@@ -167,14 +167,21 @@ def odometry_deviations(first_from_second: NDArray[np.float64]) -> NDArray[np.fl
 def share_within(radius_m: float, covariance: NDArray[np.float64]) -> float:
     """Return the probability that a position is within a distance of the truth.
 
+    The covariance (6, 6) is as of pose_covariance.
+    """
+    return float(shares_within(radius_m, covariance[None, :3, :3])[0])
+
+
+def shares_within(radius_m: float, covariances: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the probability (k,) of each covariance (k, 3, 3) of a position, see share_within.
+
     The squared distance is a sum of squares with different variances. A scaled chi-squared
     distribution of the same mean and variance stands for it (Box, "Some Theorems on Quadratic
-    Forms Applied in the Study of Analysis of Variance Problems", 1954). The covariance (6, 6) is
-    as of pose_covariance.
+    Forms Applied in the Study of Analysis of Variance Problems", 1954).
     """
-    mean = np.trace(covariance[:3, :3])
-    squares = np.sum(covariance[:3, :3] ** 2)
-    return float(gammainc(0.5 * mean ** 2 / squares, 0.5 * radius_m ** 2 * mean / squares))
+    means = np.trace(covariances, axis1=1, axis2=2)
+    squares = np.sum(covariances ** 2, axis=(1, 2))
+    return np.asarray(gammainc(0.5 * means ** 2 / squares, 0.5 * radius_m ** 2 * means / squares))
 
 
 def normalized_square(map_from_camera: NDArray[np.float64], covariance: NDArray[np.float64],
@@ -295,26 +302,21 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
         common += _shared_noise(of_objects, shared[fit.numbers])
     gradients = _sums(np.einsum('mei,me->mi', fit.jacobian, fit.weights * fit.residuals),
                       fit.objects, len(fit.sigmas))
-    without_each = _change_without_each(information - of_objects, noise - noise_of_objects,
-                                        gradients, matched)
-    return np.asarray(matched + _sandwich(information, common) + wrong_share * without_each)
+    wrong = _change_without_each(information - of_objects, noise - noise_of_objects, gradients,
+                                 matched)
+    return np.asarray(matched + _sandwich(information, common) + wrong_share * wrong)
 
 
-def moves_by_camera(rig: Rig, rotation: NDArray[np.float64], translation: NDArray[np.float64],
-                    is_its: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return how a refined pose moves (6, 7) with the errors of a camera, see camera_fit.
+def moves_with_cameras(rig: Rig, inliers: Inliers, rotation: NDArray[np.float64],
+                       translation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how a refined pose moves (F, 6, 7) with the errors of each frame, see camera_fit.
 
-    Parameters
-    ----------
-    is_its : ndarray (F,)
-        Which frames are of this camera. Others see in refined_covariance.
+    Those of a camera move it by the sum over its frames. See refined_covariance for the others.
     """
-    found = verify_rig(rig, rotation, translation)
-    fit = _linearize(one_to_one(rig, found, rotation, translation), rig.sigmas, rotation,
-                     translation)
+    fit = _linearize(inliers, rig.sigmas, rotation, translation)
     information = (fit.information.sum(axis=0) + fit.verticals.sum(axis=0)
                    + np.diag(1.0 / np.array(PRIOR_VARIANCES)))
-    return np.asarray(-np.linalg.solve(information, fit.calibrations[is_its].sum(axis=0)))
+    return np.asarray(-np.linalg.inv(information) @ fit.calibrations)
 
 
 def _change_without_each(information: NDArray[np.float64], noise: NDArray[np.float64],
