@@ -12,6 +12,7 @@ from tester import make_frame, transform_of
 from wake_ups import judge, wake_up_on_frames
 
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
+from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -46,12 +47,12 @@ def convert(office, tmp_path_factory):
     return run
 
 
-def core_answer(office, detections):
-    """What the core says of detections, without any ROS."""
-    relocalizer = Relocalizer(LandmarkMap.from_file(office / 'map.yaml'),
-                              RelocalizerOptions(matching='class'))
-    return relocalizer.relocalize([Observation(PRESETS['fr3'],
-                                               detections.usable(640, 480, 50))])
+def core_answers(office, detections):
+    """What the core says of detections in turn, without any ROS."""
+    localizer = Localizer(Relocalizer(LandmarkMap.from_file(office / 'map.yaml'),
+                                      RelocalizerOptions(matching='class')))
+    return [localizer.localize(Observation(PRESETS['fr3'], one.usable(640, 480, 50)), None)
+            for one in detections]
 
 
 def test_recorded_detections(office, convert, limits, start, tester, monkeypatch):
@@ -68,8 +69,8 @@ def test_recorded_detections(office, convert, limits, start, tester, monkeypatch
         answers = wake_up_on_frames(tester, FRAMES)
         # a busy machine may drop a message on its way here; the recording comes round again
         tester.wait(lambda: set(answers) <= set(heard), 'the detections of every answer')
-    for stamp, (answer, hypotheses) in answers.items():
-        expected = core_answer(office, heard[stamp])
+    expected_answers = core_answers(office, [heard[stamp] for stamp in answers])
+    for (answer, hypotheses), expected in zip(answers.values(), expected_answers, strict=True):
         assert answer.success == expected.accepted
         assert len(hypotheses.poses) == len(expected.hypotheses)
         for pose, hypothesis in zip(hypotheses.poses, expected.hypotheses, strict=True):

@@ -322,12 +322,17 @@ def moves_with_cameras(rig: Rig, inliers: Inliers, rotation: NDArray[np.float64]
 def _change_without_each(information: NDArray[np.float64], noise: NDArray[np.float64],
                          gradients: NDArray[np.float64], matched: NDArray[np.float64]
                          ) -> NDArray[np.float64]:
-    """Return the sum of the gains of the covariance with each of n objects left out in turn."""
+    """Return the sum of the gains of the covariance with each of n objects left out in turn.
+
+    Without an object, a pose is not surer: only a gain counts. The limit would be a loss where
+    boxes fix next to nothing.
+    """
     limit = np.diag(np.repeat([_WITHOUT_M ** -2, _WITHOUT_RAD ** -2], 3))
     inverses = np.linalg.inv(information + limit)
     shifts = np.einsum('nij,nj->ni', inverses, gradients)
     without = inverses @ (noise + limit) @ inverses
-    return np.asarray((without - matched).sum(axis=0) + shifts.T @ shifts)
+    values, vectors = np.linalg.eigh((without - matched).sum(axis=0) + shifts.T @ shifts)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def _sandwich(information: NDArray[np.float64], noise: NDArray[np.float64]
