@@ -43,7 +43,7 @@ _MOST_TILT = np.cos(np.radians(20.0))
 _NEAR_M = (0.6, 0.45, 0.3)
 # The share was chosen between a desk of 39 landmarks (TUM fr3) that repeats .36 of them by chance,
 # and two halls (seeds 1004 and 1006) that mislead and repeat .39 and .38.
-_LEAST_LANDMARKS, _LEAST_SHARE, _LEAST_MATCHED = 4, 0.38, 0.4
+_LEAST_LANDMARKS, _LEAST_SHARE, _LEAST_MATCHED, _ENOUGH = 4, 0.38, 0.4, 0.48
 # Two places differ where they share less than the first number, and are alike from the second one
 # on: share of the objects that a pose explains, and of the landmarks around it.
 _ALIKE, _ALIKE_AROUND = (0.3, 0.45), (0.45, 0.6)
@@ -116,7 +116,7 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
     if len(matched):
         # what the image shows may have moved at a place that is alike all around
         alike &= ((found[:, :len(matched)].mean(axis=1) >= _LEAST_MATCHED)
-                  | (shares >= _ALIKE_AROUND[1]))
+                  | (shares >= _ENOUGH))
     ends = np.einsum('nij,rj->nri', moves[:, :3, :3], landmark_map.centers[rows])
     misses = np.linalg.norm(ends + moves[:, None, :3, 3] - landmark_map.centers[others], axis=2)
     order = np.lexsort([(misses * found).sum(axis=1), -shares])
