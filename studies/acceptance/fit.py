@@ -3,9 +3,11 @@
 """The fit of the confidence to simulated worlds.
 
 Each group of images is localized in all modes, by labels and by classes, and in the same map with
-all objects exchanged, where every pose is wrong. For the report, each kind of world is judged by
-coefficients that the other kinds fitted. The coefficients printed in the end are fitted on rooms,
-offices, shops and bare rooms; corridors, halls and twin rooms only judge, since their mistaken
+all objects exchanged, where every pose is wrong. Half of the worlds have an error that all objects
+share: of the focal length, of the map's size or shape, or of names. For the report, each kind of
+world is judged by coefficients that the other kinds fitted. The coefficients printed in the end are
+fitted on rooms, offices, shops and bare rooms; corridors, halls and twin rooms only judge, since
+their mistaken
 places are the task of cliploc_ros.core.acceptance.look_alikes.
 """
 
@@ -27,7 +29,7 @@ from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
 from studies.acceptance.places import ALL, MODES, ONE, Simulated
-from studies.acceptance.troubles import exchange_landmarks
+from studies.acceptance.troubles import FAMILIES, exchange_landmarks
 from studies.reports import Judged, interval
 
 #: The kinds that fit; the others have places that look alike.
@@ -37,6 +39,9 @@ MATCHINGS = ('hybrid', 'class')
 _VERTICALS_DEG = (0.5, 1.0, 2.0, 4.0)
 # So low that evidence which is computed for likely poses only is there for those in doubt, too.
 _IN_DOUBT = 0.3
+# Errors that objects share, with their deviations or levels; half of the worlds have one.
+_SHARED = {'B focal length off by a factor': 0.03, 'C map scaled by': 0.05,
+           'C half of the map moved by [m]': 0.3, 'A landmarks under other classes, copies': 1}
 _THRESHOLDS = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995)
 _PRECISION = 0.99
 _FIELDS = ('score', 'misfit', 'likeness', 'rarity', 'unlabelled', 'unexplained', 'depth')
@@ -98,6 +103,8 @@ def search_world(world: Simulated) -> list[Searched]:
     kind, seed = world.kind, world.seed
     place, rng = world.load(), np.random.default_rng([seed, 7])
     vertical_deg = float(rng.choice(_VERTICALS_DEG))
+    shared = str(rng.choice([*_SHARED, *[''] * len(_SHARED)]))
+    level = _level(shared, rng) if shared else 0.0
     found = []
     for matching in MATCHINGS:
         plain = RelocalizerOptions(matching=matching, vertical_deviation_deg=vertical_deg,
@@ -106,9 +113,13 @@ def search_world(world: Simulated) -> list[Searched]:
             queries, options = place.ask(mode, seed, vertical_deg), place.options(mode, plain)
             setting = Setting(len(place.landmark_map),
                               vertical_deg if 'vertical' in mode else math.inf)
-            maps = [(place.landmark_map, False)]
+            shown = place.landmark_map
+            if shared:
+                shown, queries = FAMILIES[shared].change(shown, queries, level,
+                                                         np.random.default_rng([seed, 8]))
+            maps = [(shown, False)]
             if mode in (ONE, ALL):
-                maps.append((exchange_landmarks(place.landmark_map, queries, 1.0, rng)[0], True))
+                maps.append((exchange_landmarks(shown, queries, 1.0, rng)[0], True))
             for landmark_map, is_elsewhere in maps:
                 relocalizer = Relocalizer(landmark_map, options)
                 for query in queries:
@@ -117,6 +128,14 @@ def search_world(world: Simulated) -> list[Searched]:
                         found.append(Searched(kind, mode, matching, judge(
                             result, query.map_from_camera, setting, is_elsewhere)))
     return found
+
+
+def _level(shared: str, rng: np.random.Generator) -> float:
+    """Return by how much a world is wrong: a factor near 1, a distance, or a number of copies."""
+    deviation = _SHARED[shared]
+    if isinstance(deviation, int):
+        return deviation
+    return float(rng.normal('[m]' not in shared, deviation))
 
 
 def fit(cases: Sequence[Case], only: str = '') -> Calibration:

@@ -44,9 +44,11 @@ def four_cameras(start, tester, surroundings_map, tmp_path):
         'base_from_camera': BASE_FROM_CAMERA})
     process.wait_for_output('ready after')
     tester.connect()
-    rng = np.random.default_rng(4)
+    rng, number = np.random.default_rng(4), 0
 
-    def publish(number, working, late_s, mounts):
+    def publish(working, late_s, mounts):
+        nonlocal number
+        number += 1
         for name, seen in zip(NAMES, look(rng, mounts=mounts), strict=True):
             if name not in working:
                 continue
@@ -65,12 +67,10 @@ def four_cameras(start, tester, surroundings_map, tmp_path):
                 publishers[name][type(msg)].publish(msg)
 
     def ask(working=NAMES, late_s=None, mounts=MOUNTS):
-        future, number = tester.ask(), 0
+        future = tester.ask()
 
         def work():
-            nonlocal number
-            number += 1
-            publish(number, working, late_s or {}, mounts)
+            publish(working, late_s or {}, mounts)
             for _ in range(4):
                 tester.spin()
         wait_for(future.done, 'an answer', work=work)
