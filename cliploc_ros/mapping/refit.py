@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.association import associate, merge_pairs, pairs_of_one_class
+from cliploc_ros.mapping.association import associate
+from cliploc_ros.mapping.doubles import merge_doubles, pairs_of_one_class
 from cliploc_ros.mapping.evidence import (
     Evidence,
     explained_boxes,
@@ -152,9 +153,9 @@ def _settle(views: Views, given: Landmarks, chosen: NDArray[np.bool_], options: 
         is_own = part_of == np.arange(len(part_of))
         shown = _associate_some(views, landmarks, is_own, min_iou)
         if round_number >= len(_FIRST_IOUS):
-            pairs = [pair for pair in pairs_of_one_class(landmarks, options.merge_distance)
+            pairs = [pair for pair in pairs_of_one_class(landmarks)
                      if is_own[list(pair)].all() and chosen[list(pair)].all()]
-            _, into = merge_pairs(views, landmarks, shown, pairs, options)
+            landmarks, into = merge_doubles(views, landmarks, shown, pairs, options)
             part_of = into[part_of]
             shown = np.where(shown < 0, -1, into[shown])
         landmarks = _fit(views, landmarks, shown, chosen)

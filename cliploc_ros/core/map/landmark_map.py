@@ -15,7 +15,11 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from cliploc_ros.core.geometry.ellipsoid import shape_matrices
+from cliploc_ros.core.geometry.ellipsoid import (
+    STANDS_IN,
+    normalized_lengths,
+    shape_matrices,
+)
 from cliploc_ros.core.map.classes import ClassIndex
 from cliploc_ros.core.map.culling import SortedLandmarks, sort_landmarks
 from cliploc_ros.core.map.landmark_details import (
@@ -55,8 +59,8 @@ def objects_of(centers: NDArray[np.float64], shapes: NDArray[np.float64],
                neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the number of each landmark's object (L,): duplicates share one.
 
-    Landmarks of one class are duplicates if the centre of one lies in the other, after both have
-    got their mean shape. So books side by side are none.
+    Landmarks of one class are duplicates if they stand in one another. So books side by side are
+    none.
 
     Parameters
     ----------
@@ -66,9 +70,8 @@ def objects_of(centers: NDArray[np.float64], shapes: NDArray[np.float64],
         Landmarks of one class that are near each other.
     """
     first, second = neighbours.T
-    offsets = centers[second] - centers[first]
-    means = (0.5 * (shapes[first] + shapes[second]))[:, _UPPER]
-    inside = np.einsum('ni,nij,nj->n', offsets, np.linalg.inv(means), offsets) < 1.0
+    inside = normalized_lengths(centers[second] - centers[first],
+                                (shapes[first] + shapes[second])[:, _UPPER]) < STANDS_IN
     links = coo_matrix((np.ones(int(inside.sum())), (first[inside], second[inside])),
                        (len(centers), len(centers)))
     return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)

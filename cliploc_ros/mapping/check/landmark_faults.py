@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.mapping.association import associate, close_pairs, seen_apart
+from cliploc_ros.mapping.association import associate
+from cliploc_ros.mapping.doubles import close_pairs, show_two
 from cliploc_ros.mapping.evidence import Evidence, gather_evidence
 from cliploc_ros.mapping.fitting import fit_landmarks
 from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
@@ -104,11 +105,12 @@ def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views:
     landmarks = landmarks_of_map(landmark_map, sorted(set(landmark_map.class_ids)))
     boxes = None if witness is None else group_boxes(witness.shown, len(landmark_map))
     found = []
-    for first, second, distance in close_pairs(landmarks, _OVERLAP_DISTANCE):
-        is_duplicate = landmarks.classes[first] == landmarks.classes[second] and (
-            distance < _SAME_PLACE_DISTANCE or boxes is None or views is None
-            or seen_apart(views, boxes[first], boxes[second]) <= MappingOptions.max_seen_apart)
-        found.append(Overlap(first, second, distance, bool(is_duplicate)))
+    for first, second, distance in close_pairs(landmarks):
+        is_duplicate = bool(landmarks.classes[first] == landmarks.classes[second])
+        if boxes is not None and views is not None and len(boxes[first]) + len(boxes[second]):
+            is_duplicate = not show_two(views, landmarks.select(np.array([first, second])),
+                                        boxes[first], boxes[second])
+        found.append(Overlap(first, second, distance, is_duplicate))
     return sorted(found, key=lambda one: (not one.is_duplicate, one.distance))
 
 
