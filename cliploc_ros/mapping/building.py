@@ -14,12 +14,7 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.association import associate
-from cliploc_ros.mapping.doubles import (
-    find_doubles,
-    leave_one,
-    merge_doubles,
-    pairs_of_one_class,
-)
+from cliploc_ros.mapping.doubles import merge_doubles, pairs_of_one_class, resolve_doubles
 from cliploc_ros.mapping.evidence import (
     Evidence,
     explained_boxes,
@@ -286,14 +281,12 @@ def _one_of_each(views: Views, landmarks: Landmarks, options: MappingOptions
                  ) -> tuple[Landmarks, NDArray[np.int64]]:
     """Return landmarks without doubles, fitted to their boxes, and the one that each box shows."""
     while True:
-        shown, count = associate(views, landmarks, options.association_iou), len(landmarks.centers)
-        landmarks, shown = _keep(*merge_doubles(
-            views, landmarks, shown, find_doubles(views, landmarks, shown), options), shown)
-        is_shown = np.bincount(shown[shown >= 0], minlength=len(landmarks.centers)) > 0
-        landmarks = landmarks.select(is_shown & (leave_one(views, landmarks, shown)
-                                                 == np.arange(len(landmarks.centers))))
-        if len(landmarks.centers) == count:
+        shown = associate(views, landmarks, options.association_iou)
+        found, of_found = _keep(*resolve_doubles(views, landmarks, shown, options), shown)
+        is_shown = np.bincount(of_found[of_found >= 0], minlength=len(found.centers)) > 0
+        if is_shown.sum() == len(landmarks.centers):
             return landmarks, shown
+        landmarks = found.select(is_shown)
         shown = associate(views, landmarks, options.association_iou)
         landmarks = fit_landmarks(views, landmarks, group_boxes(shown, len(landmarks.centers)))
 

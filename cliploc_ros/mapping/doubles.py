@@ -9,6 +9,7 @@ is small and there most of the time, as that of a cup on a table.
 """
 
 from collections.abc import Iterable
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +23,16 @@ from cliploc_ros.mapping.landmarks import Landmarks, group_boxes
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import Views, camera_centers
 
-# Two boxes of one image show one thing if their IoU is greater. A box is within another one if it
-# shares more than the second number of its area, and small if its area is below the third number.
-_ONE_BOX_IOU, _WITHIN_SHARE, _SMALL_SHARE = 0.5, 0.8, 0.25
-# Two things are shown side by side about as often as chance brings their boxes together: in the
-# product of their rates. Names of one thing exclude each other. Between the two.
-_LEAST_LIFT = 1 / 3
-# Share of the images of both in which a small box within the other one is there.
-_MOST_OF_THE_TIME = 0.5
+# Two boxes of one image show one thing if their IoU is above the first number. One is within the
+# other if it shares more than the second number of its area. Below the third number of the other's
+# area it is a part, or a thing on it; below the fourth it is a thing.
+_ONE_BOX_IOU, _WITHIN_SHARE, _PART_SHARE, _THING_SHARE = 0.5, 0.8, 0.3, 1 / 16
+# Names of one thing exclude each other. Two things are side by side in this share of the images in
+# which chance brings the boxes of both together, or of the images of the rarer one.
+_LEAST_LIFT, _LEAST_SHARE = 1 / 3, 0.15
+# A part has a box of its own at times, a thing on another one in this share of the images of both.
+# All are guesses, between the doubles and the neighbours of four rooms and TUM fr3.
+_LEAST_STEADY = 0.3
 
 
 def close_pairs(landmarks: Landmarks, max_distance: float = STANDS_IN
@@ -59,21 +62,30 @@ def pairs_of_one_class(landmarks: Landmarks) -> list[tuple[int, int]]:
             if landmarks.classes[first] == landmarks.classes[second]]
 
 
-def show_two(views: Views, pair: Landmarks, rows: NDArray[np.int64], others: NDArray[np.int64]
-             ) -> bool:
-    """Tell whether the images show two things at once, by the boxes of each of two landmarks."""
+class Relation(Enum):
+    """What the images show of two landmarks that stand in one another."""
+
+    TWO = 'two things at once'
+    PART = 'boxes of different extent, seldom at once: one is a part of the other'
+    SAME = 'one box, or one at a time'
+
+
+def relation(views: Views, pair: Landmarks, rows: NDArray[np.int64], others: NDArray[np.int64]
+             ) -> Relation:
+    """Return what the images show of two landmarks, by the boxes of each."""
     _, first, second = np.intersect1d(views.frames[rows], views.frames[others],
                                       return_indices=True)
     if len(first) == 0:
-        return False
+        return Relation.SAME
     boxes = np.stack([views.edges[rows[first]], views.edges[others[second]]])
     low, high = boxes[..., :2].max(axis=0), boxes[..., 2:].min(axis=0)
     shared = np.maximum(high - low, 0.0).prod(axis=1)
     areas = np.maximum(boxes[..., 2:] - boxes[..., :2], 1e-12).prod(axis=2)
     small, large = areas.min(axis=0), areas.max(axis=0)
-    is_within = shared > _WITHIN_SHARE * small
-    beside = (shared <= _ONE_BOX_IOU * (small + large - shared)) & ~is_within
-    within = is_within & (small < _SMALL_SHARE * large)
+    is_one = shared > _ONE_BOX_IOU * (small + large - shared)
+    is_within = ~is_one & (shared > _WITHIN_SHARE * small) & (small > _THING_SHARE * large)
+    is_beside = ~is_one & ~is_within
+    may_be_part = is_within & (small < _PART_SHARE * large)
     # frames of one viewpoint err alike
     weights = views.weights
     seen, in_view = np.zeros((2, len(weights)), dtype=np.bool_), []
@@ -81,11 +93,16 @@ def show_two(views: Views, pair: Landmarks, rows: NDArray[np.int64], others: NDA
         seen[number, views.frames[own]] = True
         in_view.append(seen[number] | _expected(views, pair, number, views.frames[own]))
     both = in_view[0] & in_view[1]
-    rates = (seen & both) @ weights
+    rates, total = (seen & both) @ weights, weights[both].sum()
     together = weights[views.frames[rows[first]]]
-    total = weights[both].sum()
-    return bool(together[beside].sum() * total > _LEAST_LIFT * rates.prod()
-                or together[beside | within].sum() > _MOST_OF_THE_TIME * total)
+    one, within, beside, small_within = (
+        together[mask].sum() for mask in (is_one, is_within, is_beside, may_be_part))
+    if ((beside > one and beside * total > _LEAST_LIFT * rates.prod())
+            or (beside > one + within and beside > _LEAST_SHARE * rates.min())
+            or beside + small_within > _LEAST_STEADY * total):
+        return Relation.TWO
+    return Relation.PART if beside + within > max(one, _LEAST_SHARE * rates.min()) else (
+        Relation.SAME)
 
 
 def _expected(views: Views, pair: Landmarks, number: int, frames: NDArray[np.int64]
@@ -98,11 +115,37 @@ def _expected(views: Views, pair: Landmarks, number: int, frames: NDArray[np.int
 
 def find_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
                  ) -> list[tuple[int, int]]:
-    """Return the pairs that are one thing, the nearest first."""
+    """Return the pairs that are one thing, the nearest first.
+
+    Of two landmarks without a box the images tell nothing.
+    """
     rows_of = group_boxes(shown, len(landmarks.centers))
     return [(first, second) for first, second, _ in close_pairs(landmarks)
-            if not show_two(views, landmarks.select(np.array([first, second])),
-                            rows_of[first], rows_of[second])]
+            if len(rows_of[first]) + len(rows_of[second])
+            and relation(views, landmarks.select(np.array([first, second])), rows_of[first],
+                         rows_of[second]) is not Relation.TWO]
+
+
+def resolve_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
+                    options: MappingOptions, chosen: NDArray[np.bool_] | None = None
+                    ) -> tuple[Landmarks, NDArray[np.int64]]:
+    """Return all landmarks, and the one (L,) that each of the chosen is one thing with.
+
+    Those whose boxes fit one ellipsoid are fitted together. Of others, the landmark with more
+    boxes stays as it is: the other one is a part of it, or a wrong find.
+    """
+    def doubles(shown: NDArray[np.int64]) -> list[tuple[int, int]]:
+        return [pair for pair in find_doubles(views, landmarks, shown)
+                if chosen is None or chosen[list(pair)].all()]
+
+    landmarks, into = merge_doubles(views, landmarks, shown, doubles(shown), options)
+    shown = np.where(shown < 0, -1, into[shown])
+    counts = np.bincount(shown[shown >= 0], minlength=len(into))
+    for pair in doubles(shown):
+        if (into[list(pair)] == pair).all():
+            keep, drop = pair if counts[pair[0]] >= counts[pair[1]] else pair[::-1]
+            into[into == drop] = keep
+    return landmarks, into
 
 
 def merge_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
@@ -110,8 +153,9 @@ def merge_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
                   ) -> tuple[Landmarks, NDArray[np.int64]]:
     """Fit those of the pairs that are one thing together, in the order given.
 
-    They stay two where their boxes fit no one ellipsoid. Of two landmarks the one with more boxes
-    stays, with the classes of both. Returns all landmarks, and the one (L,) that each is part of.
+    They stay two where the boxes of either do not fit the common ellipsoid. Of two landmarks the
+    one with more boxes stays, with the classes of both. Returns all landmarks, and the one (L,)
+    that each is part of.
     """
     centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
     rows_of = group_boxes(shown, len(centers))
@@ -122,18 +166,28 @@ def merge_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
         keep, drop = ((first, second) if len(rows_of[first]) >= len(rows_of[second])
                       else (second, first))
         now = Landmarks(centers, bases, landmarks.classes)
-        if show_two(views, now.select(np.array([keep, drop])), rows_of[keep], rows_of[drop]):
+        if relation(views, now.select(np.array([keep, drop])), rows_of[keep], rows_of[drop]
+                    ) is not Relation.SAME:
             continue
-        rows = np.sort(np.concatenate([rows_of[keep], rows_of[drop]]))
-        fit = fit_ellipsoid(views, rows, centers[keep], bases[keep])
-        before = np.concatenate([ious_with(views, rows_of[number], centers[number], bases[number])
-                                 for number in (keep, drop)])
-        after = ious_with(views, rows, fit.center, fit.basis)
-        if len(rows) and after.mean() < before.mean() - options.merge_loss:
+        rows = np.concatenate([rows_of[keep], rows_of[drop]])
+        fit = fit_ellipsoid(views, np.sort(rows), centers[keep], bases[keep])
+        before = [ious_with(views, rows_of[number], centers[number], bases[number])
+                  for number in (keep, drop)]
+        after = np.split(ious_with(views, rows, fit.center, fit.basis), [len(before[0])])
+        if not (_fits(np.concatenate(before), np.concatenate(after), 1.0, options)
+                and all(_fits(*ious, options.min_median_iou, options)
+                        for ious in zip(before, after, strict=True))):
             continue
-        centers[keep], bases[keep], rows_of[keep] = fit.center, fit.basis, rows
+        centers[keep], bases[keep], rows_of[keep] = fit.center, fit.basis, np.sort(rows)
         into[into == drop] = keep
     return Landmarks(centers, bases, landmarks.classes, _joined_names(landmarks, into)), into
+
+
+def _fits(before: NDArray[np.float64], after: NDArray[np.float64], enough: float,
+          options: MappingOptions) -> bool:
+    """Tell by the IoUs of boxes, before and after, if they fit enough, or hardly worse."""
+    return len(before) == 0 or bool(
+        after.mean() >= min(enough, before.mean() - options.merge_loss))
 
 
 def _joined_names(landmarks: Landmarks, into: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -141,19 +195,3 @@ def _joined_names(landmarks: Landmarks, into: NDArray[np.int64]) -> NDArray[np.i
     names = landmarks.names
     names = np.unique(np.stack([into[names[:, 0]], names[:, 1]], axis=1), axis=0)
     return names[names[:, 1] != landmarks.classes[names[:, 0]]]
-
-
-def leave_one(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
-              ) -> NDArray[np.int64]:
-    """Return the landmark (L,) that each gives way to, as one thing; else its own row.
-
-    Of two that are one thing, and whose boxes fit no one ellipsoid, that with more boxes stays:
-    the other one is a part of it, or a wrong find.
-    """
-    into, counts = np.arange(len(landmarks.centers)), np.bincount(
-        shown[shown >= 0], minlength=len(landmarks.centers))
-    for first, second in find_doubles(views, landmarks, shown):
-        if into[first] == first and into[second] == second:
-            keep, drop = (first, second) if counts[first] >= counts[second] else (second, first)
-            into[into == drop] = keep
-    return into

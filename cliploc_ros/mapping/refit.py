@@ -15,7 +15,7 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.association import associate
-from cliploc_ros.mapping.doubles import merge_doubles, pairs_of_one_class
+from cliploc_ros.mapping.doubles import merge_doubles, pairs_of_one_class, resolve_doubles
 from cliploc_ros.mapping.evidence import (
     Evidence,
     explained_boxes,
@@ -119,9 +119,9 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
             f'explains {share_before / share_known:.0%} of the boxes: is it in their coordinate '
             'frame?')
     # boxes of what is not fitted may belong to what is
-    landmarks = Landmarks(np.where(is_fitted[:, None], settled.centers, given.centers),
-                          np.where(is_fitted[:, None, None], settled.bases, given.bases),
-                          given.classes)
+    landmarks = settled._replace(
+        centers=np.where(is_fitted[:, None], settled.centers, given.centers),
+        bases=np.where(is_fitted[:, None, None], settled.bases, given.bases))
     shown = _associate_some(views, landmarks, is_fitted | ~chosen, options.association_iou)
     landmarks = _fit(views, landmarks, shown, is_fitted)
     evidence = gather_evidence(views, landmarks, shown)
@@ -136,7 +136,7 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
         replace(landmark_map, centers=np.where(fitted, landmarks.centers, landmark_map.centers),
                 semi_axes=np.where(fitted, semi_axes, landmark_map.semi_axes),
                 quats_xyzw=np.where(fitted, quats_xyzw, landmark_map.quats_xyzw),
-                details=tuple(details)),
+                details=tuple(details)).joined(part_of),
         tuple(reasons), part_of, tuple(notes), share_before / share_known, share / share_known,
         iou_before, iou)
 
@@ -159,7 +159,10 @@ def _settle(views: Views, given: Landmarks, chosen: NDArray[np.bool_], options: 
             part_of = into[part_of]
             shown = np.where(shown < 0, -1, into[shown])
         landmarks = _fit(views, landmarks, shown, chosen)
-    return landmarks, part_of
+    is_own = part_of == np.arange(len(part_of))
+    shown = _associate_some(views, landmarks, is_own, options.association_iou)
+    landmarks, into = resolve_doubles(views, landmarks, shown, options, is_own & chosen)
+    return landmarks, into[part_of]
 
 
 def _associate_some(views: Views, landmarks: Landmarks, rows: NDArray[np.bool_], min_iou: float

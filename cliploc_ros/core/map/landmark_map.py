@@ -5,7 +5,7 @@
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -26,6 +26,7 @@ from cliploc_ros.core.map.landmark_details import (
     OPTIONAL_FIELDS,
     LandmarkDetails,
     WeightedLabels,
+    join_details,
     read_details,
 )
 from cliploc_ros.core.map.pairs import LandmarkPairs, make_pairs
@@ -106,6 +107,21 @@ class LandmarkMap:
             self.frame_id, pick(self.landmark_ids), pick(self.labels), pick(self.class_ids),
             self.centers[rows], self.semi_axes[rows], self.quats_xyzw[rows],
             pick(self.details) if self.details else ())
+
+    def joined(self, into: NDArray[np.int64]) -> 'LandmarkMap':
+        """Return the map in which each landmark has the labels and classes of its parts, too.
+
+        The array into (L,) is the row of the landmark that each is part of, or its own.
+        """
+        details = list(self.details or [LandmarkDetails()] * len(self))
+        for row, count in zip(*np.unique(into, return_counts=True), strict=True):
+            if count > 1:
+                parts = np.nonzero(into == row)[0]
+                details[row] = join_details([
+                    (self.labels[part], self.class_ids[part], details[part])
+                    for part in sorted(parts.tolist(), key=lambda part: part != row)])
+        return replace(self, details=tuple(details) if self.details or len(set(into)) < len(into)
+                       else ())
 
     def prepare(self) -> None:
         """Compute the indices now, so that the first request does not wait for them."""

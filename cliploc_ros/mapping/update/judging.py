@@ -16,7 +16,7 @@ from scipy.special import betaln, expit
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.mapping.association import find_overlaps
 from cliploc_ros.mapping.building import LeftOut, NothingFoundError, build_map, rounded
-from cliploc_ros.mapping.doubles import close_pairs, show_two
+from cliploc_ros.mapping.doubles import Relation, close_pairs, relation
 from cliploc_ros.mapping.evidence import gather_evidence
 from cliploc_ros.mapping.landmarks import (
     Landmarks,
@@ -284,9 +284,9 @@ def _without_copies(views: Views, finds: Finds, old: Landmarks, known: Known,
         is_one_class = old.classes[row] == finds.landmarks.classes[new]
         if len(of_old[row]) >= max(1.0, majority * len(of_new[new])) and (
                 (is_one_class and distance < LEAST_MOVE_SHAPES)
-                or not show_two(views, join_landmarks(old.select(np.array([row])),
-                                                      finds.landmarks.select(np.array([new]))),
-                                of_old[row], of_new[new])):
+                or relation(views, join_landmarks(old.select(np.array([row])),
+                                                  finds.landmarks.select(np.array([new]))),
+                            of_old[row], of_new[new]) is not Relation.TWO):
             reasons[new] = f'it is {known.landmark_ids[row]} in its place'
     return finds.without(reasons, sight)
 
