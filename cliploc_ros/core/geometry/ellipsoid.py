@@ -28,7 +28,7 @@ _OUTLINE_POINTS = 64
 #: Ellipsoids whose centres are nearer than this in units of their summed shapes stand in one
 #: another: two that touch are at most 1.41 apart, and a small one whose centre lies on the surface
 #: of a large one is 1 apart.
-STANDS_IN = 0.8
+STANDS_IN = 1.0
 
 
 def shape_matrices(semi_axes: NDArray[np.float64], quats_xyzw: NDArray[np.float64]
