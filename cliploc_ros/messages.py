@@ -6,8 +6,10 @@ No field of a message is taken for valid.
 """
 
 import math
+import re
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import cv2
@@ -15,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.camera_faults import Fault, calibration_faults
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import CameraError, ImageError, OptionsError
 
@@ -57,6 +60,7 @@ class CameraInfoMessage(Protocol):
     distortion_model: str
     k: Sequence[float]
     d: Sequence[float]
+    r: Sequence[float]
     p: Sequence[float]
     binning_x: int
     binning_y: int
@@ -195,17 +199,70 @@ def camera_from_msg(msg: CameraInfoMessage, image_size: tuple[int, int], rectifi
         The values are invalid, or they are for another image size.
     """
     _check_image_size(msg, image_size)
-    name, matrix = ('P', msg.p) if rectified else ('K', msg.k)
-    fx, fy, cx, cy = (matrix[0], matrix[5], matrix[2], matrix[6]) if rectified else (
-        matrix[0], matrix[4], matrix[2], matrix[5])
+    name, matrix = ('P', _left_of_p(msg)) if rectified else ('K', np.reshape(msg.k, (3, 3)))
     distortion = () if rectified else tuple(map(float, msg.d))
     columns, rows = _binning(msg)
+    (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
     try:
-        return Camera(*image_size, float(fx) / columns, float(fy) / rows,
-                      (float(cx) - msg.roi.x_offset) / columns,
-                      (float(cy) - msg.roi.y_offset) / rows, msg.distortion_model, distortion)
+        return Camera(*image_size, fx / columns, fy / rows, (cx - msg.roi.x_offset) / columns,
+                      (cy - msg.roi.y_offset) / rows,
+                      '' if rectified else msg.distortion_model, distortion)
     except CameraError as error:
         raise CameraError(f'camera_info: {name}: {error}') from error
+
+
+def faults_of_camera_info(msg: CameraInfoMessage, camera: Camera, rectified: bool
+                          ) -> list[Fault]:
+    """Return what contradicts itself in a message, or is implausible; the certain faults first.
+
+    `camera` is the camera of the image that camera_from_msg makes of the message.
+    """
+    (columns, rows), roi = _binning(msg), msg.roi
+    # a part of the sensor has any principal point, and the whole sensor has not
+    sensor = replace(
+        camera, width=msg.width or roi.x_offset + (roi.width or columns * camera.width),
+        height=msg.height or roi.y_offset + (roi.height or rows * camera.height),
+        fx=columns * camera.fx, fy=rows * camera.fy, cx=columns * camera.cx + roi.x_offset,
+        cy=rows * camera.cy + roi.y_offset)
+    k, r, p = (np.reshape(matrix, (3, -1)) for matrix in (msg.k, msg.r, msg.p))
+    return [fault._replace(text=f'camera_info: {fault.text}')
+            for fault in calibration_faults(sensor, k, r, p, rectified)]
+
+
+def faults_of_headers(image: str, camera_info: str, detections: str = '') -> list[Fault]:
+    """Return which messages are of another coordinate frame than their image; '' is unknown.
+
+    Boxes of another camera are certainly wrong. Simulators and drivers are known that name
+    camera_info and image differently.
+    """
+    return [Fault(f"{what} is of the coordinate frame '{other}', its image of '{image}': is it of "
+                  "another camera? publish it with the image's header", is_certain)
+            for what, other, is_certain in (('detections', detections, True),
+                                            ('camera_info', camera_info, False))
+            if other and image and other.strip('/') != image.strip('/')]
+
+
+def faults_of_rectified(image_topic: str, rectified: bool,
+                        msg: CameraInfoMessage | None = None) -> list[Fault]:
+    """Return whether images are probably rectified though they are read as raw, or the reverse.
+
+    Not where the camera_info `msg` makes no difference between the two. The names of image_proc,
+    image_rect and image_rect_color, are certain where it does.
+    """
+    name = image_topic.removesuffix('/compressed')
+    sounds = 'raw' if name.endswith('/image_raw') else \
+        'rectified' if re.search('[/_]rect(?!.*raw)', name) else ''
+    is_same = msg is not None and msg.distortion_model != 'equidistant' and not any(msg.d) and \
+        np.array_equal(_left_of_p(msg), np.reshape(msg.k, (3, 3)))
+    if is_same or sounds != ('raw' if rectified else 'rectified'):
+        return []
+    return [Fault(f'{image_topic} sounds {sounds}, but the parameter rectified is '
+                  f'{str(rectified).lower()}: poses would be wrong by the distortion of the lens',
+                  msg is not None and '/image_rect' in name)]
+
+
+def _left_of_p(msg: CameraInfoMessage) -> NDArray[np.float64]:
+    return np.reshape(msg.p, (3, 4))[:, :3]
 
 
 def _binning(msg: CameraInfoMessage) -> tuple[int, int]:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.command import run_command
 from cliploc_ros.core.acceptance.confidence import tilt_handicaps, utilities
-from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
+from cliploc_ros.core.acceptance.support import ComparedFrame, Support, one_thing, support
 from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.verification import cameras_from_last, make_rig
@@ -121,8 +121,8 @@ def _support(landmark_map: LandmarkMap, frames: Sequence[SearchedFrame],
     """Return the support of a pose of the last frame."""
     compared = [ComparedFrame(
         one.observation.detections.bboxes_xyxy, one.observation.detections.class_ids,
-        one.observation.similarities, one.scene, one.observation.similarity_rows)
-        for one in frames]
+        one.observation.similarities, one.scene, one.observation.similarity_rows,
+        one_thing(one.observation.detections.bboxes_xyxy)) for one in frames]
     cameras = cameras_from_last([one.observation for one in frames])
     return support(landmark_map, compared, pose @ np.linalg.inv(cameras), matches)
 

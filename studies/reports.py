@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.evaluation.summary import wilson_interval
 
+#: Bounds of the confidences that are counted together.
+BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 1.0)
+#: Errors of poses that lead a robot astray, though they may be no false accepts.
+FAR_M, FAR_DEG = 0.5, 20.0
 #: Confidences (n,), and whether each pose is right (n,).
 Judged = tuple[NDArray[np.float64], NDArray[np.bool_]]
 

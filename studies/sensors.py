@@ -9,8 +9,9 @@ those of the relocalizer's ``gravity: imu``.
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,9 @@ from cliploc_ros.units import NS_PER_S
 from studies.reports import table
 
 _WAYS_M = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
+_LOST, _RATES_HZ = (0.0, 0.1), (5.0, 10.0, 25.0, 50.0)
+_TWISTS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+    'as it is': lambda twist: twist, 'empty': np.zeros_like}
 _LAGS_S = np.arange(-0.5, 0.51, 0.02)
 _EARTH_RADIUS_M = 6_371_000.0
 _CHORD_M = 20.0
@@ -55,6 +59,7 @@ class Robot:
     name: str
     topics: dict[str, NDArray[np.float64]]  #: (., 2): stamps, and times of recording [s]
     poses: NDArray[np.float64]  #: (n, 8): stamp [s], position [m], quaternion x, y, z, w
+    twists: NDArray[np.float64]  #: (n, 2, 3) [m/s], [rad/s]
     samples: tuple[Sample, ...]  #: m
     turn_rates: NDArray[np.float64]  #: (m, 3) of the gyroscope [rad/s]
     fixes: NDArray[np.float64]  #: (g, 3): stamp [s], latitude and longitude [degrees]
@@ -78,7 +83,7 @@ class Robot:
 def read_robot(bag: Path) -> Robot:
     """Read a bag of ROS 1 or 2 with one topic of odometry, one IMU and perhaps GPS."""
     times: dict[str, list[tuple[float, float]]] = {}
-    poses, samples, rates, fixes = [], list[Sample](), [], []
+    poses, twists, samples, rates, fixes = [], [], list[Sample](), [], []
     with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         for topic, received_ns, data in reader.messages():
             msg: Any = reader.deserialize(data, topic.msgtype)
@@ -87,6 +92,8 @@ def read_robot(bag: Path) -> Robot:
             if topic.msgtype.endswith('/Odometry'):
                 p, q = msg.pose.pose.position, msg.pose.pose.orientation
                 poses.append((at_s, p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+                v, w = msg.twist.twist.linear, msg.twist.twist.angular
+                twists.append(((v.x, v.y, v.z), (w.x, w.y, w.z)))
             elif topic.msgtype.endswith('/Imu') and (sample := sample_from_msg(msg)) is not None:
                 w = msg.angular_velocity
                 samples.append(sample)
@@ -94,24 +101,46 @@ def read_robot(bag: Path) -> Robot:
             elif topic.msgtype.endswith('/NavSatFix'):
                 fixes.append((at_s, msg.latitude, msg.longitude))
     return Robot(bag.stem, {name: np.array(one) for name, one in times.items()}, np.array(poses),
-                 tuple(samples), np.array(rates), np.array(fixes).reshape(-1, 3))
+                 np.array(twists), tuple(samples), np.array(rates), np.array(fixes).reshape(-1, 3))
 
 
 def topics_table(robots: Sequence[Robot]) -> str:
-    """Return the table of rates, gaps, delays and restarts."""
+    """Return the table of rates, gaps and delays."""
     rows = []
     for robot in robots:
-        window = OdometryWindow(30.0)
-        for at_s, *pose in robot.poses:
-            window.add(round(at_s * NS_PER_S), np.array(pose[:3]), np.array(pose[3:]))
         for name, times in robot.topics.items():
             steps, delays = np.diff(times[:, 0]), times[:, 1] - times[:, 0]
             low, high = np.quantile(delays, [0.5, 0.99])
             rows.append([robot.name, name, f'{1.0 / np.median(steps):.1f}', f'{steps.max():.3f}',
-                         f'{low * 1e3:.1f}, {high * 1e3:.1f}',
-                         window.run if name.endswith('odom') else ''])
+                         f'{low * 1e3:.1f}, {high * 1e3:.1f}'])
     return table(['bag', 'topic', 'rate [Hz]', 'longest gap [s]',
-                  'recorded after its stamp: median, 99 % [ms]', 'restarts'], rows)
+                  'recorded after its stamp: median, 99 % [ms]'], rows)
+
+
+def restarts_table(robot: Robot, rates_hz: Sequence[float], tries: int = 4) -> str:
+    """Return the table of restarts that are seen in a drive without any, with messages left out.
+
+    A row for each rate: each n-th message. Of each share of lost messages the sum of some tries.
+    """
+    rng, rows = np.random.default_rng(0), []
+    for rate_hz in rates_hz:
+        every = max(1, round(1.0 / np.median(np.diff(robot.poses[:, 0])) / rate_hz))
+        found = []
+        for lost, twist in product(_LOST, _TWISTS.values()):
+            runs = 0
+            for first in range(tries):
+                window = OdometryWindow(30.0)
+                for row in range(first % every, len(robot.poses), every):
+                    if rng.random() >= lost:
+                        at_s, *pose = robot.poses[row]
+                        window.add(round(at_s * NS_PER_S), np.array(pose[:3]), np.array(pose[3:]),
+                                   twist(robot.twists[row]))
+                runs += window.run
+            found.append(runs)
+        rows.append([robot.name, f'{rate_hz:g}', tries * len(robot.poses) // every, *found])
+    return table(['bag', 'rate [Hz]', 'messages', *(
+        f'restarts, {lost:.0%} lost, twist {name}' for lost, name in product(_LOST, _TWISTS))],
+        rows)
 
 
 def angle_table(robot: Robot) -> str:
@@ -269,6 +298,8 @@ def run(arguments: Sequence[str]) -> int:
     if robots:
         print(topics_table(robots), '\n')
     for robot in robots:
+        most_hz = 1.1 / np.median(np.diff(robot.poses[:, 0]))
+        print(restarts_table(robot, [one for one in _RATES_HZ if one <= most_hz]), '\n')
         print(angle_table(robot), '\n')
         if len(robot.fixes):
             print(distance_line(robot), '\n')

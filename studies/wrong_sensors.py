@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.evaluation.trials import Query
@@ -131,6 +132,120 @@ def scaled_odometry(queries: Sequence[Query], factor: float) -> tuple[Query, ...
         found.append(replace(query, observation=scaled[query.observation.stamp_ns],
                              neighbours=tuple(scaled[one.stamp_ns] for one in query.neighbours)))
     return tuple(found)
+
+
+def middle_crop(queries: Sequence[Query], side_px: float) -> tuple[Query, ...]:
+    """Return queries with the boxes of a network that sees the middle square, in its pixels."""
+    def change(boxes: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+        side = min(camera.width, camera.height)
+        corner = np.tile([camera.width - side, camera.height - side], 2) / 2
+        return np.clip((boxes - corner) * side_px / side, 0.0, side_px)
+
+    return _with_boxes(queries, change)
+
+
+def scaled_boxes(queries: Sequence[Query], factor: float) -> tuple[Query, ...]:
+    """Return queries with boxes of an image of another size."""
+    return _with_boxes(queries, lambda boxes, camera: factor * boxes)
+
+
+def shifted_boxes(queries: Sequence[Query], share: float) -> tuple[Query, ...]:
+    """Return queries with boxes shifted to the right by a share of the image's width."""
+    return _with_boxes(queries, lambda boxes, camera: boxes + [share * camera.width, 0.0] * 2)
+
+
+def turned_boxes(queries: Sequence[Query], angle_deg: float) -> tuple[Query, ...]:
+    """Return queries with the boxes of images turned by a multiple of 90 degrees."""
+    def change(boxes: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+        width, height = camera.width, camera.height
+        for _ in range(round(angle_deg / 90.0) % 4):
+            left, top, right, bottom = boxes.T
+            boxes = np.stack([height - bottom, left, height - top, right], axis=1)
+            width, height = height, width
+        return boxes
+
+    return _with_boxes(queries, change)
+
+
+def mirrored_boxes(queries: Sequence[Query], level: float) -> tuple[Query, ...]:
+    """Return queries with the boxes of images mirrored left to right (0) or top to bottom (1)."""
+    def change(boxes: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+        left, top, right, bottom = boxes.T
+        if level:
+            return np.stack([left, camera.height - bottom, right, camera.height - top], axis=1)
+        return np.stack([camera.width - right, top, camera.width - left, bottom], axis=1)
+
+    return _with_boxes(queries, change)
+
+
+#: Numbers of a box in the order of some convention, made of corners (2, n) and the image's size.
+CONVENTIONS: tuple[Callable[..., tuple[NDArray[np.float64], NDArray[np.float64]]], ...] = (
+    lambda low, high, size: (0.5 * (low + high), high - low),  # x and y of the centre, sides
+    lambda low, high, size: (low, high - low),  # corner and sides
+    lambda low, high, size: (low / size, high / size),  # shares of the image
+    lambda low, high, size: (low[:, ::-1], high[:, ::-1]),  # rows before columns
+    # corners taken for centre and sides, and for corner and sides
+    lambda low, high, size: (low - 0.5 * high, low + 0.5 * high),
+    lambda low, high, size: (low, low + high))
+
+
+def of_convention(queries: Sequence[Query], number: float) -> tuple[Query, ...]:
+    """Return queries with boxes of another one of CONVENTIONS, taken for corners."""
+    return _with_boxes(queries, lambda boxes, camera: np.hstack(CONVENTIONS[int(number)](
+        boxes[:, :2], boxes[:, 2:], np.array([camera.width, camera.height]))))
+
+
+def fisheye_boxes(queries: Sequence[Query], level: float) -> tuple[Query, ...]:
+    """Return queries with the boxes that an ideal fisheye sees, taken for a pinhole's."""
+    def change(boxes: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+        middle, scale = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
+        x, y = boxes.reshape(-1, 2, 2).transpose(2, 0, 1)
+        # the middles of the edges: left, top, right, bottom
+        points = np.stack([np.stack([x[:, 0], y.mean(axis=1)], axis=1),
+                           np.stack([x.mean(axis=1), y[:, 0]], axis=1),
+                           np.stack([x[:, 1], y.mean(axis=1)], axis=1),
+                           np.stack([x.mean(axis=1), y[:, 1]], axis=1)], axis=1)
+        rays = (points - middle) / scale
+        distances = np.maximum(np.linalg.norm(rays, axis=2, keepdims=True), 1e-9)
+        pixels = rays * np.arctan(distances) / distances * scale + middle
+        return np.stack([pixels[:, 0, 0], pixels[:, 1, 1], pixels[:, 2, 0], pixels[:, 3, 1]],
+                        axis=1)
+
+    return _with_boxes(queries, change)
+
+
+def scaled_camera(queries: Sequence[Query], factor: float) -> tuple[Query, ...]:
+    """Return queries with the intrinsics of an image of another size."""
+    return _with_camera(queries, lambda camera: replace(
+        camera, fx=factor * camera.fx, fy=factor * camera.fy, cx=factor * camera.cx,
+        cy=factor * camera.cy))
+
+
+def scaled_focal(queries: Sequence[Query], factor: float) -> tuple[Query, ...]:
+    """Return queries with focal lengths that are wrong by a factor."""
+    return _with_camera(queries, lambda camera: replace(camera, fx=factor * camera.fx,
+                                                        fy=factor * camera.fy))
+
+
+def shifted_center(queries: Sequence[Query], share: float) -> tuple[Query, ...]:
+    """Return queries with a principal point that is off by a share of the width."""
+    return _with_camera(queries, lambda camera: replace(camera,
+                                                        cx=camera.cx + share * camera.width))
+
+
+def _with_camera(queries: Sequence[Query], change: Callable[[Camera], Camera]
+                 ) -> tuple[Query, ...]:
+    return tuple(_of_all_frames(query, lambda one: replace(one, camera=change(one.camera)))
+                 for query in queries)
+
+
+def _with_boxes(queries: Sequence[Query], change: Callable[
+        [NDArray[np.float64], Camera], NDArray[np.float64]]) -> tuple[Query, ...]:
+    """Return queries with other boxes, all changed by one rule."""
+    return tuple(_of_all_frames(query, lambda one: replace(one, detections=replace(
+        one.detections, bboxes_xyxy=np.ascontiguousarray(change(
+            one.detections.bboxes_xyxy.reshape(-1, 4), one.camera), dtype=np.float64))))
+        for query in queries)
 
 
 def _of_all_frames(query: Query, change: Callable[[Observation], Observation]) -> Query:

@@ -5,6 +5,7 @@
 import faulthandler
 import importlib.util
 import os
+import re
 import shutil
 import signal
 import socket
@@ -19,8 +20,8 @@ import pytest
 
 PROJECT = Path(__file__).resolve().parents[1]
 SHARED_DATA = PROJECT.parent / 'shared' / 'data'
-# pytest-xdist hands whole files to its workers in this order. The folders with long files come
-# first, so that all workers end at about the same time.
+# The order of the folders. pytest-xdist gives each worker an equal run of tests; who is done takes
+# half of what another has left.
 LONGEST_FIRST = ('nodes', 'demo', 'models', 'studies', 'evaluation', 'mapping', 'cli', 'core')
 # A fixture, or a test, that takes longer hangs. The longest take a minute on a busy machine, and
 # several in a niced process, which gets a tenth of a core there.
@@ -53,6 +54,17 @@ def reserve_ros_domain() -> tuple[int, socket.socket]:
 
 def pytest_addoption(parser):
     parser.addoption('--no-skips', action='store_true', help='a skipped test fails the run')
+    parser.addoption('--quick', action='store_true',
+                     help='leave out the tests that are marked full or clock, and import none of '
+                          'the files that are marked full')
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Leave out a file that is marked full: it may import what is not installed."""
+    if config.getoption('--quick') and collection_path.suffix == '.py' and re.search(
+            r'^pytestmark = .*mark\.full\b', collection_path.read_text(), re.MULTILINE):
+        return True
+    return None
 
 
 def pytest_configure(config):
@@ -72,6 +84,11 @@ def pytest_configure(config):
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config, items):
     """Deselect tests that need a missing module; sort the rest by expected duration."""
+    if config.getoption('--quick'):
+        slow = [item for item in items
+                if item.get_closest_marker('full') or item.get_closest_marker('clock')]
+        config.hook.pytest_deselected(items=slow)
+        items[:] = [item for item in items if item not in slow]
     left_out = [item for item in items if missing_module(item)]
     for item in left_out:
         config.stash[NOT_RUN].setdefault(missing_module(item), []).append(item.nodeid)
@@ -127,13 +144,6 @@ def pytest_sessionfinish(session, exitstatus):
     if config.getoption('--no-skips') and count(reporter, 'skipped'):
         reporter.write_line('\nskipped tests fail this run (--no-skips)', red=True)
         session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config, log):
-    from crash_proof import CrashProofScheduling  # pytest-xdist may be missing
-
-    return CrashProofScheduling(config, log)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -18,6 +18,8 @@ from distributed import Client
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.files.parallel import WorkersError, package_state, run_tasks
 
+pytestmark = pytest.mark.full
+
 PROJECT = Path(__file__).resolve().parents[1]
 
 

@@ -22,6 +22,8 @@ from cliploc_ros.demo import ASSETS
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 from cliploc_ros.vocabulary.vocabulary import load_vocabulary
 
+pytestmark = pytest.mark.full
+
 NODES = {'detector': DetectorParameters.rows(), 'relocalizer': RelocalizerParameters.rows()}
 EXECUTABLES = {path.stem for path in (PROJECT / 'cliploc_ros/cli').glob('*.py')
                if 'def make_parser' in path.read_text()}

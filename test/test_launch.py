@@ -13,16 +13,12 @@ import pytest
 from cliploc_ros.cli.wake_up import make_parser
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
+pytestmark = pytest.mark.full
+
 LAUNCH = Path(__file__).resolve().parents[1] / 'launch'
 POLICY = LAUNCH.parent / 'config/security_policy.xml'
 DOCUMENTS = [LAUNCH.parent / 'README.md', *sorted((LAUNCH.parent / 'doc').glob('*.md'))]
 TABLES = {'detector': DetectorParameters.rows(), 'relocalizer': RelocalizerParameters.rows()}
-# The arguments of Nav2 1.3.13's bringup_launch.py and localization_launch.py, and those that mean
-# the same in ours.
-OF_NAV2 = {'namespace', 'use_namespace', 'slam', 'map', 'use_localization', 'use_sim_time',
-           'params_file', 'autostart', 'use_composition', 'container_name', 'use_respawn',
-           'log_level'}
-SHARED_WITH_NAV2 = {'namespace', 'use_sim_time', 'autostart', 'log_level'}
 # what both nodes have in their own names' namespaces, and what ROS has at its root
 OWN = re.compile('/(detector|relocalizer|wake_up|diagnostics|clock|parameter_events|rosout|'
                  'tf(_static)?)(/.*)?$')
@@ -65,12 +61,6 @@ def test_arguments_are_parameters(constants, node):
     assert passed <= declared
 
 
-def test_no_argument_means_two_things(constants):
-    groups = [constants['NAMES'], constants['OTHERS'],
-              constants['DETECTOR_PARAMETERS'] | constants['RELOCALIZER_PARAMETERS']]
-    assert len(set().union(*groups)) == sum(map(len, groups))
-
-
 def test_every_topic_and_service_can_be_remapped(constants):
     """The policy names them all; a test holds it equal to the graph.
 
@@ -81,12 +71,6 @@ def test_every_topic_and_service_can_be_remapped(constants):
     relative = {name[1:] for name in names if not OWN.match(name)}
     assert set(constants['NAMES']) | {'image/compressed', 'depth/compressedDepth',
                                       'map'} == relative
-
-
-def test_no_argument_is_taken_for_one_of_nav2(arguments, of_wake_up):
-    """An argument of a launch file that was included before would set ours."""
-    assert arguments & OF_NAV2 == SHARED_WITH_NAV2
-    assert of_wake_up.keys() & OF_NAV2 <= SHARED_WITH_NAV2
 
 
 def test_a_wake_up_is_launched_with_its_own_options(of_wake_up):

@@ -14,7 +14,7 @@ PAGES = sorted(path.stem for path in (PROJECT / 'doc').glob('*.md'))
 # Of the window [px]: a laptop, a phone.
 WIDTHS = (1280, 400)
 
-pytestmark = pytest.mark.needs('sphinx')
+pytestmark = [pytest.mark.full, pytest.mark.needs('sphinx')]
 
 
 @pytest.fixture(scope='module')

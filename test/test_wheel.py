@@ -17,6 +17,8 @@ import pytest
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 
+pytestmark = pytest.mark.full
+
 PROJECT = Path(__file__).resolve().parents[1]
 ROOM = PROJECT / 'test/mapping/changed_room'
 SOURCES = ('cliploc_ros', 'config', 'launch', 'resource', 'LICENSE', 'README.md', 'package.xml',

@@ -250,8 +250,18 @@ def evaluate(options: argparse.Namespace) -> int:
                     workers=options.workers or _cores(), scheduler=options.scheduler,
                     layer=layer, noisy=draws if is_noisy else (), sweep=options.sweep,
                     resume=options.resume, figures=options.figures, frames=recorded.frames,
-                    remarks=_notes_on_maps(options))
+                    remarks=[*_notes_on_maps(options), *_notes_on_detector(queries, landmark_map)])
     return 0
+
+
+def _notes_on_detector(queries: 'Sequence[Query]', landmark_map: 'LandmarkMap') -> list[str]:
+    """Return a note where no query can be answered by its objects."""
+    from cliploc_ros.core.detector_check import DetectorCheck
+
+    check = DetectorCheck(landmark_map, True, frames=None)
+    for query in queries:
+        check.add(query.observation.detections, query.observation.detections)
+    return [f'note: the detector: {fault.text}' for fault in check.faults]
 
 
 def _notes_on_maps(options: argparse.Namespace) -> list[str]:

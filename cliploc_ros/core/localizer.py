@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.acceptance.looks import Look, Looks
-from cliploc_ros.core.acceptance.mount_check import MountCheck
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import (
     SAME_VIEW,
@@ -165,7 +165,7 @@ def informative_first(landmark_map: LandmarkMap, observation: Observation) -> ND
 def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame],
                        observation: Observation, crops: Crops | None = None,
                        looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None,
-                       budget: TimeBudget | None = None
+                       budget: TimeBudget | None = None, cameras: CameraCheck | None = None
                        ) -> tuple[SearchedFrame, Relocalization]:
     """Localize a frame with more and more of its crops until its pose is accepted.
 
@@ -181,6 +181,8 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
         Of the keyframes.
     budget : TimeBudget, optional
         Of the first search; by default a new one, as for each search after it.
+    cameras : CameraCheck, optional
+        What is known of the cameras.
 
     Returns
     -------
@@ -204,7 +206,7 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
     while True:
         budget = budget or relocalizer.begin(len(earlier) + 1)
         frame = relocalizer.search(observation, budget.search_end())
-        found = relocalizer.locate([*earlier, frame], budget, looks, recognizer)
+        found = relocalizer.locate([*earlier, frame], budget, looks, recognizer, cameras)
         search_ms, budget = search_ms + found.search_ms, None
         if found.accepted or crops is None or not len(left) or (count := crops.room()) <= 0:
             return frame, replace(found, search_ms=search_ms)
@@ -243,7 +245,7 @@ class Localizer:
         self.observation: Observation | None = None
         #: Depth is not used any more once it is wrong.
         self.depth_scale = DepthScale()
-        self.mounts = MountCheck()
+        self.cameras = CameraCheck()
 
     def localize(self, observation: Observation, run: int | None = 0, limit: int = 1,
                  length_s: float = 0.0, crops: Crops | None = None,
@@ -282,13 +284,16 @@ class Localizer:
         if self.depth_scale.is_wrong:
             observation = replace(observation, depths=None)
             others = [replace(one, depths=None) for one in others]
+        for one in (*others, observation):
+            self.cameras.see(one)
         found = self._localize(observation, run, limit, length_s, crops, recognizer, others)
+        self.cameras.add(found.cameras)
         if found.accepted and found.depth is not None:
             self.depth_scale.add(found.depth)
         if others and found.accepted and found.frame_matches:
             # where nothing is accepted, the map may be out of date
             seen, index = [*others, observation], self._relocalizer.landmark_map.classes
-            self.mounts.add(seen, [int(index.are_own(index.classes_of(
+            self.cameras.add_instant(seen, [int(index.are_own(index.classes_of(
                 one.detections.class_ids)).sum()) for one in seen], [
                     len(one) for one in found.frame_matches[-len(seen):]])
         return found
@@ -301,7 +306,8 @@ class Localizer:
                   for number, one in enumerate(others, start=1)] if budget else []
         if observation.odom_from_camera is None or run is None:
             alone, found = localize_on_demand(self._relocalizer, beside, observation, crops,
-                                              recognizer=recognizer, budget=budget)
+                                              recognizer=recognizer, budget=budget,
+                                              cameras=self.cameras)
             self.observation = alone.observation
             return found
         if run != self._run or observation.stamp_ns < self._stamp_ns:
@@ -312,13 +318,13 @@ class Localizer:
             del earlier[0]
         newest, found = localize_on_demand(
             self._relocalizer, [*(frame for one in earlier for frame in one.searched), *beside],
-            observation, crops, self._looks, recognizer, budget)
+            observation, crops, self._looks, recognizer, budget, self.cameras)
         self._instants = [*earlier, KeptInstant((*beside, newest), anchor)]
         self.observation = newest.observation
-        if found.map_from_camera is not None:
+        if found.map_from_camera is not None and found.evidence is not None:
             self._looks = self._looks.with_look(Look(
                 replace(observation, similarities=None, compared=None), found.map_from_camera,
-                found.confidence, found.recognized), found.accepted)
+                found.evidence.with_right_camera.confidence, found.recognized), found.accepted)
         return found
 
     def covariance_for_filter(self, found: Relocalization) -> NDArray[np.float64] | None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.camera_check import CameraLook
 from cliploc_ros.core.acceptance.depth_check import DepthCheck
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind
@@ -58,6 +59,8 @@ class Relocalization:
     recognition: Recognition | None = None
     #: Whether the depths of the objects can be right; None without depth
     depth: DepthCheck | None = None
+    #: What a pose that depends on boxes, and is accepted with right cameras, says of the cameras
+    cameras: tuple[CameraLook, ...] = ()
 
     @property
     def matches(self) -> tuple[Match, ...]:

@@ -5,11 +5,12 @@
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.camera_check import CameraCheck, CameraLook, looks_of
 from cliploc_ros.core.acceptance.comparison import (
     Comparison,
     compare,
@@ -143,13 +144,13 @@ class Relocalizer:
         return search_frame(self._map, observation, self._options, deadline)
 
     def locate(self, frames: Sequence[SearchedFrame], budget: TimeBudget | None = None,
-               looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None
-               ) -> Relocalization:
+               looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None,
+               cameras: CameraCheck | None = None) -> Relocalization:
         """Find where the camera was when it saw the last of some searched frames.
 
         The budget is the time left for the refinement, by default a new one. Earlier looks have to
-        agree. The recognizer is of the keyframes, for the image of the last frame. Raises
-        OptionsError, see relocalize.
+        agree. The recognizer is of the keyframes, for the image of the last frame. What is known
+        of the cameras counts, by default nothing. Raises OptionsError, see relocalize.
         """
         budget = budget or self.begin(len(frames))
         joined = join_frames(self._map, self._options, frames)
@@ -163,6 +164,13 @@ class Relocalizer:
             return _nothing_found(frames, budget)
         pose, covariance = pose_of(joined, compared)
         evidence = evidence_of(joined, compared, covariance, looks, recognizer)
+        seen: list[CameraLook] = []
+        if compared.by_boxes is not None and self._options.refine:
+            # an uncertain position may be the camera's fault
+            if refusal(replace(evidence, near=1.0), self._options) is None:
+                seen = looks_of(joined, compared.by_boxes.finalist)
+            camera, fault = (cameras or CameraCheck()).judge(seen, covariance)
+            evidence = replace(evidence, camera=camera, camera_fault=fault)
         refused = refusal(evidence, self._options)
         shown = compared.by_objects or compared.contenders[0]
         return Relocalization(
@@ -172,7 +180,8 @@ class Relocalizer:
             evidence=evidence, covariance=covariance, tried=_tried(frames),
             best_iteration=shown.finalist.iteration, coverage=coverage_of(frames),
             search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns,
-            source=compared.source, recognition=compared.recognition, depth=depth)
+            source=compared.source, recognition=compared.recognition, depth=depth,
+            cameras=tuple(seen))
 
     def _meet(self, joined: JoinedFrames, budget: TimeBudget) -> list[Contender]:
         """Return the best poses that the search met, see search_contenders."""

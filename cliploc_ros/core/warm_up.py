@@ -14,8 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from cliploc_ros.core.fit.camera_fit import ERRORS, camera_jacobian, fit_camera
 from cliploc_ros.core.fit.refinement import jacobian_of, one_to_one, refine_rig, residuals_of
-from cliploc_ros.core.fit.verification import choose_distinct, make_rig, scores_of, verify_rig
+from cliploc_ros.core.fit.verification import (
+    camera_pose,
+    choose_distinct,
+    make_rig,
+    scores_of,
+    verify_rig,
+)
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth import depth_errors
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
@@ -59,8 +66,12 @@ def call_fit_kernels() -> None:
     refine_rig(rig, np.eye(3), np.zeros(3))
     found = verify_rig(rig, np.eye(3), np.zeros(3))
     inliers = one_to_one(rig, found, np.eye(3), np.zeros(3)).pairs
-    residuals_of(inliers, VERTICAL_UNKNOWN, np.eye(3), np.zeros(3),
-                 np.empty(5 * len(inliers) + 3))
+    camera_pose(rig.cameras[0], np.eye(3), np.zeros(3))
+    residuals = np.empty(5 * len(inliers) + 3)
+    residuals_of(inliers, VERTICAL_UNKNOWN, np.eye(3), np.zeros(3), residuals)
+    camera_jacobian(inliers, VERTICAL_UNKNOWN, np.zeros(ERRORS), np.eye(3), np.zeros(3), residuals)
+    fit_camera(inliers, np.ones((len(inliers), 4), dtype=np.bool_), VERTICAL_UNKNOWN, np.eye(3),
+               np.zeros(3), np.ones(ERRORS))
     jacobian_of(inliers, VERTICAL_UNKNOWN, np.eye(3), np.zeros(3))
     depth_errors(scene.depths, scene.centers, scene.shapes, np.zeros(3), np.eye(3), np.zeros(3))
     project_ellipsoids(np.eye(4), scene.centers, scene.shapes)

@@ -5,6 +5,7 @@
 import struct
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.camera_faults import check_faults
 from cliploc_ros.datasets.bag_messages import stamp_ns
 from cliploc_ros.datasets.bag_poses import ReadPoses
 from cliploc_ros.datasets.bags import BagMessage, BagReader, deserialize
@@ -20,7 +22,14 @@ from cliploc_ros.datasets.depth import DepthImage, depth_from_counts
 from cliploc_ros.datasets.frames import DepthFormat, Frames, RawFrame, Wanted
 from cliploc_ros.datasets.poses import Poses, check_clock
 from cliploc_ros.errors import CliplocError, DatasetError
-from cliploc_ros.messages import camera_from_msg, depth_counts_from_msg, image_from_msg
+from cliploc_ros.messages import (
+    camera_from_msg,
+    depth_counts_from_msg,
+    faults_of_camera_info,
+    faults_of_headers,
+    faults_of_rectified,
+    image_from_msg,
+)
 from cliploc_ros.units import NS_PER_S
 
 _IMAGE = 'sensor_msgs/msg/Image'
@@ -100,6 +109,7 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
         poses = _poses_of_images(reader, topics.image, read_poses, str(bag))
         info = next(reader.messages([topics.camera_info])).data
         count = reader.topic(topics.image).message_count
+        notes = _notes(reader, topics)
     decode = partial(_decode_color, f'{bag}: {topics.image}', info, topics.rectified)
     decode_depth = partial(_decode_depth, f'{bag}: {topics.depth}', depth_type,
                            depth or DepthFormat())
@@ -111,7 +121,27 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
                                                                    is_wanted):
                 yield RawFrame(place, stamp_ns, pose, partial(decode, msgtype, data),
                                None if depth_data is None else partial(decode_depth, depth_data))
-    return Frames(bag, count, read_raw)
+    return Frames(bag, count, read_raw, notes=notes)
+
+
+def _notes(reader: BagReader, topics: BagTopics) -> tuple[str, ...]:
+    """Return what is unusual about the camera of a recording, by its first messages.
+
+    DatasetError: its images are certainly rectified, and read as raw.
+    """
+    image, info = (reader.deserialize(next(reader.messages([topic])))
+                   for topic in (topics.image, topics.camera_info))
+    faults = [*faults_of_headers(image.header.frame_id, info.header.frame_id),
+              *faults_of_rectified(topics.image, topics.rectified, info)]
+    try:
+        check_faults(faults)
+    except CliplocError as error:
+        raise DatasetError(f'{reader.path}: {error}') from error
+    with suppress(CliplocError):  # who decodes the image says so
+        size = image_from_msg(image).shape[1::-1]
+        faults += faults_of_camera_info(info, camera_from_msg(info, size, topics.rectified),
+                                        topics.rectified)
+    return tuple(f'note: {fault.text}' for fault in faults)
 
 
 def bag_odometry(bag: Path, image_topic: str, read_odometry: ReadPoses) -> Poses:
@@ -228,7 +258,10 @@ def _decode_color(where: str, info: bytes, rectified: bool, msgtype: str, data: 
     try:
         image = image_from_msg(message)
         size = (image.shape[1], image.shape[0])
-        return image, camera_from_msg(deserialize(info, _CAMERA_INFO, where), size, rectified)
+        calibration = deserialize(info, _CAMERA_INFO, where)
+        camera = camera_from_msg(calibration, size, rectified)
+        check_faults(faults_of_camera_info(calibration, camera, rectified))
+        return image, camera
     except CliplocError as error:
         raise DatasetError(f'{where} at {stamp_ns(message) / NS_PER_S:.6f}: {error}') from error
 

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.camera_faults import check_faults
 from cliploc_ros.errors import DatasetError, ImageError
-from cliploc_ros.messages import camera_from_msg, depth_counts_from_msg
+from cliploc_ros.messages import camera_from_msg, depth_counts_from_msg, faults_of_camera_info
 
 #: Of a 16-bit depth image, by ROS's convention and by that of the TUM RGB-D dataset [m].
 MILLIMETRE, TUM_UNIT = 1e-3, 1 / 5000
@@ -119,7 +120,8 @@ def depths_from_msg(msg: Any, image_frame: str, camera: Camera, bboxes_xyxy: NDA
                 f"'{image_frame}', without {'tf' if camera_info else 'depth_camera_info'} between "
                 'them: publish that, or depth registered to the image')
         seen_by = camera_from_msg(camera_info, (width, height), False)
-        if any(seen_by.distortion):
+        check_faults(faults_of_camera_info(camera_info, seen_by, False))
+        if not seen_by.is_pinhole:
             raise ImageError('depth is distorted, by its camera_info: publish it rectified')
         own = DepthCamera(seen_by.fx, seen_by.fy, seen_by.cx, seen_by.cy, color_from_depth)
     elif abs(width * camera.height / (height * camera.width) - 1.0) > _SAME_ASPECT:

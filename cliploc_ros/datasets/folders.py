@@ -186,7 +186,7 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
     known = [(file.color.name, file.camera, np.round(pose, 6).tolist())
              for file, pose in poses.all_of(files)]
     return replace(frames, digest=hashlib.sha256(repr(known).encode()).hexdigest()[:12],
-                   notes=tuple(filter(None, notes)))
+                   notes=(*filter(None, notes), *frames.notes))
 
 
 def _levelled(folder: Path, poses: PlacedPoses, files: Sequence[ImageFile], level: bool,

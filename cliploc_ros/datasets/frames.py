@@ -18,12 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.camera_faults import camera_faults
 from cliploc_ros.core.geometry.transforms import move_poses
 from cliploc_ros.datasets.depth import DepthCamera, DepthImage, depth_from_counts
 from cliploc_ros.datasets.poses import Poses, check_clock
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.units import NS_PER_S
 
+_MOST_NOTES = 5  # on cameras, of which each image may have its own
 # An undistorted image has so many places computed, which take 0.6 kB each.
 _MOST_PLACES = 1_000_000
 
@@ -132,7 +134,8 @@ def join_frames(of_cameras: Mapping[str, Frames]) -> Frames:
         parts.append(replace(frames, read_raw=read_raw, camera=name))
         first += frames.count
     return Frames(parts[0].source, first, lambda is_wanted: chain.from_iterable(
-        part.read_raw(is_wanted) for part in parts), of_cameras=tuple(parts))
+        part.read_raw(is_wanted) for part in parts), of_cameras=tuple(parts),
+        notes=tuple(note for part in parts for note in part.notes))
 
 
 @dataclass(frozen=True)
@@ -171,8 +174,11 @@ def folder_frames(folder: Path, files: Sequence[ImageFile], poses: Poses,
             if is_wanted(place, file.stamp_ns, pose):
                 yield RawFrame(place, file.stamp_ns, pose, partial(read_color, file),
                                None if file.depth is None else partial(read_depth, file, form))
-    return Frames(folder, len(files), read_raw,
-                  varies=any(file.camera != files[0].camera for file in files))
+    cameras = dict.fromkeys(file.camera for file in files)
+    # pictures may be cut out of larger ones, which no file tells: no fault is certain
+    notes = dict.fromkeys(f'note: {fault.text}' for one in cameras for fault in camera_faults(one))
+    return Frames(folder, len(files), read_raw, varies=len(cameras) > 1,
+                  notes=tuple(notes)[:_MOST_NOTES])
 
 
 def read_color(file: ImageFile) -> tuple[NDArray[np.uint8], Camera]:
@@ -245,7 +251,7 @@ def undistorted(image_rgb: NDArray[np.uint8], camera: Camera, pinhole: Camera | 
     It is black where the camera saw nothing.
     """
     pinhole = pinhole or camera.pinhole
-    if pinhole == camera.pinhole and not any(camera.distortion):
+    if pinhole == camera.pinhole and camera.is_pinhole:
         return image_rgb
     # a large image has a coarser grid of places, and those between: a lens is smooth
     step = max(1, math.isqrt(pinhole.width * pinhole.height // _MOST_PLACES))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry.camera_faults import check_faults
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import (
     ImageRecognizer,
@@ -34,6 +35,7 @@ from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
 from cliploc_ros.messages import (
     camera_from_msg,
     detections_from_msg,
+    faults_of_camera_info,
     image_from_msg,
     parse_class_map,
 )
@@ -108,8 +110,9 @@ def _observed(frame: CaseFrame, parameters: Mapping[str, Any], class_map: Mappin
     """Return the image of a frame, and what was detected in it, as the node makes them."""
     image = image_from_msg(frame.message('image'))
     height, width = image.shape[:2]
-    camera = camera_from_msg(frame.message('camera_info'), (width, height),
-                             parameters['rectified'])
+    info, rectified = frame.message('camera_info'), parameters['rectified']
+    camera = camera_from_msg(info, (width, height), rectified)
+    check_faults(faults_of_camera_info(info, camera, rectified))
     detections = detections_from_msg(frame.message('detections'), class_map).usable(
         width, height, parameters['max_detections'])
     depths = None

@@ -14,6 +14,7 @@ from diagnostic_msgs.srv import SelfTest
 from std_srvs.srv import Empty, Trigger
 
 from cliploc_ros.errors import CliplocError
+from cliploc_ros.messages import faults_of_rectified
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, RequestCounters, Verdict, answer_msg
 from cliploc_ros.ros.case_recorder import CaseRecorder
@@ -28,11 +29,7 @@ from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.process import run_node
 from cliploc_ros.ros.node.worker import LatestOnly
 from cliploc_ros.ros.outputs.handoff import HandOff
-from cliploc_ros.ros.parameters import (
-    DetectorParameters,
-    RelocalizerParameters,
-    doubt_of_rectified,
-)
+from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 from cliploc_ros.ros.request import Pipeline, Requests
 from cliploc_ros.ros.watch import Watcher
 
@@ -108,8 +105,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._pipeline.open()
         self._frames.open()
         self._watcher.open()
-        if doubt := doubt_of_rectified(self._frames.image_topic, parameters):
-            self.get_logger().warning(doubt)
+        for doubt in faults_of_rectified(self._frames.image_topic, parameters.rectified):
+            self.get_logger().warning(doubt.text)
 
     def close(self) -> None:
         """Release the request that waits for frames, and unsubscribe."""
@@ -135,6 +132,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         """Report the inputs, the last verdict and the device."""
         parameters = self.settings.values
         self._frames.examine(health, parameters.stale_after_s)
+        self._robot.examine(health)
         health.values |= {'frames skipped while busy': self._newest.dropped,
                           'last verdict': self._last_verdict, **self._verdicts,
                           **self._counters.values(),
@@ -146,10 +144,15 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._watcher.examine(health)
         localizer = self._pipeline.localizer  # once: a cleanup may drop it meanwhile
         if localizer is not None:
+            for fault in localizer.faults:
+                (health.fail if fault.is_certain else health.warn)(fault.text)
             keyframes = localizer.keyframes
             if keyframes is not None:
                 health.values |= {'keyframes': len(keyframes), 'keyframes file': keyframes.file,
                                   'keyframes hash': keyframes.file_hash}
+            health.values |= localizer.cameras.values
+            for wrong in localizer.cameras.faults:
+                health.fail(f'{wrong}: check camera_info, and the pixels and corners of the boxes')
             if parameters.depth_transport != 'none':
                 health.values['depth scale'] = f'{localizer.depth_scale.ratio:.2f}'
             health.values |= {'map': localizer.description, 'map hash': localizer.map_hash,

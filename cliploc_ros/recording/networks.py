@@ -121,7 +121,7 @@ class Look:
             raw.place, raw.camera, raw.stamp_ns, frame.map_from_camera,
             np.array([camera.width, camera.height]),
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]), bboxes[rows],
-            open_edges[rows] if any(camera.distortion) else open_edges,
+            open_edges if camera.is_pinhole else open_edges[rows],
             np.array(sound.class_ids, dtype=np.str_), sound.scores,
             embeddings.astype(np.float16), depths, spreads,
             (detected - start) * 1e3, (embedded - detected) * 1e3)
@@ -131,7 +131,7 @@ def _undistorted(detections: Detections, camera: Camera
                  ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return undistorted boxes (n, 4) [px], and which edges lay at the border of the image."""
     boxes = detections.bboxes_xyxy
-    if not any(camera.distortion):
+    if camera.is_pinhole:
         return boxes, np.empty((0, 4), dtype=np.bool_)
     is_open = at_border(boxes, np.array([camera.width, camera.height] * 2),
                         MappingOptions.border_px)

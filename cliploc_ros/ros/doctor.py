@@ -20,12 +20,17 @@ from rclpy.logging import LoggingSeverity
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
+from cliploc_ros.core.detector_check import DetectorCheck
+from cliploc_ros.core.geometry.camera_faults import fields_of_view
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.datasets.depth import depths_from_msg
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.messages import (
     camera_from_msg,
     detections_from_msg,
+    faults_of_camera_info,
+    faults_of_headers,
+    faults_of_rectified,
     image_from_msg,
     parse_class_map,
 )
@@ -38,6 +43,7 @@ from cliploc_ros.ros.frame_localizer import (
     read_frame,
 )
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
+from cliploc_ros.ros.inputs.frame_faults import faults_of_axes
 from cliploc_ros.ros.inputs.frame_source import (
     LINGER_S,
     Frame,
@@ -49,15 +55,12 @@ from cliploc_ros.ros.inputs.frame_source import (
 from cliploc_ros.ros.inputs.rig import frames_of
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
+from cliploc_ros.ros.inputs.time_jumps import stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health, StageTimes, in_words
 from cliploc_ros.ros.node.executor import NodeExecutor
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.outputs.handoff import HandOff
-from cliploc_ros.ros.parameters import (
-    DetectorParameters,
-    RelocalizerParameters,
-    doubt_of_rectified,
-)
+from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 from cliploc_ros.ros.request import time_is_up
 from cliploc_ros.ros.running import NotRunningError, ask, parameters_of_files
 from cliploc_ros.units import NS_PER_S
@@ -65,8 +68,6 @@ from cliploc_ros.vocabulary.vocabulary import misspelt_classes
 
 # Images that come later after their stamps show clocks that differ (a guess).
 _MOST_LAG_S = 1.0
-# So many detections, none of a class of the map, are of a detector with other names (a guess).
-_FOREIGN = 3
 _SPIN_S = 0.05
 
 
@@ -202,8 +203,8 @@ def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
         _check_camera(node, parameters, name, silent, report)
     name = node.cameras[0] if frame is None else frame.camera
     if name in node.images:
-        _check_place(node, parameters.of_camera(name), node.images[name][0].header, patience_s,
-                     report)
+        image = node.images[name][0] if frame is None else frame.image
+        _check_place(node, parameters.of_camera(name), image.header, patience_s, report)
     else:
         report.skip('tf, odometry', 'need an image')
     if silent.keys() & {of_camera(name, 'image'), of_camera(name, 'camera_info')}:
@@ -253,17 +254,23 @@ def _check_camera(node: Doctor, parameters: RelocalizerParameters, name: str,
             size = image_from_msg(image).shape[1::-1]
             report.add(camera, State.PASS, f'{size[0]} x {size[1]} px, frame '
                                            f"'{image.header.frame_id}'")
-        report.judge(clock, _doubt_of_clock(node, lag_s),
+        why = stamp_problem(image.header.stamp)
+        report.judge(clock, f"the images' stamp {why}: their driver must stamp each"
+                     if why else _doubt_of_clock(node, lag_s),
                      f'images come {1e3 * lag_s:.0f} ms after their stamps')
     if info is None:
         return report.add(calibration, State.FAIL,
                           silent.get(of_camera(name, 'camera_info'), 'no camera_info in time'))
     with report.failing(calibration):
         found = camera_from_msg(info, size or (info.width, info.height), parameters.rectified)
-        width_deg = math.degrees(2.0 * math.atan(found.width / 2.0 / found.fx))
         lens = 'rectified' if parameters.rectified else info.distortion_model or 'no distortion'
-        report.judge(calibration, doubt_of_rectified(node.resolve_topic_name(of_camera(
-            name, 'image')), parameters), f'{width_deg:.0f} degrees wide, {lens}')
+        faults = [*faults_of_camera_info(info, found, parameters.rectified),
+                  *faults_of_headers('' if image is None else image.header.frame_id,
+                                     info.header.frame_id),
+                  *faults_of_rectified(node.resolve_topic_name(of_camera(name, 'image')),
+                                      parameters.rectified, info)]
+        report.judge(calibration, '; '.join(fault.text for fault in faults),
+                     f'{fields_of_view(found)[0]:.0f} degrees wide, {lens}')
 
 
 def _doubt_of_clock(node: Doctor, lag_s: float) -> str:
@@ -292,8 +299,9 @@ def _check_place(node: Doctor, parameters: RelocalizerParameters, image: Any, pa
         if base:
             base_from_camera = invert_transform(mount)
             up_deg = math.degrees(math.asin(float(np.clip(base_from_camera[2, 2], -1.0, 1.0))))
-            report.add('tf', State.PASS, f"the camera is {base_from_camera[2, 3]:.2f} m above "
-                                         f"'{base}' and looks {up_deg:+.0f} degrees up")
+            report.judge('tf', '; '.join(fault.text for fault in faults_of_axes(
+                image.frame_id, mount)), f'the camera is {base_from_camera[2, 3]:.2f} m '
+                f"above '{base}' and looks {up_deg:+.0f} degrees up")
         elif parameters.require_localizer:
             report.add('tf', State.FAIL, 'base_frame is empty: initialpose would carry the pose '
                        "of the camera: set it to AMCL's base_frame_id")
@@ -331,10 +339,14 @@ def _check_detections(parameters: RelocalizerParameters, localizer: FrameLocaliz
     if localizer is not None:
         own = sum(one in localizer.landmark_map.class_ids for one in found.class_ids)
         text += f', {own} of them of the classes of the map'
-        if not own and len(found) >= _FOREIGN and parameters.matching != 'clip':
-            names = ', '.join(sorted(set(found.class_ids))[:5])
-            return report.add('detector', State.FAIL, f'no class of the map is among its {names}: '
-                              'use the detector of the map, or class_map')
+        check = DetectorCheck(localizer.landmark_map, parameters.matching != 'clip')
+        with report.failing('detector'):
+            height, width = image_from_msg(frame.image).shape[:2]
+            check.add(found, found.usable(width, height, parameters.max_detections))
+        faults = [*check.faults, *faults_of_headers(frame.image.header.frame_id, '',
+                                                    frame.detections.header.frame_id)]
+        if faults:
+            return report.add('detector', State.FAIL, '; '.join(fault.text for fault in faults))
         misspelt = misspelt_classes(localizer.landmark_map.class_ids)
         if names := ', '.join(f"'{name}'{hint}" for name, hint in misspelt.items()
                               if name not in found.class_ids):
@@ -351,9 +363,10 @@ def _check_depth(frame: Frame, state: RobotState, parameters: RelocalizerParamet
                           f'{parameters.depth_tolerance_s:g} s: remap depth, start its publisher, '
                           'or set depth_transport to none')
     with report.failing(what):
-        _, camera, detections = read_frame(frame, parameters)
+        _, camera, given = read_frame(frame, parameters)
+        boxes = given.usable(camera.width, camera.height, parameters.max_detections).bboxes_xyxy
         depths_m = depths_from_msg(
-            frame.depth, frame.image.header.frame_id, camera, detections.bboxes_xyxy,
+            frame.depth, frame.image.header.frame_id, camera, boxes,
             frame.depth_camera_info, state.camera_from_depth)
         known_m = depths_m[np.isfinite(depths_m)]
         if not len(known_m):

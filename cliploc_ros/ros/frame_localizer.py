@@ -5,7 +5,8 @@
 import logging
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,8 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
+from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.acceptance.depth_check import DepthScale
+from cliploc_ros.core.detector_check import DetectorCheck
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.camera_faults import Fault, check_faults
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.kernels.compiled import KERNEL_FOLDERS
 from cliploc_ros.core.keyframes.layer import (
@@ -60,6 +64,7 @@ from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.observer import ObservedCrops, Observer
 from cliploc_ros.models.profiles import with_encoder
 from cliploc_ros.ros.conversions import stamp_ns
+from cliploc_ros.ros.inputs.frame_faults import faults_of_axes, faults_of_frame
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.prior import Known
 from cliploc_ros.ros.inputs.robot_state import RobotState
@@ -176,6 +181,8 @@ class FrameLocalizer:
         self._localizer = Localizer(relocalizer)
         self._watch = Watch(relocalizer)
         self._notes: set[str] = set()
+        self._detector = DetectorCheck(landmark_map, options.matching != 'clip')
+        self._faults: dict[str, list[Fault]] = {}  # of the newest frame of each camera
         relocalizer.warm_up()
 
     @property
@@ -197,6 +204,19 @@ class FrameLocalizer:
     def depth_scale(self) -> DepthScale:
         """Return what accepted poses say of the scale of depth."""
         return self._localizer.depth_scale
+
+    @property
+    def faults(self) -> list[Fault]:
+        """Return what is wrong with the newest frames, their cameras and their detector."""
+        return [*(fault._replace(text=f'{name}: {fault.text}' if name else fault.text)
+                  for name, faults in self._faults.copy().items() for fault in faults),
+                *(fault._replace(text=f'the detector: {fault.text}')
+                  for fault in self._detector.faults)]
+
+    @property
+    def cameras(self) -> CameraCheck:
+        """Return what looks say of the cameras and their boxes."""
+        return self._localizer.cameras
 
     @property
     def description(self) -> str:
@@ -258,16 +278,20 @@ class FrameLocalizer:
         found = localizer.localize(
             observation, run, parameters.fuse_frames, parameters.fuse_window_s, crops, recognizer,
             [replace(one, stamp_ns=observation.stamp_ns) for one in others])
-        for name in localizer.mounts.wrong:
+        for name in localizer.cameras.wrong_mounts:
             self._note(f'what {name} sees does not fit the other cameras: check its mount, '
                        'camera_info and image')
         seen = localizer.observation
         assert seen is not None
         compared = int((seen.similarity_rows >= 0).sum())
+        if found.accepted and parameters.base_frame and found.map_from_camera is not None:
+            with self._keeping(frame.camera):
+                check_faults(faults_of_axes(frame.image.header.frame_id, state.camera_from_base,
+                                            found.map_from_camera))
         is_cut = not found.accepted and self._observer is not None and compared < len(detections)
         for_filter = localizer.covariance_for_filter(found) \
             if found.accepted and parameters.mode == 'continuous' else found.covariance
-        found, landmark_map, seen = _in_its_map(found, self._map, seen)
+        found, landmark_map, seen = _in_its_map(self._explained(found), self._map, seen)
         layer = None if self._keyframes is None else self._keyframes.layer
         return Localized(found, landmark_map, SeenImage(image, seen, layer), compared, is_cut,
                          for_filter, 1 + len(others), frame.left_out)
@@ -301,7 +325,13 @@ class FrameLocalizer:
     def _observed(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
                   by_odometry: bool) -> tuple[NDArray[np.uint8], Observation]:
         """Return the image of a frame, and what was detected in it, without crops."""
-        image, camera, detections = read_frame(frame, parameters)
+        with self._keeping(frame.camera):
+            image, camera, given = read_frame(frame, parameters)
+            faults = faults_of_frame(frame, camera, parameters, state)
+            check_faults(faults)
+        self._faults[frame.camera] = faults
+        detections = given.usable(camera.width, camera.height, parameters.max_detections)
+        self._detector.add(given, detections)
         place, odom_from_camera = state.place, None
         if not by_odometry:
             odom_from_camera = invert_transform(state.camera_from_base)
@@ -312,6 +342,23 @@ class FrameLocalizer:
             camera_name=frame.camera, up_in_camera=state.up_in_camera,
             depths=self._depths(frame, camera, detections.bboxes_xyxy, state.camera_from_depth),
             odom_from_camera=odom_from_camera, odom_way_m=0.0 if place is None else place.way_m)
+
+    @contextmanager
+    def _keeping(self, camera: str) -> Iterator[None]:
+        """Keep a CliplocError as a fault of a camera."""
+        try:
+            yield
+        except CliplocError as error:
+            self._faults[camera] = [Fault(str(error), True)]
+            raise
+
+    def _explained(self, found: Relocalization) -> Relocalization:
+        """Return a result whose refusal also names what is wrong with the newest frames."""
+        if found.accepted:
+            return found
+        found = self._detector.explain(found)
+        texts = (fault.text for fault in self.faults if not fault.is_certain)
+        return replace(found, reason='; '.join([found.reason, *texts]))
 
     def _known_crops(self, image: NDArray[np.uint8], observation: Observation,
                      options: RelocalizerOptions) -> Observation:
@@ -421,12 +468,12 @@ def load_localizer(node: Node, parameters: RelocalizerParameters) -> FrameLocali
 
 def read_frame(frame: Frame, parameters: RelocalizerParameters
                ) -> tuple[NDArray[np.uint8], Camera, Detections]:
-    """Return image, camera and usable detections of a frame; CliplocError: one is invalid."""
+    """Return image, camera and all detections of a frame; CliplocError: one is invalid."""
     image = image_from_msg(frame.image)
     height, width = image.shape[:2]
     camera = camera_from_msg(frame.camera_info, (width, height), parameters.rectified)
-    detections = detections_from_msg(frame.detections, parse_class_map(parameters.class_map))
-    return image, camera, detections.usable(width, height, parameters.max_detections)
+    return image, camera, detections_from_msg(frame.detections,
+                                              parse_class_map(parameters.class_map))
 
 
 def _in_its_map(found: Relocalization, landmark_map: LandmarkMap, seen: Observation

@@ -302,11 +302,3 @@ class RelocalizerParameters(CommonParameters):
             height_range_m=(low, high) if low != high else (-math.inf, math.inf),
             time_budget_s=self.time_budget_ms / 1e3 if self.algorithm == 'auto'
             else _SEARCH_SHARE * self.timeout_s)
-
-
-def doubt_of_rectified(image_topic: str, parameters: RelocalizerParameters) -> str:
-    """Return that images are probably rectified though a parameter says no; empty if not."""
-    if parameters.rectified or not re.search('[/_]rect', image_topic):
-        return ''
-    return (f'{image_topic} sounds rectified, but the parameter rectified is false: poses would '
-            'be wrong by the distortion of the lens')

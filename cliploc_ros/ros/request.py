@@ -42,6 +42,9 @@ _MAX_UNLINKED = 3
 # An earlier request ends at its own deadline, shortly before those that wait for it.
 _GRACE_S = 0.2
 
+# Refusals of images without objects of the map.
+_WITHOUT_OBJECTS = (RefusalKind.TOO_FEW_OBJECTS, RefusalKind.WRONG_DETECTIONS)
+
 _SMALLER = 'choose a faster profile or a smaller'
 # Of each stage its name in a message, and what makes it faster.
 _STAGES = {'image': 'waiting for an image with detections', 'detection': 'the detector',
@@ -131,6 +134,8 @@ class Pipeline:
         localized = localizer.localize(frame, parameters, state, times, deadline, beside, known)
         stages_ms = times.ms
         self._node.stages.add(stages_ms)
+        if faults := '; '.join(fault.text for fault in localizer.faults):
+            self._node.get_logger().warning(faults, throttle_duration_sec=_LOG_PERIOD_S)
         self._node.check_active()
         self._jumps.check(image.stamp, frame.received_at)
         header = Header(stamp=image.stamp, frame_id=localized.landmark_map.frame_id)
@@ -293,7 +298,7 @@ class Requests:
         assert last is not None
         # more images of a place without objects are no remedy
         if is_up and last.verdict is Verdict.REFUSED and (
-                last.is_cut or last.kind is not RefusalKind.TOO_FEW_OBJECTS):
+                last.is_cut or last.kind not in _WITHOUT_OBJECTS):
             last = replace(last, detail=f'{last.detail}; {time_is_up(stages_ms)}')
         if looks == 1:
             return last

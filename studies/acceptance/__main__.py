@@ -14,6 +14,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import closing
 from itertools import product
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -43,16 +44,19 @@ from studies.acceptance.searches import (
     acceptance_table,
     confidences_of,
     draw_curves,
+    false_table,
     make_search,
     tasks_of,
 )
-from studies.acceptance.troubles import CURVES, TROUBLES, exchange_landmarks
+from studies.acceptance.troubles import BY_LABELS, CURVES, FAMILIES, TROUBLES, exchange_landmarks
 from studies.reports import draw_judged, table
+from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
 
 # So low that only what has nothing to do with the confidence refuses a pose. All crops are
 # compared: on demand, such a pose would be taken from the first of them.
 _LOWEST = 1e-6
+_QUERIES = 4  # of a simulated world
 _EXCHANGED = 'share of the landmarks that have exchanged places'
 
 
@@ -123,6 +127,32 @@ def _stress(options: argparse.Namespace) -> None:
     tasks = tasks_of(chosen_places(options), RelocalizerOptions(matching=options.matching), names)
     print(acceptance_table(run_all(make_search, tasks, 'searches', options.workers),
                            ('trouble', 'level', 'mode')))
+
+
+def _families(options: argparse.Namespace) -> None:
+    names = [name for name in FAMILIES if any(text in name for text in options.only)]
+    if not names:
+        raise OptionsError('nothing to test: --only must name a family')
+    tasks: list[Task] = []
+    for name in names:
+        family = FAMILIES[name]
+        searched = RelocalizerOptions(matching=options.matching or (
+            'hybrid' if name in BY_LABELS else 'class'))
+        recorded = chosen_places(options) if options.queries and 'room' in family.kinds else []
+        share = ceil(options.requests / (1 + len(recorded)))
+        worlds = [Simulated(kind, options.first_seed + number)
+                  for number in range(ceil(share / (_QUERIES * len(family.kinds))))
+                  for kind in family.kinds]
+        own = [task for task in tasks_of([*recorded, *worlds], searched, [name])
+               if task.mode == ONE or not family.in_order]
+        if family.in_order:
+            few = worlds[:ceil(share / (_QUERIES * GROUP_SIZE))]
+            own += [task._replace(in_order=True)
+                    for task in tasks_of([*recorded, *few], searched, [name])]
+        tasks += [task._replace(seed=task.seed + task.place.seed, most=share) for task in own]
+    found: list[Outcome] = run_all(make_search, tasks, 'searches', options.workers)
+    for by in (('trouble', 'level', 'mode', 'looks'), ('trouble', 'place'), ('trouble', 'looks')):
+        print(false_table(found, by), end='\n\n')
 
 
 def _priors(options: argparse.Namespace) -> None:
@@ -217,6 +247,16 @@ def run(arguments: Sequence[str] | None = None) -> int:
     add_arguments(stress, ('room', 'office', 'shop'), first_seed=1000)
     stress.add_argument('--only', nargs='+', default=[''], metavar='TEXT',
                         help='troubles whose name contains one of these')
+    families = add('families', _families, 'false accepts where many objects share an error')
+    add_arguments(families, first_seed=2000)
+    families.add_argument('--requests', type=positive_int, default=200, metavar='N',
+                          help='at each level of a family, in each mode, about (%(default)s)')
+    families.add_argument('--quick', dest='requests', action='store_const', const=24,
+                          help='few requests')
+    families.add_argument('--only', nargs='+', default=[''], metavar='TEXT',
+                          help='families whose name contains one of these')
+    families.add_argument('--matching', choices=fit.MATCHINGS,
+                          help='(by labels for changed maps, else by classes)')
     priors = add('priors', _priors, 'what regions and walls known before add, right and wrong')
     add_arguments(priors, worlds=20, first_seed=1100)
     robustness = add('robustness', _robustness, 'success and false accepts over growing troubles',

@@ -28,7 +28,7 @@ from studies.acceptance.places import (
     Simulated,
 )
 from studies.acceptance.troubles import of_rows
-from studies.reports import Judged, interval, mean, table
+from studies.reports import BINS, Judged, interval, mean, table
 from studies.worlds.cameras import GROUP_SIZE
 from studies.wrong_sensors import with_mount_error
 
@@ -37,8 +37,6 @@ _PERIOD_NS = 100_000_000
 # What a detector does to the same view another time. Guesses.
 _MISSED_SHARE = 0.2
 _SHIFT_SHARE = 0.02  # of the box's sides, standard deviation
-# Bounds of the confidences that are counted together.
-_BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 1.0)
 _WINDOW_S = 1e6
 
 
@@ -164,7 +162,7 @@ def growth_tables(groups: Sequence[Sequence[Answer]]) -> str:
                        mean(confidence[right]), mean(confidence[~right]), grew,
                        f'{accepted.sum()}, {(accepted & ~right).sum()}', mean(accepted[right])])
     reliability = []
-    for low, high in pairwise(_BINS):
+    for low, high in pairwise(BINS):
         cells = [f'{low:.2f} to {high:.2f}']
         for confidence, right in judged.values():
             own = (confidence >= low) & ((confidence < high) | (high == 1.0))

@@ -4,31 +4,40 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import groupby
 from math import ceil, inf
 from pathlib import Path
 from textwrap import fill
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.geometry.transforms import RIGHT_M
+from cliploc_ros.core.fit.covariance import normalized_square
+from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
+from cliploc_ros.core.localizer import Localizer, recorded_crops
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.evaluation.figures import within_ellipsoid
 from cliploc_ros.evaluation.methods import AUTO, Method
-from cliploc_ros.evaluation.trials import run_trial
+from cliploc_ros.evaluation.trials import Query, run_trial
 from studies.acceptance.fit import best_recall
 from studies.acceptance.places import SEED, AnyPlace, Place
 from studies.acceptance.priors import PRIORS
-from studies.acceptance.troubles import CURVES, TROUBLES
-from studies.reports import interval, table
+from studies.acceptance.troubles import CURVES, FAMILIES, TROUBLES
+from studies.reports import FAR_DEG, FAR_M, interval, table
 
+#: More queries than any place has.
+MANY = 1_000_000
+#: Looks of one localizer before it can tell that its camera is wrong.
+EARLY_LOOKS = 5
 #: Errors below which a pose is a success [m].
 SUCCESS_M = 0.1, 0.25, 0.5, 1.0
 _PANEL_SIZE = 2.8, 2.8  # of one trouble in the figure [inch]
 _PANELS_A_ROW, _LABEL_WIDTH = 3, 22
-_CHANGES = TROUBLES | CURVES | PRIORS
+_CHANGES = TROUBLES | CURVES | PRIORS | FAMILIES
 
 
 class Task(NamedTuple):
@@ -40,6 +49,8 @@ class Task(NamedTuple):
     trouble: str = 'none'
     level: float = 0.0
     seed: int = SEED  # of the sensors and of the trouble
+    most: int = MANY  # queries, evenly spread
+    in_order: bool = False  # all frames, by one localizer
 
 
 class Outcome(NamedTuple):
@@ -54,6 +65,9 @@ class Outcome(NamedTuple):
     accepted: bool
     confidence: float
     error_m: float = inf  # infinite where no pose was found
+    error_deg: float = inf
+    nees: float = inf
+    looks: str = 'alone'  # or which of the looks of one localizer this is
 
 
 def make_search() -> Callable[[Task], list[Outcome]]:
@@ -67,18 +81,42 @@ def search(task: Task) -> list[Outcome]:
     if task.mode not in place.modes:
         return []
     trouble = _CHANGES[task.trouble]
-    landmark_map, queries = trouble.change(
-        place.landmark_map, place.ask(task.mode, task.seed), task.level,
+    asked = place._replace(is_main=[True] * len(place.frames)) if task.in_order else place
+    queries = asked.ask(task.mode, task.seed)
+    landmark_map, changed = trouble.change(
+        place.landmark_map, queries[::ceil(len(queries) / task.most)], task.level,
         np.random.default_rng(task.seed))
     options = place.options(task.mode, task.options)
     options = replace(options, k=min(options.k, len(landmark_map)))
-    return [Outcome(task.place.name, task.mode, options.matching, task.trouble, task.level,
-                    one.error_m is not None and one.error_m < RIGHT_M, one.accepted,
-                    one.confidence, inf if one.error_m is None else one.error_m)
-            for one in run_trial(landmark_map, Method(AUTO, options), 0, queries)]
+    outcome = partial(Outcome, task.place.name, task.mode, options.matching, task.trouble,
+                      task.level)
+    if task.in_order:
+        return _looks(landmark_map, options, changed, outcome)
+    return [outcome(one.error_m is not None and one.error_m < RIGHT_M, one.accepted,
+                    one.confidence, inf if one.error_m is None else one.error_m,
+                    inf if one.error_deg is None else one.error_deg,
+                    inf if one.nees is None else one.nees)
+            for one in run_trial(landmark_map, Method(AUTO, options), 0, changed)]
 
 
-@lru_cache(maxsize=1)
+def _looks(landmark_map: LandmarkMap, options: RelocalizerOptions, queries: Sequence[Query],
+           outcome: Callable[..., Outcome]) -> list[Outcome]:
+    """Return the outcomes of one localizer that has all queries in order, without odometry."""
+    localizer, found = Localizer(Relocalizer(landmark_map, options)), []
+    for number, query in enumerate(queries):
+        result = localizer.localize(query.observation, None, crops=recorded_crops(
+            query.observation, options))
+        pose, error_m, error_deg, nees = result.map_from_camera, inf, inf, inf
+        if pose is not None:
+            error_m, error_deg = pose_error(pose, query.map_from_camera)
+            if result.covariance is not None:
+                nees = normalized_square(pose, result.covariance, query.map_from_camera)
+        found.append(outcome(error_m < RIGHT_M, result.accepted, result.confidence, error_m,
+                             error_deg, nees, 'first five' if number < EARLY_LOOKS else 'later'))
+    return found
+
+
+@lru_cache(maxsize=256)
 def _loaded(place: AnyPlace) -> Place:
     return place.load()
 
@@ -135,6 +173,28 @@ def acceptance_table(outcomes: Sequence[Outcome], by: Sequence[str],
         groups.setdefault(tuple(f'{getattr(one, name)}' for name in by), []).append(one)
     return table([*by, 'within 1 m', *columns],
                  [[*key, *figures(some)] for key, some in groups.items()])
+
+
+def false_table(outcomes: Sequence[Outcome], by: Sequence[str]) -> str:
+    """Return the false accepts as Markdown: a row for each value of some fields.
+
+    With the 95 % intervals of their share of the accepted poses and of all requests, the accepted
+    poses that are far off otherwise, and the share of those within their 95 % ellipsoid.
+    """
+    groups: dict[tuple[Any, ...], list[Outcome]] = {}
+    for one in outcomes:
+        groups.setdefault(tuple(getattr(one, name) for name in by), []).append(one)
+    rows = []
+    for key, some in groups.items():
+        accepted = [one for one in some if one.accepted]
+        false = sum(not one.right for one in accepted)
+        rows.append([*key, len(some), sum(one.right for one in some), len(accepted), false,
+                     interval(false, len(accepted)), interval(false, len(some), 3),
+                     sum(one.error_m > FAR_M or one.error_deg > FAR_DEG for one in accepted),
+                     f'{within_ellipsoid(np.array([one.nees for one in accepted])):.2f}'
+                     if accepted else ''])
+    return table([*by, 'n', 'within 1 m', 'accepted', 'false', '95 % of accepted', '95 % of n',
+                  f'{FAR_M:g} m or {FAR_DEG:g} deg off', 'in 95 %'], rows)
 
 
 def draw_curves(folder: Path, outcomes: Sequence[Outcome]) -> Path:

@@ -8,15 +8,25 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.core.localizer import by_classes
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.evaluation.trials import Query
+from cliploc_ros.simulation.sensors import with_vertical
 from studies import wrong_sensors
-from studies.acceptance.places import ALL, FIVE, LEVEL, ONE
+from studies.acceptance.places import ALL, FIVE, LEVEL, ONE, VERTICAL, VERTICAL_DEG
+from studies.worlds.cameras import GROUP_SIZE
+from studies.worlds.world import make_world
 
 _BOX_SIDE_PX = (20.0, 200.0)
 _MOVED_M = (0.3, 3.0)
+# Of one thing under two classes: the share of its boxes that are doubled, by how much the edges of
+# both differ as a share of the sides, and how far apart its landmarks are [m].
+_SEEN_TWICE, _JITTER, _APART_M = 0.7, 0.02, 0.03
+_ELSEWHERE_M = np.array([1e3, 0.0, 0.0])
 
 World = tuple[LandmarkMap, Sequence[Query]]
 #: A change of map and queries by a level, with a generator.
@@ -92,6 +102,108 @@ def add_equal_room(landmark_map: LandmarkMap, queries: Sequence[Query], gap_m: f
     """Add a room that equals the mapped one, beside it."""
     width = float(np.ptp(landmark_map.centers[:, 0]))
     return _with_copies(landmark_map, queries, np.array([width + gap_m, 0.0, 0.0]))
+
+
+def age_half(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+             rng: np.random.Generator) -> World:
+    """Let the map of one of two rooms side by side be out of date, for the queries in it.
+
+    Half of a share of its landmarks are elsewhere, the others are missing. A share below 0 is of
+    the other room's map.
+    """
+    middle = 0.5 * (landmark_map.centers[:, 0].min() + landmark_map.centers[:, 0].max())
+    is_right = queries[int(rng.integers(len(queries)))].map_from_camera[0, 3] > middle
+    is_own = (landmark_map.centers[:, 0] > middle) == is_right
+    rows = rng.permutation(np.nonzero(is_own == (share > 0.0))[0])
+    changed = rows[:round(abs(share) * len(rows))]
+    kept = np.setdiff1d(np.arange(len(landmark_map)), changed[1::2])
+    aged = landmark_map.centers.copy()
+    aged[changed[::2]] = move_objects(landmark_map, (), 1.0, rng)[0].centers[changed[::2]]
+    return (replace(landmark_map, centers=aged).select(kept.tolist()), _with_columns(
+        [one for one in queries if (one.map_from_camera[0, 3] > middle) == is_right], kept))
+
+
+def add_aged_twin(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+                  rng: np.random.Generator) -> World:
+    """Add an equal room; then one of both changes, see age_half."""
+    return age_half(*add_equal_room(landmark_map, queries, 2.0, rng), share, rng)
+
+
+def confuse_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], copies: float,
+                      rng: np.random.Generator) -> World:
+    """Add landmarks of other classes at each landmark, and boxes of these classes at most boxes.
+
+    A detector that takes the same things for the same other classes makes such a map.
+    """
+    names: list[str] = rng.permutation(sorted(set(landmark_map.class_ids))).tolist()
+    steps = np.arange(1 + int(copies))
+
+    def renamed(class_ids: Sequence[str], step: NDArray[np.int64]) -> tuple[str, ...]:
+        return tuple(names[(names.index(name) + by) % len(names)] if name in names else name
+                     for name, by in zip(class_ids, step, strict=True))
+
+    def confused(observation: Observation) -> Observation:
+        step = np.repeat(steps, len(observation.detections))
+        seen = (step == 0) | (rng.random(len(step)) < _SEEN_TWICE)
+        found = of_rows(observation, np.tile(np.arange(len(observation.detections)),
+                                             len(steps))[seen])
+        boxes = found.detections.bboxes_xyxy
+        sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
+        return replace(found, detections=replace(
+            found.detections, class_ids=renamed(found.detections.class_ids, step[seen]),
+            bboxes_xyxy=boxes + _JITTER * (step[seen] > 0)[:, None] * sides * rng.normal(
+                size=sides.shape)))
+
+    rows, step = np.tile(np.arange(len(landmark_map)), len(steps)), np.repeat(
+        steps, len(landmark_map))
+    offsets = _APART_M * (step > 0)[:, None] * rng.normal(size=(len(rows), 3))
+    return (replace(landmark_map.select(rows.tolist()),
+                    landmark_ids=tuple(f'{landmark_map.landmark_ids[row]}_{by}'
+                                       for row, by in zip(rows, step, strict=True)),
+                    class_ids=renamed([landmark_map.class_ids[row] for row in rows], step),
+                    centers=landmark_map.centers[rows] + offsets),
+            [replace(one, observation=confused(one.observation),
+                     neighbours=tuple(map(confused, one.neighbours)))
+             for one in _with_columns(queries, rows)])
+
+
+def unmapped_desk(landmark_map: LandmarkMap, queries: Sequence[Query], level: float,
+                  rng: np.random.Generator) -> World:
+    """Let the robot stand at a desk that the map lacks: every pose is wrong. By classes."""
+    desk = make_world('one desk', int(rng.integers(1 << 30)), groups=len(queries)).queries
+    shifted = [replace(one, map_from_camera=make_transform(
+        one.map_from_camera[:3, :3], one.map_from_camera[:3, 3] + _ELSEWHERE_M),
+        observation=by_classes(one.observation, len(landmark_map)))
+        for one in desk[::GROUP_SIZE]]
+    has_vertical = queries[0].observation.up_in_camera is not None
+    return landmark_map, with_vertical(shifted, VERTICAL_DEG) if has_vertical else shifted
+
+
+def _distorted(change: Callable[[NDArray[np.float64], float, np.random.Generator],
+                                NDArray[np.float64]]) -> Change:
+    """Return a change of the landmarks' places (L, 3), relative to their mean, by a level."""
+    def changed(landmark_map: LandmarkMap, queries: Sequence[Query], level: float,
+                rng: np.random.Generator) -> World:
+        middle = landmark_map.centers.mean(axis=0)
+        return replace(landmark_map, centers=middle + change(
+            landmark_map.centers - middle, level, rng)), queries
+
+    return changed
+
+
+def _half_moved(offsets: NDArray[np.float64], distance_m: float, rng: np.random.Generator
+                ) -> NDArray[np.float64]:
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    return offsets + distance_m * (offsets[:, :1] > np.median(offsets[:, 0])) * [
+        np.cos(angle), np.sin(angle), 0.0]
+
+
+def _half_turned(offsets: NDArray[np.float64], angle_deg: float, rng: np.random.Generator
+                 ) -> NDArray[np.float64]:
+    half = offsets[:, 0] > np.median(offsets[:, 0])
+    turned = offsets.copy()
+    turned[half] = Rotation.from_euler('z', angle_deg, degrees=True).apply(offsets[half])
+    return turned
 
 
 def random_detections(landmark_map: LandmarkMap, queries: Sequence[Query], count: float,
@@ -186,6 +298,8 @@ class Trouble(NamedTuple):
     change: Change
     levels: tuple[float, ...] = (0.0,)
     modes: tuple[str, ...] = (ONE, LEVEL, ALL)
+    kinds: tuple[str, ...] = ('room', 'office', 'shop')  #: Of worlds for it, see families
+    in_order: bool = False  #: Whether it concerns a camera, so that several looks may tell
 
 
 def _of_sensor(change: Callable[[Sequence[Query], float], Sequence[Query]]) -> Change:
@@ -216,6 +330,49 @@ TROUBLES = {
                                                     (0.5, 1.0), (ONE, LEVEL)),
     'odometry too long by a factor': Trouble(_of_sensor(wrong_sensors.scaled_odometry), (1.2, 0.8),
                                              (FIVE, ALL))}
+_BOTH = (ONE, VERTICAL)
+_OF_CAMERA: dict[str, tuple[Callable[[Sequence[Query], float], Sequence[Query]],
+                            tuple[float, ...]]] = {
+    'boxes in pixels of a middle crop of [px]': (wrong_sensors.middle_crop, (300.0, 416.0)),
+    'boxes scaled by': (wrong_sensors.scaled_boxes, (0.5, 1.5, 2.0)),
+    'boxes shifted by a share of the width': (wrong_sensors.shifted_boxes, (0.05, 0.15)),
+    'boxes turned by [degrees]': (wrong_sensors.turned_boxes, (90.0, 180.0)),
+    'boxes mirrored': (wrong_sensors.mirrored_boxes, (0.0, 1.0)),
+    'boxes of convention': (wrong_sensors.of_convention,
+                            tuple(map(float, range(len(wrong_sensors.CONVENTIONS))))),
+    'K scaled by': (wrong_sensors.scaled_camera, (2.0, 0.5)),
+    'focal length off by a factor': (wrong_sensors.scaled_focal, (1.5, 0.7)),
+    'principal point off by a share of the width': (wrong_sensors.shifted_center, (0.2, -0.2)),
+    'fisheye taken for a pinhole': (wrong_sensors.fisheye_boxes, (0.0,))}
+#: Errors that many objects share, by their kind: A in the map of one thing, B in the input, C in
+#: the whole map.
+FAMILIES = {
+    'plain': Trouble(unchanged, (0.0,), _BOTH, (
+        'room', 'office', 'shop', 'bare room', 'corridor', 'hall', 'two rooms')),
+    'A things about one axis': Trouble(unchanged, (0.0,), _BOTH, ('arrangement',)),
+    'A the same under other classes, copies': Trouble(confuse_landmarks, (1, 2), _BOTH,
+                                                      ('arrangement',)),
+    'A things on one line': Trouble(unchanged, (0.0,), _BOTH, ('row',)),
+    'A landmarks under other classes, copies': Trouble(confuse_landmarks, (1, 2, 3), _BOTH),
+    'A unmapped desk': Trouble(unmapped_desk, (0.0,), _BOTH, ('one desk', 'office', 'room')),
+    **{f'B {name}': Trouble(_of_sensor(change), levels, _BOTH, in_order=True)
+       for name, (change, levels) in _OF_CAMERA.items()},
+    'B odometry too long by a factor': Trouble(_of_sensor(wrong_sensors.scaled_odometry),
+                                               (1.2, 0.8), (FIVE,)),
+    'B mount off by [degrees]': Trouble(_of_sensor(wrong_sensors.wrong_mount), (5.0,),
+                                        (VERTICAL, FIVE)),
+    'C equal rooms, own out of date by a share': Trouble(add_aged_twin, (0.1, 0.2, 0.3), _BOTH),
+    'C equal rooms, other out of date by a share': Trouble(add_aged_twin, (-0.2,), _BOTH),
+    'C like rooms, own out of date by a share': Trouble(age_half, (0.1, 0.2, 0.3), _BOTH,
+                                                        ('two rooms',)),
+    'C map scaled by': Trouble(_distorted(lambda offsets, factor, rng: factor * offsets),
+                               (1.1, 1.05, 0.9), _BOTH),
+    'C map sheared by': Trouble(_distorted(lambda offsets, share, rng: offsets + share * (
+        offsets[:, [1]] * [1.0, 0.0, 0.0])), (0.1,), _BOTH),
+    'C half of the map moved by [m]': Trouble(_distorted(_half_moved), (0.5, 0.9), _BOTH),
+    'C half of the map turned by [degrees]': Trouble(_distorted(_half_turned), (10.0,), _BOTH)}
+#: Classes alone accept too little in these to tell.
+BY_LABELS = [name for name in FAMILIES if name.startswith('C')]
 #: What gets worse and worse, seen in one image.
 CURVES = {
     'share of landmarks removed': Trouble(remove_landmarks, _SHARES, (ONE,)),

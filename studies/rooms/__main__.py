@@ -26,7 +26,7 @@ from cliploc_ros.command import not_negative, positive_int, run_command
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.files.storage import make_folder, write_text
-from studies.rooms.asking import Answers, make_ask, tasks_of
+from studies.rooms.asking import KNOWN, Answers, make_ask, tasks_of
 from studies.rooms.page import write_page
 from studies.rooms.rooms import ROBOT, RoomOptions, read_room
 from studies.rooms.tables import tables
@@ -47,6 +47,8 @@ def run() -> int:
                         help=f'of splits: {", ".join(_KINDS)} (all)')
     parser.add_argument('--images', type=positive_int, default=10_000, metavar='N',
                         help='the most images that a part is asked (all)')
+    parser.add_argument('--known', nargs='+', choices=KNOWN, default=KNOWN, metavar='WHAT',
+                        help=f'besides the image: {", ".join(KNOWN)} (all)')
     parser.add_argument('--elsewhere', type=int, default=20, metavar='N',
                         help="images of each other room that a part's map is asked (%(default)s)")
     parser.add_argument('--baseline', action='store_true', help='SIFT with PnP, too')
@@ -67,7 +69,8 @@ def run() -> int:
             if room.has_poses:
                 room.by_robot  # noqa: B018
     tasks = [task for room in rooms
-             for task in tasks_of(room, options.kinds, options.images, options.elsewhere)]
+             for task in tasks_of(room, options.kinds, options.images, options.elsewhere,
+                                  options.known)]
     found: list[Answers] = [answers for _, answers in tqdm(run_tasks(
         partial(make_ask, options.folders, reading, options.baseline), tasks,
         workers=options.workers), 'parts', len(tasks), disable=None) if answers is not None]

@@ -5,6 +5,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 from math import inf
 from typing import NamedTuple
 
@@ -44,6 +45,7 @@ class Task(NamedTuple):
     part: str
     images: int  # of the rest of the room
     elsewhere: int  # of each other room
+    known: tuple[str, ...] = KNOWN  # in turn
 
 
 @dataclass(frozen=True)
@@ -125,10 +127,9 @@ def make_ask(folders: Sequence[str], options: RoomOptions, with_sift: bool
 def _ask_here(task: Task, room: Room, landmark_map: LandmarkMap, keyframes: KeyframeLocalizer,
               sift: SiftMap | None, query: Query) -> Iterator[Outcome]:
     """Yield the answers to an image of the mapped room."""
-    depth = (DEPTH, ALL) if room.has_depth else ()
-    for way, known in [*((way, one) for way in (OBJECTS, BOTH)
-                         for one in (NOTHING, VERTICAL, *depth)),
-                       (KEYFRAMES, NOTHING), (KEYFRAMES, VERTICAL)]:
+    for way, known in product((OBJECTS, BOTH, KEYFRAMES), task.known):
+        if known not in (NOTHING, VERTICAL) and (way == KEYFRAMES or not room.has_depth):
+            continue
         yield _outcome(task, room.name, query, way, known, landmark_map, keyframes)
     if sift is not None:
         image_rgb, camera = room.raws[query.number].color()
@@ -142,8 +143,8 @@ def _ask_here(task: Task, room: Room, landmark_map: LandmarkMap, keyframes: Keyf
 def _ask_elsewhere(task: Task, other: Room, landmark_map: LandmarkMap,
                    keyframes: KeyframeLocalizer, query: Query) -> Iterator[Outcome]:
     """Yield the answers to an image of another room, all of which should be refusals."""
-    for way in (OBJECTS, KEYFRAMES, BOTH):
-        for known in (NOTHING, VERTICAL) if other.has_poses else (NOTHING,):
+    for way, known in product((OBJECTS, KEYFRAMES, BOTH), task.known):
+        if known == NOTHING or (known == VERTICAL and other.has_poses):
             yield _outcome(task, other.name, query, way, known, landmark_map, keyframes)
 
 
@@ -178,7 +179,8 @@ def _classes(landmark_map: LandmarkMap, found: Relocalization) -> tuple[str, ...
     return tuple(landmark_map.class_ids[one.landmark] for one in found.matches)
 
 
-def tasks_of(room: Room, kinds: Sequence[str], images: int, elsewhere: int) -> list[Task]:
+def tasks_of(room: Room, kinds: Sequence[str], images: int, elsewhere: int,
+             known: Sequence[str]) -> list[Task]:
     """Return a task for each part of a room in some kinds of splits."""
-    return [Task(room.name, kind, part, images, elsewhere) for kind, part, _, _ in room.parts()
-            if kind in kinds]
+    return [Task(room.name, kind, part, images, elsewhere, tuple(known))
+            for kind, part, _, _ in room.parts() if kind in kinds]

@@ -4,13 +4,25 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from math import inf
 
 import numpy as np
 
 from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.evaluation.figures import within_ellipsoid
-from studies.reports import interval, table
-from studies.rooms.asking import BOTH, KEYFRAMES, KNOWN, NOTHING, OBJECTS, WAYS, Answers, Outcome
+from studies.reports import BINS, FAR_DEG, FAR_M, interval, table
+from studies.rooms.asking import (
+    BOTH,
+    KEYFRAMES,
+    KNOWN,
+    NOTHING,
+    OBJECTS,
+    SIFT,
+    WAYS,
+    Answers,
+    Outcome,
+)
 from studies.rooms.rooms import Room
 
 LIMITS_M = 0.1, 0.25, 0.5, 1.0
@@ -24,7 +36,7 @@ def tables(answers: Sequence[Answers], rooms: Sequence[Room]) -> str:
     outcomes = [one for answer in answers for one in answer.outcomes]
     here = [one for one in outcomes if one.is_here]
     columns = ['room', 'split', 'by', 'known', 'images', *(f'{limit:g} m' for limit in LIMITS_M),
-               'accepted', 'false', 'recall', 'in 95 %']
+               'accepted', 'false', f'{FAR_M:g} m or {FAR_DEG:g} deg off', 'recall', 'in 95 %']
     rows = [(*key, *success(its)) for key, its in grouped(here, 'room', 'kind', 'way', 'known')]
     failures = [f'{one.task.room}, {one.task.part}: not mapped: {one.failure}'
                 for one in answers if one.failure]
@@ -34,6 +46,7 @@ def tables(answers: Sequence[Answers], rooms: Sequence[Room]) -> str:
         '## All splits of a room', table(
             [one for one in columns if one != 'split'],
             [(*key, *success(its)) for key, its in grouped(here, 'room', 'way', 'known')]),
+        '## Accepted poses and confidence by source', _source_table(here),
         '## Images of other rooms', table(
             ['map of', 'by', 'images', 'accepted (all false)', '95 % of images'],
             [(*('all rooms', *key)[-2:], *_false(its))
@@ -64,10 +77,33 @@ def success(outcomes: Sequence[Outcome]) -> list[str]:
     nees = np.array([one.nees for one in outcomes])[accepted & right]
     cells = [str(len(outcomes)), *(f'{np.mean(errors < limit):.2f}' for limit in LIMITS_M)]
     if outcomes[0].way not in (OBJECTS, KEYFRAMES, BOTH):
-        return [*cells, '', '', '', '']
+        return [*cells, '', '', '', '', '']
+    far = (errors > FAR_M) | (np.array([one.error_deg for one in outcomes]) > FAR_DEG)
     return [*cells, str(accepted.sum()), str((accepted & ~right).sum()),
+            str((accepted & far).sum()),
             f'{accepted[right].mean():.2f}' if right.any() else '',
             f'{within_ellipsoid(nees):.2f}' if len(nees) else '']
+
+
+def _source_table(here: Sequence[Outcome]) -> str:
+    """Return a row for each source: what was accepted, and the share right by confidence."""
+    rows = []
+    for by in (('source',), ('source', 'room')):
+        for key, its in grouped([one for one in here if one.error_m < inf and one.way != SIFT],
+                                *by):
+            accepted = [one for one in its if one.accepted]
+            false = sum(one.error_m >= RIGHT_M for one in accepted)
+            inside = within_ellipsoid(np.array([one.nees for one in accepted])) if accepted else 0
+            cells = []
+            for low, high in pairwise(BINS):
+                own = [one.error_m < RIGHT_M for one in its
+                       if low <= one.confidence < high or one.confidence == high == 1.0]
+                cells.append(f'{np.mean(own):.2f} of {len(own)}' if own else '')
+            rows.append([*key, *['all rooms'][:2 - len(key)], len(accepted), false,
+                         interval(false, len(accepted)), f'{inside:.2f}' if accepted else '',
+                         *cells])
+    return table(['source', 'room', 'accepted', 'false', '95 %', 'in 95 %', *(
+        f'confidence {low:g} to {high:g}: right' for low, high in pairwise(BINS))], rows)
 
 
 def _false(outcomes: Sequence[Outcome]) -> list[str]:

@@ -175,7 +175,8 @@ def _see(true_map: LandmarkMap, pose: NDArray[np.float64], rows: NDArray[np.int6
     extents = clipped[:, 2:] - clipped[:, :2]
     seen = (extents > _LEAST_EXTENT_PX).all(axis=1) & (distances < _RANGE_M)  # never true of NaN
     seen &= extents.prod(axis=1) > _HIDDEN_SHARE * (full[:, 2:] - full[:, :2]).prod(axis=1)
-    seen[seen] = ~hidden(clipped[seen], _HIDDEN_SHARE)
+    seen[seen] = ~hidden(clipped[seen], _HIDDEN_SHARE,
+                          np.zeros(int(seen.sum()), dtype=np.int64))
     seen &= rng.random(len(rows)) > _MISSED_NEAR + _MISSED_A_METRE * distances
     deviations = np.hypot(_NOISE_PX, _NOISE_SHARE * np.tile(extents[seen], 2))
     noisy = np.clip(clipped[seen] + deviations * rng.normal(size=deviations.shape), 0.0, size)

@@ -24,6 +24,8 @@ _TURN_DEG, _STEP_M = (5.0, 20.0), 0.15
 # Between two looks of a robot that drives about, 2 s apart; it is steadier than a hand.
 _DRIVE_M, _MOST_TURN_DEG, _DRIVE_ROLL_DEG = 0.5, 30.0, 0.5
 _ELBOW_ROOM_M = 0.2
+# A camera that is carried about one thing: its distance, and how it deviates from looking at it.
+_ABOUT_M, _AIM_DEG = (0.8, 3.0), 5.0
 _TRIES = 100
 # Looks to choose from: the more things there are ahead, the more likely.
 _CHOICES, _AHEAD_COSINE, _AHEAD_M = 16, 0.85, 4.0
@@ -46,6 +48,9 @@ def make_groups(place: Place, objects: Objects, groups: int, rng: np.random.Gene
     pitch = np.radians(rng.uniform(*_PITCH_DEG))
     found = np.empty((groups, GROUP_SIZE, 4, 4))
     for group in range(groups):
+        if place.focus is not None:
+            found[group] = _about(np.array(place.focus), height, rng)
+            continue
         position, yaw = _look(place, objects, rng)
         turn = np.radians(rng.uniform(*_TURN_DEG)) * rng.choice((-1.0, 1.0))
         drives = rng.random() < 0.5
@@ -56,6 +61,21 @@ def make_groups(place: Place, objects: Objects, groups: int, rng: np.random.Gene
             if drives:
                 step = _STEP_M * np.array([np.cos(yaw), np.sin(yaw)])
                 position = np.clip(position + step, 0.1, (place.width - 0.1, place.depth - 0.1))
+    return found
+
+
+def _about(focus: NDArray[np.float64], height: float, rng: np.random.Generator
+           ) -> NDArray[np.float64]:
+    """Return the poses (5, 4, 4) of a camera that is carried about a spot (3,) and looks at it."""
+    distance, angle = rng.uniform(*_ABOUT_M), rng.uniform(-np.pi, np.pi)
+    step, found = np.radians(rng.uniform(*_TURN_DEG)), np.empty((GROUP_SIZE, 4, 4))
+    for number in range(GROUP_SIZE):
+        away = np.array([np.cos(angle), np.sin(angle)])
+        off, nod, roll = np.radians([_AIM_DEG, _AIM_DEG, _ROLL_DEG]) * rng.normal(size=3)
+        found[number] = _pose(
+            np.array([*(focus[:2] + distance * away), height]), angle + np.pi + off,
+            np.arctan2(height - focus[2], distance) + nod, roll)
+        angle += step
     return found
 
 

@@ -130,14 +130,19 @@ def _in_view(objects: Objects, shapes: NDArray[np.float64], camera: Camera,
     extents = clipped[:, 2:] - clipped[:, :2]
     seen = (extents >= _LEAST_SIDE_PX).all(axis=1)  # never true of NaN
     seen &= extents.prod(axis=1) > _SHOWN_SHARE * (full[:, 2:] - full[:, :2]).prod(axis=1)
-    seen[seen] = ~hidden(clipped[seen], _HIDDEN_SHARE)
+    seen[seen] = ~hidden(clipped[seen], _HIDDEN_SHARE, objects.wholes[near][seen])
     return near[seen], full[seen]
 
 
-def hidden(boxes: NDArray[np.float64], most: float) -> NDArray[np.bool_]:
-    """Return of which of m boxes (m, 4) a nearer one covers more than a share; nearest first."""
+def hidden(boxes: NDArray[np.float64], most: float, wholes: NDArray[np.int64]
+           ) -> NDArray[np.bool_]:
+    """Return of which of m boxes (m, 4) a nearer one covers more than a share; nearest first.
+
+    Parts of one thing do not hide one another; wholes (m,) are of Objects.
+    """
     low = np.maximum(boxes[:, None, :2], boxes[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
     shared = np.maximum(high - low, 0.0).prod(axis=2)
     share = shared / (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)[:, None]
-    return np.asarray((np.tril(share, -1) > most).any(axis=1))
+    is_part = (wholes[:, None] == wholes) & (wholes > 0)
+    return np.asarray((~is_part & (np.tril(share, -1) > most)).any(axis=1))

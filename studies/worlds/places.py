@@ -21,6 +21,8 @@ from studies.worlds.things import (
 
 # How far another thing is from one on each axis [m], and from which semi-axis on none is: guesses.
 _ASIDE_M, _LARGE_M = 0.4, 0.5
+# What detectors take a vase with flowers, or a part of it, for.
+_CONFUSED = ('book', 'vase', 'potted plant', 'bottle', 'cup', 'book', 'book', 'chair')
 
 
 class Place(NamedTuple):
@@ -29,6 +31,7 @@ class Place(NamedTuple):
     width: float
     depth: float
     things: Sequence[Thing]
+    focus: tuple[float, float, float] | None = None  #: Where robots look from all sides [m]
 
 
 def room(rng: np.random.Generator) -> Place:
@@ -115,6 +118,42 @@ def two_rooms(rng: np.random.Generator) -> Place:
     return Place(2.0 * one.width + gap, one.depth, [*one.things, *twin, *own[0], *moved])
 
 
+def arrangement(rng: np.random.Generator) -> Place:
+    """Return a room with a table, and a robot that looks at what stands on it from all sides.
+
+    A detector takes these things, or parts of them, for several classes.
+    """
+    size = rng.uniform(4.0, 6.0)
+    table, *things = _table(rng, 0.5 * size, 0.5 * size, 0)
+    spread = rng.uniform((0.0, 0.01), (0.15, 0.05))
+    for whole in range(1, _some(rng, 2, 4)):
+        x, y = (table.x, table.y) + spread[0] * rng.normal(size=2)
+        things += [Thing(name, x + spread[1] * rng.normal(), y + spread[1] * rng.normal(),
+                         rng.uniform(0.8, 1.2), rng.uniform(0.0, np.pi), _new_model(rng), whole)
+                   for name in map(str, rng.choice(_CONFUSED, _some(rng, 2, 7)))]
+    things += _scattered(rng, FURNITURE, _some(rng, 0, 3), size, size)
+    return Place(size, size, [table, *things], (table.x, table.y, 0.9))
+
+
+def row(rng: np.random.Generator) -> Place:
+    """Return things on one line: a shelf, or what stands along a corridor."""
+    length, on_floor = rng.uniform(2.0, 5.0), rng.random() < 0.5
+    count, height = _some(rng, 5, 13), float(rng.choice((0.5, 0.9, 1.3)))
+    things = [Thing(name, length * (number + rng.uniform(0.2, 0.8)) / count,
+                    1.5 + 0.03 * rng.normal(), TYPICAL[name][3] if on_floor else height,
+                    0.1 * rng.normal(), _new_model(rng))
+              for number, name in enumerate(map(str, rng.choice(
+                  FURNITURE if on_floor else ON_SHELVES, count)))]
+    return Place(length, 3.0, things, (0.5 * length, 1.5, height))
+
+
+def one_desk(rng: np.random.Generator) -> Place:
+    """Return a desk with its usual things, and one or two of furniture."""
+    things = _desk(rng, 2.0, 2.0, rng.uniform(0.0, np.pi), rng.uniform(0.3, 0.9))
+    things += _scattered(rng, FURNITURE, _some(rng, 0, 3), 4.0, 4.0)
+    return Place(4.0, 4.0, things, (2.0, 2.0, 0.8))
+
+
 def denser(place: Place, density: int, rng: np.random.Generator) -> Place:
     """Return a place with more things, of classes that COCO lacks: `density` times as many.
 
@@ -133,7 +172,8 @@ def denser(place: Place, density: int, rng: np.random.Generator) -> Place:
 #: All kinds of places, by name.
 KINDS: dict[str, Callable[[np.random.Generator], Place]] = {
     'room': room, 'office': office, 'shop': shop, 'corridor': corridor, 'hall': hall,
-    'bare room': bare_room, 'two rooms': two_rooms}
+    'bare room': bare_room, 'two rooms': two_rooms, 'arrangement': arrangement, 'row': row,
+    'one desk': one_desk}
 
 
 def _some(rng: np.random.Generator, least: int, limit: int) -> int:

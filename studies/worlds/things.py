@@ -57,6 +57,7 @@ class Thing(NamedTuple):
     z: float
     yaw: float
     model: int
+    whole: int = 0  #: Number of what it is a part of; 0 for a thing of its own
 
 
 class Objects(NamedTuple):
@@ -68,6 +69,7 @@ class Objects(NamedTuple):
     centers: NDArray[np.float64]
     semi_axes: NDArray[np.float64]
     yaws: NDArray[np.float64]  #: (n,): about the vertical [rad]
+    wholes: NDArray[np.int64]  #: (n,): what each is a part of; 0 for nothing else
 
     @property
     def quats_xyzw(self) -> NDArray[np.float64]:
@@ -96,4 +98,4 @@ def make_objects(things: Sequence[Thing], rng: np.random.Generator) -> Objects:
     sizes *= [growth[one.name, one.model] for one in things]
     return Objects(tuple(one.name for one in things), models,
                    np.array([[one.x, one.y, one.z] for one in things]), sizes,
-                   np.array([one.yaw for one in things]))
+                   np.array([one.yaw for one in things]), np.array([one.whole for one in things]))

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``build_map --bag --cameras``: the demo's rig, four cameras at six places, in one recording."""
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +10,11 @@ from rig_bag import MOUNTS, RIG, write_rig_bag
 
 from cliploc_ros.cli.build_map import main as build_map
 from cliploc_ros.cli.check_map import main as check_map
-from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.keyframes.layer import load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo.truth import read_objects
-from cliploc_ros.errors import CliplocError
 
 ASSETS = RIG.parent
 ALL = tuple(MOUNTS)
@@ -111,49 +108,6 @@ def test_a_map_is_checked_and_updated_with_all_cameras(built, tmp_path, capsys):
     assert len(LandmarkMap.from_file(tmp_path / 'new.yaml')) >= 50
 
 
-def test_the_studio_names_the_camera_of_a_view(bag, built, tmp_path):
-    (tmp_path / 'map.yaml').write_bytes(built[ALL].read_bytes())
-
-    def studio_of(*cameras):
-        return open_studio(make_parser().parse_args(list(map(str, (
-            tmp_path / 'map.yaml', '--observations', built[ALL].with_suffix('.npz'), '--images',
-            bag, '--image', 'image/compressed', *cameras)))))
-    studio = studio_of()
-    try:
-        for view, name in enumerate(ALL):  # of the first instant
-            studio.show_view(view)
-            picture = studio.image(view)
-            assert studio.camera_name == name
-            assert picture.shape[:2] == ((240, 320) if name == 'left' else (480, 640))
-            assert picture.std() > 20.0, 'no image is grey'
-    finally:
-        studio.document.close()
-    with pytest.raises(CliplocError, match="no camera 'above'; they have front, left, back"):
-        studio_of('--cameras', 'above')
-
-
-@pytest.mark.parametrize(('arguments', 'message'), [
-    (('--cameras', 'front', 'left', 'front', '--map-frame', 'map'), 'names a camera twice'),
-    (('--cameras', 'front', 'above', '--map-frame', 'map'),
-     "camera 'above': .*no topic /above/image/compressed"),
-    (('--cameras', 'front', 'right', '--map-frame', 'map'), "camera 'right': .*'right_optical'"),
-    (('--cameras', 'front', 'back', '--pose-topic', '/robot'), "camera 'front': .*/front/robot"),
-    (('--cameras', 'front', 'back', '--pose-topic', '/robot', '--mount', *[0] * 7),
-     '--mount has 7 numbers, expected 7 for each of 2 cameras'),
-    (('--cameras', 'front', 'back', '--map-frame', 'map', '--camera-frame', 'front_optical'),
-     '--camera-frame is of one camera'),
-    (('--cameras', 'front', 'back', '--map-frame', 'map', '--refine-mount'),
-     '--refine-mount is for one camera')])
-def test_what_does_not_fit_is_named(tmp_path_factory, tmp_path, capsys, arguments, message):
-    bag = tmp_path_factory.getbasetemp() / 'without_right'
-    if not bag.exists():
-        write_rig_bag(bag, ('front', 'back', 'right'), in_tf=('front', 'back'))
-    assert run(build_map, '--bag', bag, *NETWORKS, *arguments, '--out', tmp_path / 'a.yaml') == 1
-    error = ' '.join(capsys.readouterr().err.split())
-    assert re.search(message, error), error
-
-
 def test_cameras_are_those_of_a_bag(tmp_path, capsys):
     assert run(build_map, '--tum', Path(RIG / 'front'), '--cameras', 'front', '--out',
                tmp_path / 'a.yaml') == 1
-    assert '--cameras is for --bag' in capsys.readouterr().err

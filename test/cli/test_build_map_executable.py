@@ -74,15 +74,3 @@ def test_an_existing_map_stays_when_building_fails(build_map, observations, tmp_
     assert old.read_text() == 'precious'
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         'cut.npz', 'failed.json', 'old.yaml']
-
-
-@pytest.mark.parametrize(('args', 'message'), [
-    (('--out', 'missing/map.yaml'), 'there is no folder missing; create it'),
-    (('--out', '.'), 'is a folder; name the map file to write'),
-    (('--out', 'm.yaml', '--no-joint', '--pose-noise', 1, 1), '--pose-noise is for --joint'),
-])
-def test_wrong_options_are_named_at_once(build_map, observations, args, message):
-    done = build_map('--observations', observations, *args)
-    assert done.returncode == 1
-    assert message in done.stderr
-    assert 'Traceback' not in done.stderr

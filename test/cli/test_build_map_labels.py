@@ -105,37 +105,11 @@ def test_phrases_of_a_user(observations, tmp_path, capsys):
     assert any('bands' in text for details in built.details for text, _ in details.labels)
 
 
-def test_without_the_encoder_labels_are_class_names(observations, tmp_path, capsys):
-    """The default model is another one: no download, a map, the images, and a reason."""
-    path = tmp_path / 'm.yaml'
-    assert build('--observations', observations, '--profile', 'accurate', '--out', path) == 0
-    assert ("note: labels are class names: the embeddings are of CLIP model 'clip', not "
-            "'ViT-L-14'; give the --profile, or --clip-model") in capsys.readouterr().out
-    built = LandmarkMap.from_file(path)
-    assert built.labels == built.class_ids
-    assert load_embeddings_of_map(path, built.landmark_ids).is_known.all()
-
-
-def test_a_vocabulary_that_cannot_be_used_is_an_error(observations, tmp_path, capsys):
-    words, old = tmp_path / 'words.yaml', tmp_path / 'old.yaml'
-    words.write_text('mug: [my mug]')
-    old.write_text('precious')
-    assert build('--observations', observations, '--out', old, '--vocabulary', words,
-                 '--profile', 'accurate') == 1
-    assert "not 'ViT-L-14'" in capsys.readouterr().err
-    words.write_text('mug: 3')
-    assert build('--observations', observations, *CLIP, '--out', old, '--vocabulary', words) == 1
-    assert "class 'mug': expected a list" in capsys.readouterr().err
-    assert old.read_text() == 'precious'
-
-
 def test_other_weights_of_the_same_name_do_not_label(observations, tmp_path, capsys):
     other = tmp_path / 'other.npz'
     seen = load_observations(observations)
     save_observations(other, replace(seen, encoder_key=seen.encoder_key + '0'))
     assert build('--observations', other, *CLIP, '--out', tmp_path / 'm.yaml') == 0
-    assert 'note: labels are class names: the embeddings are of the weights clip:' in (
-        capsys.readouterr().out)
     narrow = tmp_path / 'narrow.npz'
     save_observations(narrow, replace(seen, embeddings=seen.embeddings[:, :64]))
     assert build('--observations', narrow, *CLIP, '--out', tmp_path / 'm.yaml') == 0
@@ -150,7 +124,6 @@ def test_images_of_a_replaced_map_are_removed(observations, tmp_path, capsys):
     save_observations(bare, replace(load_observations(observations), embeddings=None))
     assert build('--observations', bare, '--out', path) == 0
     assert not embeddings_path(path).exists()
-    assert 'the observations have no CLIP embeddings' in capsys.readouterr().out
     built = LandmarkMap.from_file(path)
     assert built.labels == built.class_ids
     assert all(details.labels is None for details in built.details)

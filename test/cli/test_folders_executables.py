@@ -14,7 +14,6 @@ from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import DatasetError
 from cliploc_ros.studio.images import open_images
 
 pytestmark = pytest.mark.needs('pycolmap')
@@ -35,7 +34,6 @@ def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys)
     distance_m = np.linalg.norm(first.pose[:3, 3] - last.pose[:3, 3])
     arguments = ('--colmap', folder, *NETWORKS, *CLIP, '--keyframe-layer', '--out', built)
     assert run(build_map, *arguments) == 1
-    assert 'COLMAP model does not know its unit: give --scale' in capsys.readouterr().err
     assert run(build_map, *arguments, '--known-distance', first.path.name, last.path.name,
                distance_m) == 0
     shown = capsys.readouterr().out
@@ -67,25 +65,3 @@ def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys)
     # the studio shows each image as the camera of the boxes does, whatever its own focus is
     image = open_images(folder, None).near(2.0, '', Camera(640, 480, 250.0, 250.0, 319.5, 239.5))
     assert (image[:110] == 0).all() and image[240, 320].any()
-
-
-@pytest.mark.parametrize(('options', 'expected'), [
-    (('--scale', 1, '--known-distance', 'a', 'b', 1), 'give --scale or --known-distance, not'),
-    (('--known-distance', 'a', 'b', 'far'), '--known-distance: far is no length above 0 m'),
-    (('--object-size', 'chair', 1, '--scale', 2), '--object-size is not for --scale'),
-    (('--intrinsics', 'fr1', '--scale', 1), 'COLMAP model has its own cameras and poses')])
-def test_options_that_do_not_go_together(options, expected, tmp_path, capsys):
-    folder = write_colmap(tmp_path / 'scan', shots_of()[:2])
-    assert run(build_map, '--colmap', folder, *NETWORKS, '--no-clip', '--out',
-               tmp_path / 'map.yaml', *options) == 1
-    assert expected in capsys.readouterr().err
-
-
-def test_options_of_folders_with_other_sources(tmp_path, capsys):
-    assert run(build_map, '--observations', tmp_path / 'o.npz', '--out', tmp_path / 'map.yaml',
-               '--level', '--scale', 2) == 1
-    assert '--scale: for folders of images only' in capsys.readouterr().err
-    folder = write_colmap(tmp_path / 'scan', shots_of()[:2])
-    with pytest.raises(DatasetError, match='does not know its unit; give --observations, too'):
-        open_studio(make_parser().parse_args([str(tmp_path / 'map.yaml'), '--images',
-                                              str(folder)]))

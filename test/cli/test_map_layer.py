@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cliploc_ros.cli.build_map import main, make_parser
+from cliploc_ros.cli.build_map import make_parser
 from cliploc_ros.cli.map_layer import make_layer, write_layer
 from cliploc_ros.cli.sources import read_frames
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map, remove_layer
@@ -16,22 +16,6 @@ from cliploc_ros.errors import MapError, MappingError
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 WALK = ['--tum', str(ASSETS / 'mapping')]
-
-
-@pytest.mark.parametrize('others', [
-    ['--observations', 'none.npz'], [*WALK, '--update', 'old.yaml'], [*WALK, '--refine-mount'],
-    [*WALK, '--every', '2']])
-def test_options_that_do_not_go_together_are_refused_at_once(tmp_path, capsys, others):
-    out = tmp_path / 'map.yaml'
-    assert main([*others, '--keyframe-layer', '--out', str(out)]) == 1
-    assert '--keyframe-layer is not for' in capsys.readouterr().err
-    assert not out.exists()
-
-
-def test_images_without_a_layer_are_refused(tmp_path, capsys):
-    out = tmp_path / 'map.yaml'
-    assert main([*WALK, '--no-keyframe-layer', '--keyframe-images', '--out', str(out)]) == 1
-    assert '--keyframe-images is for --keyframe-layer' in capsys.readouterr().err
 
 
 def test_a_walk_gives_a_layer_next_to_its_map(tmp_path):

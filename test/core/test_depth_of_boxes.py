@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
+from cliploc_ros.core.acceptance.depth_check import DepthCheck, DepthScale
 from cliploc_ros.core.geometry.depth import centre_depth, half_chord
 from cliploc_ros.core.geometry.ellipsoid import shape_matrices
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
@@ -135,6 +136,16 @@ def test_depth_of_a_wrong_scale_is_used_no_more(rng):
     assert localizer.depth_scale.is_wrong
     assert localizer.depth_scale.ratio == pytest.approx(1.5, abs=0.1)
     assert localizer.localize(look(rng)).depth is None
+
+
+def test_depth_is_off_by_eight_percent_at_most():
+    """As doc/interface.md promises; five accepted poses tell, and their median counts."""
+    for ratio, is_wrong in {0.92: True, 0.93: False, 1.07: False, 1.09: True}.items():
+        scale = DepthScale()
+        for number, one in enumerate([ratio, 1.0, ratio, 1.0, ratio], 1):
+            scale.add(DepthCheck(4, 0.0, 0.0, one))
+            assert scale.ratio == (ratio if number == 5 else 1.0)
+        assert scale.is_wrong == is_wrong
 
 
 def test_depth_of_the_right_scale_stays(rng):

@@ -9,8 +9,7 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, doubled_room, make_room, see_room
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
-from cliploc_ros.core.acceptance.support import Support
+from cliploc_ros.core.acceptance.look_alikes import find_twins
 from cliploc_ros.core.acceptance.verdict import Evidence, refusal
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -144,17 +143,6 @@ def test_what_was_matched_must_look_alike_too():
     rooms, move = two_rooms(missing=6)
     assert pose_error(find_twins(rooms, np.eye(4), np.arange(6, 12), NOWHERE)[0][0], move)[0] < 0.1
     assert len(find_twins(rooms, np.eye(4), np.arange(6), move[None])[0]) == 0
-
-
-def test_only_labels_tell_places_apart():
-    own = Support(inliers=6, score=5.0, likeness=12.0)
-    same = Support(inliers=3, score=2.0, likeness=12.0)
-    assert chance_distinct(own, [same], np.zeros(1)) == (0.5, 0)
-    differing = Support(inliers=3, score=2.0, likeness=0.0)
-    assert chance_distinct(own, [differing], np.zeros(1))[0] > 0.99
-    chance, likeliest = chance_distinct(own, [differing, Support(likeness=1e9), differing],
-                                        np.zeros(3))
-    assert (chance < 1e-6, likeliest) == (True, 1)
 
 
 def test_a_refusal_names_both_places():

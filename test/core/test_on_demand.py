@@ -127,7 +127,8 @@ def test_without_time_for_all_crops_a_pose_must_be_as_sure():
     options = replace(OPTIONS, min_confidence=1.0 - 3.0 * (1.0 - sure))
     crops = Crops(lambda rows: SURE[rows], room=lambda: 0)
     _, found = localize_on_demand(Relocalizer(ROOM, options), (), VIEW, crops)
-    assert found.confidence == sure > options.min_confidence
+    # one camera: all crops do not change what is known of it, but for rounding
+    assert found.confidence == pytest.approx(sure, abs=1e-7) and sure > options.min_confidence
     assert not found.accepted and 'without 12 crops; raise timeout_s' in found.reason
     assert found.refusal_kind == 'not_all_crops'
 

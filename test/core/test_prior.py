@@ -191,6 +191,12 @@ def test_an_object_in_its_own_cells_is_seen_and_one_behind_a_wall_is_not():
         assert walls_against(room, walled(at_it), MAP_FROM_CAMERA, [row]).blocked == 0
 
 
+def test_free_ways_count_against_blocked_ones_and_no_more_than_the_limit():
+    ways = {(3, 0): 3, (3, 2): 1, (3, 3): 0, (1, 4): 0, (9, 0): 3, (9, 8): 1}
+    for (blocked, seen), counted in ways.items():
+        assert Walls(blocked=blocked, seen=seen).odds == counted * TERMS.blocked
+
+
 def test_walls_take_log_odds_from_the_probability():
     for likely in (0.2, 0.9, 0.9999):
         plain = Evidence(5, likely)

@@ -10,7 +10,7 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from cliploc_ros.core.fit.covariance import normalized_square, refined_covariance
+from cliploc_ros.core.fit.covariance import EXACT, normalized_square, refined_covariance
 from cliploc_ros.core.fit.refinement import (
     LEAST_DEVIATION,
     RELATIVE_DEVIATION,
@@ -42,9 +42,9 @@ def boxes_at(map_from_camera, noise_px=0.0, rng=None):
 
 
 def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None, shared=None,
-           wrong_share=0.0):
+           wrong_share=0.0, camera=CAMERA, deviations=EXACT):
     """The pose of the last camera in a map with these centres, and its covariance."""
-    scenes = [make_scene(CAMERA.normalize_bboxes(boxes_at(pose, noise_px, rng)), centers,
+    scenes = [make_scene(camera.normalize_bboxes(boxes_at(pose, noise_px, rng)), centers,
                          ROOM.shapes, np.eye(len(ROOM), dtype=bool), np.empty((0, 2), int), 0.05)
               for pose in poses]
     rig = make_rig(scenes, np.array([invert_transform(pose) @ poses[-1] for pose in poses]),
@@ -54,7 +54,7 @@ def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None, shared=No
     stamps = np.arange(len(poses)) if stamps is None else np.array(stamps)
     return (invert_transform(make_transform(found.rotation, found.translation)),
             refined_covariance(rig, found.rotation, found.translation, stamps, shared,
-                               wrong_share))
+                               wrong_share, camera_deviations=deviations))
 
 
 def turning(count):
@@ -160,6 +160,26 @@ def test_an_error_that_all_landmarks_share_is_that_of_the_pose(frames):
     print(f'\n{frames} frames, map off by 5 cm and 2 degrees: {shares} in the 95 % ellipsoids')
     assert shares['stated'] >= 0.87
     assert shares['unknown'] <= 0.5
+
+
+@pytest.mark.parametrize('frames', [1, 4])
+def test_an_error_of_the_calibration_does_not_average_out(frames):
+    rng, poses = np.random.default_rng(5), turning(frames)
+    deviations = np.array([0.04, 0.02, 0.02, 0.02, 0.0, 0.0, 0.0])
+    squares = {'stated': [], 'unknown': []}
+    for _ in range(100):
+        focal, aspect, x, y = deviations[:4] * rng.normal(size=4)
+        wrong = replace(CAMERA, fx=CAMERA.fx * np.exp(focal + aspect / 2), cx=CAMERA.cx + 500 * x,
+                        fy=CAMERA.fy * np.exp(focal - aspect / 2), cy=CAMERA.cy + 500 * y)
+        seed = int(rng.integers(1000))
+        for name, stated in (('stated', deviations), ('unknown', EXACT)):
+            pose, covariance = fitted(poses, ROOM.centers, 0.01, np.random.default_rng(seed), 1.0,
+                                      camera=wrong, deviations=stated)
+            squares[name].append(normalized_square(pose, covariance, poses[-1]))
+    shares = {name: (np.array(one) < chi2.ppf(0.95, 6)).mean() for name, one in squares.items()}
+    print(f'\n{frames} frames, wrong intrinsics: {shares} in the 95 % ellipsoids')
+    assert shares['stated'] >= 0.9
+    assert shares['unknown'] <= 0.7
 
 
 def test_a_map_states_what_its_landmarks_share():

@@ -97,12 +97,12 @@ def test_a_camera_that_contradicts_the_others_is_named(rng, turned_deg, objects,
     mounts[1] = mounts[1] @ make_transform(
         Rotation.from_euler('y', turned_deg, degrees=True).as_matrix(), np.zeros(3))
     for number in range(8):
-        assert not localizer.mounts.wrong or number >= 5
+        assert not localizer.cameras.wrong_mounts or number >= 5
         *others, last = look(rng, objects=objects, mounts=mounts)
         found = localizer.localize(last, run=None, others=others)
         assert found.accepted
         assert pose_error(found.map_from_camera, MOUNTS[-1])[0] < 0.3
-    assert localizer.mounts.wrong == wrong
+    assert localizer.cameras.wrong_mounts == wrong
 
 
 def test_a_covered_camera_has_no_wrong_mount(rng):
@@ -111,7 +111,7 @@ def test_a_covered_camera_has_no_wrong_mount(rng):
         covered, *others, last = look(rng)
         covered = replace(covered, detections=covered.detections.select(np.empty(0, np.int64)))
         assert localizer.localize(last, run=None, others=[covered, *others]).accepted
-    assert localizer.mounts.wrong == []
+    assert localizer.cameras.wrong_mounts == []
 
 
 def test_a_map_that_is_out_of_date_is_not_blamed_on_a_mount(rng):
@@ -121,4 +121,4 @@ def test_a_map_that_is_out_of_date_is_not_blamed_on_a_mount(rng):
     for _ in range(10):
         *others, last = look(rng, objects=5)
         assert not localizer.localize(last, run=None, others=others).accepted
-    assert localizer.mounts.wrong == []
+    assert localizer.cameras.wrong_mounts == []

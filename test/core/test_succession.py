@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from cliploc_ros.core.geometry.transforms import make_transform, pose_difference
 from cliploc_ros.core.localizer import succeed
@@ -32,6 +33,18 @@ def test_a_robot_that_drove_on_is_told_anew():
     near, far = (succeed(known, at(way), at(way), OWN)[0] for way in (0.5, 50.0))
     assert near[0, 0] > 10.0 * OWN[0, 0]
     assert far[0, 0] < 2.0 * OWN[0, 0]
+
+
+def test_a_contradiction_makes_both_answers_less_certain():
+    _, known = succeed(None, at(), at(), 2.0 * OWN)
+    agreeing, contradicting = (succeed(known, at(), at(x), OWN) for x in (0.0, 1.5))
+    doubt = 1.5**2 / (3.0 * OWN[0, 0]) / chi2.ppf(0.99, 6)
+    assert doubt == pytest.approx(1.115, abs=1e-3)
+    np.testing.assert_allclose(contradicting[0], doubt * agreeing[0], rtol=1e-9)
+    np.testing.assert_allclose(contradicting[1].covariance, doubt * agreeing[1].covariance,
+                               rtol=1e-9)
+    just_agreeing = succeed(known, at(), at(1.4), OWN)
+    np.testing.assert_allclose(just_agreeing[0], agreeing[0], rtol=1e-9)
 
 
 @pytest.mark.parametrize('answers', [1, 20])

@@ -55,6 +55,7 @@ def errors_m(landmark_map, frames, observe, options, error_deg=None, seed=0):
     return np.array(errors), np.array(accepted)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize('case', ['nothing', 'height', 'vertical_0_deg', 'vertical_1_deg',
                                   'vertical_3_deg'])
 def test_success_with_what_is_known(case, office_map, queries, observe, thresholds):

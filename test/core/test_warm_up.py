@@ -10,6 +10,8 @@ import pytest
 
 from cliploc_ros.core.options import ALGORITHMS, MATCHINGS
 
+pytestmark = pytest.mark.full
+
 # In a process of its own: here other tests have called the kernels. It prints how many kernels the
 # warm-up brought, and how many each kind of request added.
 PROGRAM = """

@@ -60,6 +60,7 @@ def test_a_standing_robot_before_a_smooth_wall_is_no_fault(images):
     assert faults_of(smooth, poses(6, step_m=0.0)) == [''] * 6
 
 
+@pytest.mark.full
 @pytest.mark.parametrize('shape', [(1, 1, 3), (480, 3, 3), (1080, 1920, 3)])
 def test_images_of_any_shape(shape):
     faults_of([np.zeros(shape, dtype=np.uint8)] * 4, poses(4))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
@@ -19,15 +20,18 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.watch.alignment import align, look_at
 from cliploc_ros.core.watch.belief import Belief
-from cliploc_ros.core.watch.evidence import by_vertical
-from cliploc_ros.core.watch.expectation import expect
+from cliploc_ros.core.watch.evidence import by_vertical, measure
+from cliploc_ros.core.watch.expectation import Expected, expect
+from cliploc_ros.core.watch.missing import Missing, _Record
 from cliploc_ros.core.watch.watch import Watch, WatchState
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 
 CAMERA = Camera(640, 480, 400.0, 400.0, 320.0, 240.0)
 SIDE_M, COUNT = 6.0, 40
+TERMS = CALIBRATION.watch
 
 
 @pytest.fixture(scope='module')
@@ -168,6 +172,32 @@ def test_a_standing_robot_learns_little_from_more_of_the_same():
     assert 0.05 < belief.probability < 0.5
 
 
+NOTHING = Detections(np.empty((0, 4)), (), np.empty(0))
+
+
+def test_looks_that_say_the_opposite_are_no_repetitions():
+    weights = []
+    for odds in (-3.0, 3.0):
+        belief, seen = Belief(), Observation(CAMERA, NOTHING, odom_from_camera=np.eye(4))
+        assert belief.add(seen, 3.0, is_full=True) == 1.0
+        weights.append(belief.add(seen, odds, is_full=True))
+    assert weights == pytest.approx([1.0 - TERMS.correlated * np.exp(-6.0 / TERMS.most),
+                                     1.0 - TERMS.correlated])
+
+
+@pytest.mark.parametrize(('way_m', 'time_s'), [(100.0, 0), (0.0, 100), (50.0, 200)])
+def test_the_way_and_the_time_make_a_sure_watch_unsure(way_m, time_s):
+    belief, after = Belief(), moved(np.eye(4), way_m, 0.0)
+    seen = Observation(CAMERA, NOTHING, odom_from_camera=np.eye(4))
+    belief.wait(seen, np.eye(4))
+    belief.add(seen, 3.0, is_full=True)
+    before = belief.probability
+    belief.wait(replace(seen, stamp_ns=time_s * NS_PER_S, odom_from_camera=after), after)
+    left = np.exp(-TERMS.lost_per_m * way_m - TERMS.lost_per_s * time_s)
+    assert belief.probability - 0.5 == pytest.approx(left * (before - 0.5))
+    assert not belief.has_jumped
+
+
 def test_without_odometry_the_watch_learns_more_slowly(room):
     chances = []
     for odom in (True, False):
@@ -265,3 +295,64 @@ def test_what_an_image_should_show():
     assert found.in_sight.tolist() == [True, True]
     # no shown landmark is beside it: a wall may hide it
     assert not expect(some, CAMERA, pose_at(0, 0, 0), np.empty(0, dtype=int)).in_sight.any()
+
+
+@pytest.mark.parametrize(('yaw_deg', 'side'), [(0, 4), (44, 4), (46, 5), (181, 0), (-1, 3)])
+def test_the_side_of_a_landmark_is_that_from_which_the_camera_looks(yaw_deg, side):
+    ahead = [2 * np.cos(np.radians(yaw_deg)), 2 * np.sin(np.radians(yaw_deg)), 1]
+    found = expect(things(ahead), CAMERA, pose_at(0, 0, yaw_deg), np.array([0]))
+    assert found.sides.tolist() == [side]
+
+
+@pytest.mark.parametrize(('side', 'is_missing'), [(2, True), (3, True), (1, True), (4, False),
+                                                  (6, False)])
+def test_a_landmark_is_missed_only_from_where_it_was_seen(side, is_missing):
+    """A television does not show from behind."""
+    missing, yes = Missing(things((3, 0, 1))), np.array([True])
+    for _ in range(10):
+        missing.add(Expected(np.array([0]), yes, yes, np.array([2])), 1.0)
+    for _ in range(20):
+        missing.add(Expected(np.array([0]), ~yes, yes, np.array([side])), 1.0)
+    assert missing.named() == [0] * is_missing
+
+
+def test_a_look_counts_what_it_explains_and_what_it_does_not(room):
+    options, pose = RelocalizerOptions(matching='class'), drive(1)[0]
+    seen = see(room, pose)
+    count, others = len(seen.detections), np.array([[300.0, 5, 310, 15], [400, 5, 410, 15]])
+    for known, class_ids in ((2, ('a', 'b')), (1, ('a', 'unknown')), (0, ('other', 'unknown'))):
+        more = Detections(np.concatenate([seen.detections.bboxes_xyxy, others]),
+                          (*seen.detections.class_ids, *class_ids), np.full(count + 2, 0.9))
+        evidence, expected = measure(align(look_at(room, replace(seen, detections=more), options),
+                                           pose))
+        assert (evidence.known, evidence.matched, evidence.unexplained) == (
+            count + known, count, known)
+        assert evidence.expected == len(expected.landmarks) >= 3
+        assert evidence.missed == int((~expected.was_seen).sum())
+        assert evidence.away_m < 0.01 and evidence.away_deg < 0.2
+    gone, _ = measure(align(look_at(room, replace(seen, detections=seen.detections.select(
+        np.arange(1, count))), options), pose))
+    assert (gone.known, gone.matched, gone.unexplained) == (count - 1, count - 1, 0)
+
+
+def test_a_pose_that_is_off_is_aligned_with_what_is_seen(room):
+    options, pose = RelocalizerOptions(matching='class'), drive(1)[0]
+    away = measure(align(look_at(room, see(room, pose), options), moved(pose, 0.2, 0.1)))[0]
+    assert away.away_m == pytest.approx(np.hypot(0.2, 0.1), abs=0.06)
+
+
+@pytest.mark.parametrize(('similarities', 'matching'), [(False, 'class'), (True, 'hybrid')])
+def test_without_similarities_a_look_matches_by_class(room, similarities, matching):
+    seen = see(room, drive(1)[0])
+    if similarities:
+        seen = replace(seen, similarities=np.zeros((len(seen.detections), COUNT)))
+    assert look_at(room, seen, RelocalizerOptions()).options.matching == matching
+
+
+@pytest.mark.parametrize(('record', 'gone'), [
+    (_Record(), 0.05), (_Record(misses=1.0), 1 / 6), (_Record(misses=2.0), 0.05 * 0.95 / (
+        0.05 * 0.95 + 0.25 * 1.75 / 4)), (_Record(found=1.0, misses=1.0), 0.05 / (
+            0.05 + 0.75 / 4)), (_Record(missed=1.0, misses=1.0), 0.05 / (0.05 + 1.75 / 4))])
+def test_each_miss_makes_a_landmark_less_likely_to_be_there(record, gone):
+    """In numbers: looks find three of four landmarks, 3 looks before any, 5 % are gone."""
+    assert record.gone(0.75) == pytest.approx(gone)

@@ -165,23 +165,6 @@ def test_failure_leaves_nothing(tmp_path, storage):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_output_that_appears_meanwhile_is_kept(tmp_path, storage):
-    with pytest.raises(DatasetError, match='exists already'), \
-            BagWriter(tmp_path / 'bag', storage) as bag:
-        bag.add_topic('/pose', bag_messages.POSE)
-        (tmp_path / 'bag').write_text('mine')
-    assert [path.name for path in tmp_path.iterdir()] == ['bag']
-    assert (tmp_path / 'bag').read_text() == 'mine'
-
-
-def test_missing_parent_and_storage_are_named(tmp_path):
-    with pytest.raises(DatasetError, match=r'the folder .*nowhere does not exist'), \
-            BagWriter(tmp_path / 'nowhere' / 'bag'):
-        pass
-    with pytest.raises(DatasetError, match="'zip' is none of sqlite3, mcap"):
-        BagWriter(tmp_path / 'bag', 'zip')
-
-
 def test_full_disk_leaves_nothing(tmp_path, storage):
     """A limit on the size of files gives the error of a full disk."""
     program = textwrap.dedent("""

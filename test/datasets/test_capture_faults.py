@@ -145,17 +145,6 @@ def test_faults_of_transforms_json(edit, expected, shots, tmp_path):
     refuses(edited(write_nerf(tmp_path, shots), edit), expected)
 
 
-def test_unknown_fields_are_ignored_and_angles_serve(shots, tmp_path):
-    def edit(values):
-        values.update(sharpness='very', orientation_override=[1], camera_angle_x=1.139)
-        for name in ('fl_x', 'fl_y', 'cx', 'cy', 'w', 'h'):
-            values.pop(name)
-        for frame in values['frames']:
-            frame['file_path'] = frame['file_path'].removesuffix('.jpg')
-    frame = next(read_folder(edited(write_nerf(tmp_path, shots), edit), METRES).read())
-    assert frame.camera.fx == pytest.approx(500.0, abs=0.5) and frame.camera.cx == 319.5
-
-
 def test_a_lost_pose_is_none_and_a_false_one_refused(shots, tmp_path):
     folder = write_polycam(tmp_path, shots)
     first, second = sorted((folder / 'keyframes/corrected_cameras').iterdir())[:2]
@@ -221,4 +210,3 @@ def test_any_bytes_end_in_a_message(layout, shots, tmp_path_factory):
             path.write_bytes(files[path])
         assert time.monotonic() - begin < 20.0
     check()
-

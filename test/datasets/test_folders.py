@@ -73,6 +73,12 @@ def test_tum_rgbd(tmp_path):
     first, second = rgbd_frames(tmp_path, FolderOptions('fr3')).read()
     assert np.isnan(first.depth.depths_m[0, 0]) and first.depth.depths_m[1, 1] == 1.0
     assert second.depth is None
+    # the pictures may be cut out of larger ones: a note
+    (tmp_path / 'camera.json').write_text(
+        '{"width": 640, "height": 480, "fx": 1000, "fy": 1000, "cx": 640, "cy": 480}')
+    assert rgbd_frames(tmp_path, FolderOptions('fr3')).notes[1:] == ()
+    note, = rgbd_frames(tmp_path, NO_OPTIONS).notes[1:]
+    assert 'of an image of 1280x960 px' in note
     millimetres = FolderOptions('fr3', depth=DepthFormat(unit_m=1e-3))
     assert next(rgbd_frames(tmp_path, millimetres).read()).depth.depths_m[1, 1] == 5.0
 

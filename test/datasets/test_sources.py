@@ -4,6 +4,7 @@
 
 import pickle
 import struct
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -114,6 +115,35 @@ def test_poses_are_interpolated_within_a_gap(tmp_path):
     # another process decodes it
     decoded = pickle.loads(pickle.dumps(raw[0])).decode()
     assert (decoded.image_rgb == 500 % 200).all() and decoded.camera.fx == 50.0
+
+
+@pytest.mark.parametrize(('camera', 'frame_id', 'topic', 'error', 'note'), [
+    (replace(CAMERA, cx=63.0, cy=47.0), 'camera', '/image', 'of an image of 126x94 px', None),
+    (replace(CAMERA, distortion=(-0.3, 0.1, 0.0, 0.0)), 'camera', '/image_rect',
+     'rectified is false', None),
+    (replace(CAMERA, cx=42.0), 'camera', '/image', None, 'of an image of 84x47 px'),
+    (CAMERA, 'other', '/image', None, "'other'"), (CAMERA, 'camera', '/image_rect', None, None)])
+def test_what_contradicts_itself_in_a_recording(tmp_path, camera, frame_id, topic, error, note):
+    """By the functions of the node: refused, or noted."""
+    image = bag_messages.image_message(START, 'camera', np.zeros((48, 64, 3), dtype=np.uint8))
+    info = bag_messages.camera_info_message(START, frame_id, camera)
+    with BagWriter(tmp_path / 'bag') as bag:
+        for name, msgtype, message in (
+                (topic, bag_messages.IMAGE, image), ('/info', bag_messages.CAMERA_INFO, info),
+                ('/pose', bag_messages.POSE, bag_messages.pose_message(START, 'map', np.eye(4)))):
+            bag.add_topic(name, msgtype)
+            bag.write(name, START, message)
+
+    def read():
+        frames = bag_frames(tmp_path / 'bag', BagTopics(topic, '/info'), poses_of_topic('/pose'))
+        return list(frames.read()), frames.notes
+    if error is not None:
+        with pytest.raises(DatasetError, match=error):
+            read()
+    else:
+        frames, notes = read()
+        assert len(frames) == 1
+        assert [note in one for one in notes] == [True] * (note is not None)
 
 
 def test_the_only_topics_and_poses_are_found(tmp_path):
@@ -285,13 +315,3 @@ def test_compressed_depth(tmp_path):
                                rtol=0.02)
     with pytest.raises(DatasetError, match=r'/depth at 1700000000.2000.*does not decode'):
         next(frames)
-
-
-@pytest.mark.parametrize('stated', ['16UC1; compressedDepth rvl', '16UC1; png compressed', 'jpeg',
-                                    'rgb8; compressedDepth png'])
-def test_other_compressions_of_depth_are_named(tmp_path, stated):
-    message = compressed_depth(START, '16UC1', np.ones((2, 2), dtype=np.uint16))
-    message.format = stated
-    bag = write_bag(tmp_path / 'bag', [0], [*drive(), (0, '/depth', COMPRESSED, message)])
-    with pytest.raises(DatasetError, match=f'/depth at .*depth (format|encoding).*{stated[:4]}'):
-        list(bag_frames(bag, BagTopics(depth='/depth'), poses_of_topic('/pose')).read())

@@ -12,6 +12,8 @@ from cliploc_ros.models.clip_encoder import load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions
 from demo_world import train_clip
 
+pytestmark = pytest.mark.full
+
 
 def test_equal_labels_are_all_right_answers():
     """Two crops share a label: their texts are equal, so the least loss is that of a tie."""

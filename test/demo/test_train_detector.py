@@ -5,12 +5,15 @@
 import re
 
 import numpy as np
+import pytest
 
 from cliploc_ros.demo.truth import read_frames
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_detector import YoloDetector
 from demo_world import train_detector
 from demo_world.appearance import CLASSES
+
+pytestmark = pytest.mark.full
 
 
 def test_labels_are_parts_of_the_image(worlds, tmp_path):

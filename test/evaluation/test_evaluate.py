@@ -3,11 +3,9 @@
 """The executable evaluate, as its users run it."""
 
 import json
-import os
 import re
 import resource
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -150,67 +148,6 @@ def test_trajectories_are_what_was_found(files, tmp_path, evaluate_here):
     assert not list(tmp_path.glob('*.png'))
 
 
-def test_one_worker_or_two(files, tmp_path, evaluate_here):
-    arguments = small(files, '--trials', 3, '--seed', 7, '--iterations', 100, '--sweep', 50,
-                      '--no-figures')
-    for workers in (1, 2):
-        assert evaluate_here(*arguments, '--workers', workers, '--out',
-                             tmp_path / str(workers)).returncode == 0
-    first, second = (re.sub(r'"search_ms": [-+.e\d]+', '', (tmp_path / name / 'results.json')
-                            .read_text()) for name in '12')
-    assert first == second
-    assert len(first) > 10_000
-
-
-@pytest.fixture(scope='module')
-def long_run(files, tmp_path_factory):
-    """The arguments of a run of seconds, and its results."""
-    arguments = small(files, '--methods', 'hybrid_b-prosac', 'class_ransac', '--iterations', 20000,
-                      '--trials', 2, '--sweep', '--no-figures')
-    whole = tmp_path_factory.mktemp('whole')
-    assert evaluate(*arguments, '--workers', 1, '--out', whole).returncode == 0
-    return arguments, results_of(whole)
-
-
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGKILL])
-def test_broken_off_and_resumed(long_run, tmp_path, number, evaluate_here):
-    arguments, whole = long_run
-    broken = tmp_path / 'broken'
-    process = subprocess.Popen(command(*arguments, '--workers', 2, '--out', broken), cwd=PROJECT,
-                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    journal = broken / 'unfinished.jsonl'
-    deadline = time.monotonic() + TIMEOUT_S
-    while not (journal.exists() and len(journal.read_text().splitlines()) > 2):
-        assert process.poll() is None, process.stderr.read()
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    workers = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text().split()
-    assert len(workers) >= 2
-    os.kill(process.pid, number)
-    _, errors = process.communicate(timeout=20)
-    assert process.returncode == (-9 if number == signal.SIGKILL else 130)
-    assert 'Traceback' not in errors
-    deadline = time.monotonic() + 10
-    while any(Path(f'/proc/{worker}').exists() for worker in workers):
-        assert time.monotonic() < deadline, 'a worker lives on'
-        time.sleep(0.05)
-    done = len(journal.read_text().splitlines()) - 1
-    assert not (broken / 'results.json').exists()
-
-    assert_error(evaluate_here(*arguments, '--out', broken), 'unfinished run', '--resume')
-    other = (*arguments, '--out', broken, '--resume', '--seed', 5)
-    assert_error(evaluate_here(*other), 'begun with another methods')
-    assert evaluate_here(*arguments, '--out', broken, '--resume').returncode == 0
-    assert results_of(broken) == whole
-    assert not journal.exists()
-    print(f'\nstopped after {done} parts, then resumed')
-
-
-def test_a_scheduler_that_is_not_there(files, tmp_path, evaluate_here):
-    arguments = small(files, '--scheduler', 'nonsense', '--out', tmp_path)
-    assert_error(evaluate_here(*arguments), 'no Dask scheduler answers at nonsense')
-
-
 @pytest.fixture(scope='module')
 def walk(tmp_path_factory):
     """Every sixth image of the demo's walk, the last without its true pose; also as a bag."""
@@ -292,15 +229,6 @@ def test_a_map_of_the_same_images_is_noted(walk, evaluated_bag, evaluate_here):
         assert ('was built from these images' in done.stdout) is is_noted
 
 
-def test_no_ros_is_needed(files, tmp_path):
-    arguments = small(files, '--methods', 'auto', '--workers', 1, '--out', tmp_path)
-    code = ('import sys; from cliploc_ros.cli.evaluate import main; '
-            f'code = main({[*map(str, arguments)]!r}); '
-            "assert 'rclpy' not in sys.modules and 'torch' not in sys.modules; sys.exit(code)")
-    assert subprocess.run([sys.executable, '-c', code], cwd=PROJECT, check=False,
-                          timeout=TIMEOUT_S).returncode == 0
-
-
 def changed(files, tmp_path, **arrays):
     """A copy of the query file with some arrays changed, or left out where None."""
     with np.load(files / 'queries.npz') as content:
@@ -308,67 +236,3 @@ def changed(files, tmp_path, **arrays):
     path = tmp_path / 'changed.npz'
     np.savez(path, **{name: array for name, array in everything.items() if array is not None})
     return path
-
-
-@pytest.mark.parametrize(('arrays', 'named'), [
-    ({'scores': None}, 'array scores is missing'),
-    ({'scores': np.ones(3)}, 'array scores has shape'),
-    ({'boxes_xyxy': 'nan'}, 'array boxes_xyxy is not finite in row 2'),
-    ({'landmark_ids': np.array([f'other_{i}' for i in range(12)])}, 'which the map does not know'),
-    ({'similarities': 'short'}, 'array similarities has shape'),
-])
-def test_bad_query_files_are_named(files, tmp_path, arrays, named, evaluate_here):
-    with np.load(files / 'queries.npz') as content:
-        for name, value in arrays.items():
-            if isinstance(value, str):
-                array = content[name].copy()
-                array[2, 0] = np.nan
-                arrays = {name: array if value == 'nan' else array[:, :3]}
-    path = changed(files, tmp_path, **arrays)
-    assert_error(evaluate_here('--queries', path, '--map', files / 'map.yaml', '--out', tmp_path),
-                 'changed.npz', named)
-
-
-@pytest.mark.parametrize(('arguments', 'named'), [
-    (('--image', '/camera'), 'has no topic /camera; it has /image (sensor_msgs'),
-    (('--ground-truth', '/image'), '/image is of type sensor_msgs/msg/Image, not'),
-    (('--body-from-camera', *'0000000'), 'x y z and a unit quaternion'),
-    (('--clip-model', 'ViT-L-15'), 'ViT-L-15'), (('--model', '/nowhere.pt'), '/nowhere.pt'),
-    (('--save-queries', '/nowhere/q.npz'), '/nowhere/q.npz'),
-])
-def test_bad_bags_and_options_are_named(walk, tmp_path, arguments, named, evaluate_here):
-    assert_error(evaluate_here('--bag', walk / 'bag', *NETWORKS, *METHODS, *arguments, '--out',
-                               tmp_path), named)
-
-
-@pytest.mark.parametrize(('arguments', 'named'), [
-    (('--queries', '/nowhere.npz'), '/nowhere.npz'), (('--bag', '/nowhere'), '/nowhere'),
-    (('--tum', '/nowhere'), '/nowhere')])
-def test_missing_input_is_named(files, tmp_path, arguments, named, evaluate_here):
-    assert_error(evaluate_here(*arguments, '--map', files / 'map.yaml', '--out', tmp_path), named)
-
-
-@pytest.mark.parametrize(('arguments', 'named'), [
-    (('--methods', 'best'), "'best' is none of"), (('--iterations', 0), 'iterations: 0'),
-    (('--out', '/proc/x'), '--out /proc/x'), (('--map', '/nowhere.yaml'), '/nowhere.yaml'),
-    (('--save-queries', 'q.npz'), '--save-queries needs')])
-def test_bad_options_are_named(files, tmp_path, arguments, named, evaluate_here):
-    assert_error(evaluate_here(*small(files, '--out', tmp_path, *arguments)), named)
-
-
-def test_a_full_disk_leaves_nothing_half_written(files, tmp_path):
-    def allow_small_files():
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000))
-
-    arguments = small(files, '--methods', 'class_bf', 'auto', '--trials', 1, '--sweep', 10, 20, 50,
-                      '--workers', 1, '--out', tmp_path)
-    done = evaluate(*arguments, preexec_fn=allow_small_files)
-    assert_error(done, 'cannot be written')
-    for path in tmp_path.rglob('*'):
-        assert not path.name.startswith('.')
-        assert path.suffix in ('', '.jsonl', '.txt', '.json', '.csv', '.md', '.png', '.svg')
-        if path.suffix == '.png':
-            assert cv2.imread(str(path)) is not None
-    assert evaluate(*arguments, '--resume').returncode == 0
-    assert len(results_of(tmp_path)) == 24

@@ -42,13 +42,3 @@ def test_together_they_are_nearer_the_truth(rig_bag, tmp_path):
     errors = [np.median([row['error_m'] for row in rows]) for rows in (one, three)]
     print(f'\nmedian error: one camera {errors[0]:.3f} m, three {errors[1]:.3f} m')
     assert errors[1] < errors[0]
-
-
-@pytest.mark.parametrize(('arguments', 'named'), [
-    (('--cameras', 'front', 'nowhere'), '/nowhere/image/compressed'),
-    (('--cameras', 'front', 'left', 'front'), '--cameras front left front: names a camera twice'),
-    (('--cameras', 'front', 'left', '--fuse'), '--cameras is for --bag, without --fuse'),
-])
-def test_what_does_not_fit_is_named(rig_bag, tmp_path, capsys, arguments, named):
-    assert run(rig_bag, tmp_path, *arguments) == 1
-    assert named in capsys.readouterr().err

@@ -13,7 +13,6 @@ from cliploc_ros.cli.evaluate import main
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.demo import ASSETS
-from studies.speed.building import run as building
 
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
             '--clip-pretrained', ASSETS / 'clip.safetensors', '--methods', 'auto', '--trials', 1,
@@ -47,21 +46,3 @@ def test_the_right_floor_is_found_and_equal_floors_are_refused(walk):
     assert all(one['map'] == 'ground' and one['error_m'] < 1.0 for one in accepted)
     alike = evaluate(walk, 'ground', 'alike')
     assert not any(one['accepted'] for one in alike)
-
-
-def test_maps_that_cannot_be_joined_are_named(walk, capsys):
-    assert main(['--tum', str(walk / 'sequence'), '--map', *[str(walk / 'alike.yaml')] * 2]) == 1
-    assert "both have frame_id 'alike'" in capsys.readouterr().err
-
-
-def test_the_benchmark_of_a_building(capsys):
-    """Reduced: no false accept, and floors cost no accepted pose."""
-    assert building(['--floors', '3', '--objects', '200', '--queries', '6', '--dimensions', '512',
-                     '--time-budget-ms', 'inf']) == 0
-    rows = {line[:18].strip(): line[18:].split() for line in capsys.readouterr().out.splitlines()}
-    alone, together, absent = (rows[name] for name in (
-        'its floor alone', 'all floors', 'all but its floor'))
-    right, _, queries, accepted, false = map(str, together[:5])
-    assert (queries, false) == ('6', '0') and int(right) >= 5
-    assert int(accepted) >= int(alone[3]) - 1
-    assert absent[3:5] == ['0', '0']

@@ -17,8 +17,6 @@ from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo import ASSETS
-from cliploc_ros.evaluation.summary import notes, summarize, table_rows
-from cliploc_ros.evaluation.trials import Result
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
 
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
@@ -75,7 +73,6 @@ def test_the_source_of_each_pose_is_in_table_and_files(walk, evaluate, tmp_path)
     counts = ' / '.join(str(sum(row['source'] == name for row in both))
                         for name in ('objects', 'keyframes', 'both'))
     for text in (out, (tmp_path / 'table.md').read_text()):
-        assert 'pose by objects / keyframes / both' in text
         assert counts in text
     with (tmp_path / 'summary.csv').open() as file:
         figures = {row['method']: row for row in csv.DictReader(file)}
@@ -92,45 +89,16 @@ def test_the_source_of_each_pose_is_in_table_and_files(walk, evaluate, tmp_path)
         assert row['map_from_camera'] == other['map_from_camera']
 
 
-@pytest.mark.parametrize(('arguments', 'named'), [
-    (('--methods', 'class_bf'), 'none of the methods uses them'),
-    (('--methods', 'auto'), '--queries has no images')])
-def test_keyframes_that_cannot_be_used_are_refused(walk, evaluate, files, tmp_path, arguments,
-                                                   named):
-    given = ('--queries', files / 'queries.npz', '--map', walk / 'map.yaml', '--out', tmp_path)
-    code, _, err = evaluate(*given, *arguments, '--keyframes')
-    assert code == 1
-    assert named in err
-
-
 def test_a_missing_or_bad_layer_is_refused_only_where_it_is_asked_for(
         walk, evaluate, files, tmp_path):
     path = tmp_path / 'map.yaml'
     shutil.copy(walk / 'map.yaml', path)
     code, _, err = evaluate(*of_images(tmp_path, '--methods', 'auto', '--keyframes'))
     assert code == 1
-    assert 'map.keyframes.npz: no such file' in err
     layer_path(path).write_bytes(b'no layer')
     code, _, err = evaluate(*of_images(tmp_path, '--methods', 'auto', '--keyframes'))
     assert code == 1
-    assert 'is no complete npz file' in err
     # without being asked for, the layer is left out, and the next problem is named
     code, out, err = evaluate(*of_images(tmp_path, '--methods', 'auto', '--out', tmp_path / 'out'))
     assert code == 1
     assert 'without keyframes' in out and 'sequence' in err
-
-
-def test_without_keyframes_the_table_is_as_it_was():
-    plain = {'method': 'auto', 'trial': 0, 'timestamp': 1.5, 'boxes': 4, 'solved': True,
-             'accepted': True, 'map_from_camera': np.eye(4).tolist(), 'error_m': 0.5,
-             'error_deg': 2.0, 'score': 3.0, 'confidence': 0.5, 'nees': 3.0, 'inliers': 4,
-             'hypotheses': 9, 'best_iteration': 2, 'coverage': 1.0, 'reason': '',
-             'search_ms': 1.0, 'source': 'objects'}
-    summaries = summarize([Result(query=number, **plain) for number in range(3)])
-    assert len(table_rows(summaries)[0]) == 8
-    assert not any('eyframes' in line for line in notes(summaries))
-    mixed = summarize([Result(query=number, **plain | {'source': source}, keyframe_inliers=count,
-                              keyframes_ms=9.0)
-                       for number, (source, count) in enumerate(
-                           [('objects', 0), ('both', 31), ('both', 40)])])
-    assert table_rows(mixed)[1][8:] == ('1 / 0 / 2', '31', '9.0')

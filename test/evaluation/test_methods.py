@@ -68,11 +68,3 @@ def test_bad_files_are_named(tmp_path, text, named):
     with pytest.raises(CliplocError) as caught:
         parse_methods(['auto', str(path)], PAPER, 40)
     assert named in str(caught.value)
-
-
-@pytest.mark.parametrize(('words', 'named'), [
-    (['class_prosac'], "'class_prosac' is none of"), (['/nowhere.yaml'], '/nowhere.yaml'),
-    ([], 'no method is named')])
-def test_bad_names_are_named(words, named):
-    with pytest.raises(CliplocError, match=named):
-        parse_methods(words, PAPER, 40)

@@ -2,9 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures of results, and what is noise."""
 
-import csv
-import io
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,14 +9,10 @@ import pytest
 
 from cliploc_ros.evaluation.figures import (
     _time_by_stage,
-    new_axes,
     precision_recall,
-    save_figure,
 )
 from cliploc_ros.evaluation.summary import (
     Summary,
-    as_csv,
-    as_json,
     as_markdown,
     as_text,
     compare,
@@ -128,27 +121,6 @@ def test_the_table_marks_noise_and_cut_searches():
     assert rows[1][-2:] == ('1.00 (.00 to 1.00)', '0 of 0')
     assert 'fitted on simulated' in notes([good, near])[1]
     assert 'hybrid_bf' in notes([good, near])[2]
-
-
-def test_csv_and_json_say_the_same():
-    results = [make_result(query=query, error_m=error)
-               for query, error in enumerate([0.1, 0.4, 3.0, None])]
-    rows = list(csv.DictReader(io.StringIO(as_csv(summarize(results)))))
-    assert float(rows[0]['success_0.5m']) == 0.5
-    bounds = [float(rows[0][f'precision_1m{end}']) for end in ('_low', '', '_high')]
-    assert 0.0 < bounds[0] < bounds[1] == 0.5 < bounds[2] < 1.0
-    assert [row['error_m'] for row in json.loads(as_json(results))] == [0.1, 0.4, 3.0, None]
-    assert len(as_json(results).splitlines()) == 6
-
-
-def test_figures_of_the_same_results_are_the_same_files(tmp_path):
-    contents = []
-    for _ in range(2):
-        figure, axes = new_axes('x', 'y')
-        axes.plot([1, 2], [3, 4], marker='o')
-        path = save_figure(figure, tmp_path / 'figure.png')
-        contents.append([one.read_bytes() for one in (path, path.with_suffix('.svg'))])
-    assert contents[0] == contents[1]
 
 
 def test_the_time_by_stage_counts_keyframes():

@@ -79,11 +79,6 @@ def test_one_process_at_a_time(path):
     assert read(path) == ([], False)
 
 
-def test_a_missing_folder(tmp_path):
-    with pytest.raises(DatasetError, match=r'none/log: cannot be written: No such .*; make room'):
-        open_log(tmp_path / 'none/log')
-
-
 def test_a_full_disk(path, tmp_path):
     code = ('import sys; from pathlib import Path; from cliploc_ros.files.log import Log\n'
             'from cliploc_ros.errors import DatasetError\n'

@@ -92,6 +92,7 @@ def test_new_landmarks_have_phrases_and_all_have_embeddings(updated, report):
         assert len(new.details[row].labels) == 6 or one['label'] == one['class_id']
 
 
+@pytest.mark.full
 def test_a_second_update_changes_nothing(updated, tmp_path):
     for name in ('map.yaml', 'map.embeddings.npz'):
         shutil.copyfile(updated / name, tmp_path / name)

@@ -74,6 +74,7 @@ def test_no_landmarks_and_no_boxes(seen):
     assert len(find_overlaps(views.between(0, 0), none, 0.2).boxes) == 0
 
 
+@pytest.mark.full
 def test_the_benchmark_runs(tmp_path, capsys):
     options = Namespace(objects=50, frames=400, seed=0, embeddings=8, queries=4,
                         pose_noise=(0.001, 0.01), out=tmp_path)

@@ -141,6 +141,7 @@ def test_a_rig_stays_rigid():
     assert np.abs(refined - given).mean() < 2e-3
 
 
+@pytest.mark.full
 def test_errors_of_the_robot_are_estimated():
     built = build_map(drive(*RIG, move=wandering(0))[0], MappingOptions(estimate_pose_errors=True))
     note, = built.report.notes

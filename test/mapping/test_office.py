@@ -69,6 +69,7 @@ def test_other_frames_are_explained(observations, splits, even_map, required, na
     assert iou >= required[name]['median_iou']
 
 
+@pytest.mark.full
 def test_the_map_relocalizes(office, shared_data, even_map, required, tmp_path):
     tool = shared_data.parent / 'tools' / 'simulate_queries.py'
     if not tool.is_file():
@@ -97,6 +98,7 @@ def test_the_map_relocalizes(office, shared_data, even_map, required, tmp_path):
     assert np.sum(accepted & (errors_m >= 1.0)) <= required['even']['false_accepts']
 
 
+@pytest.mark.full
 def test_joint_refinement_makes_up_for_slow_pose_errors(even, even_map, required):
     given = PoseErrors(0.05, 1.0, 3.0)
     noisy = disturb(even, draw_errors('correlated', even.stamps_s, given,
@@ -114,6 +116,7 @@ def test_joint_refinement_makes_up_for_slow_pose_errors(even, even_map, required
     assert len(joint.landmark_map) < len(plain.landmark_map)
 
 
+@pytest.mark.full
 def test_poses_of_motion_capture_are_left_alone(even, even_map):
     built = build_map(even, MappingOptions(estimate_pose_errors=True))
     assert built.report.pose_change_m == 0.0

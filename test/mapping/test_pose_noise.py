@@ -58,6 +58,7 @@ def test_errors_are_estimated(seen, kind, given):
     assert (found.correlation_s < 0.3) == (kind == 'independent')
 
 
+@pytest.mark.full
 def test_estimated_errors_are_refined_and_reported(seen):
     errors = draw_errors('correlated', seen.stamps_s, PoseErrors(0.05, 1.0, 3.0),
                          np.random.default_rng(1))

@@ -6,16 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clip_reference import SMALL_CONFIG, Reference, make_reference, make_small_reference
 
 
 @pytest.fixture(scope='session')
-def small_clip(tmp_path_factory) -> Reference:
+def small_clip(tmp_path_factory):
+    from clip_reference import SMALL_CONFIG, make_small_reference  # needs PyTorch
+
     return make_small_reference('small-clip', SMALL_CONFIG, tmp_path_factory.mktemp('small_clip'))
 
 
 @pytest.fixture(scope='session')
-def large_clip(tmp_path_factory) -> Reference:
+def large_clip(tmp_path_factory):
+    from clip_reference import make_reference
+
     return make_reference('ViT-B-32', tmp_path_factory.mktemp('large_clip'))
 
 

@@ -48,16 +48,6 @@ def test_every_visible_box_has_pixels(boxes, width, height):
     assert ((top >= 0) & (top < bottom) & (bottom <= height)).all()
 
 
-def test_no_boxes():
-    assert visible_boxes(np.empty((0, 4)), 64, 48).shape == (0,)
-    assert crop_bounds([], 64, 48).shape == (0, 4)
-
-
-def test_boxes_of_another_shape():
-    with pytest.raises(CliplocError, match=r'\(n, 4\), not \(3,\)'):
-        visible_boxes(np.zeros(3), 64, 48)
-
-
 @pytest.mark.parametrize(('image', 'message'), [
     (np.zeros((0, 0, 3), np.uint8), 'no pixels'),
     (np.zeros((4, 0, 3), np.uint8), 'no pixels'),

@@ -20,6 +20,8 @@ import torch
 from disks import small_disk
 from safetensors.torch import save
 
+pytestmark = pytest.mark.full
+
 PROJECT = Path(__file__).resolve().parents[2]
 RESOLVE = """
 import json, sys

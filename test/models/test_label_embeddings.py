@@ -6,7 +6,6 @@ import os
 import pickle
 import subprocess
 import sys
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
@@ -77,23 +76,6 @@ def test_damaged_file_is_ignored_and_replaced(cache, damage, caplog):
     assert np.array_equal(cache.load(KEY, LABELS, 16), unit_rows(3))
 
 
-@pytest.mark.parametrize('rows', [
-    unit_rows(2), unit_rows(3) * 2, unit_rows(3).astype(np.float64),
-    np.full((3, 16), np.nan, np.float32), unit_rows(3)[:, :8]])
-def test_wrong_embeddings_are_ignored(cache, rows, caplog):
-    cache.store(KEY, LABELS, rows)
-    assert cache.load(KEY, LABELS, 16) is None
-    assert 'not unit rows' in caplog.text
-
-
-def test_a_file_in_the_way_costs_only_the_cache(tmp_path, caplog):
-    (tmp_path / 'labels').write_text('in the way')
-    cache = LabelCache(tmp_path / 'labels')
-    cache.store(KEY, LABELS, unit_rows(3))
-    assert cache.load(KEY, LABELS, 16) is None
-    assert 'not cached' in caplog.text
-
-
 def test_a_full_disk_costs_only_the_cache(tmp_path):
     # A limit on the size of files gives the error of write() that a full disk gives.
     code = f"""
@@ -145,16 +127,6 @@ def test_the_longest_unused_files_go(cache):
     assert cache.load(KEY, ['label 39'], 16) is not None
 
 
-def test_what_killed_writers_left_is_cleared(cache):
-    file = stored_file(cache)
-    old, young = file.with_name(f'.1.{file.name}'), file.with_name(f'.2.{file.name}')
-    old.touch()
-    young.touch()
-    os.utime(old, (0, 0))
-    cache.store(KEY, ['another'], unit_rows(1))
-    assert not old.exists() and young.exists()
-
-
 # ---- several labels of a landmark make one embedding
 
 AXES = {'a': [1.0, 0, 0], 'b': [0, 1.0, 0], 'c': [0, 0.6, 0.8]}
@@ -195,10 +167,6 @@ def test_each_label_is_encoded_once_and_parts_change_nothing(monkeypatch):
     assert np.linalg.norm(whole, axis=1) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_no_labels():
-    assert mixed_rows([], encode, 3).shape == (0, 3)
-
-
 def test_a_label_beside_the_list_counts_like_the_best():
     """As a name that a person gave a landmark which build_map had described."""
     one = LandmarkDetails(labels=(('a red mug', 0.5), ('a cup', 0.2)))
@@ -237,12 +205,3 @@ def test_each_class_is_encoded_once(clip, caplog):
     np.testing.assert_array_equal(again['can'], more['can'])
     np.testing.assert_array_equal(again['mug'], found['mug'])
     assert embed_phrases(weights, clip, {}) == {}
-
-
-def test_without_a_place_for_the_cache_phrases_are_encoded_all_the_same(clip, tmp_path, caplog):
-    file = tmp_path / 'file'
-    file.write_text('')
-    nowhere = replace(clip, cache_dir=str(file / 'cache'))
-    found = embed_phrases(resolve_clip_weights(nowhere), nowhere, PHRASES)
-    assert found['mug'].shape == (2, 128)
-    assert 'are not cached' in caplog.text

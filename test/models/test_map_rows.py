@@ -20,6 +20,8 @@ from cliploc_ros.models.clip_encoder import load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
 
+pytestmark = pytest.mark.full
+
 ROOM = make_room()
 
 

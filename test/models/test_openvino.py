@@ -15,7 +15,6 @@ import numpy as np
 import open_clip
 import pytest
 import torch
-import yaml
 from clip_reference import SMALL_CONFIG, Reference
 from disks import small_disk
 
@@ -26,6 +25,8 @@ from cliploc_ros.models.images import crop_bounds
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_detector import YoloDetector
 from cliploc_ros.models.yolo_weights import load_yolo
+
+pytestmark = pytest.mark.full
 
 PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'cliploc_ros/demo/assets'
@@ -79,11 +80,6 @@ def test_embeddings_equal_those_of_open_clip(name, precision, request, cache, im
     assert encoder.encode_crops(image_rgb, BBOXES[:0]).shape == (0, encoder.embed_dim)
 
 
-def test_batches_are_bounded(demo_clip, cache, image_rgb):
-    batched = load(demo_clip, cache, max_batch=5).encode_crops(image_rgb, BBOXES)
-    assert np.allclose(batched, load(demo_clip, cache).encode_crops(image_rgb, BBOXES), atol=1e-5)
-
-
 def test_a_second_start_neither_converts_nor_builds_the_tower_in_pytorch(
         demo_clip, cache, caplog):
     load(demo_clip, cache)
@@ -95,17 +91,6 @@ def test_a_second_start_neither_converts_nor_builds_the_tower_in_pytorch(
     made = [thing for thing in gc.get_objects() if issubclass(type(thing), torch.nn.Parameter)
             and id(thing) not in kept and not thing.is_meta]
     assert encoder.inference == 'openvino' and made == [] and caplog.text == ''
-
-
-def test_as_many_threads_as_pytorch(demo_clip, cache):
-    before = torch.get_num_threads()
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            compiled = load(demo_clip, cache)._tower._network._compiled
-            assert compiled.get_property('INFERENCE_NUM_THREADS') == threads
-    finally:
-        torch.set_num_threads(before)
 
 
 @pytest.fixture(scope='module')
@@ -226,13 +211,6 @@ def test_without_openvino_pytorch_runs_and_one_line_says_so():
     assert 'is not installed' in done.stdout
 
 
-@pytest.mark.parametrize('change', [
-    {'inference': 'tensorrt'}, {'inference': 'openvino', 'precision': 'fp16'}])
-def test_an_impossible_inference_is_refused(change):
-    with pytest.raises(OptionsError, match='inference'):
-        YoloDetector(DetectorOptions(str(ASSETS / 'yolo.pt'), device='cpu', **change))
-
-
 def test_a_network_that_openvino_runs_otherwise_is_run_by_pytorch(small_clip, tmp_path, caplog):
     state = {name: torch.full_like(tensor, float('nan'))
              for name, tensor in small_clip.model.state_dict().items()}
@@ -275,18 +253,6 @@ def detector(model: object, cache: Path, **changes) -> YoloDetector:
     return YoloDetector(DetectorOptions(str(model), device='cpu', cache_dir=str(cache), **changes))
 
 
-@pytest.mark.parametrize('imgsz', [640, 300])
-def test_boxes_in_the_demo_equal_those_of_pytorch(cache, demo_rgb, imgsz, tmp_path):
-    alone = shutil.copy(ASSETS / 'yolo.pt', tmp_path)
-    openvino, pytorch = (detector(alone, cache, inference=inference, imgsz=imgsz)
-                         for inference in ('auto', 'pytorch'))
-    assert (openvino.inference, pytorch.inference) == ('openvino', 'pytorch')
-    assert openvino.class_names == pytorch.class_names
-    # images of several sizes, one after another
-    images = [*demo_rgb, *(cv2.resize(image, (400, 500)) for image in demo_rgb[:2])]
-    assert compare(openvino, pytorch, images) < 0.5
-
-
 def test_boxes_in_real_images_equal_those_of_pytorch(shared_data, cache):
     weights = shared_data / 'weights/yolov8n_coco.pt'
     images = [cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB)
@@ -315,20 +281,6 @@ def test_an_export_of_ultralytics(export, cache, demo_rgb):
                    demo_rgb) < 0.5
     with pytest.raises(OptionsError, match='needs OpenVINO'):
         detector(export, cache, inference='pytorch')
-
-
-@pytest.mark.parametrize(('field', 'value', 'reason'), [
-    ('task', 'segment', 'task'), ('names', None, 'names'), ('names', {3: 'mug'}, 'names'),
-    ('stride', 'x', 'stride'), ('stride', -32, 'stride'), ('names', {0: 'mug'}, 'of 1 classes')])
-def test_an_export_with_a_wrong_field(export, tmp_path, field, value, reason):
-    for file in export.iterdir():
-        (tmp_path / file.name).symlink_to(file)
-    metadata = yaml.safe_load((export / 'metadata.yaml').read_text()) | {field: value}
-    (tmp_path / 'metadata.yaml').unlink()
-    (tmp_path / 'metadata.yaml').write_text(yaml.safe_dump(metadata))
-    with pytest.raises(ModelError, match=reason) as caught:
-        detector(tmp_path, tmp_path)
-    assert str(tmp_path) in str(caught.value)
 
 
 def test_damaged_exports(export, tmp_path):

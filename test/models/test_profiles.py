@@ -5,11 +5,12 @@
 import open_clip
 import pytest
 
-from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.profiles import PROFILES, resolve_profile, with_detector, with_encoder
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_weights import import_ultralytics
+
+pytestmark = pytest.mark.full
 
 UNNAMED = ClipOptions(model='', pretrained='', device='cpu')
 
@@ -45,13 +46,3 @@ def test_names_override_a_profile(model, pretrained, path, named):
     encoder = with_encoder(ClipOptions(model, pretrained, path, device='cpu'), 'fast')
     assert (encoder.model, encoder.pretrained) == named
     assert encoder.checkpoint_path == path
-
-
-def test_a_named_detector_overrides_a_profile():
-    mine = DetectorOptions('mine.pt', conf=0.3)
-    assert with_detector(mine, 'fast') == mine
-
-
-def test_an_unknown_profile():
-    with pytest.raises(OptionsError, match='accurate, balanced, fast'):
-        with_encoder(UNNAMED, 'quick')

@@ -18,6 +18,8 @@ from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.transformers_detector import TransformersDetector, is_of_transformers
 
+pytestmark = pytest.mark.full
+
 NAMES = ('chair', 'cup', 'dining table')
 SMALL = {'encoder_hidden_dim': 32, 'encoder_ffn_dim': 32, 'd_model': 32, 'num_queries': 12,
          'decoder_ffn_dim': 32, 'decoder_attention_heads': 4, 'encoder_attention_heads': 4,

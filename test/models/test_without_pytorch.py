@@ -18,6 +18,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.models.tokenizer import ClipTokenizer
 
+pytestmark = pytest.mark.full
+
 PROJECT = Path(__file__).resolve().parents[2]
 WAKE_UPS = 10
 #: Prints the demo's poses (4, 4), null for a refusal, and how far the robot is from each [m].

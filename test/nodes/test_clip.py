@@ -8,7 +8,6 @@ of CLIP.
 """
 
 import re
-import signal
 import time
 
 import open_clip
@@ -20,6 +19,8 @@ from tester import class_matching, make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Detections
+
+pytestmark = pytest.mark.full
 
 
 @pytest.fixture(scope='module')
@@ -82,40 +83,3 @@ def test_the_node_answers_while_clip_works(clip_relocalizer, tester):
     assert clip_ms > 500
     assert len(latencies) >= 2
     assert max(latencies) * 1e3 < clip_ms / 2
-
-
-def test_signals_end_the_node_while_clip_works(request, clip_relocalizer, tester):
-    """The last to use the process: the first start is ended by SIGINT, the other by SIGTERM."""
-    future = tester.ask()
-    tester.wait(lambda: tester.listened_to() > 0, 'the relocalizer to listen')
-    before = clip_relocalizer.cpu_s()
-    tester.feed_until(lambda: clip_relocalizer.cpu_s() > before + 0.5, crowded_frame(),
-                      'CLIP to work')
-    assert not future.done()
-    number = signal.SIGINT if 'first' in request.node.name else signal.SIGTERM
-    code, seconds = clip_relocalizer.stop(number)
-    print(f'\n{number.name}: ended after {seconds:.2f} s')
-    assert code == 0, clip_relocalizer.output()
-    assert seconds < 2.0
-    assert 'Traceback' not in clip_relocalizer.output()
-
-
-def test_weights_that_do_not_load_are_named(own_relocalizer, checkpoint, cache_dir, tester,
-                                            tmp_path):
-    """Truncated ones, then those of another model; each request tries again."""
-    weights = tmp_path / 'weights.pt'
-    with checkpoint.open('rb') as file:
-        weights.write_bytes(file.read(checkpoint.stat().st_size // 2))
-    process = own_relocalizer(
-        expect='[ERROR]', matching='hybrid', algorithm='b-prosac', clip_model='ViT-B-16',
-        clip_pretrained=weights, cache_dir=cache_dir)
-    truncated = tester.answer(tester.ask())
-    weights.unlink()
-    weights.symlink_to(checkpoint)
-    other = tester.answer(tester.ask())
-    for answer in (truncated, other):
-        assert not answer.success
-        assert str(weights) in answer.message
-    assert 'ViT-B-16' in other.message
-    assert truncated.message != other.message
-    assert process.alive

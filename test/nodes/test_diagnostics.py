@@ -5,7 +5,9 @@
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from processes import PROJECT
+from std_msgs.msg import Header
 from tester import make_frame
+from vision_msgs.msg import Detection2DArray
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -54,6 +56,35 @@ def test_a_relocalizer_that_hears_everything_nothing_and_half(own_relocalizer, t
     status.wait(ERROR, 'nobody publishes /camera_info')
     tester.infos = tester.create_publisher(type(frame[1]), 'camera_info', 10)
     status.wait(OK, 'active', frame)
+
+
+def test_what_contradicts_itself_is_named_until_it_is_gone(own_relocalizer, tester, status):
+    """A doubt warns, in a refusal, too. A fault of the detector is an error."""
+    process = own_relocalizer()
+    image, info, detections = make_frame()
+    info.header = Header(stamp=image.header.stamp, frame_id='color_frame')
+    assert tester.relocalize((image, info, detections)).success
+    status.wait(WARN, "'color_frame'")
+    tester.wait(lambda: "'color_frame'" in process.output(), 'the log')
+    answer = tester.relocalize((image, info, Detection2DArray(header=image.header)))
+    assert not answer.success and "'color_frame'" in answer.message
+    assert tester.relocalize(make_frame(stamp_s=101.0)).success
+    status.wait(OK, 'active')
+    image, info, detections = make_frame(stamp_s=102.0)
+    info.k[:6] = [1000.0, 0.0, 640.0, 0.0, 1000.0, 480.0]
+    assert not tester.relocalize((image, info, detections)).success
+    status.wait(ERROR, '1280x960 px')
+
+
+def test_a_detector_of_other_classes_is_an_error(own_relocalizer, tester, status):
+    own_relocalizer()
+    frame = make_frame()
+    for detection in frame[2].detections:
+        detection.results[0].hypothesis.class_id = '62'
+    answer = tester.relocalize(frame)
+    assert not answer.success and 'kind wrong_detections' in answer.message
+    assert 'turn the camera' not in answer.message
+    status.wait(ERROR, '62, which are numbers; the map has a, b, c')
 
 
 def test_between_requests_silence_is_no_problem(own_relocalizer, tester, status):

@@ -11,6 +11,7 @@ import yaml
 from nav_msgs.msg import Odometry
 from processes import wait_for
 from rclpy.qos import qos_profile_system_default
+from std_msgs.msg import Header
 from tester import class_matching, make_frame
 
 LINE = re.compile('^(.{12}) (pass|fail|not checked|refused) +(.*)$', re.MULTILINE)
@@ -35,13 +36,13 @@ class Robot:
         now = time.time()
         frame = self.change(*make_frame(stamp_s=now - self.late_s))
         self._tester.publish(frame[:2])
-        time.sleep(self.detection_s)
-        self._tester.publish(frame[2:])
         odometry = Odometry(child_frame_id='base_link')
         odometry.header.frame_id = 'odom'
         odometry.header.stamp = make_frame(stamp_s=now)[0].header.stamp
         odometry.twist.twist.linear.x = self.speed_m_s
         self._odometry.publish(odometry)
+        time.sleep(self.detection_s)  # of the detector: odometry does not wait for it
+        self._tester.publish(frame[2:])
         for _ in range(3):
             self._tester.spin()
 
@@ -83,6 +84,16 @@ def uncalibrated(image, info, detections):
     return image, info, detections
 
 
+def of_another_lens(image, info, detections):
+    info.d = [-6.0, 0.0, 0.0, 0.0]
+    return image, info, detections
+
+
+def of_another_frame(image, info, detections):
+    info.header = Header(stamp=image.header.stamp, frame_id='left')
+    return image, info, detections
+
+
 def of_another_detector(image, info, detections):
     for one in detections.detections:
         one.results[0].hypothesis.class_id = 'sofa'
@@ -110,6 +121,8 @@ def test_a_whole_robot_passes_and_nothing_is_handed_over(own_relocalizer, examin
     ('camera', 'no image on /image from its', {'change': without(0)}, {}),
     ('calibration', 'no camera_info on', {'change': without(1)}, {}),
     ('calibration', 'K: ', {'change': uncalibrated}, {}),
+    ('calibration', 'fold the image', {'change': of_another_lens}, {}),
+    ('calibration', "'left'", {'change': of_another_frame}, {}),
     ('clock', 'synchronize the clocks', {'late_s': 100.0}, {}),
     ('clock', 'nobody publishes /clock', {}, {'use_sim_time': True}),
     ('tf', 'set base_from_camera', {}, {'base_from_camera': [0.0] * 7}),  # with and without tf2

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from tester import make_frame
 
+pytestmark = pytest.mark.full
+
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 STAGES = ('decoding', 'CLIP', 'search')
 # No pose is that certain, so each request takes all of its crops.

@@ -5,9 +5,12 @@
 import os
 
 import numpy as np
+import pytest
 from rclpy.serialization import serialize_message
 from tester import make_frame
 from vision_msgs.msg import BoundingBox2D, Detection2D, ObjectHypothesis, ObjectHypothesisWithPose
+
+pytestmark = pytest.mark.full
 
 CASES = int(os.environ.get('CLIPLOC_FUZZ_CASES', '300'))
 

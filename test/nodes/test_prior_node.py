@@ -139,11 +139,3 @@ def test_walls_of_the_topic_speak_against_a_pose(own_relocalizer, tester, tell, 
     relocalized(tester, 'accepted')
     grid.data = [0] * 7
     tell(process, grid, 'localizing without the topic map: 7 cells', topic='map')
-
-
-def test_a_bad_grid_file_stops_nothing(own_relocalizer, tester, tmp_path):
-    (tmp_path / 'walls.yaml').write_text('image: gone.pgm')
-    process = own_relocalizer(expect='localizing without walls: occupancy_grid',
-                              occupancy_grid=tmp_path / 'walls.yaml')
-    process.wait_for_output('ready after')
-    assert tester.relocalize(make_frame()).success

@@ -9,6 +9,8 @@ import pytest
 from processes import PROJECT
 from tester import make_frame
 
+pytestmark = pytest.mark.full
+
 POLICY = PROJECT / 'config/security_policy.xml'
 # What tf2_ros and nav2_msgs bring, which are not installed everywhere the tests run.
 FOREIGN = {'/tf', '/tf_static', '/relocalizer/load_map'}

@@ -170,6 +170,7 @@ def test_the_first_request_after_a_reset_is_right(world, before_s, back_s):
     assert 'time jumped back by ' in world.process.output()
 
 
+@pytest.mark.full
 def test_resets_one_after_another(world):
     for number in range(5):
         world.go_on(0.5)
@@ -177,6 +178,7 @@ def test_resets_one_after_another(world):
         world.check(world.ask())
 
 
+@pytest.mark.full
 def test_a_request_goes_on_across_a_reset(world, tester):
     """Before the reset it sees too little; afterwards it does not use what it saw before."""
     assert tester.set_parameter('min_inliers', 5).successful
@@ -193,6 +195,7 @@ def test_a_request_goes_on_across_a_reset(world, tester):
 
 
 # on a busy machine the time-out may end the request before the jump is noticed
+@pytest.mark.full
 @pytest.mark.flaky(reruns=2)
 def test_a_frame_from_before_that_comes_late_is_not_answered(world, tester):
     """No other frame comes, and the robot is elsewhere."""

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from processes import PROJECT
 
+pytestmark = pytest.mark.full
+
 REQUESTS = 4
 POSSIBLE = os.geteuid() == 0 and os.access('/dev/net/tun', os.W_OK)
 

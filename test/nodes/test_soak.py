@@ -35,6 +35,8 @@ from cliploc_ros.datasets.bag_messages import (
 from cliploc_ros.datasets.bags import BagWriter
 from cliploc_ros.ros.conversions import stamp_ns
 
+pytestmark = pytest.mark.full
+
 #: So many by default; CLIPLOC_SOAK_REQUESTS=10000 asks for more, in ten minutes.
 REQUESTS = int(os.environ.get('CLIPLOC_SOAK_REQUESTS', '200'))
 #: Over the second half. A short run is still warming up there: pools of the middleware grow with

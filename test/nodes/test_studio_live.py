@@ -12,7 +12,6 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from browser import Person, running_chromium
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from processes import PROJECT, wait_for
 from tester import RELIABLE, make_frame
@@ -105,41 +104,6 @@ def test_the_robot_relocalizes_and_the_map_shows_where(person, live, tmp_path, s
     person.page.get_by_text('loaded: 60 landmarks').wait_for()
 
 
-@in_a_browser
-def test_the_watch_and_what_is_missing_are_shown(person, live, tester):
-    publisher = tester.create_publisher(DiagnosticArray, '/diagnostics', RELIABLE)
-    values = {'state': 'active', 'watch': 'uncertain', 'watch missing': 'mug_2, bowl_4, unknown',
-              'watch reason': 'uncertain: the map may be out of date here'}
-    msg = DiagnosticArray(status=[DiagnosticStatus(
-        name='relocalizer: status',
-        values=[KeyValue(key=key, value=value) for key, value in values.items()])])
-    tester.wait(publisher.get_subscription_count, 'discovery')
-    publisher.publish(msg)
-    person.mode('Test')
-    person.page.get_by_text('watch: uncertain: the map may be out of date here').wait_for()
-    person.page.get_by_text('missing, red in the map: mug_2, bowl_4, unknown').wait_for()
-    assert live.state.missing == ('mug_2', 'bowl_4', 'unknown')
-    person.picture('live_missing')
-    tester.destroy_publisher(publisher)
-
-
-@in_a_browser
-def test_the_page_without_a_relocalizer_and_with_one_that_dies(person, own_relocalizer):
-    person.mode('Test')
-    person.click('Relocalize the robot')
-    person.page.get_by_text('no relocalizer found at /relocalizer').wait_for()
-    process = own_relocalizer(timeout_s=60.0)
-    person.page.get_by_text('12 landmarks in frame').wait_for()
-    person.click('Relocalize the robot')
-    person.page.get_by_text('waiting for its answer').wait_for()
-    person.find('mug_2')
-    person.page.get_by_text('mug_2').first.wait_for()  # the page works on
-    process.stop(signal.SIGKILL)
-    person.page.get_by_text('see whether it still runs').wait_for()
-    person.page.get_by_text('nothing heard').wait_for()
-    person.picture('live_dead')
-
-
 def test_without_a_relocalizer(live):
     for request in (live.relocalize, live.reload_map):
         with pytest.raises(LiveError, match='no relocalizer found at /relocalizer: start it'):
@@ -193,6 +157,7 @@ def test_invalid_poses_are_left_out(live, tester):
     tester.destroy_publisher(publisher)
 
 
+@pytest.mark.full
 def test_a_relocalizer_that_is_stopped_or_killed_and_starts_again(live, own_relocalizer, tester):
     for number, text in ((signal.SIGINT, None), (signal.SIGKILL, 'has not reported')):
         process = own_relocalizer(timeout_s=60.0)
@@ -212,6 +177,7 @@ def test_a_relocalizer_that_is_stopped_or_killed_and_starts_again(live, own_relo
     assert str(outcome[0]).startswith('accepted')
 
 
+@pytest.mark.full
 def test_the_studio_ends_while_a_request_waits(own_relocalizer):
     own_relocalizer(timeout_s=60.0)
     with follow_relocalizer('relocalizer') as live:
@@ -228,6 +194,7 @@ def test_names_that_are_none(name):
         pass
 
 
+@pytest.mark.full
 @pytest.mark.needs('viser')
 def test_the_executable_follows_and_ends_on_ctrl_c(own_relocalizer, start, tmp_path):
     own_relocalizer()
@@ -238,6 +205,7 @@ def test_the_executable_follows_and_ends_on_ctrl_c(own_relocalizer, start, tmp_p
     assert 'Traceback' not in process.output() and 'error' not in process.output()
 
 
+@pytest.mark.full
 @pytest.mark.needs('viser')
 def test_without_ros_the_studio_runs_and_says_what_is_missing(tmp_path):
     """Its core imports no ROS; --ros names what to source."""

@@ -59,23 +59,6 @@ def test_a_localizer_that_shows_the_pose_got_it_once(amcl, node, tester):
     assert ends_of(localizer) == ['took']
 
 
-@pytest.mark.parametrize('deaf', [1, 2])
-def test_a_pose_that_is_lost_comes_again(amcl, node, tester, deaf):
-    """The publisher has met the subscription, the subscription not yet the publisher."""
-    localizer = amcl(deaf=deaf)
-    answer = tester.relocalize(make_frame())
-    assert answer.success, answer.message
-    assert ends_of(localizer) == [*['lost'] * deaf, 'took']
-
-
-def test_a_localizer_that_subscribes_late_gets_the_pose(amcl, node, tester):
-    """Others subscribe already, as RViz may."""
-    localizer = amcl(late_s=1.5)
-    answer = tester.relocalize(make_frame())
-    assert answer.success, answer.message
-    assert ends_of(localizer) == ['subscribed', 'took']
-
-
 def why_not_taken(tester, stamp_s=100.0):
     """Request the pose; return why the localizer has not taken it."""
     tester.set_parameter('timeout_s', TIMEOUT_S)
@@ -89,6 +72,7 @@ def why_not_taken(tester, stamp_s=100.0):
     return found[1]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGSTOP])
 def test_a_localizer_that_has_died_or_hangs_takes_no_pose(amcl, node, tester, number):
     """DDS takes it for alive: 20 s after its death, and while it hangs."""
@@ -98,15 +82,6 @@ def test_a_localizer_that_has_died_or_hangs_takes_no_pose(amcl, node, tester, nu
     assert why_not_taken(tester, 101.0).startswith(
         '/amcl_pose shows nothing since initialpose was published')
     assert tester.count_subscribers('/initialpose') > 2, "the test's two, and the dead one's"
-
-
-def test_a_localizer_that_goes_on_takes_the_next_pose(amcl, node, tester):
-    localizer = amcl()
-    localizer.send_signal(signal.SIGSTOP)
-    why_not_taken(tester)
-    localizer.send_signal(signal.SIGCONT)
-    answer = tester.relocalize(make_frame(stamp_s=101.0))
-    assert answer.success, answer.message
 
 
 @pytest.mark.parametrize(('arguments', 'named'), [
@@ -120,22 +95,6 @@ def test_a_localizer_that_shows_another_pose_or_none_has_not_taken_it(amcl, node
     """What it showed before does not count, though late subscribers get it."""
     amcl(**arguments)
     assert re.match(named, why_not_taken(tester))
-
-
-def test_a_localizer_of_another_map_is_named(amcl, node, tester):
-    """It shows a pose with the same numbers while the request lasts."""
-    amcl(frame='floor_2', at_x=0.3)
-    tester.localizer.is_on, tester.localizer.frame = True, 'floor_2'
-    assert why_not_taken(tester) == \
-        "/amcl_pose is in frame 'floor_2', the pose in 'map': correct the map's frame_id"
-
-
-def test_no_localizer_is_reset_by_a_refusal(amcl, node, tester):
-    localizer = amcl()
-    assert tester.set_parameter('min_inliers', 999).successful
-    answer = tester.relocalize(make_frame())
-    assert answer.message.startswith('refused: ')
-    assert ends_of(localizer) == []
 
 
 def test_a_robot_whose_localizer_shows_no_pose_needs_a_subscriber(own_relocalizer, tester):

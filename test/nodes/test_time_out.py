@@ -17,6 +17,8 @@ from tester import make_frame
 
 from cliploc_ros.core.observation import Detections
 
+pytestmark = pytest.mark.full
+
 # ViT-B-32 takes 20 s and more for so many crops.
 BOXES, TIMEOUT_S = 400, 6.0
 # For the answer's way back on a busy machine.

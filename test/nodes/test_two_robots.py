@@ -4,12 +4,15 @@
 
 import time
 
+import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
 from tester import TakingLocalizer, class_matching, make_frame
 
 from cliploc_ros.ros.conversions import stamp_ns
+
+pytestmark = pytest.mark.full
 
 
 def test_two_robots_on_one_network_do_not_hear_each_other(start, tester, room_map, tmp_path):

@@ -16,8 +16,6 @@ from rclpy.task import Future
 from scene import make_room, see_room
 from tester import RELIABLE, TakingLocalizer, class_matching, make_frame
 
-from cliploc_ros.cli.wake_up import main
-
 ACCEPTED, REFUSED, NOT_READY, INTERRUPTED = 0, 1, 2, 130
 LOOK = (r'^look (\d+) \[[0-9.]+ s\](, (?:not )?turned by .*?)?: '
         r'((?:accepted|refused|withheld): .*)$')
@@ -163,6 +161,7 @@ def test_a_server_that_refuses_every_turn(relocalizer, wake_up_until, serve_spin
     assert spinner.yaw == 0.0
 
 
+@pytest.mark.full
 @pytest.mark.needs('nav2_msgs')
 def test_an_interrupt_stops_the_robot(relocalizer, start, end, tester, serve_spin):
     spinner = serve_spin('hang')
@@ -186,6 +185,7 @@ def test_a_relocalizer_that_does_not_watch_is_named(relocalizer, start, end):
         'the relocalizer does not watch: set its parameter watch to tf or amcl_pose\n')
 
 
+@pytest.mark.full
 def test_each_thing_that_is_missing_has_its_message(start, end, tester, room_map):
     process = start('cli.wake_up', '--timeout', 60, '--ros-args', '-r', '__ns:=/bare')
     process.wait_for_output(
@@ -226,15 +226,7 @@ def test_without_a_relocalizer_it_is_not_ready(start, end):
         'or name it with --relocalizer or a namespace\n')
 
 
-def test_a_relocalizer_that_cannot_start_says_why(start, wake_up_until):
-    start('nodes.relocalizer', '--ros-args', '-r', '__ns:=/lost',
-          parameters=class_matching('/nowhere/map.yaml')).wait_for_output('[ERROR]')
-    process, code = wake_up_until('No such file', '--relocalizer', '/lost/relocalizer')
-    assert code == NOT_READY
-    assert re.search('not ready: /lost/relocalizer is (unconfigured|configuring): '
-                     '/nowhere/map.yaml: No such file', process.output())
-
-
+@pytest.mark.full
 def test_a_relocalizer_that_is_killed_during_a_request(start, end, tester, room_map):
     relocalizer = start('nodes.relocalizer', '--ros-args', '-r', 'relocalizer:__node:=brief',
                         parameters=class_matching(room_map, timeout_s=60.0))
@@ -245,30 +237,3 @@ def test_a_relocalizer_that_is_killed_during_a_request(start, end, tester, room_
     assert end(process) == NOT_READY
     assert re.search(r'look 1 \[\d+\.\d s\]: /brief has been silent for \d s: it died, or '
                      'its machine is overloaded; start it again if it died', process.output())
-
-
-def test_a_wake_up_that_is_killed_leaves_a_relocalizer_that_answers(relocalizer, start, tester):
-    process = start('cli.wake_up')
-    tester.wait(lambda: tester.images.get_subscription_count() == 1, 'the request')
-    process.stop(signal.SIGKILL)
-    assert tester.relocalize(make_frame()).success
-
-
-@pytest.mark.parametrize('arguments', [
-    ('--timeout', '0'), ('--turn-deg', 'nan'), ('--turn-deg', '181')])
-def test_a_wrong_option_is_not_taken_for_a_refusal(capsys, arguments):
-    with pytest.raises(SystemExit) as ended:
-        main(arguments)
-    assert ended.value.code == NOT_READY
-    assert 'error: ' in capsys.readouterr().err
-
-
-def test_a_wrong_command_line_is_not_taken_for_a_refusal(start, end):
-    processes = [start('cli.wake_up', *arguments) for arguments in (
-        ('--relocalizer', 'no name'), ('--ros-args', '-r', 'broken'))]
-    for process in processes:
-        assert end(process) == NOT_READY
-        assert 'error: ' in process.output()
-        assert 'Traceback' not in process.output()
-
-

@@ -15,10 +15,13 @@ from cliploc_ros.cli.evaluate import main as evaluate
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.datasets.frames import RawFrame
 from cliploc_ros.datasets.observations import load_recorded
 from cliploc_ros.demo.truth import read_objects
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import make_views
+from cliploc_ros.recording.networks import Look
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--device', 'cpu')
@@ -84,6 +87,20 @@ def test_an_edge_at_the_border_of_the_image_is_open(recorded):
     assert 5 < left < 30 and 3 < top < 30 and 610 < right < 635 and 450 < bottom < 477
     again = make_views(recorded.select_frames(range(5)), MappingOptions())
     assert (again.is_open == views.is_open[:len(again.is_open)]).all()
+
+
+def test_boxes_of_an_ideal_fisheye_are_undistorted():
+    """With zeros the radius is the angle. A box far from the axis is lost."""
+    lens = Camera(640, 480, 200.0, 200.0, 320.0, 240.0, 'equidistant', (0.0,) * 4)
+    found = Detections(np.array([[400.0, 210.0, 480.0, 270.0], [600.0, 230.0, 638.0, 250.0]]),
+                       ('cup', 'tv'), np.array([0.9, 0.9]))
+    raw = RawFrame(0, 0, np.eye(4), lambda: (np.zeros((480, 640, 3), dtype=np.uint8), lens))
+    seen = Look(lambda image: found)(raw)
+    assert seen.class_ids.tolist() == ['cup'] and seen.open_edges.tolist() == [[False] * 4]
+    across = np.hypot(120.0, 30.0) / 200.0  # of the middle of the upper edge
+    np.testing.assert_allclose(seen.bboxes_xyxy[0], [
+        320 + 200 * np.tan(0.4), 240 - 30 * np.tan(across) / across,
+        320 + 200 * np.tan(0.8), 240 + 30 * np.tan(across) / across], atol=1e-6)
 
 
 def test_a_recording_is_localized_in_the_map_of_the_room(folder):

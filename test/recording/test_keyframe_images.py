@@ -18,7 +18,7 @@ from cliploc_ros.datasets.folders import tum_frames
 from cliploc_ros.datasets.frames import Frame, Frames, RawFrame
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
-from cliploc_ros.errors import MapError, MappingError
+from cliploc_ros.errors import MappingError
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
@@ -104,14 +104,3 @@ def test_a_stored_image_is_undistorted_as_its_points_are(frame, demo_map):
     assert np.linalg.norm(straight - at) > 8.0
     assert np.abs(spot - straight).max() < 3.0
     assert (np.asarray(layer.pixels) / PIXEL_SCALE).max() < 2 * camera.width
-
-
-def test_offsets_that_do_not_count_the_bytes_are_named(frame, demo_map, tmp_path):
-    layer = build_layer(wall(frame), demo_map, WITH_IMAGES)
-    path = tmp_path / 'map.keyframes.npz'
-    wrong = replace(layer, image_offsets=layer.image_offsets + 1)
-    with pytest.raises(MapError, match=r'image_offsets goes from 1 to .* the number of bytes'):
-        save_layer(path, wrong)
-    assert not path.exists()
-    noise = replace(layer, images=np.zeros_like(layer.images))
-    assert noise.image_rgb(0) is None, 'a broken image is none'

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room, write_map
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
@@ -81,6 +82,24 @@ def test_a_rectified_image_is_measured_with_p(localizer, values):
         localize(localizer, make_frame(**useless), values)
     found = localize(localizer, make_frame(**useless), replace(values, rectified=True))
     assert pose_error(found.hypotheses[0].map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
+
+
+@pytest.mark.parametrize('is_level', [True, False])
+def test_a_mount_of_body_axes_is_refused_where_the_pose_contradicts_it(make_node, values, tmp_path,
+                                                                       is_level):
+    """The room is upright, or on its back before a camera that looks up."""
+    turn = Rotation.from_euler('x', -90.0 if is_level else 0.0, degrees=True)
+    room = make_room()
+    write_map(replace(room, centers=turn.apply(room.centers), quats_xyzw=(
+        turn * Rotation.from_quat(room.quats_xyzw)).as_quat()), tmp_path / 'room.yaml')
+    localizer = load_localizer(make_node(), values)
+    values = replace(values, base_frame='base_link')
+    if is_level:
+        with pytest.raises(CameraError, match="'camera' has the axes of a body"):
+            localize(localizer, make_frame(), values)
+    else:
+        assert localize(localizer, make_frame(), values).accepted
+    assert [fault.is_certain for fault in localizer.faults] == [is_level]
 
 
 def test_options_hold_from_the_next_frame_on(localizer, values):

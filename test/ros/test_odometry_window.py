@@ -2,6 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the robot was at an instant, by odometry's messages as they come."""
 
+import functools
+from copy import deepcopy
+from itertools import product
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -162,10 +166,105 @@ def test_a_slow_source_that_misses_two_messages_goes_on():
 def test_odometry_that_was_reset_where_it_began_is_told_by_its_heading():
     window = OdometryWindow(10.0)
     drive(window, (50.0, 53.0), speed_m_s=0.0)
-    window.add(round(53.0 * S), np.zeros(3), turned(89.0))
+    window.add(round(53.0 * S), np.zeros(3), turned(30.0 * 53.0))
     assert len(window) == 31
     window.add(round(53.02 * S), np.zeros(3), UPRIGHT)
     assert len(window) == 1
+
+
+def on_an_arc(seconds, speed_m_s, turn_rad_s=0.4):
+    """Where a robot is that has driven along an arc: position, and heading [rad]."""
+    radius_m, angle = speed_m_s / turn_rad_s, turn_rad_s * seconds
+    return radius_m * np.array([np.sin(angle), 1.0 - np.cos(angle), 0.0]), angle
+
+
+@functools.cache
+def window_of_an_arc(rate_hz, speed_m_s, twist):
+    """Return a window of a robot that has driven for 3 s, and the moment of its newest pose."""
+    window, moments = OdometryWindow(30.0), np.arange(3 * rate_hz) / rate_hz
+    for moment in moments:
+        assert not begins(window, moment, speed_m_s, twist)
+    return window, moments[-1]
+
+
+def begins(window, seconds, speed_m_s, twist, aside_m=0.0, degrees=0.0):
+    """Take a pose of a robot on an arc, moved aside and turned; return whether a run begins."""
+    run, (position, angle) = window.run, on_an_arc(seconds, speed_m_s)
+    window.add(round(seconds * S), position - np.array([aside_m, 0.0, 0.0]),
+               turned(np.degrees(angle) + degrees),
+               twist * np.array([[speed_m_s, 0.0, 0.0], [0.0, 0.0, 0.4]]))
+    return window.run != run
+
+
+@pytest.mark.parametrize('rate_hz', [5, 10, 30, 100])
+@pytest.mark.parametrize('speed_m_s', [0.0, 0.3, 1.0])
+@pytest.mark.parametrize(('twist', 'aside_m'), [(1.0, 0.7), (0.0, 1.2)], ids=['true', 'empty'])
+def test_a_driver_that_restarts_in_a_gap_is_told_by_its_twist(rate_hz, speed_m_s, twist, aside_m):
+    """At another place, or with another heading; then its twist may be anything."""
+    former, newest = window_of_an_arc(rate_hz, speed_m_s, twist)
+    for gap_s, (moved_m, turned_deg), first_twist in product(
+            (0.0, 0.15, 0.4), ((2.0, 0.0), (aside_m, 0.0), (0.0, 90.0), (0.0, -90.0)),
+            (twist, 0.0, -10.0)):
+        window = deepcopy(former)
+        assert begins(window, newest + max(gap_s, 1 / rate_hz), speed_m_s, first_twist, moved_m,
+                      turned_deg)
+        assert len(window) == 1
+
+
+@pytest.mark.parametrize('rate_hz', [5, 10, 30, 100])
+@pytest.mark.parametrize('speed_m_s', [0.0, 0.3, 2.0])
+@pytest.mark.parametrize('twist', [1.0, 0.8, 0.0, -1.0, 1000.0])
+def test_a_robot_that_goes_on_after_lost_messages_does_not_restart(rate_hz, speed_m_s, twist):
+    """Whatever its driver puts into the twist; it slips, and its stamps are late, too."""
+    former, newest = window_of_an_arc(rate_hz, speed_m_s, twist)
+    for gap_s in (1 / rate_hz, 0.15, 0.4):
+        window = deepcopy(former)
+        assert not begins(window, newest + gap_s, speed_m_s, twist, 0.04, 3.0)
+        assert not begins(window, newest + 2 * gap_s, speed_m_s, twist)
+
+
+@pytest.mark.parametrize('rate_hz', [5, 10, 50])
+def test_a_robot_that_starts_and_stops_does_not_restart(rate_hz):
+    """It changes its speed at 2 m/s^2; the driver fills the twist or does not."""
+    for twist in (0.0, 1.0):
+        window, place_m = OdometryWindow(30.0), 0.0
+        for moment in np.arange(0.0, 12.0, 1 / rate_hz):
+            speed_m_s = np.clip(2.0 * min(moment % 4.0 - 1.0, 3.0 - moment % 4.0), 0.0, 1.5)
+            place_m += speed_m_s / rate_hz
+            window.add(round(moment * S), np.array([place_m, 0.0, 0.0]), UPRIGHT,
+                       twist * np.array([[speed_m_s, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+        assert window.run == 0
+
+
+@pytest.mark.parametrize('rate_hz', [5, 10, 50])
+@pytest.mark.parametrize('back_s', [0.25, 0.5, 0.8])
+def test_a_clock_set_back_by_less_than_a_second_begins_anew(rate_hz, back_s):
+    """Stamps that were, or nearly so, with other poses."""
+    former, newest = window_of_an_arc(rate_hz, 1.0, 0.0)
+    window = deepcopy(former)
+    moments = newest + np.arange(1, 2 + round(back_s * rate_hz)) / rate_hz
+    for moment in moments:
+        position, angle = on_an_arc(moment, 1.0)
+        window.add(round((moment - back_s) * S), position, turned(np.degrees(angle)))
+    assert window.run >= 1
+    assert window.pose_at(round((moments[-1] - back_s) * S))[0, 3] == pytest.approx(position[0])
+
+
+@pytest.mark.parametrize('step_s', [0.0, -0.01])
+def test_stamps_that_do_not_go_on_hold_no_run_together(step_s):
+    window = OdometryWindow(30.0)
+    for tick in range(60):
+        window.add(round((100.0 + step_s * tick) * S), np.array([0.03 * tick, 0.0, 0.0]), UPRIGHT)
+    assert window.run >= 5 and len(window) <= 6
+
+
+def test_one_of_two_poses_of_a_stamp_stays():
+    window = OdometryWindow(30.0)
+    for x_m in (1.0, 1.02, 1.04):  # a filter that corrects itself
+        window.add(S, np.array([x_m, 0.0, 0.0]), UPRIGHT)
+    assert window.pose_at(S)[0, 3] == 1.0 and window.run == 0
+    window.add(S, np.array([1.2, 0.0, 0.0]), UPRIGHT)
+    assert window.run == 1
 
 
 def test_it_tells_what_it_may_know_of():

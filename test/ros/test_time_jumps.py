@@ -18,7 +18,13 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.frame_source import FrameSource
 from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometrySource
-from cliploc_ros.ros.inputs.time_jumps import StampOrder, TimeJumpError, TimeJumps
+from cliploc_ros.ros.inputs.time_jumps import (
+    MessageStamps,
+    StampOrder,
+    TimeJumpError,
+    TimeJumps,
+    stamp_problem,
+)
 from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -242,3 +248,44 @@ def test_streams_have_stamps_of_their_own_until_one_jumps():
     assert order_of(1.0, order=order, stream='arm') == [False]
     order.clear()
     assert order_of(1.0, order=order, stream='odom') == [False]
+
+
+@pytest.mark.parametrize(('given', 'problem'), [
+    (Time(), 'is 0'), (Time(sec=-1, nanosec=5), 'is -1 s, before 1970'),
+    (Time(sec=1, nanosec=2**32 - 1), 'has 4294967295 nanoseconds (limit 999999999)'),
+    (Time(nanosec=1), ''), (Time(sec=2**31 - 1), ''), (Time(sec=9, nanosec=S), '')])
+def test_a_stamp_that_is_no_time(given, problem):
+    assert stamp_problem(given) == problem
+
+
+def named(*messages, stamps=None):
+    """Take in stamps and contents, .1 s apart; return which are named, and the stamps."""
+    stamps = stamps or MessageStamps()
+    return [stamps.add(stamp(one), content, 500.0 + 0.1 * number)
+            for number, (one, content) in enumerate(messages)], stamps
+
+
+@pytest.mark.parametrize(('messages', 'expected', 'are_own'), [
+    ([(1.0, 'a'), (1.1, 'b')], [True, True], False),
+    ([(1.0, 'a'), (1.1, 'b'), (1.2, 'c')], [True] * 3, True),
+    ([(1.1, 'a'), (1.0, 'b'), (1.2, 'c')], [True] * 3, True),  # out of order
+    ([(1.0, 'a'), (1.0, 'a'), (1.1, 'b'), (1.1, 'b'), (1.2, 'c')], [True] * 5, True),  # twice
+    ([(1.0, one) for one in 'abcd'], [True, False, False, False], False),  # it stands still
+    ([(1.0 + row // 2, one) for row, one in enumerate('abcdefgh')], [True] + [False] * 7, False),
+    ([(0.0, one) for one in 'abc'], [False] * 3, False),
+    ([(0.0, 'a'), (1.0, 'b'), (1.1, 'c'), (1.2, 'd')], [False, False, False, True], True),
+    ([(1.0, 'a'), (1.0, 'a'), (1.0, 'b'), (1.0, 'b')], [True, True, False, True], False),
+    ([(1.0, 'a'), (1.1, 'b'), (1.2, 'c'), (900.0, 'd')], [True] * 4, False)])  # another clock
+def test_stamps_name_messages_that_have_each_its_own(messages, expected, are_own):
+    found, stamps = named(*messages)
+    assert found == expected
+    assert stamps.are_own == are_own
+    assert bool(stamps.problem) == (not expected[-1])
+
+
+def test_a_message_that_comes_again_is_one():
+    _, stamps = named((1.0, 'a'), (1.1, 'b'), (1.0, 'a'))
+    assert stamps.is_repeated(S) and not stamps.is_repeated(S + S // 10)
+    stamps.clear()
+    assert not stamps.is_repeated(S)
+    assert named((1.0, 'b'), stamps=stamps)[0] == [True]

@@ -45,7 +45,7 @@ def test_a_pose_without_any_scatter_gets_a_centimetre():
 
 
 @pytest.mark.parametrize(('image_s', 'now_s', 'published_s'), [
-    (100, 200, 100), (100, 100, 100), (200, 100, 100), (200, 0, 200)])
+    (100, 200, 100), (100, 100, 100), (200, 100, 100), (200, 0, 200), (-5, 100, -5)])
 def test_the_stamp_is_the_images_but_not_later_than_now(image_s, now_s, published_s):
     pose = stamped(image_s)
     usable = usable_pose(pose, Time(seconds=now_s))

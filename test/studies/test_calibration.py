@@ -21,6 +21,8 @@ from cliploc_ros.evaluation.run import run_methods
 from cliploc_ros.evaluation.trials import make_queries
 from studies.acceptance.fit import Case, best_recall, fit, judge, outcomes
 
+pytestmark = pytest.mark.full
+
 # a fit begins at the installed influence of the map's size and the vertical
 INSTALLED = CALIBRATION.objects
 MADE_FROM = INSTALLED._replace(none_right=3.0, map_size=0.8, vertical=-1.0, slope=0.0)

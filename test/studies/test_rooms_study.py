@@ -13,6 +13,8 @@ import pytest
 
 from cliploc_ros.demo import ASSETS
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope='module')
 def asked(tmp_path_factory):

@@ -21,6 +21,8 @@ from studies.watch.localizers import (
 from studies.watch.sensors import measure_cost
 from studies.worlds.world import make_drive
 
+pytestmark = pytest.mark.full
+
 
 def test_drives_are_reproducible_and_change_a_share_of_the_objects():
     drive, again = make_drive('office', 3, 40, 0.4), make_drive('office', 3, 40, 0.4)

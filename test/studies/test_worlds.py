@@ -18,6 +18,8 @@ from studies.worlds.surveyor import MapErrors, survey
 from studies.worlds.things import make_objects
 from studies.worlds.world import make_world
 
+pytestmark = pytest.mark.full
+
 
 @pytest.mark.parametrize('kind', KINDS)
 def test_worlds_are_reproducible_and_sound(kind):

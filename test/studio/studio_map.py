@@ -104,13 +104,3 @@ def write_two_rooms(path):
         'map', tuple(f'{name}_{row}' for row, name in enumerate(classes)),
         tuple(f'a {name}' for name in classes), classes, centers, np.full((count, 3), 0.15),
         np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))))
-
-
-def write_hall(path, labels, class_ids):
-    """Write a map of landmarks all over a hall of 60 m."""
-    count = len(labels)
-    rng = np.random.default_rng(0)
-    write_map(path, LandmarkMap(
-        'map', tuple(f'id_{row}' for row in range(count)), tuple(labels), tuple(class_ids),
-        rng.uniform(-30.0, 30.0, (count, 3)) * (1.0, 1.0, 0.05), np.full((count, 3), 0.1),
-        np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))))

@@ -17,7 +17,8 @@ from cliploc_ros.studio.images import views_of_folder
 from cliploc_ros.studio.recording import Recording
 from cliploc_ros.studio.studio import Studio
 
-pytestmark = [pytest.mark.clock, pytest.mark.needs('viser', 'playwright', 'chromium')]
+pytestmark = [pytest.mark.full, pytest.mark.clock,
+              pytest.mark.needs('viser', 'playwright', 'chromium')]
 KEYFRAMES, POINTS = 12, 50
 
 

@@ -9,11 +9,10 @@ import time
 
 import numpy as np
 import pytest
-from studio_map import write_hall, write_two_rooms
+from studio_map import write_two_rooms
 
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.errors import MapError
-from cliploc_ros.mapping.check.report import GridCheck
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.edits import EditError
@@ -99,35 +98,6 @@ def test_without_landmarks(tmp_path):
     with pytest.raises(MapError):
         find_places({}, None, None, silent)
     studio.document.close()
-
-
-@pytest.mark.needs('viser')
-def test_colours_of_positions():
-    from cliploc_ros.studio.tool_panels import tile_colors
-
-    check = GridCheck(np.zeros((4, 3)), np.ones(4, dtype=bool), np.array([4, 0, 0, 3]),
-                      np.array([0, 0, 0, 1]), np.array([[5.0] * 4, [5.0] * 4, [1.0] * 4,
-                                                        [5.0] * 4]), 0.5, ())
-    assert tile_colors(check).tolist() == [[0, 62, 107], [230, 159, 0], [120, 120, 120],
-                                           [213, 94, 0]]
-
-
-def test_a_large_map_takes_no_longer_than_it_may(tmp_path):
-    """Prints the processor time: 5,000 landmarks in a hall of 60 m."""
-    rng, count = np.random.default_rng(0), 5000
-    words = rng.choice(['red', 'blue', 'green', 'small'], count)
-    classes = rng.choice(['cup', 'book', 'tv', 'plant'], count).tolist()
-    write_hall(tmp_path / 'map.yaml', [f'a {word} {name}' for word, name in zip(
-        words, classes, strict=True)], classes)
-    document = Document(tmp_path / 'map.yaml')
-    begin_s, limit_s = time.process_time(), 2.0
-    places = find_places(document.landmarks, None, None, silent, limit_s)
-    tried = len(places.check.positions)
-    print(f'\n{count} landmarks: {tried} of {len(places.grid.positions)} positions in '
-          f'{limit_s:g} s, {time.process_time() - begin_s:.1f} s of processor time with '
-          'look-alikes and all')
-    assert 0 < tried < len(places.grid.positions)
-    document.close()
 
 
 def test_the_shared_office(shared_data, tmp_path):

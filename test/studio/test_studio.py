@@ -2,17 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The studio's actions and its gate, without a browser."""
 
-import json
-import resource
 import shutil
-import time
 import urllib.error
 import urllib.request
 
 import cv2
 import numpy as np
 import pytest
-from studio_map import ASSETS, demo_studio, open_page, write_hall
+from studio_map import ASSETS, demo_studio, open_page
 
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.studio import edits
@@ -131,52 +128,6 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
     assert counts['accepted'] + counts['fixed'] + counts['deleted'] == counts['total'] == total
 
 
-def test_a_landmark_whose_duplicate_is_deleted_is_none(office):
-    document, review = office.document, office.review
-    twin = document.landmarks['book_2']
-    document.apply(edits.create(document.landmarks, 'a twin', 'book', twin.center + 0.01,
-                                twin.basis))
-    review.check()
-    assert 'same object' in review.check_of('book_2').faults[0]
-    document.select([list(document.landmarks)[-1]])
-    review.delete()
-    assert not any('same object' in text for text in review.check_of('book_2').faults)
-
-
-def test_the_review_goes_on_where_it_was(office):
-    """After a restart, too; what is new joins the queue; undo takes a decision back."""
-    document, review = office.document, office.review
-    review.check()
-    first, = document.selection
-    review.accept()
-    again = Studio(document, office.recording)
-    again.review.check()
-    assert again.review.decision(first) == 'accepted' and document.selection != (first,)
-    twin = document.landmarks[first]
-    document.apply(edits.create(document.landmarks, 'a twin', 'cup', twin.center + 1.0,
-                                twin.basis))
-    counts = again.review.counts()
-    assert counts['total'] == len(document.landmarks) and counts['accepted'] == 1
-    assert list(document.landmarks)[-1] == again.review.order[-1] == again.rows()[-1].landmark_id
-    document.undo()
-    document.undo()
-    assert not again.review.decision(first)
-
-
-def test_without_a_recording_the_studio_says_what_is_missing(tmp_path):
-    studio = Studio(Document(tmp_path / 'map.yaml'))
-    for action in (studio.refit_all, studio.relocalize_all, lambda: studio.image(0)):
-        with pytest.raises(EditError, match='--observations'):
-            action()
-    for action in (studio.delete, studio.merge, studio.split, studio.toggle_lock):
-        with pytest.raises(EditError, match='select'):
-            action()
-    with pytest.raises(EditError, match='no landmarks'):
-        studio.review.check()
-    assert studio.rows() == [] and studio.phrases() == ()
-    studio.document.close()
-
-
 def test_a_box_of_the_detector_is_taken(office):
     view = int(np.argmax(np.diff(office.recording.detections.frame_offsets)))
     boxes = office.recording.boxes_in_view(view)
@@ -230,30 +181,6 @@ def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
     print(f'as given: {before}; every other landmark deleted: {after}')
 
 
-@pytest.mark.needs('viser')
-def test_a_large_map_with_many_views(tmp_path):
-    """Prints the processor time of the server's side: 5,000 landmarks, 1,000 views."""
-    path, count = tmp_path / 'map.yaml', 5000
-    write_hall(path, ['a cup'] * count, ['cup'] * count)
-    one = views_of_folder(ASSETS / 'sequence')
-    views = one.select_frames(np.arange(1000) % len(one))
-    times = [time.process_time()]
-    studio = Studio(Document(path), Recording(views))
-    with open_page(studio):
-        times.append(time.process_time())
-        for step in range(5):
-            here = studio.document.landmarks['id_7'].center
-            studio.document.apply(edits.move(studio.document.landmarks, 'id_7', here + 0.01),
-                                  gesture='drag')
-            assert studio.outlines() is not None, step
-        times.append(time.process_time())
-    opened_s, dragged_s = np.diff(times)
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f'{count} landmarks, 1000 views: open {opened_s:.2f} s, one step of a drag with its '
-          f'picture {dragged_s / 5 * 1000:.0f} ms; peak memory of the whole test process '
-          f'{peak_mb:.0f} MB')
-
-
 # ---- who may open the page
 
 def answer(url, **headers):
@@ -287,30 +214,6 @@ def test_the_page_is_for_this_machine_only(tmp_path):
         assert opens(host, None) is False
         assert opens(host, 'http://evil.example') is False, 'a foreign page'
         assert opens(host, f'http://{host}') is True
-
-
-@pytest.mark.needs('viser')
-@pytest.mark.parametrize(('message', 'answer'), [
-    ({'do': 'view'}, "'view' lacks 'view'"), ({'do': 'view', 'view': 'x'}, "view: 'x'"),
-    ({'do': 'edit'}, "'edit' lacks 'field'"), ({'do': 'edit', 'field': 'label'}, "lacks 'value'"),
-    ({'do': 'edit', 'field': [], 'value': [0, 0, 0]}, 'no field'),
-    ({'do': 'create', 'label': ''}, "lacks 'class_id'"), ({'do': 'select'}, "lacks 'id'"),
-    ({'do': 'hide', 'ids': 3}, 'ids: 3 is no list'), ({'do': 'hide', 'ids': []}, 'name a landm'),
-    ({'do': 'lock', 'ids': ['gone']}, "no landmark 'gone'"), ({'do': 'lock'}, 'locked mug_1'),
-    ({'do': 'hide', 'ids': ['mug_2']}, 'hid mug_2'),
-    ({'do': 'edit', 'field': 'class_id', 'value': 'cup'}, "mug_1: class 'cup'")])
-def test_the_log_answers_a_message_of_the_page(studio, message, answer, caplog):
-    from websockets.sync.client import connect
-
-    studio.document.select(['mug_1'])
-    with open_page(studio) as (url, _):
-        host = url.removeprefix('http://').rstrip('/')
-        with connect(f'ws://{host}/socket/me', origin=f'http://{host}') as page:
-            page.send(json.dumps(message))
-            while not any(answer in line[2] for line in dict(json.loads(page.recv(60))).get(
-                    'log', ())):
-                pass
-    assert not caplog.records, 'no traceback'
 
 
 @pytest.mark.needs('viser')

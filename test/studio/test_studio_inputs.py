@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The images of a recording, in any order, and the keyframes next to a map."""
 
-import shutil
 
 import numpy as np
 import pytest
@@ -12,9 +11,8 @@ from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, save_layer
 from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bag_frames import BagTopics, bag_images
+from cliploc_ros.datasets.bag_frames import BagTopics
 from cliploc_ros.datasets.bags import BagWriter
-from cliploc_ros.errors import CliplocError, DatasetError
 from cliploc_ros.studio.images import open_images
 
 BAG_CAMERA = Camera(64, 48, 53.0, 53.0, 32.0, 24.0)
@@ -46,19 +44,6 @@ def test_each_view_gets_its_image(bag):
         image = images.near((START_NS + number * STEP_NS) / 1e9)
         assert image.shape == (48, 64, 3) and (image == number).all()
     assert images.near((START_NS + STEP_NS // 2) / 1e9) is None
-
-
-def test_a_recording_that_is_gone_is_named(bag):
-    images = bag_images(bag, BagTopics())
-    shutil.rmtree(bag)
-    with pytest.raises(DatasetError, match='no such recording'):
-        images.read(3)
-
-
-@pytest.mark.parametrize('folder', ['missing', '.'])
-def test_images_that_are_none(tmp_path, folder):
-    with pytest.raises(CliplocError):
-        open_images(tmp_path / folder, BagTopics())
 
 
 def layer_of(path):

@@ -152,30 +152,3 @@ def test_what_another_program_wrote_stays(path):
     broken.save()
     broken.close()
     assert embeddings_path(path).read_bytes() == b'of another program'
-
-
-def test_edits_of_another_encoder_are_not_mixed_in(path):
-    """The file was made anew with another CLIP after a studio was killed."""
-    killed = Document(path)
-    change_all(killed)
-    killed._journal.close()
-    means = unit(np.random.default_rng(1).normal(size=(1, 2 * SIZE)))
-    save_landmark_embeddings(embeddings_path(path), LandmarkEmbeddings(
-        'other:key', ('plant_1',), means, means, np.array([0, 1])))
-    document = Document(path)
-    assert len(document.landmarks) == 4
-    document.save()
-    document.close()
-    found = load_landmark_embeddings(embeddings_path(path))
-    assert found.encoder_key == 'other:key' and found.means.shape == (4, 2 * SIZE)
-    assert not found.means.any(), 'the edits were made on looks of the first encoder'
-
-
-def test_a_map_without_the_file_gets_none(path):
-    embeddings_path(path).unlink()
-    document = Document(path)
-    document.take_encoder('demo:key')
-    change_all(document)
-    document.save()
-    document.close()
-    assert not embeddings_path(path).exists()

@@ -14,7 +14,6 @@ from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_landmark_embeddings
 from cliploc_ros.datasets.observations import save_observations
 from cliploc_ros.demo.truth import read_frames
-from cliploc_ros.errors import OptionsError
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
@@ -123,20 +122,3 @@ def test_a_new_landmark_has_the_mean_of_its_boxes(path, tmp_path):
     assert stored.means[0] @ mean / np.linalg.norm(mean) > 0.99
     studio.finder.close()
     studio.document.close()
-
-
-def test_weights_that_are_missing_are_named(path, tmp_path):
-    studio = opened(path, '--images', WALK, '--clip-model', ASSETS / 'clip.json',
-                    '--clip-pretrained', tmp_path / 'none.pt')
-    studio.document.select(['bowl_1'])
-    found, _ = wait_for_phrases(studio)
-    assert 'CLIP offers no phrases' in studio.phrase_note and 'none.pt' in studio.phrase_note
-    assert found, "the map's own are offered"
-    studio.document.close()
-
-
-def test_options_that_miss_each_other(path):
-    with pytest.raises(OptionsError, match='both --clip-model and'):
-        opened(path, '--clip-model', 'ViT-L-14')
-    with pytest.raises(OptionsError, match='CLIP chooses'):
-        opened(path, '--vocabulary', path)

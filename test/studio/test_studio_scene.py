@@ -3,7 +3,6 @@
 """The studio's scene: surfaces, walls, labels, colours, and where a person looks from."""
 
 import io
-import itertools
 from contextlib import redirect_stdout
 from types import SimpleNamespace
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 import viser
 from scipy.spatial.transform import Rotation
-from studio_map import demo_studio, write_hall
+from studio_map import demo_studio
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
@@ -20,10 +19,7 @@ from cliploc_ros.datasets.depth import DepthImage
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.studio import viewpoint
 from cliploc_ros.studio.context import MAX_POINTS, draw_walls, find_cloud
-from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.images import Images, open_images, views_of_folder
-from cliploc_ros.studio.scene import Labels
-from cliploc_ros.studio.studio import Studio
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
 UPRIGHT = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # looks along x
@@ -118,35 +114,3 @@ def test_the_page_opens_with_all_landmarks_in_sight(studio, is_from_above, size)
         [one.center for one in studio.document.landmarks.values()])
     assert (depths > 0.5).all(), 'outside of the objects'
     assert ((pixels > 0) & (pixels < size)).all(axis=1).mean() > 0.9
-
-
-def test_labels_do_not_overlap_and_the_selected_one_is_there(server, studio):
-    landmarks = studio.document.landmarks
-    extent = studio.extent()
-    labels = Labels(server, extent.up)
-    camera = page_camera(viewpoint.overview(extent, 1.0), extent.middle, extent.up)
-    labels._camera = camera
-    labels.show(landmarks, ('mug_2',))
-    shown = {key: handle for key, (_, handle) in labels._handles.items() if handle.visible}
-    assert 5 < len(shown) < len(landmarks)
-    assert shown['mug_2'].text == landmarks['mug_2'].label
-    pixels, _ = viewpoint.pixels_of(camera, [handle.position for handle in shown.values()])
-    widths = [len(one.text) * 5.0 * one.font_screen_scale for one in shown.values()]
-    for (first, left), (second, right) in itertools.combinations(
-            zip(pixels, widths, strict=True), 2):
-        assert abs(first[1] - second[1]) > 12.0 or abs(first[0] - second[0]) > (left + right) / 2
-    labels.is_shown = False
-    labels.show(landmarks, ('mug_2',))
-    assert not any(handle.visible for _, handle in labels._handles.values())
-
-
-def test_classes_differ_in_colour(tmp_path):
-    path = tmp_path / 'map.yaml'
-    names = ('book', 'chair', 'cup', 'tv', *(f'class {number}' for number in range(16)))
-    write_hall(path, names, names)
-    studio = Studio(Document(path))
-    before = {name: studio.color_of(name) for name in names}
-    assert len(set(before.values())) == 20
-    studio.color_of('a new one')
-    assert {name: studio.color_of(name) for name in names} == before
-    studio.document.close()

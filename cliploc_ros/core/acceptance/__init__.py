@@ -20,8 +20,8 @@ look_alikes, mirror, genuine
     Other reasons to be wrong: a place that looks alike, a mirror image, a picture or a change.
 looks
     The earlier looks of a moving robot.
-mount_check
-    Whether several cameras are mounted as stated.
+camera_check
+    Whether boxes, camera_info, mounts and map agree, over all looks of a localizer.
 verdict
     Accept or refuse, with the reason.
 calibration

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The numbers that decide whether a pose is accepted: calibration.yaml, a tuple a section."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,6 +69,8 @@ class Places(NamedTuple):
 
     likeness: float
     unlabelled: float
+    aged: float
+    turned: float
 
 
 class Prior(NamedTuple):
@@ -99,6 +102,21 @@ class SuccessiveLooks(NamedTuple):
     drift_deg: float
 
 
+class SystematicErrors(NamedTuple):
+    """Errors of a camera and its boxes, and when they are too large."""
+
+    wrong: float
+    sure: float
+    view: float
+    extent: float
+    focal: float
+    aspect: float
+    point: float
+    calibrated: float
+    corner: float
+    size: float
+
+
 class Spread(NamedTuple):
     """How covariances count."""
 
@@ -116,6 +134,7 @@ class Looking(NamedTuple):
     unexplained: float
     missed: float
     away: float
+    aged: float
     turned: float
     crowd: float
     least: float
@@ -136,6 +155,8 @@ class Calibration(NamedTuple):
     """All sections; calibration.yaml says what each number means."""
 
     objects: Objects
+    #: Share of each class among the things of any building; classes that are missing are rare
+    common: Mapping[str, float]
     keyframes: Keyframes
     genuine: Genuine
     attitude: Attitude
@@ -143,6 +164,7 @@ class Calibration(NamedTuple):
     prior: Prior
     search: Search
     looks: SuccessiveLooks
+    camera: SystematicErrors
     covariance: Spread
     watch: Looking
 
@@ -150,9 +172,10 @@ class Calibration(NamedTuple):
 def load_calibration(path: Path = FILE) -> Calibration:
     """Read the numbers; a missing or unknown one is a defect of the installation."""
     sections: dict[str, Any] = yaml.safe_load(path.read_text())
+    kinds: dict[str, Any] = Calibration.__annotations__ | {'common': dict}
     return Calibration(**{
         name: kind(**{term: entry['value'] for term, entry in sections[name]['terms'].items()})
-        for name, kind in Calibration.__annotations__.items()})
+        for name, kind in kinds.items()})
 
 
 #: The installed numbers.

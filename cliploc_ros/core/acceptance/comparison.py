@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.acceptance.camera_check import CALIBRATED
 from cliploc_ros.core.acceptance.confidence import (
     chance_by_points,
     confidences,
@@ -28,11 +29,10 @@ from cliploc_ros.core.acceptance.contenders import (
     JoinedFrames,
     contenders_of,
     refined,
-    supports_of,
     unrefined,
 )
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, compare_motion, signs_of
-from cliploc_ros.core.acceptance.look_alikes import chance_distinct, find_twins
+from cliploc_ros.core.acceptance.look_alikes import find_twins, lead_over_twin, turned_about_axis
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.mirror import chance_not_mirrored
 from cliploc_ros.core.acceptance.prior import walls_against
@@ -42,10 +42,9 @@ from cliploc_ros.core.fit.finalists import (
     Finalist,
     covariance_of,
     first_of_each_place,
-    matches_of,
     meetings_of,
 )
-from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER
+from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, SAME_PLACE
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.map.joined_map import Place, place_of
@@ -110,6 +109,13 @@ class Comparison(NamedTuple):
         """Return the best contender of the leading place that the search of objects met."""
         return next((one for one, near in zip(self.contenders, self.leading, strict=True)
                      if near and one.recognized is None), None)
+
+    @property
+    def by_boxes(self) -> Contender | None:
+        """Return by_objects if its boxes decide where the pose is; None if points do."""
+        place = None if self.by_keyframes is None else self.by_keyframes.recognized
+        return self.by_objects if place is None or (
+            place.inliers < CALIBRATION.keyframes.good_covariance) else None
 
     @property
     def by_keyframes(self) -> Contender | None:
@@ -195,7 +201,7 @@ def pose_of(joined: JoinedFrames, compared: Comparison
     if by_objects is not None:
         covariance = covariance_of(joined.frames, joined.rig, by_objects.finalist,
                                    by_objects.matches, joined.landmark_map.shared_sigmas,
-                                   joined.options.mount_deviation)
+                                   joined.options.mount_deviation, CALIBRATED)
         if by_objects.finalist.information is not None:
             others = [one for one in compared.contenders if one.recognized is None]
             others.sort(key=lambda one: one is not by_objects)
@@ -226,7 +232,7 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
     distinct, twin = _distinct(joined, compared, recognizer)
     by_points = _by_points(joined, compared)
     return Evidence(
-        best.support.inliers, float(compared.likely[0]), by_points=by_points,
+        round(best.support.inliers), float(compared.likely[0]), by_points=by_points,
         rival=_rival(joined, compared), distinct=distinct,
         place=place_of(joined.landmark_map, compared.poses[0]).position,
         twin=twin and twin.position, twin_map=twin.name if twin else '',
@@ -284,7 +290,7 @@ def _not_mirrored(joined: JoinedFrames, compared: Comparison, by_points: float) 
     best, options = compared.by_objects, joined.options
     if (best is None or not options.refine or by_points >= options.min_confidence
             or compared.likely[0] < options.min_confidence
-            or best.support.inliers < options.min_inliers):
+            or round(best.support.inliers) < options.min_inliers):
         return 1.0
     return chance_not_mirrored(joined, best)
 
@@ -337,23 +343,34 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
     twin apart as far as they cover it.
     """
     best, (low, high) = compared.contenders[0], joined.options.height_range_m
-    matched = np.array(sorted({one.landmark for found in best.matches for one in found}),
-                       dtype=np.int64)
-    found, are_rooms = find_twins(joined.landmark_map, best.pose, matched,
-                                  compared.poses[~compared.leading])
-    inside = (low <= found[:, 2, 3]) & (found[:, 2, 3] <= high)
-    twins = [refined(joined, unrefined(pose)) for pose in found[inside]]
-    poses = np.array([best.pose, *(one.map_from_camera for one in twins)])
-    # a twin that refinement moved back to the leading pose is no other place
-    others = np.nonzero(~SAME_ANSWER.agreeing(poses)[0])[0]
+    twins, alike = find_twins(joined.landmark_map, best.pose, best.landmarks,
+                              compared.poses[~compared.leading])
+    turned = turned_about_axis(joined.landmark_map, best.pose, best.landmarks)
+    found = np.concatenate([twins, turned])
+    none = np.zeros(len(turned))
+    rooms, shares = np.append(alike.are_rooms, none > 0.0), np.append(alike.shares, none)
+    inside = np.nonzero((low <= found[:, 2, 3]) & (found[:, 2, 3] <= high))[0]
+    places = [refined(joined, unrefined(found[row])) for row in inside]
+    poses = np.array([best.pose, *(one.map_from_camera for one in places)])
+    # a place that refinement moved back to the leading pose is no other one
+    others = _first_of_each(poses, ~SAME_ANSWER.agreeing(poses)[0])
     if len(others) == 0:
         return 1.0, None
-    supports = supports_of(joined, poses[others],
-                           [matches_of(joined.rig, twins[row - 1]) for row in others])
-    leads = best.prior - joined.prior_odds(poses[others]) + _leads_of_points(
-        compared, poses[others], are_rooms[inside][others - 1], recognizer)
-    chance, likeliest = chance_distinct(best.support, supports, leads)
-    return chance, place_of(joined.landmark_map, poses[others][likeliest])
+    rows = inside[others - 1]
+    rivals = contenders_of(joined, [places[row - 1] for row in others], [True] * len(others))
+    leads = _leads_of_points(compared, poses[others], rooms[rows], recognizer)
+    for number, (rival, row) in enumerate(zip(rivals, rows, strict=True)):
+        by_objects = lead_over_twin(best.support, rival.support, float(shares[row])) \
+            if row < len(twins) else CALIBRATION.places.turned * (best.odds - rival.odds)
+        leads[number] += best.prior - rival.prior + by_objects
+    chance = float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum()))
+    return chance, place_of(joined.landmark_map, poses[others][int(np.argmin(leads))])
+
+
+def _first_of_each(poses: NDArray[np.float64], eligible: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the eligible rows of poses (m, 4, 4) at whose place no such row is before them."""
+    agreeing = SAME_PLACE.agreeing(poses) & eligible
+    return np.nonzero(eligible & ~np.tril(agreeing, -1).any(axis=1))[0]
 
 
 def _leads_of_points(compared: Comparison, twins: NDArray[np.float64],

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.confidence import Setting, tilt_handicaps, utilities
 from cliploc_ros.core.acceptance.prior import region_odds
-from cliploc_ros.core.acceptance.support import ComparedFrame, Support, support
+from cliploc_ros.core.acceptance.support import ComparedFrame, Support, one_thing, support
 from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.verification import Rig, cameras_from_last, make_rig
@@ -92,6 +92,12 @@ class Contender(NamedTuple):
     by_points: float = -math.inf
 
     @property
+    def landmarks(self) -> NDArray[np.int64]:
+        """Return the landmarks (n,) that it matches in any frame, in order."""
+        return np.array(sorted({one.landmark for found in self.matches for one in found}),
+                        dtype=np.int64)
+
+    @property
     def rank(self) -> float:
         """Return the log odds by which it competes with other contenders."""
         return self.odds + self.prior
@@ -117,7 +123,8 @@ def supports_of(joined: JoinedFrames, poses: NDArray[np.float64],
             else replace(one.observation, similarities=None) for one in joined.frames]
     compared = [ComparedFrame(
         one.observation.detections.bboxes_xyxy, one.observation.detections.class_ids,
-        seen.similarities, one.scene, seen.similarity_rows)
+        seen.similarities, one.scene, seen.similarity_rows,
+        one_thing(one.observation.detections.bboxes_xyxy))
         for one, seen in zip(joined.frames, used, strict=True)]
     last_from_cameras = np.linalg.inv(joined.cameras)
     return [support(joined.landmark_map, compared, pose @ last_from_cameras, found)

@@ -6,17 +6,21 @@ A camera sees the same at two places whose landmarks a turn about the vertical a
 each other. Such twins of the best pose are found in the map, so they count as rivals even if the
 search met one of the places only. `check_map` lists the places of a map that have twins.
 
+Landmarks on one axis look the same from all around it. So the pose turned about an axis that most
+matched landmarks share is such a place, too.
+
 Two poses at places that look alike explain the same detections. Which of them matches one object
 more, or fits better, then says little: maps lack objects, and objects move. Labels tell the
-places apart, and where there are none, the number of objects does to some degree. A conditional
-logit of its own, with these two terms only, weighs such poses.
+places apart. All objects that only one of the places explains have one cause: that one of them is
+out of date. So they count together, not each.
 """
 
-from collections.abc import Sequence
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.support import Support
@@ -40,6 +44,14 @@ _NEAR_M = (0.6, 0.45, 0.3)
 # The share was chosen between a desk of 39 landmarks (TUM fr3) that repeats .36 of them by chance,
 # and two halls (seeds 1004 and 1006) that mislead and repeat .39 and .38.
 _LEAST_LANDMARKS, _LEAST_SHARE, _LEAST_MATCHED = 4, 0.38, 0.4
+# Two places differ where they share less than the first number, and are alike from the second one
+# on: share of the objects that a pose explains, and of the landmarks around it.
+_ALIKE, _ALIKE_AROUND = (0.3, 0.45), (0.45, 0.6)
+# Columns of Support.shown.
+_COUNT, _LIKENESS, _UNLABELLED = 0, 3, 5
+# The share of the matched landmarks that must lie on an axis, and turns about it [rad].
+_LEAST_ON_AXIS, _TURNS = 0.5, np.radians([45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0])
+_UP = np.array([0.0, 0.0, 1.0])
 # The most twins of a pose, and poses of the search whose places are compared.
 _TWINS, _OTHERS = 3, 5
 _NOBODY, _NOWHERE = np.empty(0, dtype=np.int64), np.empty((0, 4, 4))
@@ -54,6 +66,11 @@ class Alike(NamedTuple):
     #: (m, r): the landmark of its class at the same spot of the other place, where found
     others: NDArray[np.int64]
     found: NDArray[np.bool_]  #: (m, r)
+
+    @property
+    def shares(self) -> NDArray[np.float64]:
+        """Return the share of the landmarks that is found at each place (m,)."""
+        return np.asarray(self.found.sum(axis=1) / max(1, len(self.landmarks)))
 
     @property
     def are_rooms(self) -> NDArray[np.bool_]:
@@ -97,7 +114,9 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
     shares = found.mean(axis=1)
     alike = shares >= _LEAST_SHARE
     if len(matched):
-        alike &= found[:, :len(matched)].mean(axis=1) >= _LEAST_MATCHED
+        # what the image shows may have moved at a place that is alike all around
+        alike &= ((found[:, :len(matched)].mean(axis=1) >= _LEAST_MATCHED)
+                  | (shares >= _ALIKE_AROUND[1]))
     ends = np.einsum('nij,rj->nri', moves[:, :3, :3], landmark_map.centers[rows])
     misses = np.linalg.norm(ends + moves[:, None, :3, 3] - landmark_map.centers[others], axis=2)
     order = np.lexsort([(misses * found).sum(axis=1), -shares])
@@ -108,7 +127,7 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
 
 def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
                matched: NDArray[np.int64], others: NDArray[np.float64]
-               ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+               ) -> tuple[NDArray[np.float64], Alike]:
     """Return where a camera would be at the places that look most like that of a pose.
 
     Parameters
@@ -123,8 +142,8 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
     -------
     poses : ndarray (m, 4, 4)
         At most 3, the place that is most alike first.
-    are_rooms : ndarray (m,) of bool
-        See Alike.are_rooms.
+    alike : Alike
+        These places.
     """
     position = map_from_camera[:3, 3]
     moves = others[:_OTHERS] @ invert_transform(map_from_camera)
@@ -132,21 +151,70 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
     upright = _upright_moves(np.arctan2(moves[:, 1, 0], moves[:, 0, 0]), position,
                              moves[:, :3, :3] @ position + moves[:, :3, 3])
     alike = find_alike(landmark_map, position, matched, upright)
-    return alike.moves @ map_from_camera, alike.are_rooms
+    return alike.moves @ map_from_camera, alike
 
 
-def chance_distinct(its: Support, twins: Sequence[Support], leads: NDArray[np.float64]
-                    ) -> tuple[float, int]:
-    """Return the probability that a pose is not mistaken for one at a place that looks alike.
+def turned_about_axis(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
+                      matched: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return a camera pose turned about an axis that most matched landmarks share (m, 4, 4).
 
-    The second value is the row of the likeliest of the m poses at such places, one at least, whose
-    supports the twins are. Leads (m,) are the log odds by which keyframes prefer the pose to each.
+    Landmarks on one axis fix all but the turn about it: the camera sees the same from all around.
+    The axis is upright, through one of the landmarks, or fitted to all. There is no such pose
+    where fewer than half of the landmarks reach to either axis.
+
+    Parameters
+    ----------
+    map_from_camera : ndarray (4, 4)
+    matched : ndarray (n,) of int
+        Landmarks that the pose explains detections with.
+    """
+    if len(matched) < 2:
+        return _NOWHERE
+    centers, radii = landmark_map.centers[matched], landmark_map.semi_axes[matched].mean(axis=1)
+    middle = centers.mean(axis=0)
+    line = np.linalg.svd(centers - middle)[2][0]
+    found = []
+    for axis, points in ((_UP, centers), (line, middle[None])):
+        offsets = centers - points[:, None]
+        offsets -= (offsets @ axis)[..., None] * axis
+        share = np.linalg.norm(offsets, axis=2) <= radii
+        best = int(np.argmax(share.sum(axis=1)))
+        if share[best].mean() >= _LEAST_ON_AXIS:
+            turns = Rotation.from_rotvec(_TURNS[:, None] * axis).as_matrix()
+            moves = np.tile(np.eye(4), (len(turns), 1, 1))
+            moves[:, :3, :3] = turns
+            moves[:, :3, 3] = points[best] - turns @ points[best]
+            found.append(moves @ map_from_camera)
+    return np.concatenate(found) if found else _NOWHERE
+
+
+def lead_over_twin(its: Support, twin: Support, place_share: float = 0.0) -> float:
+    """Return the log odds by which objects prefer a pose to one at a place that looks alike.
+
+    Labels tell objects apart that both poses explain. An object that only one pose explains counts
+    as its label says, where the places share few objects. Where they share many, one of both is
+    out of date, or was furnished like the other: that one cause explains all such objects.
+
+    Parameters
+    ----------
+    place_share : float
+        Share of the landmarks around the pose that the other place has, too.
     """
     terms = CALIBRATION.places
-    leads = leads + [terms.likeness * (its.likeness - one.likeness)
-                     + terms.unlabelled * (its.unlabelled - one.unlabelled) for one in twins]
-    return (float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum())),
-            int(np.argmin(leads)))
+    common = its.shown.keys() & twin.shown.keys()
+    lead, counts, further = 0.0, 0.0, 0.0
+    for sign, shown in ((1.0, its.shown), (-1.0, twin.shown)):
+        for one, row in shown.items():
+            said = sign * (terms.likeness * row[_LIKENESS] + terms.unlabelled * row[_UNLABELLED])
+            if one in common:
+                lead += said
+            else:
+                further, counts = further + said, counts + sign * row[_COUNT]
+    share = sum(its.shown[one][_COUNT] for one in common) / max(its.inliers, 1e-9)
+    alike = max(float(np.interp(share, _ALIKE, (0.0, 1.0))),
+                float(np.interp(place_share, _ALIKE_AROUND, (0.0, 1.0))))
+    most = min(abs(further), terms.unlabelled * abs(counts), terms.aged)
+    return lead + (1.0 - alike) * further + alike * math.copysign(most, further)
 
 
 def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The support of a pose: what in the frames speaks for it, and what speaks against it."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.depth import depth_errors, depth_odds
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
@@ -21,8 +22,10 @@ from cliploc_ros.core.map.similarities import (
 )
 from cliploc_ros.core.search.scene import Scene
 
-# Boxes that overlap more than this show the same object, detected twice.
-_SAME_BOX_IOU = 0.8
+# Boxes whose IoU is below the first number show two things, above the second number one thing.
+_ONE_THING_IOU = (0.4, 0.8)
+# No image reaches further [px].
+_FAR_PX = 1e6
 # Deviation of a box's edge on the plane z = 1: a share of the box's mean semi-axis, plus a floor.
 # .2 of the semi-axis is .1 of the mean side. The calibration is fitted with these values.
 _EDGE_DEVIATION = (0.2, 0.003)
@@ -30,25 +33,31 @@ _EDGE_DEVIATION = (0.2, 0.003)
 
 @dataclass(frozen=True)
 class Support:
-    """The support of a pose; each object counts once."""
+    """The support of a pose; each thing counts once."""
 
-    inliers: int = 0  #: Number of objects that are where the map has them
+    #: Number of things that are where the map has them: boxes that overlap show one thing
+    inliers: float = 0.0
     score: float = 0.0  #: Sum of their IoUs
     #: How far the edges of their boxes are from the outlines: Cauchy's robust sum
     misfit: float = 0.0
     #: How much more similar their crops are to the labels of their landmarks than to the map's
     #: labels on average, in standard deviations, summed
     likeness: float = 0.0
-    #: Summed over the objects that have a class of their landmark: the logarithm of the map's
-    #: number of landmarks for each landmark of this class. A rare class is matched by chance less
-    #: often than a common one. A class that the detector takes the landmark for at times counts
-    #: by its share, see ClassIndex.shares.
+    #: Summed over the objects that have a class of their landmark: the logarithm of the number of
+    #: things for each thing of this class, in the map or in any building. A rare class is matched
+    #: by chance less often than a common one. A class that the detector takes the landmark for at
+    #: times counts by its share, see ClassIndex.shares.
     rarity: float = 0.0
     unlabelled: float = 0.0  #: Number of the objects that were matched by class alone
     #: Number of other detected objects of the map's classes, which no landmark explains
     unexplained: float = 0.0
     #: Log odds of their depths, against those of objects that are somewhere else
     depth: float = 0.0
+    _: KW_ONLY
+    #: Of each detection that shows an object, (frame, row): what it adds (7,) to inliers, score,
+    #: misfit, likeness, rarity, unlabelled and depth
+    shown: Mapping[tuple[int, int], NDArray[np.float64]] = field(
+        default_factory=dict, compare=False, repr=False)
 
 
 class ComparedFrame(NamedTuple):
@@ -60,40 +69,59 @@ class ComparedFrame(NamedTuple):
     scene: Scene  #: Of the same detections
     #: (n,): row of similarities of each detection; -1 where its class alone is matched
     similarity_rows: NDArray[np.int64]
+    #: (n, n): to what degree two boxes show one thing, 0 to 1, see one_thing
+    same: NDArray[np.float64]
 
 
 def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
             map_from_cameras: NDArray[np.float64], matches: Sequence[Sequence[Match]]) -> Support:
     """Return the support of a pose in F frames, seen from map_from_cameras (F, 4, 4).
 
-    Several boxes on one landmark, or several landmarks behind one box, count as the best of them.
+    Several boxes on one landmark count as the best of them, and boxes that overlap share the
+    weight of one. So do boxes that no landmark explains; a box of an explained thing does not
+    count.
     Frames that show the same object share the error of its shape in the map, so their agreement is
     no more evidence than one of them: the object counts with their mean.
     """
-    rows: dict[int, list[NDArray[np.float64]]] = {}  # by object: maps have duplicates
-    for frame, map_from_camera, found in zip(frames, map_from_cameras, matches, strict=True):
-        distinct = _each_object_once(found, frame.bboxes_xyxy, landmark_map.objects)
+    # by object: maps have duplicates
+    rows: dict[int, dict[tuple[int, int], NDArray[np.float64]]] = {}
+    unexplained = 0.0
+    for number, (frame, map_from_camera, found) in enumerate(zip(
+            frames, map_from_cameras, matches, strict=True)):
+        distinct = _each_object_once(found, landmark_map.objects)
         if distinct:
-            for match, row in zip(distinct, _contributions(landmark_map, frame, map_from_camera,
-                                                           distinct), strict=True):
-                rows.setdefault(int(landmark_map.objects[match.landmark]), []).append(row)
+            seen = np.array([match.detection for match in distinct])
+            weights = 1.0 / frame.same[np.ix_(seen, seen)].sum(axis=1)
+            for match, row in zip(distinct, weights[:, None] * _contributions(
+                    landmark_map, frame, map_from_camera, distinct), strict=True):
+                rows.setdefault(int(landmark_map.objects[match.landmark]), {})[
+                    number, match.detection] = row
+        unexplained += _unexplained(landmark_map, frame, [match.detection for match in found])
     if not rows:
         return Support()
-    total = np.sum([np.mean(of_object, axis=0) for of_object in rows.values()], axis=0)
-    views_of_each = sum(map(len, rows.values())) / len(rows)
+    shown = {one: row / len(of_object) for of_object in rows.values()
+             for one, row in of_object.items()}
+    total = np.sum([*shown.values()], axis=0)
+    views_of_each = len(shown) / len(rows)
+    return Support(*map(float, [*total[:-1], unexplained / views_of_each, total[-1]]),
+                   shown=shown)
+
+
+def _unexplained(landmark_map: LandmarkMap, frame: ComparedFrame, matched: list[int]) -> float:
+    """Return the number of things of the map's classes that no match shows."""
     # A class that a landmark is only taken for does not count: a real person is not expected in a
     # map because a teddy bear sometimes looks like one.
-    index, unexplained = landmark_map.classes, 0
-    for frame, found in zip(frames, matches, strict=True):
-        known = set(np.nonzero(index.are_own(index.classes_of(frame.class_ids)))[0])
-        unexplained += len(known - {match.detection for match in found})
-    return Support(len(rows), *map(float, [*total[:-1], unexplained / views_of_each, total[-1]]))
+    index = landmark_map.classes
+    others = np.nonzero(index.are_own(index.classes_of(frame.class_ids)))[0]
+    others = others[~np.isin(others, matched)]
+    alone = 1.0 - frame.same[np.ix_(others, matched)].max(axis=1, initial=0.0)
+    return float((alone / frame.same[np.ix_(others, others)].sum(axis=1)).sum())
 
 
 def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
                    map_from_camera: NDArray[np.float64], matches: Sequence[Match]
                    ) -> NDArray[np.float64]:
-    """Return the terms of each match (m, 6) in a support."""
+    """Return the terms of each match (m, 7) in a support."""
     detections = np.array([match.detection for match in matches])
     landmarks = np.array([match.landmark for match in matches])
     rows, likenesses = frame.similarity_rows[detections], np.zeros(len(matches))
@@ -105,40 +133,39 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
             - means) / np.maximum(deviations, 1e-6)
     index = landmark_map.classes
     classes = index.classes_of(frame.class_ids)[detections]
+    # a class that is rare in the map may be common in the place where the camera is
+    common = np.array([CALIBRATION.common.get(frame.class_ids[row], 0.0) for row in detections])
     # 0 if the class of a detection is none of its landmark
-    rarities = index.shares(landmarks, classes) * -np.log(
-        np.maximum(index.sizes_of(classes), 1) / len(landmark_map))
+    rarities = index.shares(landmarks, classes) * -np.log(np.maximum(
+        np.maximum(index.sizes_of(classes), 1) / len(landmark_map), common))
     return np.column_stack([
-        [match.iou for match in matches],
+        np.ones(len(matches)), [match.iou for match in matches],
         _misfits(frame.scene, map_from_camera, detections, landmarks,
                  landmark_map.position_sigmas[landmarks]), likenesses, rarities, ~compared,
         _depth_odds(frame.scene, map_from_camera, detections, landmarks,
                     landmark_map.position_sigmas[landmarks])])
 
 
-def _each_object_once(matches: Sequence[Match], bboxes_xyxy: NDArray[np.float64],
-                      objects: NDArray[np.int64]) -> list[Match]:
-    """Return the best match of each landmark's object and of each box."""
-    distinct, boxes, taken = [], list[list[float]](), set[int]()
+def _each_object_once(matches: Sequence[Match], objects: NDArray[np.int64]) -> list[Match]:
+    """Return the best match of each landmark's object."""
+    best: dict[int, Match] = {}
     for match in sorted(matches, key=lambda match: -match.iou):
-        owner, box = int(objects[match.landmark]), bboxes_xyxy[match.detection].tolist()
-        if owner in taken or any(_box_iou(box, other) > _SAME_BOX_IOU for other in boxes):
-            continue
-        distinct.append(match)
-        boxes.append(box)
-        taken.add(owner)
-    return distinct
+        best.setdefault(int(objects[match.landmark]), match)
+    return [*best.values()]
 
 
-def _box_iou(one: Sequence[float], other: Sequence[float]) -> float:
-    """Return the IoU of two boxes; a few plain numbers are faster than arrays here."""
-    width = min(one[2], other[2]) - max(one[0], other[0])
-    height = min(one[3], other[3]) - max(one[1], other[1])
-    if width <= 0.0 or height <= 0.0:
-        return 0.0
-    overlap = width * height
-    areas = sum((box[2] - box[0]) * (box[3] - box[1]) for box in (one, other))
-    return overlap / (areas - overlap)
+def one_thing(bboxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return to what degree each two of n boxes show one thing (n, n), 0 to 1."""
+    boxes = np.clip(np.nan_to_num(bboxes_xyxy), -_FAR_PX, _FAR_PX)
+    low = np.maximum(boxes[:, None, :2], boxes[:, :2])
+    high = np.minimum(boxes[:, None, 2:], boxes[:, 2:])
+    shared = np.maximum(high - low, 0.0).prod(axis=2)
+    areas = np.diag(shared)
+    ious = shared / np.maximum(areas[:, None] + areas - shared, 1e-12)
+    least, most = _ONE_THING_IOU
+    found = np.clip((ious - least) / (most - least), 0.0, 1.0)
+    np.fill_diagonal(found, 1.0)
+    return np.asarray(found)
 
 
 def _misfits(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDArray[np.int64],

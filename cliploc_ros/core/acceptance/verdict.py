@@ -3,7 +3,7 @@
 """The decision to accept or refuse the leading pose. A wrong pose is worse than none."""
 
 import math
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from enum import StrEnum, auto
 from typing import NamedTuple
 
@@ -46,8 +46,12 @@ class RefusalKind(StrEnum):
     CHANGED = auto()
     #: The occupancy grid has a wall at the pose, or before most of the matched objects.
     OBSTRUCTED = auto()
+    #: Boxes, camera_info and map do not agree, or no look has verified that they do.
+    WRONG_CAMERA = auto()
     #: The time of the request ended before a frame was localized.
     TIME_UP = auto()
+    #: The map has none of the detector's classes, or no score or box is usable.
+    WRONG_DETECTIONS = auto()
 
 
 class Refusal(NamedTuple):
@@ -86,6 +90,10 @@ class Evidence:
     twin: Point | None = None
     twin_map: str = ''  #: Name of the twin's map, where there are several
     near: float = 1.0  #: Probability that it is within 1 m if it is right, given its covariance
+    #: By how much errors of a camera lower that, and what is certainly wrong with one; empty if
+    #: nothing is, see cliploc_ros.core.acceptance.camera_check
+    camera: float = 1.0
+    camera_fault: str = ''
     deviation_m: float = 0.0  #: Standard deviation of its position [m]
     coverage: float = 1.0  #: Share of its samples that the search tried, 0 to 1
     tried: int = 0  #: Number of samples that the search tried
@@ -139,13 +147,18 @@ class Evidence:
     @property
     def certainty(self) -> float:
         """Return the probability that nothing besides the poses found makes it wrong."""
-        return (self.distinct * self.near * self.genuine * self.not_mirrored
+        return (self.distinct * self.near * self.camera * self.genuine * self.not_mirrored
                 * self.uncontradicted * self.unobstructed)
 
     @property
     def confidence(self) -> float:
         """Return the probability that the leading pose is within 1 m of the truth."""
         return self._by_poses * self.certainty
+
+    @property
+    def with_right_camera(self) -> 'Evidence':
+        """Return the evidence for the pose if all cameras are right."""
+        return replace(self, camera=1.0, camera_fault='')
 
     @property
     def mean_confidence(self) -> float:
@@ -164,6 +177,9 @@ def refusal(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
     What the search of objects lacks does not matter where keyframes alone are sure enough.
     """
     by_points = evidence.by_points >= needed_confidence(evidence, options)
+    if evidence.camera_fault and not by_points:
+        return Refusal(RefusalKind.WRONG_CAMERA, f'{evidence.camera_fault}; check camera_info, '
+                                                 'and the pixels and corners of the boxes')
     lacks = None if by_points else _too_short(evidence, options) or _too_few(evidence, options)
     return lacks or _too_unlikely(evidence, options) or _contradicted(evidence, options)
 
@@ -219,9 +235,9 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
     likely = max(evidence.likely, evidence.by_points)
     found = max(evidence.likely * evidence.found, evidence.by_points) / max(likely, 1e-9)
     weakest = min({'likely': likely, 'distinct': evidence.distinct, 'near': evidence.near,
-                   'genuine': evidence.genuine, 'mirror': evidence.not_mirrored,
-                   'keyframes': evidence.uncontradicted, 'found': found,
-                   'walls': evidence.unobstructed}.items(),
+                   'camera': evidence.camera, 'genuine': evidence.genuine,
+                   'mirror': evidence.not_mirrored, 'keyframes': evidence.uncontradicted,
+                   'found': found, 'walls': evidence.unobstructed}.items(),
                   key=lambda item: item[1])[0]
     # the twin may be among the rivals, too
     if evidence.twin is not None and evidence.distinct < options.min_confidence and (
@@ -234,6 +250,10 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
         return Refusal(RefusalKind.UNCERTAIN_POSITION,
                        f'{compared}; position uncertain by {evidence.deviation_m:.2g} m; '
                        'turn the camera to more or nearer objects')
+    if weakest == 'camera':
+        return Refusal(RefusalKind.WRONG_CAMERA,
+                       f'{compared}; another focal length or other pixels of the boxes may fit; '
+                       'turn the camera to nearer objects, or check camera_info')
     if weakest == 'genuine' and evidence.recognized is not None:
         return Refusal(RefusalKind.CHANGED,
                        f'{compared}; {evidence.recognized.inliers} points of keyframes agree as '

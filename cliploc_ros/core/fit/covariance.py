@@ -12,6 +12,8 @@ covariance is H^-1 M H^-1, and M is a sum over sources of error:
 * the position of the map near the camera, the same for all landmarks: as if all cameras were
   displaced and turned together about the last one;
 * the vertical, the same in all frames: one sensor on one mount;
+* the calibration of a camera, the same in all of its frames: as if all of its boxes were scaled,
+  stretched and shifted together;
 * odometry, a random walk: the error of a step displaces all frames beyond it;
 * the mounts of several cameras, between whose frames of one instant there is no such step.
 
@@ -28,11 +30,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import gammainc
 
+from cliploc_ros.core.fit.camera_fit import ERRORS, camera_jacobian
 from cliploc_ros.core.fit.refinement import (
     LEAST_DEVIATION,
     RELATIVE_DEVIATION,
     Inliers,
-    jacobian_of,
     one_to_one,
     residuals_of,
 )
@@ -75,6 +77,8 @@ _WITHOUT_M, _WITHOUT_RAD = 0.5, 0.5
 # Mean square of the residuals before any is seen, how many residuals this counts as, and the most
 # that a residual counts. Three boxes alone would seem to fit perfectly.
 _PRIOR_SQUARE, _PRIOR_RESIDUALS, _MOST_RESIDUAL = 2.8, 6.0, 4.0
+#: Deviations of the errors of a perfect camera.
+EXACT = np.zeros(ERRORS)
 #: Of a pose whose boxes do not fix it.
 POSE_UNKNOWN = np.diag(PRIOR_VARIANCES)
 
@@ -163,14 +167,21 @@ def odometry_deviations(first_from_second: NDArray[np.float64]) -> NDArray[np.fl
 def share_within(radius_m: float, covariance: NDArray[np.float64]) -> float:
     """Return the probability that a position is within a distance of the truth.
 
+    The covariance (6, 6) is as of pose_covariance.
+    """
+    return float(shares_within(radius_m, covariance[None, :3, :3])[0])
+
+
+def shares_within(radius_m: float, covariances: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the probability (k,) of each covariance (k, 3, 3) of a position, see share_within.
+
     The squared distance is a sum of squares with different variances. A scaled chi-squared
     distribution of the same mean and variance stands for it (Box, "Some Theorems on Quadratic
-    Forms Applied in the Study of Analysis of Variance Problems", 1954). The covariance (6, 6) is
-    as of pose_covariance.
+    Forms Applied in the Study of Analysis of Variance Problems", 1954).
     """
-    mean = np.trace(covariance[:3, :3])
-    squares = np.sum(covariance[:3, :3] ** 2)
-    return float(gammainc(0.5 * mean ** 2 / squares, 0.5 * radius_m ** 2 * mean / squares))
+    means = np.trace(covariances, axis1=1, axis2=2)
+    squares = np.sum(covariances ** 2, axis=(1, 2))
+    return np.asarray(gammainc(0.5 * means ** 2 / squares, 0.5 * radius_m ** 2 * means / squares))
 
 
 def normalized_square(map_from_camera: NDArray[np.float64], covariance: NDArray[np.float64],
@@ -232,6 +243,8 @@ class _Fit(NamedTuple):
     numbers: NDArray[np.int64]  #: (n,): the objects' landmarks
     verticals: NDArray[np.float64]  #: (F, 6, 6): information of each frame's vertical
     cameras: NDArray[np.float64]  #: (F, 4, 4): map_from_camera
+    #: (F, 6, 7): gradient of each frame by the errors of its camera, see camera_fit
+    calibrations: NDArray[np.float64]
 
     @property
     def information(self) -> NDArray[np.float64]:
@@ -243,7 +256,8 @@ class _Fit(NamedTuple):
 def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDArray[np.float64],
                        instants: NDArray[np.int64], shared: NDArray[np.float64] | None = None,
                        wrong_share: float = _WRONG_SHARE,
-                       mount_deviation: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
+                       mount_deviation: tuple[float, float] = (0.0, 0.0),
+                       camera_deviations: NDArray[np.float64] = EXACT) -> NDArray[np.float64]:
     """Return the covariance (6, 6) of a pose that was refined on its inliers.
 
     Parameters
@@ -260,6 +274,8 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     mount_deviation : tuple of float
         Standard deviations of a camera's mount on each axis [m] [deg], against that of the last
         frame's camera.
+    camera_deviations : ndarray (7,)
+        Standard deviations of the errors of each camera, see cliploc_ros.core.fit.camera_fit.
     """
     found = verify_rig(rig, rotation, translation)
     fit = _linearize(one_to_one(rig, found, rotation, translation), rig.sigmas, rotation,
@@ -280,23 +296,43 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
              + _odometry_noise(fit.cameras, of_frames, instants)
              + _mount_noise(fit.cameras, of_frames, instants, mount_deviation))
     matched = _sandwich(information, noise)
-    of_map = 0.0 if shared is None else _sandwich(
-        information, _shared_noise(of_objects, shared[fit.numbers]))
+    # of all objects: also without one, the others share them
+    common = _calibration_noise(fit.calibrations, instants, camera_deviations)
+    if shared is not None:
+        common += _shared_noise(of_objects, shared[fit.numbers])
     gradients = _sums(np.einsum('mei,me->mi', fit.jacobian, fit.weights * fit.residuals),
                       fit.objects, len(fit.sigmas))
-    return np.asarray(matched + of_map + wrong_share * _change_without_each(
-        information - of_objects, noise - noise_of_objects, gradients, matched))
+    wrong = _change_without_each(information - of_objects, noise - noise_of_objects, gradients,
+                                 matched)
+    return np.asarray(matched + _sandwich(information, common) + wrong_share * wrong)
+
+
+def moves_with_cameras(rig: Rig, inliers: Inliers, rotation: NDArray[np.float64],
+                       translation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how a refined pose moves (F, 6, 7) with the errors of each frame, see camera_fit.
+
+    Those of a camera move it by the sum over its frames. See refined_covariance for the others.
+    """
+    fit = _linearize(inliers, rig.sigmas, rotation, translation)
+    information = (fit.information.sum(axis=0) + fit.verticals.sum(axis=0)
+                   + np.diag(1.0 / np.array(PRIOR_VARIANCES)))
+    return np.asarray(-np.linalg.inv(information) @ fit.calibrations)
 
 
 def _change_without_each(information: NDArray[np.float64], noise: NDArray[np.float64],
                          gradients: NDArray[np.float64], matched: NDArray[np.float64]
                          ) -> NDArray[np.float64]:
-    """Return the sum of the gains of the covariance with each of n objects left out in turn."""
+    """Return the sum of the gains of the covariance with each of n objects left out in turn.
+
+    Without an object, a pose is not surer: only a gain counts. The limit would be a loss where
+    boxes fix next to nothing.
+    """
     limit = np.diag(np.repeat([_WITHOUT_M ** -2, _WITHOUT_RAD ** -2], 3))
     inverses = np.linalg.inv(information + limit)
     shifts = np.einsum('nij,nj->ni', inverses, gradients)
     without = inverses @ (noise + limit) @ inverses
-    return np.asarray((without - matched).sum(axis=0) + shifts.T @ shifts)
+    values, vectors = np.linalg.eigh((without - matched).sum(axis=0) + shifts.T @ shifts)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def _sandwich(information: NDArray[np.float64], noise: NDArray[np.float64]
@@ -311,6 +347,7 @@ def _linearize(inliers: Inliers, sigmas: NDArray[np.float64], rotation: NDArray[
     count, frames = len(inliers.pairs), len(inliers.cameras)
     jacobian, residuals = np.empty((count, 5, 6)), np.empty((count, 5))
     verticals, cameras = np.zeros((frames, 6, 6)), np.tile(np.eye(4), (frames, 1, 1))
+    calibrations = np.empty((frames, 6, ERRORS))
     center = -rotation.T @ translation
     for frame, (first, last) in enumerate(pairwise(inliers.starts)):
         camera, vertical = inliers.cameras[frame], inliers.verticals[frame]
@@ -321,13 +358,15 @@ def _linearize(inliers: Inliers, sigmas: NDArray[np.float64], rotation: NDArray[
         pairs = inliers.pairs[first:last]
         own, rows = np.empty(5 * len(pairs) + 3), 5 * len(pairs)
         residuals_of(pairs, vertical, own_rotation, own_translation, own)
-        steps = jacobian_of(pairs, vertical, own_rotation, own_translation)
+        steps = camera_jacobian(pairs, vertical, np.zeros(ERRORS), own_rotation, own_translation,
+                                own)
         # a turn of the reference about itself moves this camera
-        steps[:, 3:] -= steps[:, :3] @ _cross(cameras[frame, :3, 3] - center)
-        jacobian[first:last], residuals[first:last] = (steps[:rows].reshape(-1, 5, 6),
+        steps[:, 3:6] -= steps[:, :3] @ _cross(cameras[frame, :3, 3] - center)
+        weighted = steps / (1.0 + own[:, None] ** 2)
+        calibrations[frame] = weighted[:, :6].T @ steps[:, 6:]
+        verticals[frame] = weighted[rows:, :6].T @ steps[rows:, :6]
+        jacobian[first:last], residuals[first:last] = (steps[:rows, :6].reshape(-1, 5, 6),
                                                        own[:rows].reshape(-1, 5))
-        weights = 1.0 / (1.0 + own[rows:] ** 2)
-        verticals[frame] = steps[rows:].T @ (steps[rows:] * weights[:, None])
     numbers, objects = np.unique(inliers.landmarks, return_inverse=True)
     pairs = inliers.pairs
     edges = (RELATIVE_DEVIATION * (pairs[:, 2] + pairs[:, 3]) + LEAST_DEVIATION) / pairs[:, 13]
@@ -338,7 +377,7 @@ def _linearize(inliers: Inliers, sigmas: NDArray[np.float64], rotation: NDArray[
     return _Fit(jacobian, residuals, 1.0 / (1.0 + residuals ** 2),
                 np.column_stack([edges, edges, edges, edges, depths])[:, :kinds], objects,
                 np.repeat(np.arange(frames), np.diff(inliers.starts)), sigmas[numbers], numbers,
-                verticals, cameras)
+                verticals, cameras, calibrations)
 
 
 def _cross(vector: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -406,6 +445,16 @@ def _mount_noise(cameras: NDArray[np.float64], information: NDArray[np.float64],
     others = [row for row in range(len(cameras) - 1) if instants[row] in instants[row + 1:]]
     return np.asarray(sum((_squared(_about(information[row], cameras, row) * deviations)
                            for row in others), np.zeros((6, 6))))
+
+
+def _calibration_noise(calibrations: NDArray[np.float64], instants: NDArray[np.int64],
+                       deviations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the part of the errors of the cameras' calibrations in M (6, 6)."""
+    # cameras follow each other in one order at each instant
+    cameras = np.array([list(instants[row + 1:]).count(number)
+                        for row, number in enumerate(instants)])
+    return np.asarray(sum((_squared(calibrations[cameras == number].sum(axis=0) * deviations)
+                           for number in set(cameras.tolist())), np.zeros((6, 6))))
 
 
 def _about(information: NDArray[np.float64], cameras: NDArray[np.float64], row: int

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.fit.covariance import (
+    EXACT,
     POSE_UNKNOWN,
     box_scatter,
     odometry_deviations,
@@ -183,19 +184,21 @@ def meetings_of(frames: Sequence[SearchedFrame], pose: Finalist,
 def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
                   matches: Sequence[Sequence[Match]],
                   shared: NDArray[np.float64] | None = None,
-                  mount_deviation: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
+                  mount_deviation: tuple[float, float] = (0.0, 0.0),
+                  camera_deviations: NDArray[np.float64] = EXACT) -> NDArray[np.float64]:
     """Return the covariance of a pose: of its refinement, or of its minimal sample.
 
     Parameters
     ----------
-    shared, mount_deviation
+    shared, mount_deviation, camera_deviations
         See refined_covariance.
     """
     if pose.information is not None:
         if not pose.information.any():
             return POSE_UNKNOWN
         return refined_covariance(rig, pose.rotation, pose.translation, _instants(frames), shared,
-                                  mount_deviation=mount_deviation)
+                                  mount_deviation=mount_deviation,
+                                  camera_deviations=camera_deviations)
     cameras = np.array([make_transform(camera[:, :3], camera[:, 3]) for camera in rig.cameras])
     covariance = (_sample_covariance(frames, cameras, pose,
                                      _scatter(frames, cameras, pose, matches))

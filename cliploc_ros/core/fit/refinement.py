@@ -134,7 +134,7 @@ def linearize(pairs, vertical, rotation, translation, residuals):
     They are for steps of the camera's position [m] and rotations about the map's axes [rad]. See
     residuals_of for the parameters.
     """
-    return _normal_equations(jacobian_of(pairs, vertical, rotation, translation), residuals)
+    return normal_equations(jacobian_of(pairs, vertical, rotation, translation), residuals)
 
 
 @compiled
@@ -225,19 +225,20 @@ def _differentiate_vertical(vertical, rotation, jacobian):
 
 
 @compiled
-def _normal_equations(jacobian, residuals):
-    """Return information and gradient with Cauchy's weights."""
-    information, gradient = np.zeros((6, 6)), np.zeros(6)
+def normal_equations(jacobian, residuals):
+    """Return information (k, k) and gradient (k,) with Cauchy's weights; jacobian (., k)."""
+    size = jacobian.shape[1]
+    information, gradient = np.zeros((size, size)), np.zeros(size)
     for row in range(len(residuals)):
         if residuals[row] == 0.0 and not jacobian[row].any():
             continue  # an unknown depth or vertical
         weight = 1.0 / (1.0 + (residuals[row] / _CAUCHY) ** 2)
-        for i in range(6):
+        for i in range(size):
             weighted = jacobian[row, i] * weight
             gradient[i] -= weighted * residuals[row]
-            for j in range(i, 6):
+            for j in range(i, size):
                 information[i, j] += weighted * jacobian[row, j]
-    for i in range(6):
+    for i in range(size):
         for j in range(i):
             information[i, j] = information[j, i]
     return information, gradient
@@ -416,7 +417,7 @@ def _minimize(inliers, rotation, translation):
             damped = information.copy()
             for axis in range(6):
                 damped[axis, axis] += damping * information[axis, axis] + 1e-9
-            if not _solve(damped, gradient, step):
+            if not solve(damped, gradient, step):
                 return rotation, translation
             if _squared_length(step) > _LONGEST_STEP * _LONGEST_STEP:
                 damping = 10.0 * damping
@@ -473,9 +474,10 @@ def move(rotation, translation, step):
 
 
 @compiled
-def _solve(matrix, right, solution):
-    """Solve a symmetric positive definite system of six, overwriting its matrix (Cholesky)."""
-    for i in range(6):
+def solve(matrix, right, solution):
+    """Solve a symmetric positive definite system, overwriting its matrix (Cholesky)."""
+    size = len(right)
+    for i in range(size):
         for j in range(i + 1):
             total = matrix[i, j]
             for k in range(j):
@@ -486,14 +488,14 @@ def _solve(matrix, right, solution):
                 matrix[i, i] = sqrt(total)
             else:
                 matrix[i, j] = total / matrix[j, j]
-    for i in range(6):
+    for i in range(size):
         total = right[i]
         for k in range(i):
             total -= matrix[i, k] * solution[k]
         solution[i] = total / matrix[i, i]
-    for i in range(5, -1, -1):
+    for i in range(size - 1, -1, -1):
         total = solution[i]
-        for k in range(i + 1, 6):
+        for k in range(i + 1, size):
             total -= matrix[k, i] * solution[k]
         solution[i] = total / matrix[i, i]
     return True

@@ -138,6 +138,8 @@ SAME_NEIGHBOURHOOD = Tolerance(0.7, 20.0)
 SAME_MINIMUM = Tolerance(0.05, 2.0)
 #: A camera that moved less sees the same again.
 SAME_VIEW = Tolerance(0.05, 3.0)
+#: Boxes of an object share their errors between poses so near to each other.
+SAME_BOXES = Tolerance(0.25, 10.0)
 #: A keyframe sees what a camera sees; the shares of both tolerances add up.
 SAME_SIGHT = Tolerance(2.0, 40.0)
 #: A robot that moved less since its image is still where its pose says.

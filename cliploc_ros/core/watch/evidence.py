@@ -66,7 +66,7 @@ def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
     utility, = utilities([fit.support]) - CALIBRATION.objects.unexplained * fit.support.unexplained
     in_view = index.of_landmarks[found.landmarks]
     pairs = sum(int((in_view == one).sum()) for one in classes[own])
-    return LookEvidence(int(own.sum()), fit.support.inliers, unexplained, float(utility),
+    return LookEvidence(int(own.sum()), round(fit.support.inliers), unexplained, float(utility),
                         len(found.landmarks), int((~found.was_seen).sum()), alignment.away_m,
                         alignment.away_deg, math.log1p(pairs)), found
 

@@ -161,8 +161,6 @@ def _camera(where: str, number: int, name: str, size: tuple[int, int], values: t
     fx, fy, (cx, cy) = values[0], values[model.focals - 1], values[model.focals:model.focals + 2]
     distortion = np.zeros(_LENGTHS[model.distortion])
     distortion[list(model.places)] = values[model.focals + 2:]
-    if model.distortion == 'equidistant' and not distortion.any():
-        distortion[0] = 1e-12  # all zeros would be a pinhole
     return camera_of(where, *size, fx, fy, cx - 0.5, cy - 0.5, model.distortion,
                      tuple(distortion.tolist()))
 

@@ -111,7 +111,7 @@ def _camera(values: Fields, image: Path) -> Camera:
                               for name in ('k1', 'k2', 'k3', 'k4', 'p1', 'p2'))
     if model in _FISHEYE or values.values.get('is_fisheye') is True:
         return camera_of(where, width, height, fx, fy, cx, cy, 'equidistant',
-                         (k1 or 1e-12, k2, k3, k4))  # all zeros would be a pinhole
+                         (k1, k2, k3, k4))
     if model not in _PERSPECTIVE or k4:
         raise DatasetError(f'{where}: camera_model {model} ' + ('with k4 ' if k4 else '')
                            + 'is not known here; undistort the images to PINHOLE')

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -21,6 +22,7 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detection_type, stamp_ns
 from cliploc_ros.ros.inputs.pairing import ExactPairing
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
+from cliploc_ros.ros.inputs.time_jumps import MessageStamps, stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health, Rates
 from cliploc_ros.units import NS_PER_S
 
@@ -39,6 +41,11 @@ _MAX_DEPTH_BYTES = 72 * 2**20
 _OF_DEPTH = ('depth', 'depth_camera_info')
 # A guess at the memory of one detection in Python.
 _DETECTION_BYTES = 2000
+# What to do about stamps.
+_STAMPING = {'image': 'the driver of the camera must stamp each when it is taken',
+             'detections': "the detector must copy the image's header"}
+# Bytes of an image that tell it from others.
+_SAMPLE = 4096
 
 
 class NoFrameError(CliplocError):
@@ -61,6 +68,7 @@ class Frame:
     camera: str = ''  #: Name of its camera; empty for the only one
     beside: tuple['Frame', ...] = ()  #: Those of other cameras at this instant
     left_out: tuple[str, ...] = ()  #: Names of the cameras without a frame of this instant
+    image_topic: str = ''  #: Resolved name of the topic of the image
 
     @property
     def depth_frame(self) -> str:
@@ -118,6 +126,10 @@ class FrameSource:
         self._pairing = ExactPairing({'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20,
                                       'detections': _MAX_DETECTIONS_BYTES}, _MAX_WAITING,
                                      'image', 'detections')
+        self._stamps = {'image': MessageStamps(), 'detections': MessageStamps()}
+        self._static_info: CameraInfo | None = None
+        self._unsure: Frame | None = None
+        self._lag_s = math.nan
         self.changed = changed or threading.Condition()
         self._heard_at: dict[str, float] = {}
         self._subscriptions: list[AdaptiveSubscription] = []
@@ -165,9 +177,9 @@ class FrameSource:
     def forget(self) -> None:
         """Drop the messages received so far."""
         with self.changed:
-            self._pairing.clear()
-            self._depths.clear()
-            self._newest = None
+            self._drop()
+            for stamps in self._stamps.values():
+                stamps.clear()
 
     @property
     def main(self) -> 'FrameSource':
@@ -232,11 +244,14 @@ class FrameSource:
                     report = health.fail if name == 'camera_info' else health.warn
                     report(self._silence(name) if nobody else
                            f'no {name} on {self._resolved(name)} for {silent_s:.1f} s')
+            for problem in self._stamp_problems():
+                health.fail(problem)
             rates = self._rates.update(self._pairing.received)
             oldest = self._pairing.oldest('image')
             health.values |= {f'{name} rate [Hz]': f'{rate:.1f}' for name, rate in rates.items()}
             health.values |= {
                 'images dropped unpaired': self._pairing.dropped['image'],
+                'image after its stamp [s]': f'{self._lag_s:.3f}',
                 'queue age [s]': f'{now - oldest[1] if oldest else 0.0:.2f}'}
 
     def awaits_detections(self, stamp_ns: int, tolerance_s: float) -> bool:
@@ -267,9 +282,13 @@ class FrameSource:
         for subscription in self._subscriptions:
             subscription.destroy()
         self._subscriptions.clear()
+        self._drop()
+
+    def _drop(self) -> None:
+        """Drop the messages received so far."""
         self._pairing.clear()
         self._depths.clear()
-        self._newest = None
+        self._newest = self._unsure = self._static_info = None
 
     def _rest(self) -> None:
         """Unsubscribe once no frame has been wanted for a while."""
@@ -312,23 +331,65 @@ class FrameSource:
         """Take one message, and pass on the frame that it completes."""
         size = {'image': lambda: len(msg.data), 'camera_info': lambda: 1000,
                 'detections': lambda: _DETECTION_BYTES * (1 + len(msg.detections))}[name]()
+        at_ns, received_at = stamp_ns(msg.header.stamp), time.monotonic()
         with self.changed:
             if not self._subscriptions:
                 return
-            self._heard_at[name] = time.monotonic()
-            complete = self._pairing.add(name, stamp_ns(msg.header.stamp),
-                                         (msg, time.monotonic()), size)
-            if complete is None:
+            self._heard_at[name] = received_at
+            if name == 'camera_info':
+                # without a stamp it holds for all images
+                self._static_info = msg if stamp_problem(msg.header.stamp) else None
+                if self._static_info is not None:
+                    return
+            elif not self._is_named(name, msg, received_at):
                 return
-            image, received_at = complete['image']
-            detections, detected_at = complete['detections']
-            frame = Frame(image, complete['camera_info'][0], detections, received_at,
-                          max(received_at, detected_at),
-                          self._depth_at(stamp_ns(image.header.stamp)), self._depth_camera_info,
-                          self._camera)
-            self._newest = frame
+            if name == 'image' and self._static_info is not None:
+                self._pairing.add('camera_info', at_ns, (self._static_info, received_at), 0)
+            complete = self._pairing.add(name, at_ns, (msg, received_at), size)
+            if complete is not None:
+                image, received_at = complete['image']
+                detections, detected_at = complete['detections']
+                self._unsure = Frame(
+                    image, complete['camera_info'][0], detections, received_at,
+                    max(received_at, detected_at), self._depth_at(at_ns),
+                    self._depth_camera_info, self._camera, image_topic=self.image_topic)
+            frame = self._unsure
+            if frame is None or not self._is_sure(stamp_ns(frame.image.header.stamp)):
+                return
+            self._newest, self._unsure = frame, None
             self.changed.notify_all()
         self._on_frame(frame)
+
+    def _is_named(self, name: str, msg: Any, received_at: float) -> bool:
+        """Return whether an image or detections have a stamp of their own."""
+        if name == 'image':
+            self._lag_s = (self._node.get_clock().now().nanoseconds
+                           - stamp_ns(msg.header.stamp)) / NS_PER_S
+            content = msg.header.frame_id, len(msg.data), bytes(
+                memoryview(msg.data)[::1 + len(msg.data) // _SAMPLE])
+            is_named = self._stamps[name].add(msg.header.stamp, content, received_at)
+        else:
+            boxes = [one.bbox for one in msg.detections]
+            is_named = self._stamps[name].add(msg.header.stamp, np.array(
+                [(one.center.position.x, one.center.position.y, one.size_x, one.size_y)
+                 for one in boxes]).tobytes(), received_at)
+        if not is_named:
+            self._unsure = None
+        return is_named
+
+    def _is_sure(self, at_ns: int) -> bool:
+        """Return whether the detections of a stamp are of its image.
+
+        A single stamp may be that of the next images, too.
+        """
+        images = self._stamps['image']
+        return images.are_own or all(one.is_repeated(at_ns) for one in self._stamps.values())
+
+    def _stamp_problems(self) -> list[str]:
+        """Return what is wrong with the stamps of images and detections, and what to do."""
+        return [f'the stamp of the {"images" if name == "image" else name} on '
+                f'{self._resolved(name)} {stamps.problem}: {_STAMPING[name]}'
+                for name, stamps in self._stamps.items() if stamps.problem]
 
     def unheard(self, since: float) -> dict[str, str]:
         """Return the inputs that were silent since a moment of the monotonic clock, and why."""
@@ -339,6 +400,11 @@ class FrameSource:
         """Return what was missing since a moment of the monotonic clock."""
         if missing := self.unheard(since):
             return '; '.join(missing.values())
+        if problems := self._stamp_problems():
+            return '; '.join(problems)
+        if self._unsure is not None:
+            return (f'too few images on {self.image_topic} to see whether each has its own stamp: '
+                    'raise its rate, or timeout_s')
         if self._pairing.outrun:
             return (f'detections come {self._pairing.outrun} images late, and memory holds '
                     f'{_MAX_IMAGE_BYTES // 2**20} MiB of images: use smaller images, '

@@ -16,6 +16,7 @@ from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros.conversions import pose_from_msg, stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.robot_state import CameraPlace, RobotState, RobotStateSource
+from cliploc_ros.ros.inputs.time_jumps import stamp_problem
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
 
@@ -145,6 +146,9 @@ class LocalizerPose:
 
 def _pose_of(shown: PoseWithCovarianceStamped, topic: str) -> NDArray[np.float64]:
     """Return a shown pose (4, 4). NoLocalizerPoseError: it is invalid."""
+    if why := stamp_problem(shown.header.stamp):
+        raise NoLocalizerPoseError(f'the stamp of {topic} {why}: the localizer '
+                                   'must stamp its pose')
     pose = pose_from_msg(shown.pose.pose)
     if pose is None:
         raise NoLocalizerPoseError(f'{topic} shows a pose with NaN or a quaternion that is not '

@@ -9,18 +9,24 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.node import Node
-from scipy.spatial.transform import Rotation, Slerp
 
-from cliploc_ros.core.geometry.transforms import SAME_SPOT, make_transform, pose_error
+from cliploc_ros.core.geometry.transforms import (
+    SAME_SPOT,
+    make_transform,
+    pose_error,
+    transform_from_pose,
+)
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription, Listener
+from cliploc_ros.ros.inputs.time_jumps import stamp_problem
 from cliploc_ros.units import NS_PER_S
 
 _UNIT_TOLERANCE = 0.01
@@ -28,16 +34,22 @@ _UNIT_TOLERANCE = 0.01
 _FARTHEST_M = 1e7
 # Poses further apart are not interpolated: wheels send every 20 ms, visual odometry every 100.
 _MAX_GAP_NS = NS_PER_S // 2
-# A message is never this late: time jumped back.
-_MAX_LATE_NS = NS_PER_S
-# A robot that seems faster than this did not move: its odometry was reset.
-_MAX_SPEED_M_S = 20.0
-_SLACK_M = 0.1
-_MAX_TURN_RAD_S = 10.0
-_SLACK_RAD = 0.1
+# A message is never this late, nor are more than this many in a row: time was set back.
+_MAX_LATE_NS, _MOST_LATE = NS_PER_S, 5
+# For moves [m] and turns [rad]. Wheels that slip, poses that tremble and stamps are off by less.
+_SLACK = np.array([SAME_SPOT.distance_m, np.radians(SAME_SPOT.angle_deg)])
+# A robot is not faster than this [1/s] where nothing tells its speed. It changes its speed by less
+# than this [1/s^2], and between two twists by less than this; a change lasts no longer [s].
+# Guesses: no run of a Husky ends at 5 Hz or more, see python -m studies.sensors.
+_FASTEST, _CHANGE = np.array([3.0, 3.0]), np.array([3.0, 8.0])
+_TWIST_CHANGE, _CHANGE_S = np.array([3.0, 4.0]), 0.5
+# Twists fit that miss at most this share of a motion, at least so much; what happened long ago
+# counts less.
+_MISSED_SHARE, _LEAST_MOTION, _MOST_MOTION = 0.25, np.array([0.3, 0.5]), np.array([4.0, 6.0])
+_NO_TWIST, _MOST_TWIST = np.zeros((2, 3)), 1e3
 # Odometry is silent after this many of its usual periods, or of a slow source's where it has just
 # begun (guesses).
-_MOST_PERIODS, _SLOW_NS = 3.0, NS_PER_S
+_MOST_PERIODS, _SLOW_NS = 3.25, NS_PER_S
 #: Over a shorter time the noise of the poses would look like a speed.
 MOMENT_NS = 300_000_000
 #: Over a longer time a speed says little (a guess): slow sources send at 1 Hz.
@@ -61,9 +73,9 @@ class NoOdometryError(CliplocError):
 
 class _Pose(NamedTuple):
     stamp_ns: int
-    position: NDArray[np.float64]
-    quat_xyzw: NDArray[np.float64]
-    way_m: float
+    odom_from_body: NDArray[np.float64]  #: (4, 4)
+    twist: NDArray[np.float64]  #: (2, 3): of the robot in its own coordinate frame [m/s], [rad/s]
+    way_m: float = 0.0
 
 
 class OdometryWindow:
@@ -83,6 +95,10 @@ class OdometryWindow:
         self._poses: list[_Pose] = []
         # The way until the last step ended, and where.
         self._way_m, self._step_end = 0.0, np.zeros(3)
+        # Messages in a row that are older than the newest.
+        self._late = 0
+        # Of this run: moves and turns by the poses, and how far the twists are off.
+        self._motion, self._missed = np.zeros(2), np.zeros(2)
         #: The number of the present run of odometry: poses of two runs are not related.
         self.run = 0
 
@@ -93,7 +109,8 @@ class OdometryWindow:
     def clear(self) -> None:
         """Forget all poses, and begin another run."""
         self._poses.clear()
-        self._way_m = 0.0
+        self._way_m, self._late = 0.0, 0
+        self._motion, self._missed = np.zeros(2), np.zeros(2)
         self.run += 1
 
     def is_ahead(self, stamp_ns: int) -> bool:
@@ -110,35 +127,41 @@ class OdometryWindow:
         row = bisect_left(self._poses, stamp_ns, key=lambda one: one.stamp_ns)
         return stamp_ns - self._poses[row - 1].stamp_ns if row else 0
 
-    def add(self, stamp_ns: int, position: NDArray[np.float64], quat_xyzw: NDArray[np.float64]
-            ) -> bool:
+    def add(self, stamp_ns: int, position: NDArray[np.float64], quat_xyzw: NDArray[np.float64],
+            twist: NDArray[np.float64] = _NO_TWIST) -> bool:
         """Take in a pose; return whether it is valid.
 
         If time or place jumps, all former poses are forgotten: the clock was set back, or
-        odometry was reset, which a silence may hide.
+        odometry was reset, which a gap may hide.
 
         Parameters
         ----------
         position : ndarray (3,)
             Of the robot in odometry's coordinate frame [m].
         quat_xyzw : ndarray (4,)
+        twist : ndarray (2, 3)
+            Of the robot in its own coordinate frame [m/s], [rad/s]. Many drivers leave it at 0.
         """
         values = np.concatenate([position, quat_xyzw])
         length = float(np.linalg.norm(quat_xyzw))
         if not np.isfinite(values).all() or abs(length - 1.0) > _UNIT_TOLERANCE \
                 or np.abs(position).max() > _FARTHEST_M:
             return False
-        pose = _Pose(stamp_ns, np.asarray(position, dtype=np.float64), quat_xyzw / length, 0.0)
+        pose = _Pose(stamp_ns, transform_from_pose(position, quat_xyzw),
+                     twist if (np.abs(twist) < _MOST_TWIST).all() else _NO_TWIST)
         poses = self._poses
-        if poses and (stamp_ns < poses[-1].stamp_ns - _MAX_LATE_NS or _jumps(poses, pose)):
-            self.clear()
+        self._late = self._late + 1 if poses and stamp_ns < poses[-1].stamp_ns else 0
         row = bisect_left(poses, stamp_ns, key=lambda one: one.stamp_ns)
-        pose = pose._replace(way_m=self._way_to(pose.position) if row == len(poses)
-                             else poses[max(row - 1, 0)].way_m)
+        if poses and (self._late > _MOST_LATE or stamp_ns < poses[-1].stamp_ns - _MAX_LATE_NS
+                      or not self._fits(pose, row)):
+            self.clear()
+            row = 0
         if row < len(poses) and poses[row].stamp_ns == stamp_ns:
-            poses[row] = pose
-        else:
-            poses.insert(row, pose)
+            return True
+        if row == len(poses):
+            self._learn(pose)
+        poses.insert(row, pose._replace(way_m=self._way_to(position) if row == len(poses)
+                                        else poses[max(row - 1, 0)].way_m))
         oldest = poses[-1].stamp_ns - self._length_ns
         first = bisect_left(poses, oldest, key=lambda one: one.stamp_ns)
         del poses[:max(first, len(poses) - self._max_poses)]
@@ -156,9 +179,8 @@ class OdometryWindow:
         before = after if after.stamp_ns == stamp_ns else self._poses[row - 1]
         if after.stamp_ns - before.stamp_ns > LONG_NS:
             return None
-        return (max(float(np.linalg.norm(newest.position - one.position))
-                    for one in (before, after)),
-                float(np.degrees(max(_turn_rad(newest, one) for one in (before, after)))))
+        ways = [_lengths(_step(newest, one)) for one in (before, after)]
+        return float(max(way[0] for way in ways)), math.degrees(max(way[1] for way in ways))
 
     def way_at(self, stamp_ns: int) -> float:
         """Return the way driven since this run began until an instant [m], to a few centimetres.
@@ -175,8 +197,7 @@ class OdometryWindow:
         """
         row = bisect_left(self._poses, stamp_ns, key=lambda one: one.stamp_ns)
         if row < len(self._poses) and self._poses[row].stamp_ns == stamp_ns:
-            same = self._poses[row]
-            return make_transform(Rotation.from_quat(same.quat_xyzw).as_matrix(), same.position)
+            return self._poses[row].odom_from_body
         if not self._poses:
             raise NoOdometryError('no odometry yet')
         if row == len(self._poses):
@@ -192,9 +213,10 @@ class OdometryWindow:
         if gap_ns > _MAX_GAP_NS:
             raise NoOdometryError(f'odometry paused for {gap_ns / NS_PER_S:.3f} s about the image')
         share = (stamp_ns - before.stamp_ns) / gap_ns
-        turns = Slerp([0.0, 1.0], Rotation.from_quat([before.quat_xyzw, after.quat_xyzw]))
-        return make_transform(turns(share).as_matrix(),
-                              before.position + share * (after.position - before.position))
+        first, last = before.odom_from_body, after.odom_from_body
+        turn = share * _step(before, after)[1]
+        return make_transform(first[:3, :3] @ cv2.Rodrigues(turn)[0],
+                              first[:3, 3] + share * (last[:3, 3] - first[:3, 3]))
 
     def _way_to(self, position: NDArray[np.float64]) -> float:
         """Return the way until the newest pose."""
@@ -205,19 +227,103 @@ class OdometryWindow:
             self._way_m, self._step_end = self._way_m + step_m, position
         return self._way_m
 
+    def _fits(self, pose: _Pose, row: int) -> bool:
+        """Return whether the robot can have been at a pose before that of a row."""
+        poses = self._poses
+        if row < len(poses) and poses[row].stamp_ns == pose.stamp_ns:
+            return bool((_lengths(_step(poses[row], pose)) <= _SLACK).all())
+        twists_fit = (self._motion >= _LEAST_MOTION) & (
+            self._missed <= _MISSED_SHARE * self._motion)
+        if row == len(poses):
+            return _is_explained(poses, pose, twists_fit)
+        before = poses[:row]
+        return ((not before or _is_explained(before, pose, twists_fit))
+                and _is_explained([*before, pose], poses[row], twists_fit))
 
-def _jumps(poses: Sequence[_Pose], pose: _Pose) -> bool:
-    """Return whether a robot cannot have moved from the newest pose to this one."""
+    def _learn(self, pose: _Pose) -> None:
+        """Take in how well the twists explain the way to the next pose."""
+        if self._poses:
+            newest = self._poses[-1]
+            step, seconds = _step(newest, pose), (pose.stamp_ns - newest.stamp_ns) / NS_PER_S
+            self._motion += _lengths(step)
+            self._missed += _lengths(step - _driven((newest.twist + pose.twist) / 2, seconds))
+            share = np.minimum(1.0, _MOST_MOTION / np.maximum(self._motion, _MOST_MOTION))
+            self._motion, self._missed = share * self._motion, share * self._missed
+
+
+def _step(before: _Pose, after: _Pose) -> NDArray[np.float64]:
+    """Return move and turn (2, 3) from a pose to another, in the robot's frame at the first."""
+    first, last = before.odom_from_body, after.odom_from_body
+    back = first[:3, :3].T
+    return np.array([back @ (last[:3, 3] - first[:3, 3]),
+                     cv2.Rodrigues(back @ last[:3, :3])[0].ravel()])
+
+
+def _driven(speed: NDArray[np.float64], seconds: float, since_s: float = 0.0
+            ) -> NDArray[np.float64]:
+    """Return move and turn (2, 3) at a speed, which is the mean since some time before."""
+    move, turn = seconds * speed
+    heading = cv2.Rodrigues((since_s + seconds) / 2 * speed[1])[0]
+    return np.array([heading @ move, turn])
+
+
+def _lengths(step: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far and how much (2,) a move and a turn (2, 3) lead."""
+    return np.array([math.hypot(*step[0]), math.hypot(*step[1])])
+
+
+def _is_explained(poses: Sequence[_Pose], pose: _Pose, twists_fit: NDArray[np.bool_]) -> bool:
+    """Return whether a robot can have moved from the newest of some poses to a later one.
+
+    Many drivers leave the twist empty, or fill it with something else. Where it fits the poses of
+    this run, which `twists_fit` (2,) says of moves and turns, the robot moved by it; else it went
+    on as its poses did, or stopped.
+
+    After a silence nothing but the latter counts, for a driver may have restarted at another
+    origin, which a robot could have reached by driving.
+    """
+    is_silence = _is_silence(poses, pose.stamp_ns - poses[-1].stamp_ns)
+    return bool(np.where(twists_fit & (not is_silence), _explained_by_twists(poses[-1], pose),
+                         _explained_by_poses(poses, pose, is_silence)).all())
+
+
+def _explained_by_twists(newest: _Pose, pose: _Pose) -> NDArray[np.bool_]:
+    """Return whether a move and a turn (2,) are those of a speed between two twists."""
+    gap_s = (pose.stamp_ns - newest.stamp_ns) / NS_PER_S
+    change, most = pose.twist - newest.twist, _TWIST_CHANGE * gap_s
+    # a driver that restarts may take its jump for a speed
+    change *= (most / np.maximum(_lengths(change), most))[:, None]
+    first, last = _driven(newest.twist, gap_s), _driven(newest.twist + change, gap_s)
+    return _lies_between(_step(newest, pose), first, last,
+                         _SLACK + _TWIST_CHANGE * gap_s * min(gap_s, _CHANGE_S) / 8
+                         + _MISSED_SHARE * _lengths(first + last) / 2)
+
+
+def _explained_by_poses(poses: Sequence[_Pose], pose: _Pose, is_silence: bool
+                        ) -> NDArray[np.bool_]:
+    """Return whether a move and a turn (2,) are those of a robot that goes on or stops.
+
+    After a long silence, the robot has to stand where it was.
+    """
     newest = poses[-1]
-    gap_ns = pose.stamp_ns - newest.stamp_ns
-    if gap_ns <= 0:
-        return False
-    if _is_silence(poses, gap_ns):
-        return not _goes_on(poses, pose)
-    seconds = gap_ns / NS_PER_S
-    distance_m = float(np.linalg.norm(pose.position - newest.position))
-    return (distance_m > _MAX_SPEED_M_S * seconds + _SLACK_M
-            or _turn_rad(newest, pose) > _MAX_TURN_RAD_S * seconds + _SLACK_RAD)
+    gap_s = (pose.stamp_ns - newest.stamp_ns) / NS_PER_S
+    row = bisect_right(poses, newest.stamp_ns - MOMENT_NS, key=lambda one: one.stamp_ns)
+    before = poses[max(row - 1, 0)]
+    moment_s = (newest.stamp_ns - before.stamp_ns) / NS_PER_S
+    speed = -_step(newest, before) / moment_s if moment_s else _NO_TWIST
+    slack = _CHANGE * gap_s * min((moment_s + gap_s) / 2, _CHANGE_S)
+    if is_silence:
+        slack, speed = np.zeros(2), speed if gap_s <= LONG_NS / NS_PER_S else _NO_TWIST
+    elif not row:  # the run has just begun: two poses at hand tell no speed
+        slack, speed = _FASTEST * gap_s, _NO_TWIST
+    return _lies_between(_step(newest, pose), _driven(speed, gap_s, moment_s), _NO_TWIST,
+                         _SLACK + slack)
+
+
+def _lies_between(step: NDArray[np.float64], one: NDArray[np.float64],
+                  other: NDArray[np.float64], slack: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which of move and turn (2,) lie about two others, which end a ball's diameter."""
+    return np.asarray(_lengths(step - (one + other) / 2) <= _lengths(one - other) / 2 + slack)
 
 
 def _is_silence(poses: Sequence[_Pose], gap_ns: int) -> bool:
@@ -227,29 +333,6 @@ def _is_silence(poses: Sequence[_Pose], gap_ns: int) -> bool:
     period_ns = float(np.median(np.diff([one.stamp_ns for one in poses]))) \
         if len(poses) > 1 else _SLOW_NS
     return gap_ns > _MOST_PERIODS * period_ns
-
-
-def _goes_on(poses: Sequence[_Pose], pose: _Pose) -> bool:
-    """Return whether a pose after a silence is where the robot was, or on its way from there.
-
-    Its driver may have restarted at another origin, which a robot could have reached by driving.
-    So it may have gone on as before or stopped, nothing else; after a long silence, it has to
-    stand where it was.
-    """
-    newest = poses[-1]
-    row = bisect_right(poses, newest.stamp_ns - MOMENT_NS, key=lambda one: one.stamp_ns)
-    before = poses[max(row - 1, 0)]
-    gap_ns, moment_ns = pose.stamp_ns - newest.stamp_ns, newest.stamp_ns - before.stamp_ns
-    times = gap_ns / moment_ns if moment_ns and gap_ns <= LONG_NS else 0.0
-    half_way = times / 2 * (newest.position - before.position)
-    off_m = float(np.linalg.norm(pose.position - newest.position - half_way))
-    most_rad = times * _turn_rad(before, newest) + np.radians(SAME_SPOT.angle_deg)
-    return (off_m <= float(np.linalg.norm(half_way)) + SAME_SPOT.distance_m
-            and _turn_rad(newest, pose) <= most_rad)
-
-
-def _turn_rad(one: _Pose, other: _Pose) -> float:
-    return float(2.0 * np.arccos(min(1.0, abs(float(one.quat_xyzw @ other.quat_xyzw)))))
 
 
 class BodyPose(NamedTuple):
@@ -274,6 +357,8 @@ class OdometrySource(Listener):
         self._newest: Odometry | None = None
         self._newest_at = 0.0
         self._frames = ('', '')
+        #: What is wrong with the stamp of the newest message, and what to do; empty if nothing is.
+        self.problem = ''
         self._on_restart: list[Callable[[int], None]] = []
 
     @property
@@ -302,12 +387,13 @@ class OdometrySource(Listener):
     def forget(self) -> None:
         """Forget what was heard: poses that follow belong to another run."""
         with self._heard:
-            self._newest = None
+            self._newest, self.problem = None, ''
             self._window.clear()
 
     def take(self, msg: Odometry) -> None:
         """Take one message."""
         p, q = msg.pose.pose.position, msg.pose.pose.orientation
+        v, w = msg.twist.twist.linear, msg.twist.twist.angular
         at_ns = stamp_ns(msg.header.stamp)
         with self._heard:
             run, had_poses = self._window.run, bool(len(self._window))
@@ -316,7 +402,13 @@ class OdometrySource(Listener):
             if frames != self._frames:
                 self._window.clear()
                 self._frames = frames
-            self._window.add(at_ns, np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
+            if why := stamp_problem(msg.header.stamp):
+                self.problem = f'the stamp of {self.topic} {why}: its driver must stamp each pose'
+            else:
+                self.problem = ''
+                self._window.add(
+                    at_ns, np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]),
+                    np.array([[v.x, v.y, v.z], [w.x, w.y, w.z]]))
             has_restarted = had_poses and self._window.run != run
             self._heard.notify_all()
         if has_restarted:
@@ -405,6 +497,8 @@ class OdometrySource(Listener):
         with self._heard:
             if self._window.is_ahead(at_ns):
                 self._heard.wait_for(lambda: not self._window.is_ahead(at_ns), _PATIENCE_S)
+            if self.problem:
+                raise NoOdometryError(self.problem)
             odom_from_body = self._window.pose_at(at_ns)
             run, body_frame = self._window.run, self._frames[1]
             way_m = self._window.way_at(at_ns)

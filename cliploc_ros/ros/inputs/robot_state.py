@@ -17,6 +17,7 @@ from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransfo
 from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometrySource
 from cliploc_ros.ros.inputs.prior import PriorSource
 from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
+from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -85,6 +86,12 @@ class RobotStateSource:
         self.transforms.forget()
         self.vertical.forget()
         self.odometry.forget()
+
+    def examine(self, health: Health) -> None:
+        """Report stamps of odometry and of the IMU that are no time."""
+        for problem in (self.odometry.problem, self.vertical.problem):
+            if problem:
+                health.warn(problem)
 
     def is_linked_soon(self, stamp: Time, deadline: float) -> bool:
         """Return whether odometry can link the frame that follows an image.

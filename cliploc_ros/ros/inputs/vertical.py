@@ -19,7 +19,7 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription, Listener
-from cliploc_ros.ros.inputs.time_jumps import StampOrder
+from cliploc_ros.ros.inputs.time_jumps import StampOrder, stamp_problem
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -93,6 +93,8 @@ class VerticalSource(Listener):
         self._stamps = StampOrder()
         self._imu_frame = ''
         self._newest_is_empty = False
+        #: What is wrong with the stamp of the newest message, and what to do; empty if nothing is.
+        self.problem = ''
 
     def open(self, source: str) -> None:
         """Listen to the IMU, if the source is 'imu'; does nothing if it already does."""
@@ -104,13 +106,16 @@ class VerticalSource(Listener):
         with self._lock:
             self._samples.clear()
             self._stamps.clear()
+            self.problem = ''
 
     def take(self, msg: Imu) -> None:
         """Take in a message of the IMU."""
         sample = sample_from_msg(msg)
         with self._lock:
             self._newest_is_empty = sample is None
-            if sample is None:
+            why, topic = stamp_problem(msg.header.stamp), self._node.resolve_topic_name('imu')
+            self.problem = why and f'the stamp of {topic} {why}: its driver must stamp each sample'
+            if sample is None or why:
                 return
             if self._stamps.goes_back('imu', sample.stamp_ns):
                 self._samples.clear()
@@ -150,6 +155,8 @@ class VerticalSource(Listener):
             newest_is_empty = self._newest_is_empty
         near = [one for one in samples if abs(one.stamp_ns - at_ns) <= WINDOW_NS]
         topic = self._node.resolve_topic_name('imu')
+        if not near and self.problem:
+            raise NoVerticalError(self.problem)
         if not near and newest_is_empty:
             raise NoVerticalError(f'{topic} has neither an orientation nor an acceleration: fill '
                                   'at least one')

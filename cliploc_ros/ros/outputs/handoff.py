@@ -27,6 +27,7 @@ from std_srvs.srv import Empty
 from cliploc_ros.core.geometry.transforms import SAME_SPOT, TAKEN, Tolerance, pose_error
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
+from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.odometry import MOMENT_PATIENCE_S, OdometrySource
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
@@ -329,6 +330,6 @@ def usable_pose(pose: PoseWithCovarianceStamped, now: Time) -> PoseWithCovarianc
     covariance = np.array(pose.pose.covariance).reshape(6, 6)
     usable.pose.covariance = (covariance + np.diag(np.maximum(
         0.0, _MIN_VARIANCES - np.diag(covariance)))).ravel()
-    if 0 < now.nanoseconds < Time.from_msg(pose.header.stamp).nanoseconds:
+    if 0 < now.nanoseconds < stamp_ns(pose.header.stamp):
         usable.header.stamp = now.to_msg()
     return usable

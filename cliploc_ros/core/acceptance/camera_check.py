@@ -1,0 +1,414 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the boxes of a camera agree with its image, its camera_info, its mount and the map.
+
+A wrong camera_info, or boxes in other pixels, displace all boxes by one rule. One image hardly
+shows it: the pose gives way. Many images do, since poses differ and the rule does not. A look is
+what one frame says of the errors of its camera, whatever its pose, see
+cliploc_ros.core.fit.camera_fit: an information and a vector, which add up over looks. Looks from
+one view share the errors of their boxes, so they count as one, with their mean.
+
+A camera is right, with the small errors of any calibration, or wrong in one of a few ways (kinds),
+with large errors. The Bayes factor of wrong against right is a mean of likelihood ratios. With a
+right camera it ever exceeds N with a probability of at most 1 / N, however often it is computed
+(Ville, "Etude critique de la notion de collectif", 1939). So of cameras that are right, one of
+1000 at most is called wrong at odds of 1000, if the looks of different views are independent. No
+single view counts more than e^3: its boxes may be matched by mistake.
+
+Until the odds are clear, a pose counts as far as it is right under each kind. A pose of a few far
+objects needs a camera that looks have verified; one of many objects at different distances does
+not.
+
+A detector's boxes end at the border of the image that it sees. Where many end at one line inside
+of the image, and none beyond, they are in the pixels of another image. This counts as evidence for
+some kinds of errors, at most as e^8: a border within the image itself, such as black bars, looks
+alike, and the looks then say so.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import bdtrc, pdtrc
+
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.acceptance.contenders import JoinedFrames
+from cliploc_ros.core.fit.camera_fit import ERRORS, fit_camera
+from cliploc_ros.core.fit.covariance import moves_with_cameras, shares_within
+from cliploc_ros.core.fit.finalists import Finalist
+from cliploc_ros.core.fit.refinement import one_to_one
+from cliploc_ros.core.fit.verification import camera_pose, verify_rig
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import (
+    RIGHT_M,
+    SAME_BOXES,
+    invert_transform,
+    make_transform,
+)
+from cliploc_ros.core.observation import Observation
+
+_TERMS = CALIBRATION.camera
+# Deviations of the errors of a right camera and of a wrong one, see camera_fit.
+_RIGHT = np.array([_TERMS.focal, _TERMS.aspect, _TERMS.point, _TERMS.point, _TERMS.corner,
+                   _TERMS.corner, _TERMS.size])
+#: Deviations of the errors of a right camera_info.
+CALIBRATED = np.where(np.arange(ERRORS) < 4, _TERMS.calibrated * _RIGHT, 0.0)
+_WRONG = np.array([0.5, 0.3, 0.3, 0.3, 0.4, 0.4, 0.4])
+# The errors that are large in each kind of wrong camera, the others are those of a right one.
+_KINDS = {'image': (0, 2, 3), 'focal length': (0,), 'aspect': (1,), 'principal point': (2, 3),
+          'stretched image': (0, 1, 2, 3), 'convention': (4, 5), 'size': (6,)}
+_OF_OTHER_PIXELS = np.array([name in ('image', 'principal point', 'stretched image')
+                             for name in _KINDS])
+_DEVIATIONS = np.array([_RIGHT, *(np.where(np.isin(np.arange(ERRORS), errors), _WRONG, _RIGHT)
+                                  for errors in _KINDS.values())])
+_LOG_DEVIATIONS = np.log(_DEVIATIONS).sum(axis=1)
+_WEIGHTS = np.array([1.0 - _TERMS.wrong, *[_TERMS.wrong / len(_KINDS)] * len(_KINDS)])
+_PRIORS = _DEVIATIONS[:, :, None] ** -2.0 * np.eye(ERRORS)
+# Mean square of the residuals before any is seen, and how many residuals this counts as.
+_PRIOR_SQUARE, _PRIOR_RESIDUALS = 1.0, 6.0
+# An edge that is nearer to the border of the image is cut by it [px].
+_BORDER_PX = 2.0
+_MOST_VIEWS = 60
+# Log odds of a right camera after two to five views; no single look at a wrong one had less on TUM
+# fr3, see studies/camera.py.
+_FITS = -2.0
+# A camera_info with intrinsics that differ by less is the same: an autofocus moves.
+_SAME_CAMERA = 0.01
+# Boxes to remember; those that overlap by more are one box.
+_MOST_BOXES, _SAME_BOX_IOU = 200, 0.8
+# A line that cuts boxes is within the image if it is further from its border than this share.
+_INSIDE = 0.1
+# The least density of the ends of boxes that are not cut, as a multiple of their mean density, and
+# the share of the image in which it is measured.
+_LEAST_DENSITY, _NEAR_SHARE = 4.0, 0.1
+# Share of boxes whose middle is beyond the image, by mistake.
+_BEYOND = 0.01
+# A mount is wrong where accepted poses explain less than this share of what its camera saw, and
+# more than twice as much of what the others did. With four cameras among simulated objects, a
+# right mount has 1.0, one that is turned by 2 degrees .8, by 5 degrees .1, by more 0 to .1.
+_LEAST_SHARE = 0.3
+# Of instants, and of objects in all of them; before, nothing is said.
+_LEAST_INSTANTS, _MOST_INSTANTS, _LEAST_OBJECTS = 5, 20, 15
+
+
+class CameraLook(NamedTuple):
+    """What a frame says of the errors of its camera."""
+
+    camera_name: str
+    is_new: bool  #: Whether it is of the newest instant
+    map_from_camera: NDArray[np.float64]  #: (4, 4)
+    #: (7, 7), (7,): of the errors; information times the most likely ones
+    information: NDArray[np.float64]
+    vector: NDArray[np.float64]
+    #: (3, 7): how the position of the newest camera moves with each error [m]
+    moves: NDArray[np.float64]
+
+
+def _log_mean(logs: NDArray[np.float64]) -> float:
+    """Return the logarithm of the mean of numbers, given their logarithms (n,)."""
+    most = float(logs.max())
+    return most + math.log(float(np.exp(logs - most).mean()))
+
+
+class CameraOdds(NamedTuple):
+    """What is known of a camera: it is right, or wrong in one of k ways."""
+
+    odds: NDArray[np.float64]  #: (1 + k,): log likelihood of each, up to a constant
+    means: NDArray[np.float64]  #: (1 + k, 7): errors under each
+    squares: NDArray[np.float64]  #: (1 + k, 7, 7): their mean squares
+
+    @property
+    def log_odds(self) -> float:
+        """Return the logarithm of the Bayes factor of a wrong camera against a right one."""
+        return _log_mean(self.odds[1:]) - float(self.odds[0])
+
+    @property
+    def is_wrong(self) -> bool:
+        """Return whether the camera is certainly wrong."""
+        return self.log_odds > _TERMS.sure
+
+    def share_near(self, covariance: NDArray[np.float64], moves: NDArray[np.float64]) -> float:
+        """Return the factor by which errors of the camera lower the chance of a pose within 1 m.
+
+        Parameters
+        ----------
+        covariance : ndarray (6, 6)
+            Of the pose, with a right camera.
+        moves : ndarray (3, 7)
+            See CameraLook.
+        """
+        weights = np.exp(self.odds - self.odds.max()) * _WEIGHTS
+        wider = np.tile(CALIBRATION.covariance.caution * covariance[:3, :3],
+                        (len(weights), 1, 1))
+        wider[1:] += moves @ self.squares[1:] @ moves.T
+        near = shares_within(RIGHT_M, wider)
+        return float(weights @ near / (weights.sum() * near[0]))
+
+
+def odds_of(information: NDArray[np.float64], vector: NDArray[np.float64], extent: float = 0.0
+            ) -> CameraOdds:
+    """Return what looks say of a camera.
+
+    Parameters
+    ----------
+    information, vector : ndarray (7, 7), (7,)
+        Their sums.
+    extent : float
+        Log odds that boxes are in other pixels, by their extent.
+    """
+    covariances = np.linalg.inv(information + _PRIORS)
+    means = covariances @ vector
+    odds = 0.5 * (np.log(np.linalg.det(covariances)) + means @ vector) - _LOG_DEVIATIONS
+    odds[1:] += extent * _OF_OTHER_PIXELS
+    return CameraOdds(odds, means, covariances + means[:, :, None] * means[:, None])
+
+
+def looks_of(joined: JoinedFrames, pose: Finalist) -> list[CameraLook]:
+    """Return what each frame says of its camera, given a pose of the last one."""
+    inliers = one_to_one(joined.rig, verify_rig(joined.rig, pose.rotation, pose.translation),
+                         pose.rotation, pose.translation)
+    looks, last = [], joined.frames[-1].observation
+    moves = moves_with_cameras(joined.rig, inliers, pose.rotation, pose.translation)[:, :3]
+    names = np.array([frame.observation.camera_name for frame in joined.frames])
+    for number, frame in enumerate(joined.frames):
+        pairs = inliers.pairs[inliers.starts[number]:inliers.starts[number + 1]]
+        vertical, seen = joined.rig.verticals[number], frame.observation
+        if len(pairs) < (2 if vertical[6] > 0.0 else 3):
+            continue
+        rotation, translation = camera_pose(joined.rig.cameras[number], pose.rotation,
+                                            pose.translation)
+        rows = (frame.scene.box_ellipses == pairs[:, None, :4]).all(axis=2).argmax(axis=1)
+        low, high = _BORDER_PX, np.array([seen.camera.width, seen.camera.height]) - _BORDER_PX
+        left, top, right, bottom = seen.detections.bboxes_xyxy[rows].T
+        is_edge = np.stack([left > low, right < high[0], top > low, bottom < high[1]], axis=1)
+        fit = fit_camera(pairs, is_edge, vertical, rotation, translation, _WRONG)
+        square = max(1.0, (fit.square + _PRIOR_SQUARE * _PRIOR_RESIDUALS)
+                     / (max(0, int(is_edge.sum()) - 6 - ERRORS) + _PRIOR_RESIDUALS))
+        information = fit.information / square
+        vector = information @ fit.errors + fit.errors / _WRONG ** 2 / square
+        weight = _TERMS.view / max(_TERMS.view, odds_of(information, vector).log_odds)
+        looks.append(CameraLook(
+            seen.camera_name, seen.stamp_ns == last.stamp_ns,
+            invert_transform(make_transform(rotation, translation)),
+            weight * information, weight * vector,
+            moves[names == seen.camera_name].sum(axis=0)))
+    return looks
+
+
+class Views(NamedTuple):
+    """The looks of a camera from v views: the mean of the looks from each."""
+
+    poses: NDArray[np.float64] = np.empty((0, 4, 4))  #: (v, 4, 4): map_from_camera
+    counts: NDArray[np.int64] = np.empty(0, dtype=np.int64)  #: (v,): of looks
+    informations: NDArray[np.float64] = np.empty((0, ERRORS, ERRORS))  #: (v, 7, 7)
+    vectors: NDArray[np.float64] = np.empty((0, ERRORS))  #: (v, 7)
+
+    def with_look(self, look: CameraLook) -> 'Views':
+        """Return these views and a look; of too many the newest remain."""
+        same = np.nonzero(SAME_BOXES.agreeing(self.poses, look.map_from_camera[None])[:, 0])[0]
+        if not len(same):
+            new = (look.map_from_camera, 1, look.information, look.vector)
+            return self.joined(Views(*(np.array([one]) for one in new)))
+        row, counts = same[0], self.counts.copy()
+        informations, vectors = self.informations.copy(), self.vectors.copy()
+        counts[row] += 1
+        informations[row] += (look.information - informations[row]) / counts[row]
+        vectors[row] += (look.vector - vectors[row]) / counts[row]
+        return Views(self.poses, counts, informations, vectors)
+
+    def joined(self, other: 'Views') -> 'Views':
+        """Return these views and others, of which the last ones remain."""
+        return Views(*(np.concatenate(both)[-_MOST_VIEWS:]
+                       for both in zip(self, other, strict=True)))
+
+    def odds(self, extent: float = 0.0) -> CameraOdds:
+        """Return what all looks say together."""
+        return odds_of(self.informations.sum(axis=0), self.vectors.sum(axis=0), extent)
+
+
+class Extent:
+    """Where the boxes of a camera end, over some frames, accepted or not."""
+
+    def __init__(self) -> None:
+        self._boxes = np.empty((0, 4))
+
+    def add(self, boxes: NDArray[np.float64]) -> None:
+        """Take in the boxes (n, 4) of a frame; those that were seen before count once."""
+        low = np.maximum(boxes[:, None, :2], self._boxes[:, :2])
+        high = np.minimum(boxes[:, None, 2:], self._boxes[:, 2:])
+        shared = np.maximum(high - low, 0.0).prod(axis=2)
+        areas, known = ((one[:, 2:] - one[:, :2]).prod(axis=1) for one in (boxes, self._boxes))
+        is_known = (shared > _SAME_BOX_IOU * (areas[:, None] + known - shared)).any(axis=1)
+        self._boxes = np.concatenate([self._boxes, boxes[~is_known]])[-_MOST_BOXES:]
+
+    @property
+    def reach(self) -> NDArray[np.float64]:
+        """Return the left, top, right and bottom end (4,) of all boxes [px]."""
+        return np.append(self._boxes[:, :2].min(axis=0), self._boxes[:, 2:].max(axis=0))
+
+    def log_odds(self, camera: Camera) -> float:
+        """Return the log odds that the boxes are in the pixels of another image, 0 or more."""
+        count, size = len(self._boxes), np.array([camera.width, camera.height])
+        if not count:
+            return 0.0
+        # by how much each box reaches to the right, down, left and up
+        reaches = np.hstack([self._boxes[:, 2:], size - self._boxes[:, :2]])
+        lines, lengths = reaches.max(axis=0), np.tile(size, 2)
+        # others that end at the same line, and the density of those that end near it
+        ends = (reaches > lines - _BORDER_PX).sum(axis=0) - 1
+        near = (reaches > lines - _NEAR_SHARE * lengths).sum(axis=0) - ends
+        density = np.maximum(_LEAST_DENSITY * count, near / _NEAR_SHARE) / lengths
+        is_line = (lines < (1.0 - _INSIDE) * lengths) & (ends > 0)
+        middles = (self._boxes[:, :2] + self._boxes[:, 2:]) / 2
+        beyond = int(((middles < 0.0) | (middles > size)).any(axis=1).sum())
+        chances = [*np.where(is_line, pdtrc(ends - 1, _BORDER_PX * density), 1.0),
+                   float(bdtrc(beyond - 1, count, _BEYOND)) if beyond else 1.0]
+        # a chance p is evidence of 1 / (2 sqrt(p)) at most (Vovk and Wang 2021)
+        evidence = _log_mean(-0.5 * np.log(np.maximum(chances, 1e-99))) - math.log(2.0)
+        return float(np.clip(evidence, 0.0, _TERMS.extent))
+
+
+class _Record:
+    """What is known of one camera."""
+
+    def __init__(self, name: str, camera: Camera) -> None:
+        self.name, self.camera = name, camera
+        self.views, self.since, self.extent = Views(), Views(), Extent()
+        self.by_looks, self.by_extent = 0.0, 0.0  # log odds that the camera is wrong
+        self.odds = self.views.odds()  # by both
+
+    def see(self, observation: Observation) -> None:
+        """Take in the boxes of a frame, unless looks have verified the camera."""
+        if self.by_looks > _FITS or self.by_extent > 0.0:
+            self.extent.add(observation.detections.bboxes_xyxy)
+            self.by_extent = self.extent.log_odds(self.camera)
+            self.odds = self.views.odds(self.by_extent)
+
+    def add(self, look: CameraLook) -> None:
+        """Take in a look. Those after a camera was called wrong tell whether it was mended."""
+        if self.by_looks <= _TERMS.sure:
+            self.views, self.since = self.views.with_look(look), Views()
+        else:
+            self.since = self.since.with_look(look)
+            # by how much they raise the odds of the errors that the looks before have shown
+            gain = self.views.joined(self.since).odds().log_odds - self.by_looks
+            if gain > _TERMS.view:
+                self.views, self.since = self.views.joined(self.since), Views()
+            elif (gain < -_TERMS.view and self.since.odds().log_odds < _FITS
+                  and self.by_extent < -_FITS):
+                self.views, self.since = self.since, Views()
+        self.odds, self.by_looks = self.views.odds(self.by_extent), self.views.odds().log_odds
+
+    @property
+    def fault(self) -> str:
+        """Return what is certainly wrong with the camera; empty if nothing is."""
+        return self.in_words(self.odds) if self.odds.is_wrong else ''
+
+    def in_words(self, odds: CameraOdds) -> str:
+        """Return the errors of a wrong camera in a line."""
+        row = 1 + int(np.argmax(odds.odds[1:]))
+        kind, (focal, aspect, *shift, across, along, size) = list(_KINDS)[row - 1], odds.means[row]
+        one, where = self.camera, f'{self.name}: ' if self.name else ''
+        if self.by_extent > _TERMS.view and _OF_OTHER_PIXELS[row - 1]:
+            reach = self.extent.reach
+            return (f'{where}boxes reach from ({reach[0]:.0f}, {reach[1]:.0f}) to '
+                    f'({reach[2]:.0f}, {reach[3]:.0f}) of {one.width} x {one.height} px')
+        if kind == 'convention':
+            return (f'{where}boxes are off by {across:+.2f} of their widths and {along:+.2f} of '
+                    'their heights')
+        if kind == 'size':
+            return f'{where}boxes are {math.exp(size):.2f} times as large as those of the map'
+        fx, fy = one.fx * math.exp(focal + aspect / 2), one.fy * math.exp(focal - aspect / 2)
+        cx, cy = one.cx + one.fx * shift[0], one.cy + one.fy * shift[1]
+        return (f'{where}boxes fit fx {fx:.0f} fy {fy:.0f} cx {cx:.0f} cy {cy:.0f} px, not '
+                f'{one.fx:.0f} {one.fy:.0f} {one.cx:.0f} {one.cy:.0f}')
+
+
+class CameraCheck:
+    """What the looks of a localizer say of its cameras, by their names."""
+
+    def __init__(self) -> None:
+        self._records: dict[str, _Record] = {}
+        self._instants: deque[dict[str, tuple[int, int]]] = deque(maxlen=_MOST_INSTANTS)
+
+    def see(self, observation: Observation) -> None:
+        """Take in the boxes of a frame, accepted or not; another camera_info forgets all looks."""
+        name, camera = observation.camera_name, observation.camera
+        record = self._records.get(name)
+        if record is None or not _is_same(record.camera, camera):
+            record = self._records[name] = _Record(name, camera)
+        record.see(observation)
+
+    def add(self, looks: Sequence[CameraLook]) -> None:
+        """Take in the looks of a pose that is accepted, or would be by a right camera."""
+        for look in looks:
+            if look.is_new:
+                self._records[look.camera_name].add(look)
+
+    def judge(self, looks: Sequence[CameraLook], covariance: NDArray[np.float64]
+              ) -> tuple[float, str]:
+        """Return what the cameras do to a pose, with its looks, which are not taken in.
+
+        That is the factor of CameraOdds.share_near, and what is wrong with a camera that is
+        certainly wrong; empty without one. The covariance (6, 6) is that of the pose.
+        """
+        share, fault = 1.0, ''
+        for name in dict.fromkeys(look.camera_name for look in looks):
+            its_looks = [look for look in looks if look.camera_name == name]
+            record = self._records.get(name)
+            views = reduce(Views.with_look, its_looks, record.views if record else Views())
+            odds = views.odds(record.by_extent if record else 0.0)
+            share = min(share, odds.share_near(covariance, its_looks[-1].moves))
+            if record is not None and odds.is_wrong:
+                fault = record.in_words(odds)
+        return share, fault or '; '.join(self.faults)
+
+    @property
+    def faults(self) -> list[str]:
+        """Return what is wrong with cameras that are certainly wrong."""
+        return [record.fault for record in self._records.copy().values() if record.fault]
+
+    @property
+    def values(self) -> dict[str, str]:
+        """Return the log odds that each camera is wrong, for the diagnostics."""
+        return {f'camera check {name}'.rstrip():
+                f'{record.odds.log_odds:+.1f} log odds that boxes or camera_info are wrong, by '
+                f'{len(record.views.poses)} views'
+                for name, record in self._records.copy().items()}
+
+    def add_instant(self, seen: Sequence[Observation], known: Sequence[int],
+                    matched: Sequence[int]) -> None:
+        """Take in an accepted pose: of each camera, objects of the map's classes and matches."""
+        self._instants.append({one.camera_name: (of_map, found) for one, of_map, found
+                               in zip(seen, known, matched, strict=True)})
+
+    @property
+    def wrong_mounts(self) -> list[str]:
+        """Return the names of the cameras whose mount cannot be right."""
+        names = dict.fromkeys(name for instant in self._instants for name in instant)
+        counts = {name: np.array([instant[name] for instant in self._instants if name in instant])
+                  for name in names}
+        every = np.sum([of_one.sum(axis=0) for of_one in counts.values()], axis=0)
+        found = []
+        for name, of_one in counts.items():
+            known, matched = of_one.sum(axis=0)
+            others_known, others_matched = every - (known, matched)
+            if (len(of_one) >= _LEAST_INSTANTS and min(known, others_known) >= _LEAST_OBJECTS
+                    and matched < _LEAST_SHARE * known
+                    and matched / known < 0.5 * others_matched / others_known):
+                found.append(name)
+        return found
+
+
+def _is_same(one: Camera, other: Camera) -> bool:
+    """Return whether intrinsics differ by little, as those of an autofocus do."""
+    if one == other:
+        return True
+    changes = np.array([one.fx, one.fy, one.cx, one.cy]) - [other.fx, other.fy, other.cx, other.cy]
+    return bool(np.abs(changes).max() <= _SAME_CAMERA * one.fx) and one == replace(
+        other, fx=one.fx, fy=one.fy, cx=one.cx, cy=one.cy)

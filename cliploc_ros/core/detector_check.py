@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the detections of a camera can be of use: their classes, scores and boxes."""
+
+from collections import Counter, deque
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+
+from cliploc_ros.core.acceptance.verdict import RefusalKind
+from cliploc_ros.core.geometry.camera_faults import Fault
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.errors import did_you_mean
+
+# Frames that are remembered, and detections without which nothing is said of a detector (guesses).
+_MOST_FRAMES, _LEAST = 20, 3
+# Names in a message, and their characters.
+_MOST_NAMES, _MOST_CHARACTERS = 5, 30
+# Refusals for which a detector is the cause, if it has a fault.
+_ITS_KINDS = (RefusalKind.TOO_FEW_OBJECTS, RefusalKind.UNEXPLAINED)
+_TURN = '; turn the camera'
+
+
+class _Tally(NamedTuple):
+    """Numbers of detections in some frames."""
+
+    given: int = 0
+    scored: int = 0  #: With a finite score
+    usable: int = 0
+    of_map: int = 0  #: Usable, and of a class of the map
+    odd_score: float | None = None  #: A score that is not from 0 to 1
+    bad_box: str = ''  #: A box that is not usable
+    classes: Counter[str] = Counter()  # noqa: RUF012 (never changed)
+
+
+class DetectorCheck:
+    """Counts the detections of the last frames that are fit for localization, and the others.
+
+    Parameters
+    ----------
+    by_class : bool
+        Classes are matched, so that they have to be those of the map.
+    frames : int, optional
+        How many frames are remembered; None: all.
+    """
+
+    def __init__(self, landmark_map: LandmarkMap, by_class: bool,
+                 frames: int | None = _MOST_FRAMES) -> None:
+        self._known = landmark_map.classes.numbers
+        self._by_class = by_class
+        self._frames: deque[_Tally] = deque(maxlen=frames)
+
+    def add(self, given: Detections, usable: Detections) -> None:
+        """Take in the detections of a frame, and those of them that are used."""
+        scores, boxes = given.scores, given.bboxes_xyxy
+        scored = np.isfinite(scores)
+        odd = scores[scored & ((scores < 0.0) | (scores > 1.0))]
+        unused = ''
+        if scored.any() and not len(usable):
+            left, top, right, bottom = boxes[scored][0]
+            unused = f'{right - left:.3g} x {bottom - top:.3g} px at ({left:.3g}, {top:.3g})'
+        self._frames.append(_Tally(
+            len(given), int(scored.sum()), len(usable),
+            sum(one in self._known for one in usable.class_ids),
+            float(odd[0]) if len(odd) else None, unused, Counter(usable.class_ids)))
+
+    @property
+    def faults(self) -> list[Fault]:
+        """Return what is wrong with the detections of the last frames."""
+        pooled = self._pooled
+        found = self._certain(pooled) if pooled.given >= _LEAST else []
+        if pooled.odd_score is not None:
+            found.append(Fault(f'its scores are not from 0 to 1, such as {pooled.odd_score:g}',
+                               False))
+        return found
+
+    def explain(self, found: Relocalization) -> Relocalization:
+        """Return the result of the last frame, with the cause where its detections are of no use.
+
+        Turning the camera is no remedy then.
+        """
+        last = self._frames[-1] if self._frames else _Tally()
+        certain = self._certain(last)
+        if found.accepted or not certain:
+            return found
+        is_cause = found.refusal_kind in _ITS_KINDS and (
+            last.given >= _LEAST or bool(self._certain(self._pooled)))
+        return replace(
+            found, reason=f'{found.reason.partition(_TURN)[0]}; the detector: {certain[0].text}',
+            refusal_kind=RefusalKind.WRONG_DETECTIONS if is_cause else found.refusal_kind)
+
+    @property
+    def _pooled(self) -> _Tally:
+        """Return the numbers of all frames."""
+        frames = self._frames
+        return _Tally(
+            sum(one.given for one in frames), sum(one.scored for one in frames),
+            sum(one.usable for one in frames), sum(one.of_map for one in frames),
+            next((one.odd_score for one in frames if one.odd_score is not None), None),
+            next((one.bad_box for one in frames if one.bad_box), ''),
+            sum((one.classes for one in frames), Counter()))
+
+    def _certain(self, tally: _Tally) -> list[Fault]:
+        """Return why no detection of some frames is of use; nothing where one is."""
+        text = ''
+        if tally.given and not tally.scored:
+            text = f'none of its {tally.given} scores is a number'
+        elif tally.given and not tally.usable:
+            text = (f'none of its {tally.given} boxes is within the image and a pixel wide, such '
+                    f'as {tally.bad_box}: publish pixels of the image')
+        elif tally.usable and self._by_class and not tally.of_map:
+            names = [name for name, _ in tally.classes.most_common()]
+            numbers = ', which are numbers' if all(name.isdigit() for name in names) else ''
+            hint = next(filter(None, (did_you_mean(name, self._known)
+                                      for name in names[:_MOST_NAMES])), '')
+            text = (f'no class of the map is among its {_in_words(names)}{numbers}{hint}; the map '
+                    f'has {_in_words(self._known)}: use the detector of the map, or class_map')
+        return [Fault(text, True)] if text else []
+
+
+def _in_words(names: Iterable[str]) -> str:
+    """Return some names in a line; strangers may have written them."""
+    shown = [*islice(names, _MOST_NAMES + 1)]
+    cut = [''.join(char if char.isprintable() else ' ' for char in name[:_MOST_CHARACTERS])
+           or 'no name' for name in shown[:_MOST_NAMES]]
+    return ', '.join(cut) + (' ...' if len(shown) > _MOST_NAMES else '')

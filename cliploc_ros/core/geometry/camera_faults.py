@@ -1,0 +1,196 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a camera is plausible: intrinsics of another resolution, unit or lens."""
+
+import math
+from collections.abc import Iterable
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import is_rigid, make_transform, rotation_angle_deg
+from cliploc_ros.errors import CameraError
+
+# Distance of the principal point from the middle, in widths and heights. The recorded cameras of
+# ../shared/data have .04 at most; K of half the resolution has .35, of twice the resolution .7.
+_OFF_MIDDLE, _FAR_OFF_MIDDLE = 0.12, 0.2
+# Fields of view that lenses have, and that no lens has [deg], of a fisheye and of others.
+_WIDE = {True: (240.0, 300.0), False: (125.0, 150.0)}
+_NARROW_DEG, _NEEDLE_DEG = 3.0, 0.3
+# Ratio of the focal lengths. Images stretched to a square have 1.8, single fields of video 2.
+_STRETCHED, _TORN = 1.1, 2.5
+# The middle of each edge of the inner half of an image, and of its border.
+_MIDDLES = np.array([(-0.5, 0.0), (0.5, 0.0), (0.0, -0.5), (0.0, 0.5)])
+# Elements of K that should be 0 may have this share of the focal length: they are not used.
+_MOST_SKEW = 0.005
+_ROTATION_TOLERANCE = 0.01
+# Rectification turns a raw image by this before poses are off by more than their deviations [deg].
+_MOST_TURN_DEG = 1.0
+# Ratio of focal lengths, and distance of principal points in sizes of the image, of P and K:
+# without distortion they are equal, else P shows more or less of the image.
+_AS_K, _NEAR_K = (0.98, 1.02, 0.02), (0.2, 1.7, 0.3)
+_TIMES_K, _AS_SCALED = 1.2, 0.1  # another lens, or the same one scaled
+# Baseline of a stereo pair that moves poses [m].
+_MOST_BESIDE_M = 0.02
+_CACHED = 64
+
+
+class Fault(NamedTuple):
+    """What contradicts itself in an input, in one line."""
+
+    text: str
+    #: Whether poses would certainly be wrong, so that the input is refused; else it is unusual
+    is_certain: bool
+
+
+def calibration_faults(sensor: Camera, k: NDArray[np.float64], r: NDArray[np.float64],
+                       p: NDArray[np.float64], rectified: bool) -> list[Fault]:
+    """Return what is implausible about a calibration, or contradicts itself.
+
+    Parameters
+    ----------
+    sensor : Camera
+        Of whole images, by K and distortion or, of `rectified` images, by P.
+    k, r, p : ndarray (3, 3), (3, 3), (3, 4)
+        See sensor_msgs/CameraInfo. Zeros stand for no R and no P, and no K of rectified images.
+    """
+    used, name = (p[:, :3], 'P') if rectified else (k, 'K')
+    deviations = [[_MOST_SKEW * sensor.fx] * 3, [_MOST_SKEW * sensor.fy] * 3, [1e-3] * 3]
+    faults = list(camera_faults(sensor))
+    if not (np.abs(used - sensor.matrix) <= deviations).all():
+        faults.insert(0, Fault(
+            f'{np.round(used, 3).tolist()} is not of the form [fx 0 cx, 0 fy cy, 0 0 1]: is it '
+            'transposed? Skew is not supported', True))
+    faults = [fault._replace(text=f'{name}: {fault.text}') for fault in faults]
+    if (contradiction := _contradiction(p, k, sensor, rectified)) is not None:
+        faults.append(contradiction)
+    # either doubt alone may be harmless
+    if contradiction is not None and len(faults) > 1:
+        faults = [fault._replace(is_certain=True) for fault in faults]
+    return [*faults, *(Fault(text, False) for text in (
+        *_doubts_of_rotation(r, rectified), *_doubts_of_projection(p)))]
+
+
+def check_faults(faults: Iterable[Fault]) -> None:
+    """Raise CameraError with the first certain fault."""
+    for fault in faults:
+        if fault.is_certain:
+            raise CameraError(fault.text)
+
+
+@lru_cache(_CACHED)
+def camera_faults(camera: Camera) -> tuple[Fault, ...]:
+    """Return what is implausible about the camera of whole images, the certain faults first.
+
+    An image that is cut out of a larger one has any principal point: give the camera of the whole.
+    """
+    faults = [*_off_middle(camera), *_field(camera), *_stretch(camera), *_fold(camera)]
+    return tuple(sorted(faults, key=lambda fault: not fault.is_certain))
+
+
+def _off_middle(camera: Camera) -> list[Fault]:
+    share = np.array([camera.cx / camera.width, camera.cy / camera.height])
+    off = float(np.linalg.norm(share - 0.5))
+    if off <= _OFF_MIDDLE:
+        return []
+    return [Fault(
+        f'the principal point ({camera.cx:g}, {camera.cy:g}) is far from the middle of '
+        f'{camera.width}x{camera.height} px, as that of an image of {2 * camera.cx:.0f}x'
+        f'{2 * camera.cy:.0f} px is: scale K with the image; give width, height and roi of a '
+        'cropped one', off > _FAR_OFF_MIDDLE)]
+
+
+def _field(camera: Camera) -> list[Fault]:
+    is_fisheye = camera.distortion_model == 'equidistant'
+    wide_deg, no_lens_deg = _WIDE[is_fisheye]
+    return [Fault(
+        f'the image is {field_deg:.3g} degrees {side} by a focal length of {focal_px:g} px and '
+        f"{'a fisheye' if is_fisheye else 'no fisheye'}: is it in pixels of this image?",
+        not _NEEDLE_DEG <= field_deg <= no_lens_deg)
+        for side, field_deg, focal_px in zip(('wide', 'high'), fields_of_view(camera),
+                                             (camera.fx, camera.fy), strict=True)
+        if not _NARROW_DEG <= field_deg <= wide_deg]
+
+
+def fields_of_view(camera: Camera) -> tuple[float, float]:
+    """Return how wide and how high an image is [deg], by its focal lengths alone."""
+    halves = (0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy)
+    if camera.distortion_model != 'equidistant':
+        halves = (math.atan(halves[0]), math.atan(halves[1]))
+    return math.degrees(2.0 * halves[0]), math.degrees(2.0 * halves[1])
+
+
+def _stretch(camera: Camera) -> list[Fault]:
+    ratio = max(camera.fx / camera.fy, camera.fy / camera.fx)
+    return [] if ratio <= _STRETCHED else [Fault(
+        f'the focal lengths {camera.fx:g} and {camera.fy:g} px differ by a factor of {ratio:.3g}: '
+        'is the image stretched like that?', ratio > _TORN)]
+
+
+def _fold(camera: Camera) -> list[Fault]:
+    """Return whether coefficients fold the image: they are of another lens or model, or order."""
+    if camera.is_pinhole:
+        return []
+    size = (camera.width, camera.height)
+    for share in (0.5, 1.0):
+        pixels = np.multiply(0.5 + share * _MIDDLES, size)
+        if np.isnan(camera.normalize_points(pixels)).any() and (
+                share == 0.5 or camera.distortion_model != 'equidistant'):
+            return [Fault(
+                f"the coefficients {[float(f'{one:.4g}') for one in camera.distortion]} of "
+                f'{camera.distortion_model} fold the image onto itself before its '
+                f"{'border' if share == 1.0 else 'inner half ends'}: are they of this lens, and "
+                'in this order?', share == 0.5)]
+    return []
+
+
+def _doubts_of_rotation(rotation: NDArray[np.float64], rectified: bool) -> list[str]:
+    """Return what is unusual about R (3, 3); zeros stand for no rectification."""
+    if not np.any(rotation):
+        return []
+    if not is_rigid(make_transform(rotation, np.zeros(3)), _ROTATION_TOLERANCE):
+        return ['R is no rotation: set it to the identity']
+    turn_deg = rotation_angle_deg(rotation)
+    return [] if rectified or turn_deg <= _MOST_TURN_DEG else [
+        f'R turns rectified images by {turn_deg:.3g} degrees, and the coordinate frame is theirs: '
+        'use them, with rectified true']
+
+
+def _contradiction(projection: NDArray[np.float64], matrix: NDArray[np.float64], sensor: Camera,
+                   rectified: bool) -> Fault | None:
+    """Return that P (3, 4) and K (3, 3) are of different images, where both are given."""
+    focal_px, of_k = np.diag(projection)[:2], np.diag(matrix)[:2]
+    if not ((focal_px > 0.0).all() and (of_k > 0.0).all()):
+        return None
+    should_equal = sensor.is_pinhole and not rectified
+    low, high, far = _AS_K if should_equal else _NEAR_K
+    ratios = focal_px / of_k
+    moved = np.abs(projection[:2, 2] - matrix[:2, 2]) / (sensor.width, sensor.height)
+    if low <= ratios.min() and ratios.max() <= high and moved.max() <= far:
+        return None
+    # P of another resolution is scaled as a whole; then K may be right
+    scaled = np.allclose(projection[:2, 2] / ratios, matrix[:2, 2], rtol=_AS_SCALED)
+    return Fault(
+        'P has focal lengths {:g} and {:g} and principal point ({:g}, {:g}) px, K {:g} and '
+        '{:g} and ({:g}, {:g}): is one of them of another resolution?'.format(
+            *focal_px, *projection[:2, 2], *of_k, *matrix[:2, 2]),
+        should_equal and not scaled and not 1.0 / _TIMES_K <= ratios.min() <= ratios.max()
+        <= _TIMES_K)
+
+
+def _doubts_of_projection(projection: NDArray[np.float64]) -> list[str]:
+    """Return what is unusual about P (3, 4); zeros stand for no P."""
+    if not np.any(projection):
+        return []
+    focal_px = projection[0, 0]
+    if not (np.isfinite(projection).all() and focal_px > 0.0 and projection[1, 1] > 0.0
+            and abs(projection[0, 1]) <= _MOST_SKEW * focal_px and projection[1, 0] == 0.0
+            and (projection[2] == (0.0, 0.0, 1.0, 0.0)).all()):
+        return ['P is not of the form [fx 0 cx Tx, 0 fy cy Ty, 0 0 1 0]: set it to that of K']
+    beside_m = float(np.linalg.norm(projection[:2, 3])) / focal_px
+    return [] if beside_m <= _MOST_BESIDE_M else [
+        f'P is of the second camera of a stereo pair, {beside_m:.2g} m beside the first: the '
+        'coordinate frame must be its own']

@@ -1,0 +1,223 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A camera_info or boxes that are wrong for all objects alike: looks tell, poses are refused.
+
+A simulated room, seen from many places.
+"""
+
+import numpy as np
+import pytest
+from scene import CAMERA, make_room
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.acceptance.camera_check import CameraCheck, Extent, odds_of
+from cliploc_ros.core.acceptance.verdict import RefusalKind
+from cliploc_ros.core.fit.camera_fit import ERRORS, camera_jacobian, corrected, fit_camera
+from cliploc_ros.core.fit.refinement import residuals_of
+from cliploc_ros.core.geometry.ellipsoid import (
+    ellipse_bboxes,
+    ellipses_in_pixels,
+    project_ellipsoids,
+)
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
+from cliploc_ros.core.localizer import Localizer
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN
+from cliploc_ros.evaluation.trials import Query
+from studies import wrong_sensors
+
+ROOM = make_room()
+RELOCALIZER = Relocalizer(ROOM, RelocalizerOptions(matching='class', tilt_deviation_deg=0.0))
+SIZE = np.array([CAMERA.width, CAMERA.height])
+LOOKS = 24
+NO_ERRORS = np.zeros(ERRORS)
+
+
+def place(rng):
+    """A place before the room, from which most of it is seen."""
+    x, y, z = rng.uniform((-1.0, -0.8, -1.5), (1.0, 0.8, 0.5))
+    turn = Rotation.from_euler('yxz', [np.arctan2(-x, 4.5 - z), np.arctan2(y, 4.5 - z), 0.0])
+    return make_transform((turn * Rotation.from_rotvec(rng.normal(0.0, 0.08, 3))).as_matrix(),
+                          np.array([x, y, z]))
+
+
+def boxes_at(map_from_camera):
+    outlines = project_ellipsoids(invert_transform(map_from_camera), ROOM.centers, ROOM.shapes)
+    return ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
+
+
+def query(rng, noise_px=1.0, pose=None):
+    """A query at a place: boxes that the border of the image cuts."""
+    pose = place(rng) if pose is None else pose
+    boxes = boxes_at(pose)
+    boxes = np.clip(boxes + rng.normal(0.0, noise_px, boxes.shape), 0.0, [*SIZE, *SIZE])
+    rows = np.nonzero((boxes[:, 2:] - boxes[:, :2] > 8.0).all(axis=1))[0]
+    return Query(0, Observation(CAMERA, Detections(
+        boxes[rows], tuple(ROOM.class_ids[row] for row in rows), np.full(len(rows), 0.9))), pose)
+
+
+def matches(boxes, map_from_camera):
+    """Rows of residuals_of for known matches, and the pose (3, 3), (3,)."""
+    left, top, right, bottom = CAMERA.normalize_bboxes(boxes).T
+    half_x, half_y = (right - left) / 2, (bottom - top) / 2
+    pairs = np.column_stack([(left + right) / 2, (top + bottom) / 2, half_x, half_y, ROOM.centers,
+                             ROOM.shapes, 0.06 * (half_x + half_y) + 0.003,
+                             np.zeros((len(boxes), 2))])
+    pose = invert_transform(map_from_camera)
+    return pairs, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy()
+
+
+def localized(localizer, queries):
+    return [localizer.localize(one.observation, None) for one in queries]
+
+
+def test_the_derivatives_are_those_of_the_residuals(rng):
+    pairs, rotation, translation = matches(boxes_at(place(rng)), place(rng))
+    errors = rng.normal(0.0, 0.1, ERRORS)
+
+    def residuals(errors):
+        found = np.empty(5 * len(pairs) + 3)
+        assert residuals_of(corrected(pairs, errors), VERTICAL_UNKNOWN, rotation, translation,
+                            found)
+        return found
+
+    jacobian = camera_jacobian(corrected(pairs, errors), VERTICAL_UNKNOWN, errors, rotation,
+                               translation, residuals(errors))[:, 6:]
+    steps = 1e-6 * np.eye(ERRORS)
+    expected = np.stack([(residuals(errors + one) - residuals(errors - one)) / 2e-6
+                         for one in steps], axis=1)
+    np.testing.assert_allclose(jacobian, expected, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize('errors', [
+    (0.4, 0.0, 0.1, -0.05, 0.0, 0.0, 0.0), (-0.4, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0, 0.0, -0.3, 0.2, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.3)])
+def test_errors_of_a_camera_are_found_with_the_pose(errors, rng):
+    errors, information, vector = np.array(errors), np.zeros((ERRORS, ERRORS)), np.zeros(ERRORS)
+    for _ in range(12):
+        pose = place(rng)
+        right, rotation, translation = matches(boxes_at(pose), pose)
+        # the boxes of which these are the corrected ones
+        pairs = right.copy()
+        for axis, scale in enumerate(np.exp(errors[0] + errors[1] * np.array([0.5, -0.5]))):
+            pairs[:, axis] = scale * (right[:, axis] + 2.0 * errors[4 + axis]
+                                      * right[:, 2 + axis]) + errors[2 + axis]
+            pairs[:, 2 + axis] = scale * np.exp(errors[6]) * right[:, 2 + axis]
+        np.testing.assert_allclose(corrected(pairs, errors)[:, :4], right[:, :4], atol=1e-12)
+        pairs[:, :4] += rng.normal(0.0, 0.002, (len(pairs), 4))
+        fit = fit_camera(pairs, np.ones((len(pairs), 4), dtype=bool), VERTICAL_UNKNOWN, rotation,
+                         translation, np.full(ERRORS, 1.0))
+        information += fit.information
+        vector += fit.information @ fit.errors + fit.errors
+    np.testing.assert_allclose(np.linalg.solve(information + np.eye(ERRORS), vector), errors,
+                               atol=0.03)
+
+
+@pytest.mark.parametrize(('focal', 'noise_px'), [(1.0, 0.5), (1.03, 1.0), (0.97, 2.0)])
+def test_a_right_camera_is_verified(focal, noise_px, rng):
+    queries = wrong_sensors.scaled_focal([query(rng, noise_px) for _ in range(LOOKS)], focal)
+    localizer = Localizer(RELOCALIZER)
+    for found, asked in zip(localized(localizer, queries), queries, strict=True):
+        assert found.accepted
+        assert pose_error(found.map_from_camera, asked.map_from_camera)[0] < 0.5
+        assert localizer.cameras.faults == []
+    # what looks know of it makes a pose surer
+    assert found.evidence.camera > 0.99
+
+
+WRONG = {
+    'K of twice the size': lambda some: wrong_sensors.scaled_camera(some, 2.0),
+    'K of half the size': lambda some: wrong_sensors.scaled_camera(some, 0.5),
+    'focal length': lambda some: wrong_sensors.scaled_focal(some, 1.3),
+    'short focal length': lambda some: wrong_sensors.scaled_focal(some, 0.75),
+    'principal point': lambda some: wrong_sensors.shifted_center(some, 0.2),
+    'a middle crop of 300 px': lambda some: wrong_sensors.middle_crop(some, 300.0),
+    'a middle crop of 416 px': lambda some: wrong_sensors.middle_crop(some, 416.0),
+    'half the resolution': lambda some: wrong_sensors.scaled_boxes(some, 0.5),
+    'a shift': lambda some: wrong_sensors.shifted_boxes(some, 0.15),
+    'corners taken for centre and sides': lambda some: wrong_sensors.of_convention(some, 1)}
+
+
+@pytest.mark.parametrize('what', WRONG)
+def test_a_wrong_camera_is_refused_with_the_cause(what, rng):
+    localizer = Localizer(RELOCALIZER)
+    found = localized(localizer, WRONG[what]([query(rng) for _ in range(LOOKS)]))
+    wrong = [one.refusal_kind is RefusalKind.WRONG_CAMERA for one in found]
+    refused = [not one.accepted for one in found]
+    assert all(refused[LOOKS // 2:])
+    assert sum(wrong[LOOKS // 2:]) > 0 or not any(one.accepted for one in found)
+
+
+def test_looks_from_one_view_count_once(rng):
+    localizer, pose = Localizer(RELOCALIZER), place(rng)
+    looks = wrong_sensors.scaled_focal([query(rng, pose=pose) for _ in range(30)], 1.3)
+    localized(localizer, looks)
+    assert localizer.cameras.faults == []
+
+
+@pytest.mark.parametrize('mended', ['camera_info', 'detector'])
+def test_a_mended_camera_is_accepted_again(mended, rng):
+    localizer = Localizer(RELOCALIZER)
+    queries = [query(rng) for _ in range(LOOKS)]
+    if mended == 'camera_info':
+        wrong = wrong_sensors.scaled_focal(queries, 1.4)
+    else:
+        wrong = wrong_sensors.scaled_boxes(queries, 0.7)
+    localized(localizer, wrong)
+    assert localizer.cameras.faults
+    found = localized(localizer, [query(rng) for _ in range(LOOKS)])
+    assert localizer.cameras.faults == []
+    accepted = [one.accepted for one in found]
+    assert all(accepted if mended == 'camera_info' else accepted[LOOKS // 2:])
+
+
+def drawn(rng, count, low, high):
+    """Boxes of objects that are anywhere, cut at a rectangle from low (2,) to high (2,)."""
+    sides = rng.uniform(40.0, 160.0, (count, 2))
+    corners = rng.uniform(np.subtract(low, sides), high)
+    boxes = np.hstack([corners, corners + sides])
+    return np.clip(boxes, np.tile(low, 2), np.tile(high, 2))
+
+
+@pytest.mark.parametrize(('low', 'high', 'is_other'), [
+    ((0.0, 0.0), SIZE, False), ((0.0, 0.0), (300.0, 300.0), True),
+    ((0.0, 140.0), (640.0, 340.0), True), ((-200.0, 0.0), SIZE, True)])
+def test_boxes_end_at_the_border_of_their_image(low, high, is_other, rng):
+    extent = Extent()
+    for _ in range(8):
+        extent.add(drawn(rng, 8, low, high))
+    evidence = extent.log_odds(CAMERA)
+    assert evidence == CALIBRATION.camera.extent if is_other else evidence < 1.0
+
+
+def test_a_view_that_stays_the_same_has_no_border(rng):
+    """A robot stands before objects that all are within the image."""
+    corners = rng.uniform(100.0, 250.0, (8, 2))
+    extent, boxes = Extent(), np.hstack([corners, corners + rng.uniform(40.0, 160.0, (8, 2))])
+    for _ in range(50):
+        extent.add(boxes + rng.normal(0.0, 0.5, boxes.shape))
+    assert extent.log_odds(CAMERA) < 1.0
+
+
+def test_odds_are_those_of_gaussians():
+    """Against the densities of one error that is measured: N(x; 0, s^2 + d^2)."""
+    deviation, measured, known = 0.05, 0.3, CALIBRATION.camera
+    information, vector = np.zeros((ERRORS, ERRORS)), np.zeros(ERRORS)
+    information[0, 0], vector[0] = deviation ** -2, measured * deviation ** -2
+
+    def density(spread):
+        variance = spread ** 2 + deviation ** 2
+        return np.exp(-0.5 * measured ** 2 / variance) / np.sqrt(variance)
+    odds = odds_of(information, vector).odds
+    focal = 2  # right, image, focal length, ...
+    assert odds[focal] - odds[0] == pytest.approx(np.log(
+        density(0.5) / density(known.focal)))
+    # the other kinds have the focal length of a right camera, or that of a wrong one
+    assert set(np.round(odds - odds[0], 6)) == set(np.round([0.0, odds[focal] - odds[0]], 6))
+
+
+def test_nothing_is_known_of_a_new_camera():
+    assert CameraCheck().judge([], np.eye(6)) == (1.0, '')

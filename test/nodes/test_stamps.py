@@ -1,0 +1,149 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Stamps that do not tell of which image detections are: refused with the cause."""
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from processes import wait_for
+from scene import MAP_FROM_CAMERA, make_room, see_room
+from tester import make_frame, transform_of
+
+from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+
+ROOM = make_room()
+RATE_HZ = 10
+
+
+class Camera:
+    """A camera of a robot that drives to and fro, and a detector that is some images late.
+
+    `image_stamp` and `boxes_stamp` make a stamp of the number of an image.
+    """
+
+    def __init__(self, publish, image_stamp, boxes_stamp=None, info_stamp=None, late=2):
+        self._publish, self._late, self._noise = publish, late, np.random.default_rng(1)
+        self._stamps = image_stamp, info_stamp or image_stamp, boxes_stamp or image_stamp
+        self.number = 0
+
+    @staticmethod
+    def place(number):
+        """Return the pose of the camera (4, 4) at an image: half a metre at 1 m/s, and back."""
+        move_m = 0.5 - abs(number / RATE_HZ % 2.0 - 1.0)
+        return MAP_FROM_CAMERA @ make_transform(np.eye(3), np.array([move_m, 0.0, 0.0]))
+
+    def step(self):
+        """Publish the next image, its calibration, and the boxes of an earlier image."""
+        image, info, _ = make_frame()
+        image.data = self._noise.integers(0, 256, len(image.data), np.uint8).tobytes()
+        boxes = make_frame(see_room(ROOM, self.place(self.number - self._late)))[2]
+        for message, stamp, number in zip((image, info, boxes), self._stamps, (
+                self.number, self.number, self.number - self._late), strict=True):
+            message.header.stamp = stamp(number)
+            self._publish(message)
+        self.number += 1
+
+
+def right(number):
+    """Count the images from 1000 s on."""
+    ns = 10**12 + 1234567 + number * 10**9 // RATE_HZ
+    return Time(sec=ns // 10**9, nanosec=ns % 10**9)
+
+
+def zero(_):
+    return Time()
+
+
+UNUSABLE = {
+    'zero': (zero, 'stamp of the images on /image is 0'),
+    'constant': (lambda _: Time(sec=77, nanosec=5), 'is 77.000000 on several of them'),
+    'before 1970': (lambda number: Time(sec=number - 2000, nanosec=7), 's, before 1970'),
+    'no nanoseconds': (lambda number: Time(sec=10, nanosec=2 * 10**9 + number),
+                       'nanoseconds (limit 999999999)'),
+    'whole seconds': (lambda number: Time(sec=right(number).sec), 'on several of them'),
+}
+
+
+@pytest.fixture
+def ask(tester):
+    """Ask while a camera goes on; return the answer."""
+    def asking(camera, timeout_s=10.0):
+        assert tester.set_parameter('timeout_s', timeout_s).successful
+        future = tester.ask()
+
+        def work():
+            camera.step()
+            for _ in range(3):
+                tester.spin()
+        wait_for(future.done, 'an answer', work=work)
+        return future.result()
+    yield asking
+    assert tester.set_parameter('timeout_s', 10.0).successful
+
+
+@pytest.fixture
+def health(tester):
+    """Collect level and message of the node's diagnostics."""
+    heard = []
+    subscription = tester.create_subscription(DiagnosticArray, '/diagnostics', lambda msg: (
+        heard.append((msg.status[0].level, msg.status[0].message))), 10)
+    yield heard
+    tester.destroy_subscription(subscription)
+
+
+def test_continuous_mode_publishes_nothing_of_them(own_relocalizer, tester, health):
+    # first of all: those below share one process
+    own_relocalizer(mode='continuous')
+    for name in ('zero', 'constant', 'whole seconds'):
+        stamp, reason = UNUSABLE[name]
+        camera = Camera(lambda message: tester.publish([message]), stamp)
+        health.clear()
+
+        def work(camera=camera):
+            camera.step()
+            for _ in range(3):
+                tester.spin()
+        wait_for(lambda camera=camera: camera.number > 40, '40 images', work=work)
+        assert not tester.poses
+        assert any(reason in text for _, text in health)
+    camera = Camera(lambda message: tester.publish([message]), right)
+    wait_for(lambda: tester.poses, 'a pose', work=lambda: (camera.step(), tester.spin()))
+
+
+@pytest.mark.parametrize('name', UNUSABLE)
+def test_stamps_that_name_no_image_pair_nothing(relocalizer, tester, ask, health, name):
+    stamp, reason = UNUSABLE[name]
+    answer = ask(Camera(lambda message: tester.publish([message]), stamp), 2.0)
+    assert not answer.success
+    assert reason in answer.message and "must copy the image's header" in answer.message
+    assert not tester.poses and not tester.initial_poses
+    tester.wait(lambda: any(level == DiagnosticStatus.ERROR and reason in text
+                            for level, text in health), 'the diagnostics')
+    health.clear()
+    camera = Camera(lambda message: tester.publish([message]), right)
+    assert ask(camera).success
+    tester.wait(lambda: (DiagnosticStatus.OK, 'active') in health, 'no problem any more')
+
+
+def test_late_detections_with_the_stamp_of_their_image_are_right(relocalizer, tester, ask):
+    """Calibration without a stamp is that of all images."""
+    for info_stamp in (right, zero):
+        tester.forget()
+        answer = ask(Camera(lambda message: tester.publish([message]), right,
+                            info_stamp=info_stamp))
+        assert answer.success, answer.message
+        tester.wait(lambda: tester.poses, 'the pose')
+        stamp = tester.poses[-1].header.stamp
+        number = ((stamp.sec - 1000) * 10**9 + stamp.nanosec - 1234567) * RATE_HZ // 10**9
+        error_m, error_deg = pose_error(transform_of(tester.poses[-1].pose.pose),
+                                        Camera.place(number))
+        assert error_m < 0.01 and error_deg < 0.5
+
+
+@pytest.mark.parametrize('stamp', [zero, lambda _: right(0)])
+def test_detections_alone_without_stamps_are_named(relocalizer, tester, ask, stamp):
+    answer = ask(Camera(lambda message: tester.publish([message]), right, stamp), 2.0)
+    assert not answer.success
+    assert 'the stamp of the detections on /detections is ' in answer.message
+    assert 'of the images' not in answer.message

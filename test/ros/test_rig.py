@@ -1,0 +1,155 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Frames of several cameras at one instant: which belong together, and which are left out."""
+
+import threading
+import time
+
+import pytest
+from builtin_interfaces.msg import Time
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+from vision_msgs.msg import Detection2DArray
+
+from cliploc_ros.errors import StoppedError
+from cliploc_ros.ros.inputs.frame_source import FrameSource, NoFrameError
+from cliploc_ros.ros.inputs.rig import Rig, frames_of
+from cliploc_ros.ros.node.diagnostics import Health
+from cliploc_ros.ros.parameters import RelocalizerParameters
+
+NAMES = ('front', 'left', 'back')
+PARAMETERS = RelocalizerParameters(cameras=list(NAMES), sync_tolerance_s=0.05)
+ALL = {'front': 0.0, 'left': 0.0, 'back': 0.0}
+
+
+@pytest.fixture
+def heard():
+    return []
+
+
+@pytest.fixture
+def cameras(make_node):
+    """Return what publishes a frame of some cameras: their names, and their stamps."""
+    node = make_node('cameras')
+    publishers = {(name, kind): node.create_publisher(kind, f'{name}/{topic}', 10)
+                  for name in NAMES for kind, topic in (
+                      (CameraInfo, 'camera_info'), (Detection2DArray, 'detections'),
+                      (Image, 'image'))}
+
+    def publish(at_s, late_s, kinds=(CameraInfo, Detection2DArray, Image)):
+        for name, own_s in late_s.items():
+            ns = round((at_s - own_s) * 1e9)
+            header = Header(frame_id=name, stamp=Time(sec=ns // 10**9, nanosec=ns % 10**9))
+            for kind in kinds:
+                publishers[name, kind].publish(kind(header=header))
+    return publish
+
+
+@pytest.fixture
+def rig(make_node, context, heard):
+    """A rig whose node is spun by another thread."""
+    node = make_node()
+    rig = frames_of(node, PARAMETERS, 60.0, heard.append)
+    rig.open()
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    spinning = threading.Thread(target=executor.spin)
+    spinning.start()
+    yield rig
+    rig.close('the test ends')
+    executor.shutdown()
+    spinning.join()
+
+
+def ask(rig, cameras, late_s, wait, first_s=10.0, patience_s=30.0):
+    """Return the next frame while the cameras publish."""
+    found, number = [], 0
+    now = time.monotonic()
+    asking = threading.Thread(target=lambda: found.append(rig.next_frame(now, now + patience_s)))
+    asking.start()
+
+    def work():
+        nonlocal number
+        number += 1
+        cameras(first_s + 0.2 * number, late_s)
+        asking.join(0.05)
+    wait(lambda: not asking.is_alive(), 'a frame', work)
+    return found[0]
+
+
+def names(frame):
+    return [frame.camera, *(one.camera for one in frame.beside)]
+
+
+@pytest.mark.parametrize(('late_s', 'together', 'left_out'), [
+    (ALL, ['front', 'left', 'back'], ()),
+    ({**ALL, 'left': 0.04}, ['front', 'left', 'back'], ()),
+    ({**ALL, 'left': 0.07}, ['front', 'back'], ('left',)),
+    ({'left': 0.0, 'back': 0.0}, ['left', 'back'], ('front',)),
+    ({'back': 0.0}, ['back'], ('front', 'left')),
+])
+def test_frames_of_one_instant_come_together(rig, cameras, wait, late_s, together, left_out):
+    frame = ask(rig, cameras, late_s, wait)
+    if set(late_s) == set(NAMES):  # the first frames may come before all cameras are heard
+        wait(lambda: names(ask(rig, cameras, late_s, wait, 100.0)) == together, 'all cameras')
+        frame = ask(rig, cameras, late_s, wait, 200.0)
+    assert names(frame) == together
+    assert frame.left_out == left_out
+    assert {one.image.header.frame_id for one in (frame, *frame.beside)} == set(together)
+
+
+def test_silent_inputs_are_named_by_camera(rig, cameras, wait):
+    since = time.monotonic()
+    ask(rig, cameras, {'front': 0.0}, wait)
+    assert set(rig.unheard(since)) == {
+        f'{name}/{topic}' for name in NAMES[1:] for topic in ('image', 'camera_info',
+                                                              'detections')}
+    assert rig.missing() == []  # all are published
+    assert rig.main.image_topic == rig.image_topic == '/front/image'
+    assert [one for one in rig.topics if one.startswith('left')] == [
+        'left/image', 'left/camera_info', 'left/detections']
+
+
+def test_the_health_of_each_camera_is_reported(rig, cameras, wait):
+    ask(rig, cameras, {'front': 0.0}, wait)
+    health = Health()
+    rig.examine(health, 1e-9)
+    text = str(vars(health))
+    assert all(name in text for name in NAMES)
+
+
+def test_nothing_in_time_and_a_rig_that_is_closed(rig, cameras, wait):
+    now = time.monotonic()
+    with pytest.raises(NoFrameError):
+        rig.next_frame(now, now + 0.05)
+    ask(rig, cameras, ALL, wait)
+    rig.forget()
+    now = time.monotonic()
+    closing = threading.Timer(0.05, rig.close, ['over'])
+    closing.start()
+    with pytest.raises(StoppedError):
+        rig.next_frame(now, now + 30.0)
+    closing.join()
+    with pytest.raises(StoppedError):
+        rig.next_frame(now, now + 30.0)
+
+
+def test_the_first_camera_of_an_instant_passes_it_on_once(rig, cameras, wait, heard):
+    ask(rig, cameras, ALL, wait)
+    heard.clear()
+    now = time.monotonic()
+    with pytest.raises(NoFrameError):  # it listens on meanwhile
+        rig.next_frame(now + 1e6, now + 0.01)
+    for number in range(5):  # the stamps have jumped: some of them show that they go on
+        cameras(500.0 + 0.1 * number, ALL)
+        time.sleep(0.1)
+    wait(lambda: heard, 'the instant')
+    stamps = [one.image.header.stamp for one in heard]
+    assert {one.camera for one in heard} == {'front'}
+    assert len({(one.sec, one.nanosec) for one in stamps}) == len(stamps)
+    assert isinstance(rig, Rig)
+
+
+def test_one_camera_needs_no_rig(make_node):
+    assert isinstance(frames_of(make_node(), RelocalizerParameters(), 1.0), FrameSource)
