@@ -8,7 +8,7 @@ it: boxes that lie on one another show one thing, and so does a box within anoth
 is small and there most of the time, as that of a cup on a table.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from enum import Enum
 
 import numpy as np
@@ -80,23 +80,14 @@ def relation(views: Views, pair: Landmarks, rows: NDArray[np.int64], others: NDA
     boxes = np.stack([views.edges[rows[first]], views.edges[others[second]]])
     low, high = boxes[..., :2].max(axis=0), boxes[..., 2:].min(axis=0)
     shared = np.maximum(high - low, 0.0).prod(axis=1)
-    areas = np.maximum(boxes[..., 2:] - boxes[..., :2], 1e-12).prod(axis=2)
-    small, large = areas.min(axis=0), areas.max(axis=0)
+    small, large = np.sort((boxes[..., 2:] - boxes[..., :2]).prod(axis=2), axis=0)
     is_one = shared > _ONE_BOX_IOU * (small + large - shared)
     is_within = ~is_one & (shared > _WITHIN_SHARE * small) & (small > _THING_SHARE * large)
-    is_beside = ~is_one & ~is_within
-    may_be_part = is_within & (small < _PART_SHARE * large)
     # frames of one viewpoint err alike
-    weights = views.weights
-    seen, in_view = np.zeros((2, len(weights)), dtype=np.bool_), []
-    for number, own in enumerate((rows, others)):
-        seen[number, views.frames[own]] = True
-        in_view.append(seen[number] | _expected(views, pair, number, views.frames[own]))
-    both = in_view[0] & in_view[1]
-    rates, total = (seen & both) @ weights, weights[both].sum()
-    together = weights[views.frames[rows[first]]]
-    one, within, beside, small_within = (
-        together[mask].sum() for mask in (is_one, is_within, is_beside, may_be_part))
+    together = views.weights[views.frames[rows[first]]]
+    one, within, beside = (together @ mask for mask in (is_one, is_within, ~is_one & ~is_within))
+    small_within = together @ (is_within & (small < _PART_SHARE * large))
+    rates, total = _rates_in_view(views, pair, (views.frames[rows], views.frames[others]))
     if ((beside > one and beside * total > _LEAST_LIFT * rates.prod())
             or (beside > one + within and beside > _LEAST_SHARE * rates.min())
             or beside + small_within > _LEAST_STEADY * total):
@@ -105,12 +96,21 @@ def relation(views: Views, pair: Landmarks, rows: NDArray[np.int64], others: NDA
         Relation.SAME)
 
 
-def _expected(views: Views, pair: Landmarks, number: int, frames: NDArray[np.int64]
-              ) -> NDArray[np.bool_]:
-    """Return the frames (F,) that should show one of two landmarks, by those that show it."""
-    cameras, center = camera_centers(views), pair.centers[number]
-    farthest = np.linalg.norm(cameras[frames] - center, axis=1).max(initial=0.0)
-    return np.asarray(is_expected(views, cameras, center, pair.bases[number], REACH * farthest))
+def _rates_in_view(views: Views, pair: Landmarks, frames: Sequence[NDArray[np.int64]]
+                   ) -> tuple[NDArray[np.float64], float]:
+    """Return the weight of the frames with a box of each of two landmarks (2,), and of all.
+
+    Of the frames with both of their places in view: those that have a box, or should have one by
+    those that have one.
+    """
+    cameras = camera_centers(views)
+    seen, in_view = np.zeros((2, len(cameras)), dtype=np.bool_), []
+    for center, basis, own, is_seen in zip(pair.centers, pair.bases, frames, seen, strict=True):
+        is_seen[own] = True
+        farthest = np.linalg.norm(cameras[own] - center, axis=1).max()
+        in_view.append(is_seen | is_expected(views, cameras, center, basis, REACH * farthest))
+    both = in_view[0] & in_view[1]
+    return (seen & both) @ views.weights, float(views.weights @ both)
 
 
 def find_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]

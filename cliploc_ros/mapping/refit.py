@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fit the landmarks of a given map to the boxes of a recording.
 
-No landmark is found here, and none gets another class: the map says what there is and about
-where, the boxes say where exactly.
+No landmark is found here: the map says what there is and about where, the boxes say where
+exactly.
 """
 
 from dataclasses import dataclass, replace
@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.association import associate
@@ -53,7 +52,7 @@ class RefitMap:
     landmark_map: LandmarkMap  #: All L landmarks. Those with a reason are as they were given.
     #: Why a landmark could not be fitted; None where it was fitted, or was not chosen
     reasons: tuple[str | None, ...]
-    #: (L,): the landmark that a duplicate shares its object with; else its own row
+    #: (L,): the landmark that each is one thing with; else its own row
     part_of: NDArray[np.int64]
     notes: tuple[str, ...]  #: What is wrong with the recording
     #: Share of the boxes of the map's classes that a landmark explains
@@ -69,8 +68,8 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
               ) -> RefitMap:
     """Fit the chosen landmarks of a map to the boxes that show them.
 
-    Ids, labels, classes and class weights stay. The others of the landmarks stay as they are,
-    and keep the boxes that show them.
+    Ids, labels, classes and class weights stay; a landmark that is one thing with others gets
+    theirs, too. Landmarks that are not chosen stay as they are, and keep the boxes that show them.
 
     Parameters
     ----------
@@ -126,7 +125,7 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
     landmarks = _fit(views, landmarks, shown, is_fitted)
     evidence = gather_evidence(views, landmarks, shown)
     share, iou = explained_boxes(views, landmarks.select(is_fitted | ~chosen))
-    details = list(landmark_map.details or [LandmarkDetails()] * len(landmark_map))
+    details = list(landmark_map.joined(part_of).details)
     for row in np.nonzero(is_fitted)[0]:
         details[row] = evidence.details(int(row), replace(
             details[row], shared_sigma=None, shared_sigma_deg=None))
@@ -136,7 +135,7 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
         replace(landmark_map, centers=np.where(fitted, landmarks.centers, landmark_map.centers),
                 semi_axes=np.where(fitted, semi_axes, landmark_map.semi_axes),
                 quats_xyzw=np.where(fitted, quats_xyzw, landmark_map.quats_xyzw),
-                details=tuple(details)).joined(part_of),
+                details=tuple(details)),
         tuple(reasons), part_of, tuple(notes), share_before / share_known, share / share_known,
         iou_before, iou)
 

@@ -114,14 +114,11 @@ class LandmarkMap:
         The array into (L,) is the row of the landmark that each is part of, or its own.
         """
         details = list(self.details or [LandmarkDetails()] * len(self))
-        for row, count in zip(*np.unique(into, return_counts=True), strict=True):
-            if count > 1:
-                parts = np.nonzero(into == row)[0]
-                details[row] = join_details([
-                    (self.labels[part], self.class_ids[part], details[part])
-                    for part in sorted(parts.tolist(), key=lambda part: part != row)])
-        return replace(self, details=tuple(details) if self.details or len(set(into)) < len(into)
-                       else ())
+        for row in np.unique(into[into != np.arange(len(into))]).tolist():
+            parts = [row, *(part for part in np.nonzero(into == row)[0].tolist() if part != row)]
+            details[row] = join_details([
+                (self.labels[part], self.class_ids[part], details[part]) for part in parts])
+        return replace(self, details=tuple(details))
 
     def prepare(self) -> None:
         """Compute the indices now, so that the first request does not wait for them."""

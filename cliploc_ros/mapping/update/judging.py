@@ -117,7 +117,7 @@ def judge(detections: PosedDetections, views: Views, known: Known, options: Mapp
     shown, sight = _look(views, known, finds, displaced, options)
     is_gone = displaced | _is_absent(known, sight.select(slice(count)), _GONE_BELOW)
     # a new object may be in the place of an old one of which a wrong box remains
-    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 1.0, options)
+    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 1.0)
     _, sight = _look(views, known, finds, is_gone, options)
     # finds are seen about as often as the old landmarks, which come first
     ratios = sight.seen_ratio[:count][sight.seen[:count] > 0]
@@ -137,7 +137,7 @@ def judge(detections: PosedDetections, views: Views, known: Known, options: Mapp
             limits[row] = _GONE_BELOW_IF_TAKEN
     is_gone = displaced | _is_absent(known, sight.select(slice(count)), limits)
     shown, sight = _look(views, known, finds, is_gone, options)
-    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 0.0, options)
+    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 0.0)
     # objects that are gone hide nothing
     shown, sight = _look(views, known, finds, is_gone, options)
     own = sight.select(slice(count))
@@ -270,8 +270,7 @@ def _with_displaced(finds: Finds, refits: Refits, displaced: NDArray[np.bool_],
 
 
 def _without_copies(views: Views, finds: Finds, old: Landmarks, known: Known,
-                    shown: NDArray[np.int64], sight: Sight, majority: float,
-                    options: MappingOptions) -> Finds:
+                    shown: NDArray[np.int64], sight: Sight, majority: float) -> Finds:
     """Return the new landmarks without those that are an old one in its place.
 
     An old landmark is in its place if it has a box, and a majority for each of the new one's. Of

@@ -9,7 +9,7 @@ counts alone. An ellipsoid without position_sigma was made by hand, and stays.
 """
 
 from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,21 +70,16 @@ def renew(old: LandmarkMap, known: Known, views: Views, objects: Objects, fates:
         tuple(every) if any(one != LandmarkDetails() for one in every) else ())
 
 
-class OneOfEach(NamedTuple):
-    """A new map without doubles: L landmarks were in it before, n boxes show them."""
-
-    landmark_map: LandmarkMap
-    shown: NDArray[np.int64]  #: (n,): the landmark that each box shows, -1 for none
-    first_new: int  #: Row of the first new landmark
-    notes: list[str]  #: What was one thing
-
-
 def one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], first_new: int,
-                class_names: tuple[str, ...]) -> OneOfEach:
+                class_names: tuple[str, ...]
+                ) -> tuple[LandmarkMap, NDArray[np.int64], int, list[str]]:
     """Return the new map in which landmarks that are one thing by the recording are one.
 
-    The older one keeps its id and gets the other one's labels and classes; the ellipsoid is that
-    with more boxes. Of old ones of which the recording shows one alone, it does not tell.
+    The older landmark keeps its id and gets the labels and classes of the other; the ellipsoid is
+    that with more boxes. Two old landmarks stay if the recording shows only one of them.
+
+    Returns the map, the landmark that each box shows (n,), the row of the first new landmark, and
+    notes.
     """
     into, counts = np.arange(len(updated)), np.bincount(shown[shown >= 0], minlength=len(updated))
     shapes, notes = into.copy(), []
@@ -97,17 +92,16 @@ def one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], fi
             ids = updated.landmark_ids
             notes.append(f'{ids[second]} is one thing with {ids[first]}, which has its classes')
     if not notes:
-        return OneOfEach(updated, shown, first_new, notes)
-    joined = updated.joined(into)
-    kept = np.unique(into)
+        return updated, shown, first_new, notes
+    joined, kept = updated.joined(into), np.unique(into)
     numbers = np.append(np.searchsorted(kept, into), -1)
-    return OneOfEach(replace(
+    return replace(
         joined, centers=updated.centers[shapes], semi_axes=updated.semi_axes[shapes],
         quats_xyzw=updated.quats_xyzw[shapes],
         details=tuple(replace(joined.details[shape], labels=one.labels,
                               class_weights=one.class_weights)
                       for shape, one in zip(shapes, joined.details, strict=True))
-    ).select(kept.tolist()), numbers[shown], int(np.sum(kept < first_new)), notes)
+    ).select(kept.tolist()), numbers[shown], int(np.sum(kept < first_new)), notes
 
 
 def _refitted(known: Known, objects: Objects, fates: Fates) -> dict[int, float]:

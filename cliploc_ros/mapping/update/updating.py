@@ -97,9 +97,9 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     has_object = fates.objects[kept] >= 0
     rows_of[fates.objects[kept][has_object]] = np.nonzero(has_object)[0]
     rows_of[fates.new] = len(kept) + np.arange(len(fates.new))
-    found = one_of_each(updated, aligned.views, rows_of[objects.shown], len(kept),
-                        detections.class_names)
-    notes += _notes(old, known, aligned, detections) + found.notes
+    without_doubles, shown, first_new, joined = one_of_each(
+        updated, aligned.views, rows_of[objects.shown], len(kept), detections.class_names)
+    notes += _notes(old, known, aligned, detections) + joined
     report = UpdateReport(
         frames=len(detections), viewpoints=int(given.viewpoints.max()) + 1,
         offset_m=aligned.offset_m, offset_deg=aligned.offset_deg,
@@ -107,10 +107,9 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
         **describe(old, updated, objects, fates, judged),
         left_out=tuple(sorted(judged.finds.left_out, key=lambda one: -one.support)),
         notes=tuple(notes))
-    return UpdatedMap(found.landmark_map, report, found.shown, found.first_new,
-                      map_from_cameras(aligned.views),
-                      renew_embeddings(embeddings, found.landmark_map.landmark_ids, detections,
-                                       found.shown))
+    return UpdatedMap(without_doubles, report, shown, first_new, map_from_cameras(aligned.views),
+                      renew_embeddings(embeddings, without_doubles.landmark_ids, detections,
+                                       shown))
 
 
 def _check_belongs(judged: Judged, well_share: float) -> None:
