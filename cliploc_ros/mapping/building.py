@@ -14,7 +14,7 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.association import associate
-from cliploc_ros.mapping.doubles import merge_doubles, pairs_of_one_class, resolve_doubles
+from cliploc_ros.mapping.doubles import close_pairs, merge_doubles, resolve_doubles
 from cliploc_ros.mapping.evidence import (
     Evidence,
     explained_boxes,
@@ -260,8 +260,9 @@ def _settle(views: Views, landmarks: Landmarks, options: MappingOptions
     """Associate, merge and fit until landmarks and boxes agree; return both."""
     for _ in range(options.settling_rounds):
         shown = associate(views, landmarks, options.association_iou)
-        landmarks, shown = _keep(*merge_doubles(
-            views, landmarks, shown, pairs_of_one_class(landmarks), options), shown)
+        pairs = [(first, second) for first, second, _ in close_pairs(landmarks)
+                 if landmarks.classes[first] == landmarks.classes[second]]
+        landmarks, shown = _keep(*merge_doubles(views, landmarks, shown, pairs, options), shown)
         boxes = group_boxes(shown, len(landmarks.centers))
         seen = [len(np.unique(views.viewpoints[views.frames[rows]])) >= options.min_viewpoints
                 for rows in boxes]

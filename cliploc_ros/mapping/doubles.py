@@ -56,12 +56,6 @@ def close_pairs(landmarks: Landmarks, max_distance: float = STANDS_IN
         pairs[order].tolist(), distances[order].tolist(), strict=True)]
 
 
-def pairs_of_one_class(landmarks: Landmarks) -> list[tuple[int, int]]:
-    """Return the pairs of one class that stand in one another, the nearest first."""
-    return [(first, second) for first, second, _ in close_pairs(landmarks)
-            if landmarks.classes[first] == landmarks.classes[second]]
-
-
 class Relation(Enum):
     """What the images show of two landmarks that stand in one another."""
 
@@ -70,24 +64,25 @@ class Relation(Enum):
     SAME = 'one box, or one at a time'
 
 
-def relation(views: Views, pair: Landmarks, rows: NDArray[np.int64], others: NDArray[np.int64]
-             ) -> Relation:
+def relation(views: Views, landmarks: Landmarks, rows_of: Sequence[NDArray[np.int64]],
+             pair: tuple[int, int]) -> Relation:
     """Return what the images show of two landmarks, by the boxes of each."""
-    _, first, second = np.intersect1d(views.frames[rows], views.frames[others],
-                                      return_indices=True)
-    if len(first) == 0:
+    first, second = (rows_of[number] for number in pair)
+    common, *places = np.intersect1d(views.frames[first], views.frames[second],
+                                     return_indices=True)
+    if len(common) == 0:
         return Relation.SAME
-    boxes = np.stack([views.edges[rows[first]], views.edges[others[second]]])
+    boxes = views.edges[np.stack([first[places[0]], second[places[1]]])]
     low, high = boxes[..., :2].max(axis=0), boxes[..., 2:].min(axis=0)
     shared = np.maximum(high - low, 0.0).prod(axis=1)
     small, large = np.sort((boxes[..., 2:] - boxes[..., :2]).prod(axis=2), axis=0)
     is_one = shared > _ONE_BOX_IOU * (small + large - shared)
     is_within = ~is_one & (shared > _WITHIN_SHARE * small) & (small > _THING_SHARE * large)
     # frames of one viewpoint err alike
-    together = views.weights[views.frames[rows[first]]]
+    together = views.weights[common]
     one, within, beside = (together @ mask for mask in (is_one, is_within, ~is_one & ~is_within))
     small_within = together @ (is_within & (small < _PART_SHARE * large))
-    rates, total = _rates_in_view(views, pair, (views.frames[rows], views.frames[others]))
+    rates, total = _rates_in_view(views, landmarks, rows_of, pair)
     if ((beside > one and beside * total > _LEAST_LIFT * rates.prod())
             or (beside > one + within and beside > _LEAST_SHARE * rates.min())
             or beside + small_within > _LEAST_STEADY * total):
@@ -96,8 +91,8 @@ def relation(views: Views, pair: Landmarks, rows: NDArray[np.int64], others: NDA
         Relation.SAME)
 
 
-def _rates_in_view(views: Views, pair: Landmarks, frames: Sequence[NDArray[np.int64]]
-                   ) -> tuple[NDArray[np.float64], float]:
+def _rates_in_view(views: Views, landmarks: Landmarks, rows_of: Sequence[NDArray[np.int64]],
+                   pair: tuple[int, int]) -> tuple[NDArray[np.float64], float]:
     """Return the weight of the frames with a box of each of two landmarks (2,), and of all.
 
     Of the frames with both of their places in view: those that have a box, or should have one by
@@ -105,10 +100,12 @@ def _rates_in_view(views: Views, pair: Landmarks, frames: Sequence[NDArray[np.in
     """
     cameras = camera_centers(views)
     seen, in_view = np.zeros((2, len(cameras)), dtype=np.bool_), []
-    for center, basis, own, is_seen in zip(pair.centers, pair.bases, frames, seen, strict=True):
-        is_seen[own] = True
-        farthest = np.linalg.norm(cameras[own] - center, axis=1).max()
-        in_view.append(is_seen | is_expected(views, cameras, center, basis, REACH * farthest))
+    for number, is_seen in zip(pair, seen, strict=True):
+        center, frames = landmarks.centers[number], views.frames[rows_of[number]]
+        is_seen[frames] = True
+        farthest = np.linalg.norm(cameras[frames] - center, axis=1).max()
+        in_view.append(is_seen | is_expected(views, cameras, center, landmarks.bases[number],
+                                             REACH * farthest))
     both = in_view[0] & in_view[1]
     return (seen & both) @ views.weights, float(views.weights @ both)
 
@@ -122,8 +119,7 @@ def find_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
     rows_of = group_boxes(shown, len(landmarks.centers))
     return [(first, second) for first, second, _ in close_pairs(landmarks)
             if len(rows_of[first]) + len(rows_of[second])
-            and relation(views, landmarks.select(np.array([first, second])), rows_of[first],
-                         rows_of[second]) is not Relation.TWO]
+            and relation(views, landmarks, rows_of, (first, second)) is not Relation.TWO]
 
 
 def resolve_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
@@ -157,17 +153,15 @@ def merge_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
     one with more boxes stays, with the classes of both. Returns all landmarks, and the one (L,)
     that each is part of.
     """
-    centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
-    rows_of = group_boxes(shown, len(centers))
+    merged = landmarks._replace(centers=landmarks.centers.copy(), bases=landmarks.bases.copy())
+    centers, bases, rows_of = merged.centers, merged.bases, group_boxes(shown, len(merged.centers))
     into = np.arange(len(centers))
     for first, second in pairs:
         if into[first] != first or into[second] != second:
             continue
         keep, drop = ((first, second) if len(rows_of[first]) >= len(rows_of[second])
                       else (second, first))
-        now = Landmarks(centers, bases, landmarks.classes)
-        if relation(views, now.select(np.array([keep, drop])), rows_of[keep], rows_of[drop]
-                    ) is not Relation.SAME:
+        if relation(views, merged, rows_of, (keep, drop)) is not Relation.SAME:
             continue
         rows = np.concatenate([rows_of[keep], rows_of[drop]])
         fit = fit_ellipsoid(views, np.sort(rows), centers[keep], bases[keep])
@@ -180,7 +174,8 @@ def merge_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
             continue
         centers[keep], bases[keep], rows_of[keep] = fit.center, fit.basis, np.sort(rows)
         into[into == drop] = keep
-    return Landmarks(centers, bases, landmarks.classes, _joined_names(landmarks, into)), into
+    names = np.unique(np.stack([into[merged.names[:, 0]], merged.names[:, 1]], axis=1), axis=0)
+    return merged._replace(others=names[names[:, 1] != merged.classes[names[:, 0]]]), into
 
 
 def _fits(before: NDArray[np.float64], after: NDArray[np.float64], enough: float,
@@ -188,10 +183,3 @@ def _fits(before: NDArray[np.float64], after: NDArray[np.float64], enough: float
     """Tell by the IoUs of boxes, before and after, if they fit enough, or hardly worse."""
     return len(before) == 0 or bool(
         after.mean() >= min(enough, before.mean() - options.merge_loss))
-
-
-def _joined_names(landmarks: Landmarks, into: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the classes besides its own of each landmark, with those of its parts."""
-    names = landmarks.names
-    names = np.unique(np.stack([into[names[:, 0]], names[:, 1]], axis=1), axis=0)
-    return names[names[:, 1] != landmarks.classes[names[:, 0]]]

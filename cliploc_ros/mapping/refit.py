@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.mapping.association import associate
-from cliploc_ros.mapping.doubles import merge_doubles, pairs_of_one_class, resolve_doubles
+from cliploc_ros.mapping.doubles import resolve_doubles
 from cliploc_ros.mapping.evidence import (
     Evidence,
     explained_boxes,
@@ -142,26 +142,15 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
 
 def _settle(views: Views, given: Landmarks, chosen: NDArray[np.bool_], options: MappingOptions
             ) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Associate, fit and merge until the chosen landmarks and their boxes agree.
+    """Associate and fit until the chosen landmarks and their boxes agree, and resolve doubles.
 
     Returns the landmarks, and the one (L,) that each of them is part of.
     """
-    landmarks, part_of = given, np.arange(len(chosen))
-    for round_number, min_iou in enumerate(
-            (*_FIRST_IOUS, *[options.association_iou] * options.settling_rounds)):
-        is_own = part_of == np.arange(len(part_of))
-        shown = _associate_some(views, landmarks, is_own, min_iou)
-        if round_number >= len(_FIRST_IOUS):
-            pairs = [pair for pair in pairs_of_one_class(landmarks)
-                     if is_own[list(pair)].all() and chosen[list(pair)].all()]
-            landmarks, into = merge_doubles(views, landmarks, shown, pairs, options)
-            part_of = into[part_of]
-            shown = np.where(shown < 0, -1, into[shown])
-        landmarks = _fit(views, landmarks, shown, chosen)
-    is_own = part_of == np.arange(len(part_of))
-    shown = _associate_some(views, landmarks, is_own, options.association_iou)
-    landmarks, into = resolve_doubles(views, landmarks, shown, options, is_own & chosen)
-    return landmarks, into[part_of]
+    landmarks = given
+    for min_iou in (*_FIRST_IOUS, *[options.association_iou] * options.settling_rounds):
+        landmarks = _fit(views, landmarks, associate(views, landmarks, min_iou), chosen)
+    shown = associate(views, landmarks, options.association_iou)
+    return resolve_doubles(views, landmarks, shown, options, chosen)
 
 
 def _associate_some(views: Views, landmarks: Landmarks, rows: NDArray[np.bool_], min_iou: float

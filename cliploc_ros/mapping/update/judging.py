@@ -279,13 +279,13 @@ def _without_copies(views: Views, finds: Finds, old: Landmarks, known: Known,
     """
     of_old, of_new = _boxes(shown, len(old.centers), finds)
     reasons: list[str | None] = [None] * len(of_new)
+    every = join_landmarks(old, finds.landmarks)
     for new, row, distance in _pairs_between(finds.landmarks, old):
         is_one_class = old.classes[row] == finds.landmarks.classes[new]
         if len(of_old[row]) >= max(1.0, majority * len(of_new[new])) and (
                 (is_one_class and distance < LEAST_MOVE_SHAPES)
-                or relation(views, join_landmarks(old.select(np.array([row])),
-                                                  finds.landmarks.select(np.array([new]))),
-                            of_old[row], of_new[new]) is not Relation.TWO):
+                or relation(views, every, of_old + of_new, (row, len(of_old) + new))
+                is not Relation.TWO):
             reasons[new] = f'it is {known.landmark_ids[row]} in its place'
     return finds.without(reasons, sight)
 
