@@ -128,7 +128,7 @@ def resolve_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
     """Return all landmarks, and the one (L,) that each of the chosen is one thing with.
 
     Those whose boxes fit one ellipsoid are fitted together. Of others, the landmark with more
-    boxes stays as it is: the other one is a part of it, or a wrong find.
+    boxes, weighted by their IoU, stays as it is: the other is a part of it, or a wrong find.
     """
     def doubles(shown: NDArray[np.int64]) -> list[tuple[int, int]]:
         return [pair for pair in find_doubles(views, landmarks, shown)
@@ -136,10 +136,11 @@ def resolve_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
 
     landmarks, into = merge_doubles(views, landmarks, shown, doubles(shown), options)
     shown = np.where(shown < 0, -1, into[shown])
-    counts = np.bincount(shown[shown >= 0], minlength=len(into))
+    fits = [ious_with(views, rows, center, basis).sum() for rows, center, basis in zip(
+        group_boxes(shown, len(into)), landmarks.centers, landmarks.bases, strict=True)]
     for pair in doubles(shown):
         if (into[list(pair)] == pair).all():
-            keep, drop = pair if counts[pair[0]] >= counts[pair[1]] else pair[::-1]
+            keep, drop = pair if fits[pair[0]] >= fits[pair[1]] else pair[::-1]
             into[into == drop] = keep
     return landmarks, into
 
