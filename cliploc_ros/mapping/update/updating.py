@@ -100,11 +100,14 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     without_doubles, shown, first_new, joined = one_of_each(
         updated, aligned.views, rows_of[objects.shown], len(kept), detections.class_names)
     notes += _notes(old, known, aligned, detections) + joined
+    lists = describe(old, updated, objects, fates, judged)
+    lists['new'] = tuple(one for one in lists['new']
+                         if one.landmark_id in without_doubles.landmark_ids)
     report = UpdateReport(
         frames=len(detections), viewpoints=int(given.viewpoints.max()) + 1,
         offset_m=aligned.offset_m, offset_deg=aligned.offset_deg,
         pose_change_m=aligned.change_m, pose_change_deg=aligned.change_deg,
-        **describe(old, updated, objects, fates, judged),
+        **lists,
         left_out=tuple(sorted(judged.finds.left_out, key=lambda one: -one.support)),
         notes=tuple(notes))
     return UpdatedMap(without_doubles, report, shown, first_new, map_from_cameras(aligned.views),
