@@ -5,10 +5,9 @@
 Each group of images is localized in all modes, by labels and by classes, and in the same map with
 all objects exchanged, where every pose is wrong. Half of the worlds have an error that all objects
 share: of the focal length, of the map's size or shape, or of names. For the report, each kind of
-world is judged by coefficients that the other kinds fitted. The coefficients printed in the end are
-fitted on rooms, offices, shops and bare rooms; corridors, halls and twin rooms only judge, since
-their mistaken
-places are the task of cliploc_ros.core.acceptance.look_alikes.
+world is judged by coefficients that the other kinds fitted. The coefficients printed in the end
+are fitted on rooms, offices, shops and bare rooms; corridors, halls and twin rooms only judge,
+since their mistaken places are the task of cliploc_ros.core.acceptance.look_alikes.
 """
 
 import math
