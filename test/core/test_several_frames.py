@@ -163,7 +163,7 @@ def test_the_verticals_of_several_frames_count_as_one(deviation_deg, room):
     print(f'\ntilt: the same objects in one frame {one:.3f} deg, in four {four:.3f} deg')
     # refinement trusts four verticals more than one, and the boxes less
     assert four == pytest.approx(one, rel=0.06)
-    assert four >= 0.99 * one
+    assert four >= 0.95 * one
 
 
 def test_odometry_adds_more_error_to_frames_that_are_further_apart(room):
