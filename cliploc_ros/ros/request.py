@@ -129,9 +129,9 @@ class Pipeline:
         state = self._robot.at(image, parameters.of_camera(frame.camera), deadline,
                                frame.depth_frame)
         beside = self._beside(frame, parameters, deadline)
-        known = self._robot.prior.known(image.stamp, parameters, state.camera_from_base,
-                                        localizer.frame_ids, localizer.map_hash)
-        localized = localizer.localize(frame, parameters, state, times, deadline, beside, known)
+        region = self._robot.prior.region(image.stamp, parameters, state.camera_from_base,
+                                          localizer.frame_ids, localizer.map_hash)
+        localized = localizer.localize(frame, parameters, state, times, deadline, beside, region)
         stages_ms = times.ms
         self._node.stages.add(stages_ms)
         if faults := '; '.join(fault.text for fault in localizer.faults):

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, KeyframeLayer
-from cliploc_ros.core.map.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from cliploc_ros.datasets.depth import points_in_color
 from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.studio.floor import FREE, OCCUPIED, OccupancyGrid
 from cliploc_ros.studio.images import Images
 from cliploc_ros.studio.viewpoint import Extent, wxyz_of
 

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.map.occupancy_grid import OccupancyGrid
 from cliploc_ros.mapping.check.relocalization import RecordedKeyframes, sample_frames
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.edits import EditError
+from cliploc_ros.studio.floor import OccupancyGrid
 from cliploc_ros.studio.images import Images, Outline, Pixel, landmark_at, outlines_of
 from cliploc_ros.studio.landmark import Landmark
 from cliploc_ros.studio.new_landmark import NewLandmark
