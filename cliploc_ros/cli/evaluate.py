@@ -37,15 +37,10 @@ if TYPE_CHECKING:
 
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.datasets.bag_poses import ReadPoses
     from cliploc_ros.datasets.frames import Frames
     from cliploc_ros.datasets.queries import Queries
     from cliploc_ros.evaluation.methods import Method
     from cliploc_ros.evaluation.trials import Query
-
-# Poses of a watched localizer are interpolated over gaps up to this [ns]: AMCL speaks as the robot
-# moves, its transforms at its own rate.
-_WATCHED_GAP_NS = 1_000_000_000
 
 EPILOG = f"""\
 methods: {', '.join(PAPER_METHODS)};
@@ -62,8 +57,6 @@ examples:
   evaluate --queries office.npz --map office.yaml --methods auto --fuse --odometry-noise 0.01 0.5
   evaluate --bag case_20260101T120000.000_refused --map office.yaml
       answers a request again that ~/record stored; exit code 1: another verdict
-  evaluate --bag office --map office.yaml --watch /amcl_pose --odometry /odom
-      watches the poses of a localizer: when they are lost, and whether that is true
 """
 
 
@@ -172,14 +165,6 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
                        help='of tf: interpolate between poses so far apart (%(default)s)')
     group.add_argument('--body-from-camera', type=float, nargs=7, metavar='V',
                        help='x y z qx qy qz qw of the camera on the body of the ground truth')
-    group.add_argument('--watch', metavar='TOPIC',
-                       help='watch these poses of a localizer by objects, in place of methods; '
-                       'they and those of --odometry are of the same body; writes watch.json and '
-                       'figures')
-    group.add_argument('--watch-period', type=not_negative, default=2.0, metavar='SECONDS',
-                       help='least time between two looks (%(default)s)')
-    group.add_argument('--odometry', metavar='TOPIC',
-                       help='of --watch: which looks are independent')
 
 
 def evaluate(options: argparse.Namespace) -> int:
@@ -200,13 +185,11 @@ def evaluate(options: argparse.Namespace) -> int:
     check_folder_options(options)
     if options.level and folder_of(options) is None:
         raise OptionsError('--level is for folders of images only')
-    of_case = options.watch is None and options.bag is not None and _is_case(options)
+    of_case = options.bag is not None and _is_case(options)
     if options.queries is None and not of_case:
         find_topics(options, options.bag)
     landmark_map = join_maps([LandmarkMap.from_file(file) for file in options.map],
                              [str(file) for file in options.map])
-    if options.watch is not None:
-        return _watch(options, landmark_map)
     if of_case:
         return _replay_case(options, landmark_map)
     paper = RelocalizerOptions(
@@ -275,40 +258,6 @@ def _notes_on_maps(options: argparse.Namespace) -> list[str]:
             for file in options.map
             if (recording := load_recording(file)) is not None
             and recording.source is not None and recording.source.resolve() == images]
-
-
-def _watch(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
-    """Watch the poses of a localizer in a recording; return the exit code."""
-    from cliploc_ros.core.relocalizer import Relocalizer
-    from cliploc_ros.core.watch.watch import Watch
-    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames, bag_odometry
-    from cliploc_ros.datasets.bag_poses import pose_sources, poses_of_topic
-    from cliploc_ros.evaluation.watching import watch_recording, write_watch
-    from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
-
-    if options.bag is None or options.cameras != [''] or len(options.map) > 1:
-        raise OptionsError('--watch is for --bag, with one map and one camera')
-
-    def read(topic: str) -> 'ReadPoses':
-        return poses_of_topic(topic, _WATCHED_GAP_NS, mount_of(options.body_from_camera))
-    reading = repr([options.watch, options.odometry, options.image, options.camera_info,
-                    options.body_from_camera, options.rectified])
-    odometry, truth = (bag_odometry(options.bag, options.image, read(topic))
-                       if (topic and topic in pose_sources(options.bag)) or required else None
-                       for topic, required in ((options.odometry, bool(options.odometry)),
-                                               (_truth(options), False)))
-    recorded = record_once(
-        bag_frames(options.bag, BagTopics(options.image, options.camera_info, options.rectified),
-                   read(options.watch)),
-        RecordingOptions(detector_options(options), None, EVERY_FRAME, reading,
-                         options.workers or 1, options.scheduler),
-        odometry=None if odometry is None else {'': odometry})
-    relocalizer = Relocalizer(landmark_map, RelocalizerOptions(
-        matching='class', tilt_deviation_deg=options.tilt_deviation,
-        height_range_m=tuple(options.height_range)))
-    looks = watch_recording(recorded, Watch(relocalizer), truth, options.watch_period)
-    print(write_watch(options.out, looks, options.figures), flush=True)
-    return 0
 
 
 def _needs_clip(options: argparse.Namespace, methods: 'Sequence[Method]') -> bool:

@@ -106,7 +106,8 @@ class Answer(NamedTuple):
     accepted: bool
 
 
-class MakeWalker(NamedTuple):
+@dataclass(frozen=True)
+class MakeWalker:
     """Makes the function that answers at a place after one image, two and so on."""
 
     vertical: bool
