@@ -123,7 +123,7 @@ def check(options: argparse.Namespace) -> int:
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.evaluation.map_check.page import PAGE, summary_lines, write_report
     from cliploc_ros.evaluation.map_check.pictures import draw_pictures
-    from cliploc_ros.evaluation.map_check.views import Views
+    from cliploc_ros.evaluation.map_check.views import ViewPainter
     from cliploc_ros.files.storage import make_folder
     from cliploc_ros.mapping.check.checking import check_map
 
@@ -140,7 +140,7 @@ def check(options: argparse.Namespace) -> int:
     detections, images = _read_recording(options) or (None, None)
     image_of = views = None
     if detections is not None and images is not None:
-        views = Views(landmark_map, detections, images.near)
+        views = ViewPainter(landmark_map, detections, images.near)
         if options.observations is None:  # the layer's own: judged by those of other times
             image_of = partial(_image_of, detections, images)
     if detections is not None and (note := tilt_note(detections.map_from_camera)):

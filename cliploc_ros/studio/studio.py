@@ -22,9 +22,9 @@ from cliploc_ros.studio.images import Images, Outline, Pixel, landmark_at, outli
 from cliploc_ros.studio.landmark import Landmark
 from cliploc_ros.studio.new_landmark import NewLandmark
 from cliploc_ros.studio.phrases import FoundPhrases, PhraseFinder, Question
-from cliploc_ros.studio.recording import Answer, Recording
+from cliploc_ros.studio.recording import Recording, ViewAnswer
 from cliploc_ros.studio.review import Review
-from cliploc_ros.studio.viewpoint import Extent, extent_of
+from cliploc_ros.studio.viewpoint import Bounds, extent_of
 
 Rgb = tuple[int, int, int]
 SELECTED_RGB: Rgb = (255, 220, 0)
@@ -70,7 +70,7 @@ class Studio:
         self.new = None if recording is None else NewLandmark(document, recording)
         self.view = 0
         #: The relocalizer's answers that are shown; an edit leaves them as they are.
-        self.answers: tuple[Answer, ...] = ()
+        self.answers: tuple[ViewAnswer, ...] = ()
         # of the last run over the whole recording, by verdict
         self._counts: dict[str, int] = {}
         self._colors: dict[str, Rgb] = {}
@@ -79,7 +79,7 @@ class Studio:
         if recording is not None and recording.detections.encoder_key:
             document.take_encoder(recording.detections.encoder_key)
 
-    def extent(self) -> Extent:
+    def extent(self) -> Bounds:
         """Return where the map is, by its landmarks and by the cameras that saw it."""
         poses = (self.recording.detections.map_from_camera if self.recording is not None
                  else self.layer.map_from_camera if self.layer is not None

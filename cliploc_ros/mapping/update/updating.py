@@ -15,8 +15,8 @@ from cliploc_ros.mapping.pose_noise import estimated_note
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.update.alignment import (
     MIN_CONFIRMED,
-    Alignment,
-    Known,
+    Aligned,
+    OldMap,
     align,
     known_landmarks,
 )
@@ -123,7 +123,7 @@ def _check_belongs(judged: Judged, well_share: float) -> None:
             'errors, or build a new map')
 
 
-def _notes(old: LandmarkMap, known: Known, aligned: Alignment, detections: PosedDetections
+def _notes(old: LandmarkMap, known: OldMap, aligned: Aligned, detections: PosedDetections
            ) -> list[str]:
     """Return what the user should know of the input."""
     notes = []
