@@ -295,6 +295,11 @@ class FrameLocalizer:
 
         CliplocError: names what to fix in the frame or in the parameters.
         """
+        shift = next((part.shift for part in parts_of(self._map)
+                      if part.landmark_map.frame_id == frame_id), None)
+        if shift is None:
+            raise MapError(f"no map is in frame '{frame_id}', but in {', '.join(self.frame_ids)}: "
+                           "correct the map's frame_id")
         options = parameters.options()
         self._localizer_for(options)
         image, observation = self._observed(frame, parameters, state, True)
@@ -305,8 +310,7 @@ class FrameLocalizer:
         recognizer = None if self._keyframes is None else self._keyframes.recognizer(
             image, observation.camera, math.inf, StageTimes('keyframes', time.monotonic()))
         pose = map_from_camera.copy()
-        pose[:3, 3] += next(part.shift for part in parts_of(self._map)
-                            if part.landmark_map.frame_id == frame_id)
+        pose[:3, 3] += shift
         return self._watch.look(observation, pose, image, recognizer)
 
     def forget_looks(self) -> None:

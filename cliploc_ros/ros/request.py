@@ -7,7 +7,7 @@ import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import count
@@ -69,6 +69,8 @@ class Pipeline:
         self._jumps = jumps
         self._robot = robot
         self.localizer: FrameLocalizer | None = None
+        #: Called in the worker's thread after another map is searched.
+        self.on_map: Callable[[], None] = lambda: None
         self._pose = node.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
         self._map_to_odom = MapToOdom(node, robot.transforms)
         robot.odometry.on_restart(self._map_to_odom.forget)
@@ -172,6 +174,7 @@ class Pipeline:
         self.localizer = localizer
         self._visualization.set_map(localizer.landmark_map, None if localizer.keyframes is None
                                     else localizer.keyframes.layer)
+        self.on_map()
         return localizer.description
 
     def _publish(self, header: Header, localized: Localized, state: RobotState,

@@ -95,6 +95,7 @@ class Watcher:
         self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
         if self.is_on:
             handoff.on_shown(self._pose.hear)
+            pipeline.on_map = lambda: self._drop('a map was loaded')
             robot.odometry.on_restart(lambda _: self._drop('odom restarted'))
             self._localized = node.create_publisher(Bool, '~/localized', qos.LATCHED)
             self._state = node.create_publisher(String, '~/localization_state', qos.LATCHED)

@@ -109,6 +109,11 @@ def test_options_hold_from_the_next_frame_on(localizer, values):
     assert found.accepted and localizer.description.endswith('matching class, algorithm ransac')
 
 
+def test_a_look_at_a_pose_in_another_frame_names_the_frames(localizer, values):
+    with pytest.raises(MapError, match="'elsewhere'"):
+        localizer.look(make_frame(), values, RobotState(np.eye(4)), 'elsewhere', MAP_FROM_CAMERA)
+
+
 def test_more_detections_than_allowed_are_not_searched(localizer, values):
     assert not localize(localizer, make_frame(), replace(values, max_detections=3)).accepted
 
