@@ -27,7 +27,7 @@ from cliploc_ros.cli.sources import (
     read_named_folder,
     source_of,
 )
-from cliploc_ros.command import not_negative, positive_int, run_main, within
+from cliploc_ros.command import SEEDS, finite, limit, not_negative, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.methods import ALL, AUTO, PAPER_METHODS
@@ -83,7 +83,8 @@ def make_parser() -> argparse.ArgumentParser:
                         help=f'default: {ALL}; see below')
     parser.add_argument('--trials', type=positive_int, default=5,
                         help="the paper's %(default)s by default")
-    parser.add_argument('--seed', type=int, default=0, help='of the first trial (%(default)s)')
+    parser.add_argument('--seed', type=within(*SEEDS), default=0,
+                        help='of the first trial (%(default)s)')
     parser.add_argument('--frames', choices=('main', 'all'), default='main',
                         help="of a query file; 'all' includes the neighbours of the queries")
     parser.add_argument('--crops', type=lambda text: text.replace('-', '_'), choices=CROPS,
@@ -107,10 +108,10 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _add_paper_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("options of the paper's methods")
-    group.add_argument('--iterations', type=int, default=500, help='(%(default)s)')
-    group.add_argument('--k', type=int, default=3, help='(%(default)s)')
-    group.add_argument('--iou-threshold', type=float, default=0.2, help='(%(default)s)')
-    group.add_argument('--time-budget-ms', type=float, default=float('inf'), metavar='MS',
+    group.add_argument('--iterations', type=positive_int, default=500, help='(%(default)s)')
+    group.add_argument('--k', type=positive_int, default=3, help='(%(default)s)')
+    group.add_argument('--iou-threshold', type=within(0.0, 1.0), default=0.2, help='(%(default)s)')
+    group.add_argument('--time-budget-ms', type=limit, default=float('inf'), metavar='MS',
                        help='limit of each search (none); with one, results vary')
     group.add_argument('--sweep', type=positive_int, nargs='*', metavar='N',
                        default=[50, 100, 200, 1000],
@@ -124,10 +125,10 @@ def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
                        'methods do not use it')
     group.add_argument('--gravity-noise-deg', type=within(0.0, 45.0), default=0.0, metavar='DEG',
                        help='standard deviation of the vertical (0)')
-    group.add_argument('--height-range', type=float, nargs=2, metavar=('LOW', 'HIGH'),
+    group.add_argument('--height-range', type=limit, nargs=2, metavar=('LOW', 'HIGH'),
                        default=(-math.inf, math.inf),
                        help='heights that the camera may have in the map [m]')
-    group.add_argument('--tilt-deviation', type=float, default=40.0, metavar='DEG',
+    group.add_argument('--tilt-deviation', type=not_negative, default=40.0, metavar='DEG',
                        help=f"of the camera off upright, for '{AUTO}' without vertical; 0 where "
                        "the map's z axis is not up (%(default)s)")
     group.add_argument('--fuse', action='store_true',
@@ -163,7 +164,7 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
                        help="take ground truth from /tf: the map's coordinate frame (map)")
     group.add_argument('--max-gap', type=not_negative, default=0.5, metavar='SECONDS',
                        help='of tf: interpolate between poses so far apart (%(default)s)')
-    group.add_argument('--body-from-camera', type=float, nargs=7, metavar='V',
+    group.add_argument('--body-from-camera', type=finite, nargs=7, metavar='V',
                        help='x y z qx qy qz qw of the camera on the body of the ground truth')
 
 

@@ -231,16 +231,28 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log)
         log.restart([run])
     if seen:
         logger.warning('going on after %d frames of an unfinished run', len(seen))
-    with _read_keyframes(frames, options.keyframes) as (raws, filters):
-        tasks = (raw for raw in raws if raw.place not in seen)
-        for _, result in run_tasks(options.networks, tasks, workers=options.workers,
-                                   scheduler=options.scheduler):
-            if result is not None:
-                log.append({'frame': base64.b64encode(result.to_bytes()).decode()})
-                seen[result.place] = result
-                _judge_depth(seen, frames.source)
+    try:
+        with _read_keyframes(frames, options.keyframes) as (raws, filters):
+            tasks = (raw for raw in raws if raw.place not in seen)
+            for _, result in run_tasks(options.networks, tasks, workers=options.workers,
+                                       scheduler=options.scheduler):
+                if result is not None:
+                    log.append({'frame': base64.b64encode(result.to_bytes()).decode()})
+                    seen[result.place] = result
+                    _judge_depth(seen, frames.source)
+    except BaseException:
+        if seen:
+            logger.warning('%d frames are kept in %s: run again to go on from there, or delete it',
+                           len(seen), log.path)
+        else:
+            log.remove()
+        raise
     encoder_key = '' if options.clip is None else resolve_clip_weights(options.clip).key
-    return _assemble(list(seen.values()), frames, filters, encoder_key, described)
+    try:
+        return _assemble(list(seen.values()), frames, filters, encoder_key, described)
+    except CliplocError:
+        log.remove()  # the same frames fail again
+        raise
 
 
 def _parse_entry(line: bytes) -> Any:

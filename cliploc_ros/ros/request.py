@@ -289,7 +289,7 @@ class Requests:
                 if last is not None:
                     is_up = True
                     break
-                if isinstance(error, NoFrameError):
+                if problem is not None or isinstance(error, NoFrameError):
                     raise problem or error from error
                 return Answer(Verdict.REFUSED, time_is_up(times.ms), kind=RefusalKind.TIME_UP)
             may_go_on = may_go_on and self._robot.is_linked_soon(frame.image.header.stamp,
