@@ -32,7 +32,7 @@ from cliploc_ros.datasets.observations import (
     save_recorded,
 )
 from cliploc_ros.datasets.poses import Poses
-from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.mapping.options import MappingOptions

@@ -144,7 +144,7 @@ class Localized(NamedTuple):
     #: the new information, see cliploc_ros.core.localizer.
     for_filter: NDArray[np.float64] | None
     cameras: int  #: Number of cameras whose frames of this instant were used
-    left_out: tuple[str, ...]  #: Names of those that had none
+    left_out: tuple[str, ...]  #: Names of those that had none, or of another run of odometry
 
 
 class FrameLocalizer:
@@ -258,9 +258,13 @@ class FrameLocalizer:
         image, observation = self._observed(frame, parameters, state,
                                             run is not None or not frame.camera)
         observation = replace(observation, region=region)
+        linked = [(one, its) for one, its in beside
+                  if run == (None if its.place is None else its.place.run)]
         others = [
             self._known_crops(*self._observed(one, parameters, its, run is not None), options)
-            for one, its in beside if run == (None if its.place is None else its.place.run)]
+            for one, its in linked]
+        names = [one.camera for one, _ in linked]
+        left_out = (*frame.left_out, *(one.camera for one, _ in beside if one.camera not in names))
         camera, detections = observation.camera, observation.detections
         crops, observation = self._crops(image, observation, options, times, deadline)
         recognizer = None if self._keyframes is None else self._keyframes.recognizer(
@@ -285,7 +289,7 @@ class FrameLocalizer:
         found, landmark_map, seen = _in_its_map(self._explained(found), self._map, seen)
         layer = None if self._keyframes is None else self._keyframes.layer
         return Localized(found, landmark_map, SeenImage(image, seen, layer), compared, is_cut,
-                         for_filter, 1 + len(others), frame.left_out)
+                         for_filter, 1 + len(others), left_out)
 
     def look(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
              frame_id: str, map_from_camera: NDArray[np.float64]) -> WatchReport:
