@@ -32,8 +32,8 @@ _WINDOW = 200
 def join_names(names: Sequence[str]) -> str:
     """Return names as one value, separated by commas; those with a comma or a quote are quoted."""
     text = io.StringIO()
-    csv.writer(text, lineterminator='').writerow(names)
-    return text.getvalue()
+    csv.writer(text).writerow(names)
+    return text.getvalue().removesuffix('\r\n')
 
 
 def split_names(text: str) -> tuple[str, ...]:
