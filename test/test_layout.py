@@ -28,14 +28,14 @@ LAYERS = (
     ('core.fit',),
     ('core.acceptance',),
     ('core',),
-    ('simulation.detector', 'simulation.labels'),
-    ('mapping',),
+    ('simulation',),
     ('messages', 'command'),
-    ('models', 'datasets'),
+    ('models',),
+    ('mapping',),
+    ('datasets',),
     ('recording',),
     ('make_map',),
     ('evaluation',),
-    ('simulation',),
     ('ros.qos', 'ros.conversions'),
     ('ros.node',),
     ('ros.parameters',),
@@ -85,6 +85,13 @@ def test_imports_point_downwards():
             if there != here and RANKS[there] >= RANKS[here]:
                 upward.append(f'{module} ({here}) imports {imported} ({there})')
     assert not upward, '\n' + '\n'.join(upward)
+
+
+def test_each_folder_stands_in_one_layer():
+    """Only core and ros have layers of their own."""
+    folders = [prefix.partition('.')[0] for prefixes in LAYERS for prefix in prefixes]
+    twice = {name for name in folders if folders.count(name) > 1}
+    assert twice == {'core', 'ros'}
 
 
 def test_the_acceptance_names_its_modules():

@@ -176,9 +176,9 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.evaluation.methods import parse_methods
     from cliploc_ros.evaluation.recording import with_features
     from cliploc_ros.evaluation.run import compare_methods
+    from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
     from cliploc_ros.evaluation.trials import join_cameras, make_queries
     from cliploc_ros.files.storage import make_folder
-    from cliploc_ros.simulation.sensors import with_neighbours, with_vertical
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):

@@ -11,8 +11,8 @@ import pytest
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.evaluation import sensors
 from cliploc_ros.evaluation.trials import make_queries
-from cliploc_ros.simulation import sensors
 from studies import wrong_sensors
 from studies.acceptance import priors, troubles
 from studies.acceptance.__main__ import run
