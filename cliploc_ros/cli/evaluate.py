@@ -173,6 +173,8 @@ def evaluate(options: argparse.Namespace) -> int:
     # imported late, so that --help is fast
     from cliploc_ros.core.map.joined_map import join_maps
     from cliploc_ros.core.map.landmark_map import LandmarkMap
+    from cliploc_ros.datasets.bags import BagReader
+    from cliploc_ros.datasets.cases import is_case
     from cliploc_ros.evaluation.methods import parse_methods
     from cliploc_ros.evaluation.recording import with_features
     from cliploc_ros.evaluation.run import compare_methods
@@ -186,7 +188,10 @@ def evaluate(options: argparse.Namespace) -> int:
     check_folder_options(options)
     if options.level and folder_of(options) is None:
         raise OptionsError('--level is for folders of images only')
-    of_case = options.bag is not None and _is_case(options)
+    of_case = False
+    if options.bag is not None:  # or it has ground truth, and is no request alone
+        with BagReader(options.bag) as reader:
+            of_case = _truth(options) not in reader.topics and is_case(options.bag)
     if options.queries is None and not of_case:
         find_topics(options, options.bag)
     landmark_map = join_maps([LandmarkMap.from_file(file) for file in options.map],
@@ -298,15 +303,6 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
     if wanted is None and layer_path(options.map[0]).exists():
         print(f'without keyframes: {problem}', flush=True)
     return None
-
-
-def _is_case(options: argparse.Namespace) -> bool:
-    """Return whether --bag is a recorded request, without ground truth."""
-    from cliploc_ros.datasets.bags import BagReader
-    from cliploc_ros.datasets.cases import is_case
-
-    with BagReader(options.bag) as reader:
-        return _truth(options) not in reader.topics and is_case(options.bag)
 
 
 def _truth(options: argparse.Namespace) -> str:

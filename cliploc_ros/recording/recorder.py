@@ -181,7 +181,9 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
             if recorded.described == described:
                 logger.warning('using the observations of an earlier run: %s', file)
                 linked = _with_odometry(recorded, odometry)
-                if _adds_odometry(recorded, linked):
+                old = recorded.detections.odom_from_camera
+                new = linked.detections.odom_from_camera
+                if new is not None and (old is None or not np.array_equal(old, new, True)):
                     save_recorded(file, linked)
                 return linked
             logger.warning('recording again, with other options: %s', file)
@@ -205,11 +207,6 @@ def _with_odometry(recorded: Recorded, odometry: Mapping[str, Poses] | None) -> 
                  for frame, stamp_ns in enumerate(recorded.stamps_ns)]
         placed = np.array([_UNKNOWN if pose is None else pose for pose in poses])
     return replace(recorded, detections=replace(recorded.detections, odom_from_camera=placed))
-
-
-def _adds_odometry(before: Recorded, after: Recorded) -> bool:
-    old, new = before.detections.odom_from_camera, after.detections.odom_from_camera
-    return new is not None and (old is None or not np.array_equal(old, new, equal_nan=True))
 
 
 def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame]) -> Recorded:

@@ -23,7 +23,7 @@ from cliploc_ros.studio.landmark import Landmark
 from cliploc_ros.studio.new_landmark import NewLandmark
 from cliploc_ros.studio.phrases import FoundPhrases, PhraseFinder, Question
 from cliploc_ros.studio.recording import Recording, ViewAnswer
-from cliploc_ros.studio.review import Review
+from cliploc_ros.studio.review import ReviewQueue
 from cliploc_ros.studio.viewpoint import Bounds, extent_of
 
 Rgb = tuple[int, int, int]
@@ -66,7 +66,7 @@ class Studio:
         self.finder = finder
         self.recording = recording
         self.images = images
-        self.review = Review(document, recording)
+        self.review = ReviewQueue(document, recording)
         self.new = None if recording is None else NewLandmark(document, recording)
         self.view = 0
         #: The relocalizer's answers that are shown; an edit leaves them as they are.

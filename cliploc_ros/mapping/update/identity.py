@@ -21,7 +21,7 @@ from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.mapping.labelling import embed_landmarks
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.update.alignment import OldMap, has_moved
-from cliploc_ros.mapping.update.judging import Judged, Shown
+from cliploc_ros.mapping.update.judging import Judgement, Shown
 
 # Gains, in nats. Guesses: no look outweighs an object that is seen in its place, but two looks
 # that are exchanged do; and looks decide whether a new object is a missing one.
@@ -54,7 +54,7 @@ class Fates(NamedTuple):
     rivals: dict[int, tuple[int, ...]]  #: Old landmarks that an object could be as well
 
 
-def decide_fates(known: OldMap, judged: Judged, objects: Shown, looks: 'Likeness | None'
+def decide_fates(known: OldMap, judged: Judgement, objects: Shown, looks: 'Likeness | None'
                  ) -> Fates:
     """Return what became of each old landmark."""
     numbers, rivals = _identify(known, objects, judged, looks)
@@ -150,7 +150,7 @@ class _LookModel(NamedTuple):
         return np.nan_to_num(np.clip(gains, -_MAX_LOOK_GAIN, _MAX_LOOK_GAIN), nan=0.0)
 
 
-def _identify(known: OldMap, objects: Shown, judged: Judged, looks: Likeness | None
+def _identify(known: OldMap, objects: Shown, judged: Judgement, looks: Likeness | None
               ) -> tuple[NDArray[np.int64], dict[int, tuple[int, ...]]]:
     """Return the object (L,) that each old landmark is, -1 for none, and the rivals of objects.
 
@@ -220,7 +220,7 @@ def _learn_looks(objects: Shown, looks: Likeness, groups: NDArray[np.int64]) -> 
     return _LookModel(middle, elsewhere, max(*spreads, 1e-3))
 
 
-def _gains(known: OldMap, objects: Shown, judged: Judged, rows: NDArray[np.int64],
+def _gains(known: OldMap, objects: Shown, judged: Judgement, rows: NDArray[np.int64],
            columns: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the gains (k, j) by place, class and size; -inf where a pair is impossible."""
     sizes = [np.log(np.sort(np.linalg.norm(one.bases, axis=1), axis=1)[:, 1:]).mean(axis=1)

@@ -86,7 +86,7 @@ class Finds(NamedTuple):
                 for row, reason in enumerate(reasons) if reason is not None))
 
 
-class Judged(NamedTuple):
+class Judgement(NamedTuple):
     """What the recording says: L old landmarks, m finds, n boxes."""
 
     #: (n,): the old landmark that each box shows in its place, L + the find, or -1 for none
@@ -100,7 +100,7 @@ class Judged(NamedTuple):
 
 
 def judge(detections: PosedDetections, views: Views, known: OldMap, options: MappingOptions
-          ) -> Judged:
+          ) -> Judgement:
     """Return what the recording says of each place of the map, and what else it shows.
 
     The views have poses in the coordinate frame of the map.
@@ -153,7 +153,7 @@ def judge(detections: PosedDetections, views: Views, known: OldMap, options: Map
     is_doubtful = (is_gone & ~_is_absent(known, own, limits)) | (
         ~is_there & ~is_gone & (is_rare | _is_absent(known, own, _STAYS))
         & (known.landmarks.classes >= 0))
-    return Judged(shown, finds, sight, is_gone, is_there, is_doubtful)
+    return Judgement(shown, finds, sight, is_gone, is_there, is_doubtful)
 
 
 def _is_absent(known: OldMap, sight: Sight, limits: NDArray[np.float64] | float
@@ -313,7 +313,7 @@ class Shown(NamedTuple):
         return self.refits.landmarks
 
 
-def gather_objects(aligned: Aligned, known: OldMap, judged: Judged, options: MappingOptions
+def gather_objects(aligned: Aligned, known: OldMap, judged: Judgement, options: MappingOptions
                    ) -> Shown:
     """Return the objects that the recording shows."""
     views, count, finds = aligned.views, len(known.sigmas), judged.finds

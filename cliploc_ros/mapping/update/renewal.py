@@ -20,7 +20,7 @@ from cliploc_ros.mapping.evidence import Evidence, gather_evidence
 from cliploc_ros.mapping.landmarks import ellipsoid_numbers, unused_ids
 from cliploc_ros.mapping.update.alignment import LEAST_MOVE_SIGMAS, OldMap, deviations
 from cliploc_ros.mapping.update.identity import Fates
-from cliploc_ros.mapping.update.judging import Judged, Shown
+from cliploc_ros.mapping.update.judging import Judgement, Shown
 from cliploc_ros.mapping.update.sight import Sight
 from cliploc_ros.mapping.views import Views
 
@@ -28,7 +28,7 @@ _ROWS_SHOWN = 40
 
 
 def renew(old: LandmarkMap, known: OldMap, views: Views, objects: Shown, fates: Fates,
-          judged: Judged, class_names: tuple[str, ...]) -> LandmarkMap:
+          judged: Judgement, class_names: tuple[str, ...]) -> LandmarkMap:
     """Return the new map: the old landmarks that are left, in their order, then new ones.
 
     The class names are those of the recording; the views have its poses in the map.
@@ -173,7 +173,7 @@ class UpdateReport:
 
 
 def describe(old: LandmarkMap, updated: LandmarkMap, objects: Shown, fates: Fates,
-             judged: Judged) -> dict[str, tuple[UpdatedLandmark, ...]]:
+             judged: Judgement) -> dict[str, tuple[UpdatedLandmark, ...]]:
     """Return the lists of an UpdateReport."""
     places = dict(zip(updated.landmark_ids, range(len(updated)), strict=True))
 

@@ -26,7 +26,7 @@ from cliploc_ros.mapping.update.identity import (
     renew_embeddings,
     why_not_comparable,
 )
-from cliploc_ros.mapping.update.judging import LEAST_VIEWS, Judged, gather_objects, judge
+from cliploc_ros.mapping.update.judging import LEAST_VIEWS, Judgement, gather_objects, judge
 from cliploc_ros.mapping.update.renewal import UpdateReport, describe, renew
 from cliploc_ros.mapping.views import check_input, make_views, map_from_cameras
 
@@ -110,7 +110,7 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
                       renew_embeddings(embeddings, updated.landmark_ids, detections, shown))
 
 
-def _check_belongs(judged: Judged, well_share: float) -> None:
+def _check_belongs(judged: Judgement, well_share: float) -> None:
     """Refuse a recording that shows hardly any landmark in its place, or most of them badly."""
     count, there = len(judged.is_there), int(judged.is_there.sum())
     in_view = int((judged.is_there | (judged.sight.expected[:count] >= LEAST_VIEWS)).sum())
