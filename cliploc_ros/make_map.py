@@ -15,7 +15,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.frames import Frames
 from cliploc_ros.errors import MappingError, ModelError
 from cliploc_ros.mapping.building import MappingReport, build_map
-from cliploc_ros.mapping.labelling import classes_of, embed_landmarks, label_landmarks
+from cliploc_ros.mapping.labelling import embed_landmarks, label_landmarks
+from cliploc_ros.mapping.landmarks import classes_of
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.systematic import MountCorrection

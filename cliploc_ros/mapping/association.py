@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which box shows which landmark, and which landmarks are one object.
-
-Boxes and landmarks belong together one to one in every frame, by greatest overlap in sum. Two
-landmarks that lie in one another are one object, unless frames show both of them apart. A
-detector may call one object by two names, in different frames or in one.
-"""
+"""Which box shows which landmark: one to one in every frame, by greatest overlap in sum."""
 
 from math import sqrt
 from typing import NamedTuple
@@ -13,23 +8,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
 
 from cliploc_ros.core.kernels.compiled import compiled
-from cliploc_ros.mapping.fitting import fit_ellipsoid
-from cliploc_ros.mapping.landmarks import Landmarks, box_iou, group_boxes, project_box
-from cliploc_ros.mapping.options import MappingOptions
+from cliploc_ros.mapping.landmarks import Landmarks, box_iou, project_box
 from cliploc_ros.mapping.views import Views
 
 _GROUP_SIZE = 8
 # Rounding must not hide a landmark [m].
 _SLACK = 1e-6
-# Two boxes of one frame that overlap more than this are one object. A guess.
-_ONE_BOX_IOU = 0.6
 
 
 class Overlaps(NamedTuple):
-    """Pairs of a box and a landmark of its class that overlap, in the order of the boxes."""
+    """Pairs of a box and a landmark with its class that overlap, in the order of the boxes."""
 
     #: (p,)
     boxes: NDArray[np.int64]
@@ -38,8 +28,8 @@ class Overlaps(NamedTuple):
 
 
 def find_overlaps(views: Views, landmarks: Landmarks, min_iou: float) -> Overlaps:
-    """Return the pairs of equal class that overlap more than min_iou."""
-    classes = int(max(views.classes.max(initial=0), landmarks.classes.max(initial=0))) + 1
+    """Return the pairs that overlap more than min_iou, by each class of a landmark."""
+    classes = int(max(views.classes.max(initial=0), landmarks.names[:, 1].max(initial=0))) + 1
     boxes, numbers, ious = _overlaps(views, landmarks.centers, landmarks.bases,
                                      _make_groups(landmarks, classes), min_iou)
     order = np.lexsort((numbers, boxes))
@@ -62,10 +52,10 @@ class _Groups(NamedTuple):
 
 
 def _make_groups(landmarks: Landmarks, classes: int) -> _Groups:
-    """Return groups of landmarks; one of a class below 0 is in none."""
-    order = np.lexsort((_along_curve(landmarks.centers), landmarks.classes))
-    members = order[landmarks.classes[order] >= 0]
-    own = landmarks.classes[members]
+    """Return groups of landmarks; one without a class is in none."""
+    rows, of_names = landmarks.names.T
+    order = np.lexsort((_along_curve(landmarks.centers)[rows], of_names))
+    members, own = rows[order], of_names[order]
     first = np.searchsorted(own, np.arange(classes + 1))
     starts = np.concatenate([[0], np.cumsum(-(-np.diff(first) // _GROUP_SIZE))])
     group_of = starts[own] + (np.arange(len(own)) - first[own]) // _GROUP_SIZE
@@ -183,84 +173,3 @@ def ious_with(views, rows, center, basis):
         if project_box(views.rotations[frame], views.translations[frame], center, basis, box):
             ious[place] = box_iou(box, views.edges[rows[place]], views.bounds[frame])
     return ious
-
-
-def merge_duplicates(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
-                     pairs: list[tuple[int, int]], options: MappingOptions
-                     ) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Return the landmarks with those pairs merged that are one object, and shown for these."""
-    landmarks, into = merge_pairs(views, landmarks, shown, pairs, options)
-    is_kept = into == np.arange(len(into))
-    numbers = np.append((np.cumsum(is_kept) - 1)[into], -1)
-    return landmarks.select(is_kept), numbers[shown]
-
-
-def merge_pairs(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
-                pairs: list[tuple[int, int]], options: MappingOptions
-                ) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Fit those of the pairs together that are one object, in the order given.
-
-    Of two landmarks the one with more boxes stays. Returns all landmarks, and the one (L,) that
-    each is part of.
-    """
-    centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
-    rows_of = group_boxes(shown, len(centers))
-    into = np.arange(len(centers))
-    for first, second in pairs:
-        if into[first] != first or into[second] != second:
-            continue
-        keep, drop = ((first, second) if len(rows_of[first]) >= len(rows_of[second])
-                      else (second, first))
-        if seen_apart(views, rows_of[keep], rows_of[drop]) > options.max_seen_apart:
-            continue
-        rows = np.sort(np.concatenate([rows_of[keep], rows_of[drop]]))
-        fit = fit_ellipsoid(views, rows, centers[keep], bases[keep])
-        before = np.concatenate([ious_with(views, rows_of[number], centers[number], bases[number])
-                                 for number in (keep, drop)])
-        after = ious_with(views, rows, fit.center, fit.basis)
-        if len(rows) and after.mean() < before.mean() - options.merge_loss:
-            continue
-        centers[keep], bases[keep], rows_of[keep] = fit.center, fit.basis, rows
-        into[into == drop] = keep
-    return Landmarks(centers, bases, landmarks.classes), into
-
-
-def pairs_of_one_class(landmarks: Landmarks, max_distance: float) -> list[tuple[int, int]]:
-    """Return the pairs of one class nearer than a normalized distance, the nearest first."""
-    return [(first, second) for first, second, _ in close_pairs(landmarks, max_distance)
-            if landmarks.classes[first] == landmarks.classes[second]]
-
-
-def close_pairs(landmarks: Landmarks, max_distance: float) -> list[tuple[int, int, float]]:
-    """Return the pairs nearer than a normalized distance, with it, the nearest first."""
-    if len(landmarks.centers) < 2:
-        return []
-    reach = np.linalg.norm(landmarks.bases, axis=(1, 2))
-    # the smaller of two touching landmarks lies within the reach of the larger one
-    tree = cKDTree(landmarks.centers)
-    pairs = {(min(first, second), max(first, second)) for first in range(len(reach))
-             for second in tree.query_ball_point(landmarks.centers[first],
-                                                 2.0 * max_distance * reach[first])
-             if second != first}
-    close = [(*pair, normalized_distance(landmarks, *pair)) for pair in sorted(pairs)]
-    return sorted((one for one in close if one[2] < max_distance), key=lambda one: one[2])
-
-
-def normalized_distance(landmarks: Landmarks, first: int, second: int) -> float:
-    """Return the distance of two centres in units of the summed shapes, about 1 if they touch."""
-    shape = (landmarks.bases[first] @ landmarks.bases[first].T
-             + landmarks.bases[second] @ landmarks.bases[second].T)
-    offset = landmarks.centers[first] - landmarks.centers[second]
-    return float(np.sqrt(offset @ np.linalg.solve(shape, offset)))
-
-
-def seen_apart(views: Views, rows: NDArray[np.int64], others: NDArray[np.int64]) -> float:
-    """Return in which share of the frames of the landmark with fewer both have a box of their own.
-
-    Two boxes that overlap well are one object under two classes.
-    """
-    _, first, second = np.intersect1d(views.frames[rows], views.frames[others],
-                                      return_indices=True)
-    apart = sum(box_iou(views.edges[row], views.edges[other], views.bounds[views.frames[row]])
-                < _ONE_BOX_IOU for row, other in zip(rows[first], others[second], strict=True))
-    return float(apart) / max(1, min(len(rows), len(others)))

@@ -13,12 +13,8 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.association import (
-    associate,
-    close_pairs,
-    merge_duplicates,
-    pairs_of_one_class,
-)
+from cliploc_ros.mapping.association import associate
+from cliploc_ros.mapping.doubles import close_pairs, merge_doubles, resolve_doubles
 from cliploc_ros.mapping.evidence import (
     Evidence,
     explained_boxes,
@@ -264,14 +260,36 @@ def _settle(views: Views, landmarks: Landmarks, options: MappingOptions
     """Associate, merge and fit until landmarks and boxes agree; return both."""
     for _ in range(options.settling_rounds):
         shown = associate(views, landmarks, options.association_iou)
-        landmarks, shown = merge_duplicates(
-            views, landmarks, shown, pairs_of_one_class(landmarks, options.merge_distance),
-            options)
+        pairs = [(first, second) for first, second, _ in close_pairs(landmarks)
+                 if landmarks.classes[first] == landmarks.classes[second]]
+        landmarks, shown = _keep(*merge_doubles(views, landmarks, shown, pairs, options), shown)
         boxes = group_boxes(shown, len(landmarks.centers))
         seen = [len(np.unique(views.viewpoints[views.frames[rows]])) >= options.min_viewpoints
                 for rows in boxes]
         landmarks = fit_landmarks(views, landmarks, boxes).select(np.array(seen, dtype=np.bool_))
     return landmarks, associate(views, landmarks, options.association_iou)
+
+
+def _keep(landmarks: Landmarks, into: NDArray[np.int64], shown: NDArray[np.int64]
+          ) -> tuple[Landmarks, NDArray[np.int64]]:
+    """Return the landmarks that are no part of another one, and the one that each box shows."""
+    is_kept = into == np.arange(len(into))
+    numbers = np.append((np.cumsum(is_kept) - 1)[into], -1)
+    return landmarks.select(is_kept), numbers[shown]
+
+
+def _one_of_each(views: Views, landmarks: Landmarks, options: MappingOptions
+                 ) -> tuple[Landmarks, NDArray[np.int64]]:
+    """Return landmarks without doubles, fitted to their boxes, and the one that each box shows."""
+    while True:
+        shown = associate(views, landmarks, options.association_iou)
+        found, of_found = _keep(*resolve_doubles(views, landmarks, shown, options), shown)
+        is_shown = np.bincount(of_found[of_found >= 0], minlength=len(found.centers)) > 0
+        if is_shown.sum() == len(landmarks.centers):
+            return landmarks, shown
+        landmarks = found.select(is_shown)
+        shown = associate(views, landmarks, options.association_iou)
+        landmarks = fit_landmarks(views, landmarks, group_boxes(shown, len(landmarks.centers)))
 
 
 def _why_none(reasons: Sequence[str]) -> str:
@@ -324,11 +342,7 @@ def _with_poses(given: Views, odometry: NDArray[np.float64] | None, draft: _Draf
 def _finish(detections: PosedDetections, given: Views, views: Views, draft: _Draft,
             errors: PoseErrors | None, options: MappingOptions, notes: Sequence[str]) -> BuiltMap:
     """Return the map of a draft, with labels that are the class names, and its report."""
-    # one object may have two classes: the one that more boxes have stays
-    pairs = [(first, second) for first, second, _ in close_pairs(draft.landmarks,
-                                                                 options.class_merge_distance)
-             if draft.landmarks.classes[first] != draft.landmarks.classes[second]]
-    landmarks, shown = merge_duplicates(views, draft.landmarks, draft.shown, pairs, options)
+    landmarks, shown = _one_of_each(views, draft.landmarks, options)
     count = len(landmarks.centers)
     evidence = gather_evidence(views, landmarks, shown)
     explained, median_iou = explained_boxes(views, landmarks, shown)
@@ -340,14 +354,15 @@ def _finish(detections: PosedDetections, given: Views, views: Views, draft: _Dra
         evidence.position_sigma,
         left_by_poses(views, np.square(pose_errors(given, views)), shown, count)))
     shared = None if errors is None else shared_by_neighbours(views, shown, count, errors)
+    weights = [_class_weights(detections, boxes) for boxes in group_boxes(shown, count)]
     details = tuple(
         evidence.details(row, LandmarkDetails(
-            class_weights=_class_weights(detections, boxes),
+            class_weights=one if len(one) > 1 else None,
             shared_sigma=None if shared is None else float(shared[row, 0]),
             shared_sigma_deg=None if shared is None else float(shared[row, 1]),
             source=options.source))
-        for row, boxes in enumerate(group_boxes(shown, count)))
-    names = tuple(detections.class_names[number] for number in landmarks.classes)
+        for row, one in enumerate(weights))
+    names = tuple(one[0][0] for one in weights)
     return BuiltMap(
         LandmarkMap(options.frame_id, unused_ids(names), names, names, landmarks.centers,
                     *ellipsoid_numbers(landmarks.bases), details),
@@ -364,10 +379,8 @@ def _left_out(detections: PosedDetections, draft: _Draft) -> tuple[LeftOut, ...]
 
 
 def _class_weights(detections: PosedDetections, rows: NDArray[np.int64]
-                   ) -> tuple[tuple[str, float], ...] | None:
-    """Return the classes of some boxes with their shares, the greatest first; None for one."""
+                   ) -> tuple[tuple[str, float], ...]:
+    """Return the classes of some boxes with their shares, the greatest first."""
     counts = np.bincount(detections.classes[rows], minlength=len(detections.class_names))
-    if np.count_nonzero(counts) < 2:
-        return None
     return tuple((detections.class_names[number], float(counts[number] / counts.sum()))
                  for number in np.argsort(-counts, kind='stable') if counts[number])

@@ -57,7 +57,7 @@ def fit_landmarks(views: Views, landmarks: Landmarks, boxes: Sequence[NDArray[np
         if len(rows):
             fit = fit_ellipsoid(views, rows, centers[number], bases[number], iterations)
             centers[number], bases[number] = fit.center, fit.basis
-    return Landmarks(centers, bases, landmarks.classes)
+    return landmarks._replace(centers=centers, bases=bases)
 
 
 def fit_ellipsoid(views: Views, rows: NDArray[np.int64], center: NDArray[np.float64],

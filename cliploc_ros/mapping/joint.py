@@ -190,7 +190,7 @@ class State(NamedTuple):
         shifts = pose_steps[:, :3] + np.cross(pose_steps[:, 3:], self.views.levers)
         translations = -np.einsum('fij,fj->fi', rotations, origins + shifts)
         return State(self.views._replace(rotations=rotations, translations=translations),
-                      Landmarks(centers, bases, self.landmarks.classes),
+                      self.landmarks._replace(centers=centers, bases=bases),
                       self.errors + pose_steps)
 
 

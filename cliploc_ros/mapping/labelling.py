@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import MOST_MEDOIDS, LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.mapping.landmarks import group_boxes
+from cliploc_ros.mapping.landmarks import classes_of, group_boxes
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.views import number_viewpoints
 from cliploc_ros.vocabulary.vocabulary import Phrases
@@ -75,13 +75,6 @@ def label_landmarks(landmark_map: LandmarkMap, embeddings: LandmarkEmbeddings,
         labels[row] = fitting[0][0]
         details[row] = replace(details[row], labels=fitting)
     return replace(landmark_map, labels=tuple(labels), details=tuple(details))
-
-
-def classes_of(landmark_map: LandmarkMap, row: int) -> tuple[str, ...]:
-    """Return all classes that a landmark was detected as."""
-    weights = landmark_map.details[row].class_weights if landmark_map.details else None
-    names = [landmark_map.class_ids[row], *(name for name, _ in weights or ())]
-    return tuple(dict.fromkeys(names))
 
 
 def best_phrases(mean: NDArray[np.float32], phrases: Sequence[Phrases]

@@ -186,25 +186,54 @@ def move_ellipsoid(center, basis, step, new_center, new_basis):
             new_basis[i, k] = directions[i, k] * sqrt(max(squares[k], 1e-8))
 
 
+_NO_NAMES = np.empty((0, 2), dtype=np.int64)
+
+
 class Landmarks(NamedTuple):
     """L ellipsoids of known classes."""
 
     centers: NDArray[np.float64]  #: (L, 3): [m]
     #: (L, 3, 3): their columns are the semi-axes [m], see cliploc_ros.mapping.landmarks
     bases: NDArray[np.float64]
-    classes: NDArray[np.int64]  #: (L,): detector classes
+    classes: NDArray[np.int64]  #: (L,): detector classes; -1: one that no box has
+    #: (k, 2): a landmark and another class that a detector gives it, each pair once
+    others: NDArray[np.int64] = _NO_NAMES
+
+    @property
+    def names(self) -> NDArray[np.int64]:
+        """Return each landmark with each of its classes (m, 2), without those that no box has."""
+        own = np.stack([np.arange(len(self.classes)), self.classes], axis=1)
+        return np.concatenate([own[self.classes >= 0], self.others])
 
     def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> 'Landmarks':
         """Return some of the landmarks."""
-        return Landmarks(self.centers[rows], self.bases[rows], self.classes[rows])
+        places = np.full(len(self.classes), -1, dtype=np.int64)
+        places[rows] = np.arange(len(places[rows]))
+        others = np.stack([places[self.others[:, 0]], self.others[:, 1]], axis=1)
+        return Landmarks(self.centers[rows], self.bases[rows], self.classes[rows],
+                         others[others[:, 0] >= 0])
 
 
 def landmarks_of_map(landmark_map: LandmarkMap, class_names: Sequence[str]) -> Landmarks:
-    """Return the landmarks of a map; those of other classes than the named ones get -1."""
+    """Return the landmarks of a map with those of their classes that are among the named ones.
+
+    A landmark without any gets -1.
+    """
     numbers = {name: number for number, name in enumerate(class_names)}
     rotations = Rotation.from_quat(landmark_map.quats_xyzw).as_matrix()
+    known = [[numbers[name] for name in classes_of(landmark_map, row) if name in numbers]
+             for row in range(len(landmark_map))]
+    others = [(row, number) for row, own in enumerate(known) for number in own[1:]]
     return Landmarks(landmark_map.centers, rotations * landmark_map.semi_axes[:, None, :],
-                     np.array([numbers.get(name, -1) for name in landmark_map.class_ids]))
+                     np.array([own[0] if own else -1 for own in known], dtype=np.int64),
+                     np.array(others, dtype=np.int64).reshape(-1, 2))
+
+
+def classes_of(landmark_map: LandmarkMap, row: int) -> tuple[str, ...]:
+    """Return all classes that a landmark was detected as."""
+    weights = landmark_map.details[row].class_weights if landmark_map.details else None
+    names = [landmark_map.class_ids[row], *(name for name, _ in weights or ())]
+    return tuple(dict.fromkeys(names))
 
 
 def no_landmarks() -> Landmarks:
@@ -214,7 +243,10 @@ def no_landmarks() -> Landmarks:
 
 def join_landmarks(*parts: Landmarks) -> Landmarks:
     """Return the landmarks of all parts."""
-    columns = zip(no_landmarks(), *parts, strict=True)
+    starts = np.cumsum([0, *(len(one.classes) for one in parts)])
+    shifted = [one._replace(others=one.others + np.array([start, 0]))
+               for one, start in zip(parts, starts[:-1].tolist(), strict=True)]
+    columns = zip(no_landmarks(), *shifted, strict=True)
     return Landmarks(*(np.concatenate(column) for column in columns))
 
 

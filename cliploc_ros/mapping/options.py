@@ -88,13 +88,9 @@ class MappingOptions:
     discovery_rounds: int = 2
     settling_rounds: int = 3
     association_iou: float = 0.2  #: A box and a landmark that overlap less do not belong together
-    #: Landmarks of one class nearer than this may be one object, see
-    #: cliploc_ros.mapping.association.normalized_distance
-    merge_distance: float = 0.8
-    class_merge_distance: float = 0.4  #: The same for landmarks of two classes
-    #: Unless more than this share of the frames of the one with fewer show them as two boxes
-    max_seen_apart: float = 0.15
-    merge_loss: float = 0.1  #: Or the mean IoU of their boxes falls by more than this
+    #: Landmarks of one thing are fitted together, unless the mean IoU of their boxes falls by more
+    #: than this
+    merge_loss: float = 0.1
     #: Share of the frames showing a landmark's place in which it must be detected. Chance
     #: arrangements of boxes are seen rarely, but so are objects that others hide.
     min_seen_ratio: float = 0.03

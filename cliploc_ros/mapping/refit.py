@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fit the landmarks of a given map to the boxes of a recording.
 
-No landmark is found here, and none gets another class: the map says what there is and about
-where, the boxes say where exactly.
+No landmark is found here: the map says what there is and about where, the boxes say where
+exactly.
 """
 
 from dataclasses import dataclass, replace
@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.association import associate, merge_pairs, pairs_of_one_class
+from cliploc_ros.mapping.association import associate
+from cliploc_ros.mapping.doubles import resolve_doubles
 from cliploc_ros.mapping.evidence import (
     Evidence,
     explained_boxes,
@@ -52,7 +52,7 @@ class RefitMap:
     landmark_map: LandmarkMap  #: All L landmarks. Those with a reason are as they were given.
     #: Why a landmark could not be fitted; None where it was fitted, or was not chosen
     reasons: tuple[str | None, ...]
-    #: (L,): the landmark that a duplicate shares its object with; else its own row
+    #: (L,): the landmark that each is one thing with; else its own row
     part_of: NDArray[np.int64]
     notes: tuple[str, ...]  #: What is wrong with the recording
     #: Share of the boxes of the map's classes that a landmark explains
@@ -68,8 +68,8 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
               ) -> RefitMap:
     """Fit the chosen landmarks of a map to the boxes that show them.
 
-    Ids, labels, classes and class weights stay. The others of the landmarks stay as they are,
-    and keep the boxes that show them.
+    Ids, labels, classes and class weights stay; a landmark that is one thing with others gets
+    theirs, too. Landmarks that are not chosen stay as they are, and keep the boxes that show them.
 
     Parameters
     ----------
@@ -118,14 +118,14 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
             f'explains {share_before / share_known:.0%} of the boxes: is it in their coordinate '
             'frame?')
     # boxes of what is not fitted may belong to what is
-    landmarks = Landmarks(np.where(is_fitted[:, None], settled.centers, given.centers),
-                          np.where(is_fitted[:, None, None], settled.bases, given.bases),
-                          given.classes)
+    landmarks = settled._replace(
+        centers=np.where(is_fitted[:, None], settled.centers, given.centers),
+        bases=np.where(is_fitted[:, None, None], settled.bases, given.bases))
     shown = _associate_some(views, landmarks, is_fitted | ~chosen, options.association_iou)
     landmarks = _fit(views, landmarks, shown, is_fitted)
     evidence = gather_evidence(views, landmarks, shown)
     share, iou = explained_boxes(views, landmarks.select(is_fitted | ~chosen))
-    details = list(landmark_map.details or [LandmarkDetails()] * len(landmark_map))
+    details = list(landmark_map.joined(part_of).details)
     for row in np.nonzero(is_fitted)[0]:
         details[row] = evidence.details(int(row), replace(
             details[row], shared_sigma=None, shared_sigma_deg=None))
@@ -142,23 +142,15 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
 
 def _settle(views: Views, given: Landmarks, chosen: NDArray[np.bool_], options: MappingOptions
             ) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Associate, fit and merge until the chosen landmarks and their boxes agree.
+    """Associate and fit until the chosen landmarks and their boxes agree, and resolve doubles.
 
     Returns the landmarks, and the one (L,) that each of them is part of.
     """
-    landmarks, part_of = given, np.arange(len(chosen))
-    for round_number, min_iou in enumerate(
-            (*_FIRST_IOUS, *[options.association_iou] * options.settling_rounds)):
-        is_own = part_of == np.arange(len(part_of))
-        shown = _associate_some(views, landmarks, is_own, min_iou)
-        if round_number >= len(_FIRST_IOUS):
-            pairs = [pair for pair in pairs_of_one_class(landmarks, options.merge_distance)
-                     if is_own[list(pair)].all() and chosen[list(pair)].all()]
-            _, into = merge_pairs(views, landmarks, shown, pairs, options)
-            part_of = into[part_of]
-            shown = np.where(shown < 0, -1, into[shown])
-        landmarks = _fit(views, landmarks, shown, chosen)
-    return landmarks, part_of
+    landmarks = given
+    for min_iou in (*_FIRST_IOUS, *[options.association_iou] * options.settling_rounds):
+        landmarks = _fit(views, landmarks, associate(views, landmarks, min_iou), chosen)
+    shown = associate(views, landmarks, options.association_iou)
+    return resolve_doubles(views, landmarks, shown, options, chosen)
 
 
 def _associate_some(views: Views, landmarks: Landmarks, rows: NDArray[np.bool_], min_iou: float

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.map.landmark_details import join_details
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.studio.landmark import (
@@ -196,7 +197,7 @@ def create(landmarks: Landmarks, label: str, class_id: str, center: NDArray[np.f
 
 def merge(landmarks: Landmarks, landmark_ids: Sequence[str],
           fit: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None) -> Change:
-    """Make one landmark of two or more; the first one's id, label and class stay.
+    """Make one landmark of two or more, with the classes of all; the first id and label stay.
 
     A fit is the centre (3,) and basis (3, 3) that fit the boxes of all. Without it, the ellipsoid
     has the mean and the second moments of the volume of all.
@@ -216,8 +217,10 @@ def merge(landmarks: Landmarks, landmark_ids: Sequence[str],
             shape += weight * (one.basis @ one.basis.T + 5.0 * np.outer(offset, offset))
         squares, directions = np.linalg.eigh(shape)
         fit = center, directions * np.sqrt(np.maximum(squares, 0.0))
+    classes = join_details([(one.label, one.class_id, one.details) for one in parts]).class_weights
     merged = replace(
-        parts[0].changed(**shape_fields(*fit), **_NO_EVIDENCE),
+        parts[0].changed(**shape_fields(*fit), **_NO_EVIDENCE,
+                         class_weights=None if classes is None else dict(classes)),
         look=merge_looks([one.look for one in parts],
                          [one.details.support or 1 for one in parts]))
     return _change_of(f'merge {", ".join(ids)}'[:80], landmarks,

@@ -91,7 +91,7 @@ def test_a_duplicate_is_part_of_the_other(table, detections):
 def test_a_landmark_without_boxes_stays_and_gets_a_reason(table, detections):
     given = disturb(table)
     ghosts = given.select([0, 1, 2])
-    ghosts = replace(ghosts, class_ids=('book', 'book', 'lamp'),
+    ghosts = replace(ghosts, class_ids=('book', 'book', 'lamp'), details=(LandmarkDetails(),) * 3,
                      centers=np.array([[0.2, -0.3, 1.2], [60.0, 0.0, 40.0], [0.0, 0.0, 2.0]]))
     refit = refit_map(detections, join_maps(given, ghosts))
     assert refit.reasons[:9] == (None,) * 9

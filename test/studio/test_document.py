@@ -175,6 +175,12 @@ def test_merging_halves_gives_back_the_whole(document):
     assert np.allclose(squares, [0.1**2, 0.15**2, 6 * 0.15**2], rtol=1e-4)
 
 
+def test_a_merged_landmark_has_the_classes_of_all(document):
+    document.apply(edits.merge(document.landmarks, ['cup_1', 'book_1']))
+    assert dict(document.landmarks['cup_1'].details.class_weights) == pytest.approx(
+        {'cup': 0.5, 'book': 0.45, 'tv': 0.05})
+
+
 # ---- the file on the disk
 
 def test_a_file_that_changed_on_disk_is_not_overwritten(document, path):

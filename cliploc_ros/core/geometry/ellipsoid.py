@@ -25,6 +25,10 @@ from cliploc_ros.core.kernels.compiled import compiled
 _UPPER = np.triu_indices(3)
 
 _OUTLINE_POINTS = 64
+#: Ellipsoids whose centres are nearer than this in units of their summed shapes stand in one
+#: another: two that touch are at most 1.41 apart, and a small one whose centre lies on the surface
+#: of a large one is 1 apart.
+STANDS_IN = 1.0
 
 
 def shape_matrices(semi_axes: NDArray[np.float64], quats_xyzw: NDArray[np.float64]
@@ -36,6 +40,13 @@ def shape_matrices(semi_axes: NDArray[np.float64], quats_xyzw: NDArray[np.float6
     rotations = Rotation.from_quat(quats_xyzw).as_matrix().reshape(-1, 3, 3)
     shapes = np.einsum('nij,nj,nkj->nik', rotations, np.square(semi_axes), rotations)
     return np.ascontiguousarray(shapes[:, _UPPER[0], _UPPER[1]])
+
+
+def normalized_lengths(offsets: NDArray[np.float64], shapes: NDArray[np.float64]
+                       ) -> NDArray[np.float64]:
+    """Return the lengths (n,) of offsets (n, 3) in units of shape matrices (n, 3, 3)."""
+    return np.asarray(np.sqrt(np.einsum(
+        'ni,ni->n', offsets, np.linalg.solve(shapes, offsets[..., None])[..., 0])))
 
 
 @compiled

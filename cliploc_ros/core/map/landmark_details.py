@@ -3,8 +3,9 @@
 """What a map may say of a landmark besides its ellipsoid: optional fields of the map file."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from cliploc_ros.errors import MapError
@@ -54,6 +55,31 @@ class LandmarkDetails:
         weights = dict(self.class_weights or ())
         most = max(weights.values(), default=1.0)
         return tuple((name, weights[name] / most) for name in self.likely_classes())
+
+
+def join_details(parts: Sequence[tuple[str, str, LandmarkDetails]]) -> LandmarkDetails:
+    """Return the details of one thing that is several landmarks: label, class and details of each.
+
+    It has the labels and classes of all, weighted by the frames that show each, and else what the
+    first one has.
+    """
+    first = parts[0][2]
+    labels = _shares([(one.labels_with(label), one.support or 1) for label, _, one in parts])
+    classes = _shares([(one.class_weights or ((name, 1.0),), one.support or 1)
+                       for _, name, one in parts])
+    return replace(first, labels=labels if len(labels) > 1 else first.labels,
+                   class_weights=classes if len(classes) > 1 else first.class_weights)
+
+
+def _shares(parts: Sequence[tuple[WeightedLabels, int]]) -> WeightedLabels:
+    """Return the shares of names in weighted parts, the greatest first."""
+    shares = defaultdict[str, float](float)
+    for names, weight in parts:
+        for name, share in names:
+            shares[name] += share * weight / sum(one for _, one in names)
+    total = sum(shares.values())
+    return tuple((name, shares[name] / total) for name in sorted(
+        shares, key=lambda name: -shares[name]))
 
 
 OPTIONAL_FIELDS = tuple(field.name for field in fields(LandmarkDetails))

@@ -5,7 +5,7 @@
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,13 +15,18 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from cliploc_ros.core.geometry.ellipsoid import shape_matrices
+from cliploc_ros.core.geometry.ellipsoid import (
+    STANDS_IN,
+    normalized_lengths,
+    shape_matrices,
+)
 from cliploc_ros.core.map.classes import ClassIndex
 from cliploc_ros.core.map.culling import SortedLandmarks, sort_landmarks
 from cliploc_ros.core.map.landmark_details import (
     OPTIONAL_FIELDS,
     LandmarkDetails,
     WeightedLabels,
+    join_details,
     read_details,
 )
 from cliploc_ros.core.map.pairs import LandmarkPairs, make_pairs
@@ -55,8 +60,8 @@ def objects_of(centers: NDArray[np.float64], shapes: NDArray[np.float64],
                neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the number of each landmark's object (L,): duplicates share one.
 
-    Landmarks of one class are duplicates if the centre of one lies in the other, after both have
-    got their mean shape. So books side by side are none.
+    Landmarks of one class are duplicates if they stand in one another. So books side by side are
+    none.
 
     Parameters
     ----------
@@ -66,9 +71,8 @@ def objects_of(centers: NDArray[np.float64], shapes: NDArray[np.float64],
         Landmarks of one class that are near each other.
     """
     first, second = neighbours.T
-    offsets = centers[second] - centers[first]
-    means = (0.5 * (shapes[first] + shapes[second]))[:, _UPPER]
-    inside = np.einsum('ni,nij,nj->n', offsets, np.linalg.inv(means), offsets) < 1.0
+    inside = normalized_lengths(centers[second] - centers[first],
+                                (shapes[first] + shapes[second])[:, _UPPER]) < STANDS_IN
     links = coo_matrix((np.ones(int(inside.sum())), (first[inside], second[inside])),
                        (len(centers), len(centers)))
     return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
@@ -103,6 +107,18 @@ class LandmarkMap:
             self.frame_id, pick(self.landmark_ids), pick(self.labels), pick(self.class_ids),
             self.centers[rows], self.semi_axes[rows], self.quats_xyzw[rows],
             pick(self.details) if self.details else ())
+
+    def joined(self, into: NDArray[np.int64]) -> 'LandmarkMap':
+        """Return the map in which each landmark has the labels and classes of its parts, too.
+
+        The array into (L,) is the row of the landmark that each is part of, or its own.
+        """
+        details = list(self.details or [LandmarkDetails()] * len(self))
+        for row in np.unique(into[into != np.arange(len(into))]).tolist():
+            parts = [row, *(part for part in np.nonzero(into == row)[0].tolist() if part != row)]
+            details[row] = join_details([
+                (self.labels[part], self.class_ids[part], details[part]) for part in parts])
+        return replace(self, details=tuple(details))
 
     def prepare(self) -> None:
         """Compute the indices now, so that the first request does not wait for them."""

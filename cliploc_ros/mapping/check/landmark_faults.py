@@ -12,19 +12,16 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.mapping.association import associate, close_pairs, seen_apart
+from cliploc_ros.mapping.association import associate
+from cliploc_ros.mapping.doubles import close_pairs, find_doubles
 from cliploc_ros.mapping.evidence import Evidence, gather_evidence
 from cliploc_ros.mapping.fitting import fit_landmarks
-from cliploc_ros.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
+from cliploc_ros.mapping.landmarks import Landmarks, classes_of, group_boxes, landmarks_of_map
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.update.sight import look_for
 from cliploc_ros.mapping.views import Views
 from cliploc_ros.vocabulary.vocabulary import misspelt_classes
 
-# Landmarks nearer than this are reported, see normalized_distance. Those of one class are one
-# object, unless they are farther apart than the second distance and frames show both at once.
-# Guesses: build_map merges below 0.8 if the boxes agree.
-_OVERLAP_DISTANCE, _SAME_PLACE_DISTANCE = 0.5, 0.3
 # A class has so many words at most to be looked for in labels.
 _MOST_WORDS = 3
 # A thinner landmark was seen from one side, or is a sheet: boxes tell little of its position.
@@ -41,8 +38,9 @@ class Overlap(NamedTuple):
     #: Rows in the map
     first: int
     second: int
-    distance: float  #: Normalized, about 1 if they touch
-    is_duplicate: bool  #: They are of one class, and no frames tell them apart
+    distance: float  #: Normalized, see cliploc_ros.core.geometry.ellipsoid.STANDS_IN
+    #: They are one thing: no frames show two. Where no frame shows either, by a common class.
+    is_duplicate: bool
 
 
 @dataclass(frozen=True)
@@ -100,15 +98,15 @@ def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str
 
 def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views: Views | None
                       ) -> list[Overlap]:
-    """Return the landmarks of a map that lie in one another, the nearest first."""
-    landmarks = landmarks_of_map(landmark_map, sorted(set(landmark_map.class_ids)))
-    boxes = None if witness is None else group_boxes(witness.shown, len(landmark_map))
-    found = []
-    for first, second, distance in close_pairs(landmarks, _OVERLAP_DISTANCE):
-        is_duplicate = landmarks.classes[first] == landmarks.classes[second] and (
-            distance < _SAME_PLACE_DISTANCE or boxes is None or views is None
-            or seen_apart(views, boxes[first], boxes[second]) <= MappingOptions.max_seen_apart)
-        found.append(Overlap(first, second, distance, bool(is_duplicate)))
+    """Return the landmarks of a map that stand in one another, the nearest first."""
+    doubles, shown = set[tuple[int, int]](), np.empty(0, dtype=np.int64)
+    if witness is not None and views is not None:
+        shown, doubles = witness.shown, {*find_doubles(views, witness.landmarks, witness.shown)}
+    is_shown = np.isin(np.arange(len(landmark_map)), shown)
+    names = [{*classes_of(landmark_map, row)} for row in range(len(landmark_map))]
+    found = [Overlap(first, second, distance, (first, second) in doubles
+                     if is_shown[[first, second]].any() else bool(names[first] & names[second]))
+             for first, second, distance in close_pairs(landmarks_of_map(landmark_map, ()))]
     return sorted(found, key=lambda one: (not one.is_duplicate, one.distance))
 
 
@@ -147,7 +145,7 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
             faults += _support_faults(check, float(np.linalg.norm(semi_axes)), options)
         faults += [(0.4, f'lies in {ids[other]} of class {classes[other]}: one object under two '
                          'classes, or one on the other; keep one if it is one object')
-                   for other, _ in others if classes[other] != classes[row]]
+                   for other, one in others if witness is None and not one.is_duplicate]
         if check.thinness < _MIN_THINNESS:
             faults.append((0.3, f'is a sheet: its axes have the ratio {check.thinness:.3f}; '
                                 'record it from another side, or give it thickness'))

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.geometry.ellipsoid import normalized_lengths
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.association import associate
 from cliploc_ros.mapping.fitting import fit_ellipsoid
 from cliploc_ros.mapping.joint import Anchors, pose_changes, pose_errors, refine_jointly
-from cliploc_ros.mapping.labelling import classes_of
 from cliploc_ros.mapping.landmarks import (
     Landmarks,
     group_boxes,
@@ -60,51 +60,33 @@ class OldMap(NamedTuple):
     landmarks: Landmarks  #: Class -1: no box of the recording has a class of this landmark
     sigmas: NDArray[np.float64]  #: (L,): deviations of the centres [m]
     details: tuple[LandmarkDetails, ...]
-    named: Landmarks  #: The landmarks once for each of their classes
-    owners: NDArray[np.int64]  #: The landmark of each of these
     landmark_ids: tuple[str, ...]
     class_ids: tuple[str, ...]
 
     @property
     def names(self) -> set[tuple[int, int]]:
         """Return all pairs of a landmark and one of its classes."""
-        return set(zip(self.owners.tolist(), self.named.classes.tolist(), strict=True))
+        return {(row, name) for row, name in self.landmarks.names.tolist()}
 
     def shown(self, views: Views, min_iou: float, is_gone: NDArray[np.bool_] | None = None,
               others: Landmarks | None = None) -> NDArray[np.int64]:
         """Return the old landmark (n,) that each box shows, or L + the other one; -1 for none.
 
-        One landmark has at most one box in a frame, whatever its classes. Those that are gone
-        (L,) have none.
+        Those that are gone (L,) have none.
         """
-        count, others = len(self.sigmas), others or no_landmarks()
-        kept = np.nonzero(np.ones(len(self.owners), dtype=np.bool_) if is_gone is None
-                          else ~is_gone[self.owners])[0]
-        owned = np.append(self.owners[kept], count + np.arange(len(others.centers)))
-        shown = associate(views, join_landmarks(self.named.select(kept), others), min_iou)
-        rows = np.nonzero(shown >= 0)[0]
-        owners = owned[shown[rows]]
-        _, kept = np.unique(views.frames[rows] * (count + len(others.centers)) + owners,
-                            return_index=True)
-        once = np.full(len(shown), -1, dtype=np.int64)
-        once[rows[kept]] = owners[kept]
-        return once
+        kept = np.ones(len(self.sigmas), dtype=np.bool_) if is_gone is None else ~is_gone
+        others = others or no_landmarks()
+        rows = np.concatenate([np.nonzero(kept)[0],
+                               len(kept) + np.arange(len(others.centers)), [-1]])
+        return rows[associate(views, join_landmarks(self.landmarks.select(kept), others), min_iou)]
 
 
 def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...]) -> OldMap:
     """Return the landmarks of a map for a recording with some classes."""
     details = old.details or (LandmarkDetails(),) * len(old)
-    numbers = {name: number for number, name in enumerate(class_names)}
-    names = [(row, numbers[name]) for row in range(len(old))
-             for name in classes_of(old, row) if name in numbers]
-    owners, classes = np.array(names, dtype=np.int64).reshape(-1, 2).T
-    landmarks = landmarks_of_map(old, class_names)
-    first = np.full(len(old), -1, dtype=np.int64)
-    first[owners[::-1]] = classes[::-1]
     sigmas = np.array([_UNKNOWN_SIGMA_M if one.position_sigma is None
                        else one.position_sigma for one in details])
-    return OldMap(landmarks._replace(classes=first), np.maximum(sigmas, _LEAST_SIGMA_M), details,
-                  Landmarks(landmarks.centers[owners], landmarks.bases[owners], classes), owners,
+    return OldMap(landmarks_of_map(old, class_names), np.maximum(sigmas, _LEAST_SIGMA_M), details,
                   old.landmark_ids, old.class_ids)
 
 
@@ -144,7 +126,7 @@ def refit(views: Views, landmarks: Landmarks, shown: NDArray[np.int64], min_view
             centers[number], bases[number] = fit.center, fit.basis
             covariances[number] = (np.linalg.inv(fit.information)[:3, :3]
                                    + _LEAST_SIGMA_M ** 2 * np.eye(3))
-    return Refits(Landmarks(centers, bases, landmarks.classes), covariances)
+    return Refits(landmarks._replace(centers=centers, bases=bases), covariances)
 
 
 class Aligned(NamedTuple):
@@ -238,7 +220,7 @@ def has_moved(old: Landmarks, sigmas: NDArray[np.float64], found: Refits) -> NDA
     rows = np.nonzero(far)[0]
     bases, others = old.bases[rows], found.landmarks.bases[rows]
     shapes = bases @ bases.transpose(0, 2, 1) + others @ others.transpose(0, 2, 1)
-    far[rows] = ((_lengths(offsets[rows], shapes) > LEAST_MOVE_SHAPES)
+    far[rows] = ((normalized_lengths(offsets[rows], shapes) > LEAST_MOVE_SHAPES)
                  & (deviations(old.select(rows), sigmas[rows], found.select(rows))
                     > LEAST_MOVE_SIGMAS))
     return far
@@ -248,10 +230,4 @@ def deviations(old: Landmarks, sigmas: NDArray[np.float64], found: Refits
                ) -> NDArray[np.float64]:
     """Return by how many standard deviations (L,) old and new positions of landmarks differ."""
     covariances = found.covariances + np.square(sigmas)[:, None, None] * np.eye(3)
-    return _lengths(found.landmarks.centers - old.centers, covariances)
-
-
-def _lengths(offsets: NDArray[np.float64], shapes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the lengths (k,) of offsets (k, 3) in units of shape matrices (k, 3, 3)."""
-    return np.asarray(np.sqrt(np.einsum(
-        'li,li->l', offsets, np.linalg.solve(shapes, offsets[..., None])[..., 0])))
+    return normalized_lengths(found.landmarks.centers - old.centers, covariances)

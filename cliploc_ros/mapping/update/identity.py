@@ -191,10 +191,11 @@ def _identify(known: OldMap, objects: Shown, judged: Judgement, looks: Likeness 
 
 def _class_groups(known: OldMap, objects: Shown) -> NDArray[np.int64]:
     """Return a group for each class: the classes of one landmark belong together."""
-    count = 1 + max(int(one.classes.max(initial=0))
-                    for one in (known.named, objects.landmarks, known.landmarks))
-    main = known.landmarks.classes[known.owners]
-    links = coo_matrix((np.ones(len(main)), (main, known.named.classes)), shape=(count, count))
+    count = 1 + max(int(one.names[:, 1].max(initial=0))
+                    for one in (objects.landmarks, known.landmarks))
+    rows, classes = known.landmarks.names.T
+    main = known.landmarks.classes[rows]
+    links = coo_matrix((np.ones(len(main)), (main, classes)), shape=(count, count))
     return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
 
 

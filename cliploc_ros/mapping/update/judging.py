@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from scipy.special import betaln, expit
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.mapping.association import close_pairs, find_overlaps, seen_apart
+from cliploc_ros.mapping.association import find_overlaps
 from cliploc_ros.mapping.building import LeftOut, NothingFoundError, build_map, rounded
+from cliploc_ros.mapping.doubles import Relation, close_pairs, relation
 from cliploc_ros.mapping.evidence import gather_evidence
 from cliploc_ros.mapping.landmarks import (
     Landmarks,
@@ -112,11 +113,11 @@ def judge(detections: PosedDetections, views: Views, known: OldMap, options: Map
     refits = refit(views, known.landmarks, np.where(shown < count, shown, -1),
                    options.min_viewpoints)
     displaced = has_moved(known.landmarks, known.sigmas, refits)
-    finds = _with_displaced(finds, refits, displaced, known.class_ids, options.merge_distance)
+    finds = _with_displaced(finds, refits, displaced, known.class_ids)
     shown, sight = _look(views, known, finds, displaced, options)
     is_gone = displaced | _is_absent(known, sight.select(slice(count)), _GONE_BELOW)
     # a new object may be in the place of an old one of which a wrong box remains
-    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 1.0, options)
+    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 1.0)
     _, sight = _look(views, known, finds, is_gone, options)
     # finds are seen about as often as the old landmarks, which come first
     ratios = sight.seen_ratio[:count][sight.seen[:count] > 0]
@@ -131,12 +132,12 @@ def judge(detections: PosedDetections, views: Views, known: OldMap, options: Map
     # an old landmark is hardly there if a find with more boxes is in its place
     of_old, of_new = _boxes(shown, count, finds)
     limits = np.full(count, _GONE_BELOW)
-    for new, row, _ in _pairs_between(finds.landmarks, known.landmarks, options.merge_distance):
+    for new, row, _ in _pairs_between(finds.landmarks, known.landmarks):
         if len(of_new[new]) > len(of_old[row]):
             limits[row] = _GONE_BELOW_IF_TAKEN
     is_gone = displaced | _is_absent(known, sight.select(slice(count)), limits)
     shown, sight = _look(views, known, finds, is_gone, options)
-    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 0.0, options)
+    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 0.0)
     # objects that are gone hide nothing
     shown, sight = _look(views, known, finds, is_gone, options)
     own = sight.select(slice(count))
@@ -229,8 +230,8 @@ def _free(views: Views, known: OldMap, options: MappingOptions) -> NDArray[np.bo
     own = known.shown(views, options.min_median_iou)
     nameless = find_overlaps(
         views._replace(classes=np.zeros_like(views.classes)),
-        known.landmarks._replace(classes=np.zeros_like(known.landmarks.classes)),
-        options.min_median_iou)
+        Landmarks(known.landmarks.centers, known.landmarks.bases,
+                  np.zeros_like(known.landmarks.classes)), options.min_median_iou)
     others = own[nameless.boxes] < 0
     on, count = nameless.landmarks[others], len(known.sigmas)
     is_named = np.bincount(own[own >= 0], minlength=count) >= np.bincount(on, minlength=count)
@@ -256,11 +257,11 @@ def _find_new(detections: PosedDetections, views: Views, is_free: NDArray[np.boo
 
 
 def _with_displaced(finds: Finds, refits: Refits, displaced: NDArray[np.bool_],
-                    class_ids: Sequence[str], merge_distance: float) -> Finds:
+                    class_ids: Sequence[str]) -> Finds:
     """Return the finds with the landmarks that stand a little off their place, if not found."""
     rows = np.nonzero(displaced)[0]
     again = {moved for moved, _, _ in _pairs_between(refits.landmarks.select(rows),
-                                                     finds.landmarks, merge_distance)}
+                                                     finds.landmarks)}
     rows = rows[[moved not in again for moved in range(len(rows))]]
     return finds._replace(
         landmarks=join_landmarks(finds.landmarks, refits.landmarks.select(rows)),
@@ -269,8 +270,7 @@ def _with_displaced(finds: Finds, refits: Refits, displaced: NDArray[np.bool_],
 
 
 def _without_copies(views: Views, finds: Finds, old: Landmarks, known: OldMap,
-                    shown: NDArray[np.int64], sight: Sight, majority: float,
-                    options: MappingOptions) -> Finds:
+                    shown: NDArray[np.int64], sight: Sight, majority: float) -> Finds:
     """Return the new landmarks without those that are an old one in its place.
 
     An old landmark is in its place if it has a box, and a majority for each of the new one's. Of
@@ -279,21 +279,22 @@ def _without_copies(views: Views, finds: Finds, old: Landmarks, known: OldMap,
     """
     of_old, of_new = _boxes(shown, len(old.centers), finds)
     reasons: list[str | None] = [None] * len(of_new)
-    for new, row, distance in _pairs_between(finds.landmarks, old, options.merge_distance):
+    every = join_landmarks(old, finds.landmarks)
+    for new, row, distance in _pairs_between(finds.landmarks, old):
         is_one_class = old.classes[row] == finds.landmarks.classes[new]
         if len(of_old[row]) >= max(1.0, majority * len(of_new[new])) and (
                 (is_one_class and distance < LEAST_MOVE_SHAPES)
-                or seen_apart(views, of_old[row], of_new[new]) <= options.max_seen_apart):
+                or relation(views, every, of_old + of_new, (row, len(of_old) + new))
+                is not Relation.TWO):
             reasons[new] = f'it is {known.landmark_ids[row]} in its place'
     return finds.without(reasons, sight)
 
 
-def _pairs_between(new: Landmarks, old: Landmarks, max_distance: float
-                   ) -> list[tuple[int, int, float]]:
-    """Return pairs of a new and an old landmark nearer than a normalized distance, with it."""
+def _pairs_between(new: Landmarks, old: Landmarks) -> list[tuple[int, int, float]]:
+    """Return pairs of a new and an old landmark that stand in one another, see close_pairs."""
     count = len(new.centers)
     return [(first, second - count, distance) for first, second, distance
-            in close_pairs(join_landmarks(new, old), max_distance) if first < count <= second]
+            in close_pairs(join_landmarks(new, old)) if first < count <= second]
 
 
 class Shown(NamedTuple):
@@ -329,8 +330,7 @@ def gather_objects(aligned: Aligned, known: OldMap, judged: Judgement, options: 
         covariances=refits.covariances + np.square(left_m)[:, None, None] * np.eye(3))
     near: list[set[int]] = [set() for _ in places]
     names = known.names
-    for new, row, _ in _pairs_between(finds.landmarks, known.landmarks,
-                                      options.merge_distance):
+    for new, row, _ in _pairs_between(finds.landmarks, known.landmarks):
         if not judged.is_there[row] and (row, int(finds.landmarks.classes[new])) in names:
             near[len(in_place) + new].add(row)
     return Shown(

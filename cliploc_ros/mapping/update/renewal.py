@@ -12,12 +12,14 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.building import LeftOut, left_out_lines, rounded
+from cliploc_ros.mapping.doubles import find_doubles
 from cliploc_ros.mapping.evidence import Evidence, gather_evidence
-from cliploc_ros.mapping.landmarks import ellipsoid_numbers, unused_ids
+from cliploc_ros.mapping.landmarks import ellipsoid_numbers, landmarks_of_map, unused_ids
 from cliploc_ros.mapping.update.alignment import LEAST_MOVE_SIGMAS, OldMap, deviations
 from cliploc_ros.mapping.update.identity import Fates
 from cliploc_ros.mapping.update.judging import Judgement, Shown
@@ -66,6 +68,40 @@ def renew(old: LandmarkMap, known: OldMap, views: Views, objects: Shown, fates: 
         np.concatenate([semi_axes[kept], new_axes[fates.new]]),
         np.concatenate([quats[kept], new_quats[fates.new]]),
         tuple(every) if any(one != LandmarkDetails() for one in every) else ())
+
+
+def one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], first_new: int,
+                class_names: tuple[str, ...]
+                ) -> tuple[LandmarkMap, NDArray[np.int64], int, list[str]]:
+    """Return the new map in which landmarks that are one thing by the recording are one.
+
+    The older landmark keeps its id and gets the labels and classes of the other; the ellipsoid is
+    that with more boxes. Two old landmarks stay if the recording shows only one of them.
+
+    Returns the map, the landmark that each box shows (n,), the row of the first new landmark, and
+    notes.
+    """
+    into, counts = np.arange(len(updated)), np.bincount(shown[shown >= 0], minlength=len(updated))
+    shapes, notes = into.copy(), []
+    for first, second in find_doubles(views, landmarks_of_map(updated, class_names), shown):
+        if (into[[first, second]] == (first, second)).all() and (
+                second >= first_new or counts[[first, second]].all()):
+            into[into == second] = first
+            if counts[shapes[second]] > counts[shapes[first]]:
+                shapes[first] = shapes[second]
+            ids = updated.landmark_ids
+            notes.append(f'{ids[second]} is one thing with {ids[first]}, which has its classes')
+    if not notes:
+        return updated, shown, first_new, notes
+    joined, kept = updated.joined(into), np.unique(into)
+    numbers = np.append(np.searchsorted(kept, into), -1)
+    return replace(
+        joined, centers=updated.centers[shapes], semi_axes=updated.semi_axes[shapes],
+        quats_xyzw=updated.quats_xyzw[shapes],
+        details=tuple(replace(joined.details[shape], labels=one.labels,
+                              class_weights=one.class_weights)
+                      for shape, one in zip(shapes, joined.details, strict=True))
+    ).select(kept.tolist()), numbers[shown], int(np.sum(kept < first_new)), notes
 
 
 def _refitted(known: OldMap, objects: Shown, fates: Fates) -> dict[int, float]:

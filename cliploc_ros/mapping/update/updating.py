@@ -27,7 +27,7 @@ from cliploc_ros.mapping.update.identity import (
     why_not_comparable,
 )
 from cliploc_ros.mapping.update.judging import LEAST_VIEWS, Judgement, gather_objects, judge
-from cliploc_ros.mapping.update.renewal import UpdateReport, describe, renew
+from cliploc_ros.mapping.update.renewal import UpdateReport, describe, one_of_each, renew
 from cliploc_ros.mapping.views import check_input, make_views, map_from_cameras
 
 # A larger offset of the recording's coordinate frame from the map's is noted [m] [deg].
@@ -92,22 +92,27 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
         looks = compare_looks(embeddings, old.landmark_ids, detections, objects)
     fates = decide_fates(known, judged, objects, looks)
     updated = renew(old, known, aligned.views, objects, fates, judged, detections.class_names)
-    notes += _notes(old, known, aligned, detections)
-    report = UpdateReport(
-        frames=len(detections), viewpoints=int(given.viewpoints.max()) + 1,
-        offset_m=aligned.offset_m, offset_deg=aligned.offset_deg,
-        pose_change_m=aligned.change_m, pose_change_deg=aligned.change_deg,
-        **describe(old, updated, objects, fates, judged),
-        left_out=tuple(sorted(judged.finds.left_out, key=lambda one: -one.support)),
-        notes=tuple(notes))
     kept = np.setdiff1d(np.arange(len(old)), fates.missing)
     rows_of = np.full(len(objects.owners) + 1, -1, dtype=np.int64)
     has_object = fates.objects[kept] >= 0
     rows_of[fates.objects[kept][has_object]] = np.nonzero(has_object)[0]
     rows_of[fates.new] = len(kept) + np.arange(len(fates.new))
-    shown = rows_of[objects.shown]
-    return UpdatedMap(updated, report, shown, len(kept), map_from_cameras(aligned.views),
-                      renew_embeddings(embeddings, updated.landmark_ids, detections, shown))
+    without_doubles, shown, first_new, joined = one_of_each(
+        updated, aligned.views, rows_of[objects.shown], len(kept), detections.class_names)
+    notes += _notes(old, known, aligned, detections) + joined
+    lists = describe(old, updated, objects, fates, judged)
+    lists['new'] = tuple(one for one in lists['new']
+                         if one.landmark_id in without_doubles.landmark_ids)
+    report = UpdateReport(
+        frames=len(detections), viewpoints=int(given.viewpoints.max()) + 1,
+        offset_m=aligned.offset_m, offset_deg=aligned.offset_deg,
+        pose_change_m=aligned.change_m, pose_change_deg=aligned.change_deg,
+        **lists,
+        left_out=tuple(sorted(judged.finds.left_out, key=lambda one: -one.support)),
+        notes=tuple(notes))
+    return UpdatedMap(without_doubles, report, shown, first_new, map_from_cameras(aligned.views),
+                      renew_embeddings(embeddings, without_doubles.landmark_ids, detections,
+                                       shown))
 
 
 def _check_belongs(judged: Judgement, well_share: float) -> None:
