@@ -116,6 +116,26 @@ def not_negative(text: str) -> float:
     return value
 
 
+def finite(text: str) -> float:
+    """Return a number that is not infinite, for argparse."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f'{text} is not a finite number')
+    return value
+
+
+def limit(text: str) -> float:
+    """Return a number, which may be infinite, for argparse."""
+    value = float(text)
+    if math.isnan(value):
+        raise argparse.ArgumentTypeError(f'{text} is not a number')
+    return value
+
+
+#: Seeds that NumPy takes, for argparse.
+SEEDS = 0, 2**63 - 1
+
+
 def within[Number: (int, float)](low: Number, high: Number) -> Callable[[str], Number]:
     """Return a type for argparse: numbers of the limits' type, from low to high."""
     def number(text: str) -> Number:

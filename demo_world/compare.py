@@ -35,7 +35,7 @@ from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_weights import import_ultralytics
-from cliploc_ros.recording.networks import Look
+from cliploc_ros.recording.networks import RunNetworks
 from cliploc_ros.recording.recorder import record_every_frame
 from demo_world import train_detector
 
@@ -47,7 +47,7 @@ def record(sequence: Path, landmark_map: LandmarkMap, cache_dir: Path) -> Querie
                        pretrained=str(ASSETS / 'clip.safetensors'))
     encoder, labels = load_encoder(clip, landmark_map.weighted_labels)
     frames = tum_frames(read_tum(sequence), find_camera(None, sequence)[0])
-    recorded = record_every_frame(frames, Look(detector.detect, encoder))
+    recorded = record_every_frame(frames, RunNetworks(detector.detect, encoder))
     return make_queries_of(recorded, landmark_map, labels)
 
 

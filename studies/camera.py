@@ -28,8 +28,8 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.sensors import with_vertical
 from cliploc_ros.evaluation.trials import Query, make_queries
-from cliploc_ros.simulation.sensors import with_vertical
 from studies import wrong_sensors
 from studies.reports import interval, table
 from studies.worlds.places import KINDS

@@ -30,7 +30,15 @@ from cliploc_ros.cli.sources import (
     recording_of,
     source_of,
 )
-from cliploc_ros.command import StageBar, not_negative, positive, positive_int, run_main
+from cliploc_ros.command import (
+    SEEDS,
+    StageBar,
+    not_negative,
+    positive,
+    positive_int,
+    run_main,
+    within,
+)
 from cliploc_ros.errors import CliplocError, MappingError, OptionsError
 
 if TYPE_CHECKING:
@@ -79,7 +87,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--frame-id', default='map', help='of the map (%(default)s)')
     parser.add_argument('--every', type=positive_int, default=1, metavar='N',
                         help='use each N-th frame only (%(default)s)')
-    parser.add_argument('--seed', type=int, default=0, help='(%(default)s)')
+    parser.add_argument('--seed', type=within(*SEEDS), default=0, help='(%(default)s)')
     parser.add_argument('--check', action=argparse.BooleanOptionalAction, default=True,
                         help='at the end, check the map as check_map does, with fewer views, into '
                         'NAME_check; the exit code is that of the build (%(default)s)')
@@ -107,7 +115,7 @@ def make_parser() -> argparse.ArgumentParser:
     limits = parser.add_argument_group('which landmarks belong into the map')
     limits.add_argument('--min-viewpoints', type=positive_int, default=3, metavar='N',
                         help='10 cm or 5 degrees apart (%(default)s)')
-    limits.add_argument('--min-baseline', type=float, default=20.0, metavar='DEG',
+    limits.add_argument('--min-baseline', type=within(0.0, 180.0), default=20.0, metavar='DEG',
                         help='angle between two of its directions (%(default)s)')
     return parser
 

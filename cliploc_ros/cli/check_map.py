@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.cli.sources import add_topic_options
 from cliploc_ros.command import (
+    SEEDS,
     StageBar,
+    finite,
     positive,
     positive_int,
     printable,
@@ -72,7 +74,7 @@ def make_parser() -> argparse.ArgumentParser:
                         help='folder of check.html and check.json (NAME_check next to the map)')
     parser.add_argument('--every', type=positive_int, default=1, metavar='N',
                         help='use each N-th frame of the observations only (%(default)s)')
-    parser.add_argument('--seed', type=int, default=0, help='(%(default)s)')
+    parser.add_argument('--seed', type=within(*SEEDS), default=0, help='(%(default)s)')
     add_use_option(parser, 'report what the keyframes next to the map reach')
     _add_relocalizer_options(parser)
     _add_thresholds(parser)
@@ -84,7 +86,7 @@ def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('expected relocalization')
     group.add_argument('--frames', type=positive_int, default=CheckOptions.frames, metavar='N',
                        help='the most recorded frames to relocalize (%(default)s)')
-    group.add_argument('--folds', type=int, default=CheckOptions.folds, metavar='N',
+    group.add_argument('--folds', type=within(2, 10**6), default=CheckOptions.folds, metavar='N',
                        help='of the cross-validation, 2 or more (%(default)s)')
     group.add_argument('--grid', type=positive, default=CheckOptions.spacing_m, metavar='METRES',
                        help='spacing of the camera positions, larger in large maps (%(default)s)')
@@ -92,10 +94,10 @@ def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
                        metavar='N', help='the most camera positions (%(default)s)')
     group.add_argument('--headings', type=positive_int, default=CheckOptions.headings, metavar='N',
                        help='directions at each position (%(default)s)')
-    group.add_argument('--camera-height', type=float, metavar='METRES',
+    group.add_argument('--camera-height', type=finite, metavar='METRES',
                        help='of the grid (as recorded; else .3 m above the middle landmark)')
     group.add_argument('--gravity', action='store_true', help='the robot knows the vertical')
-    group.add_argument('--min-confidence', type=float,
+    group.add_argument('--min-confidence', type=within(0.0, 1.0),
                        default=RelocalizerOptions().min_confidence,
                        help="the relocalizer's (%(default)s)")
 
@@ -123,7 +125,7 @@ def check(options: argparse.Namespace) -> int:
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.evaluation.map_check.page import PAGE, summary_lines, write_report
     from cliploc_ros.evaluation.map_check.pictures import draw_pictures
-    from cliploc_ros.evaluation.map_check.views import Views
+    from cliploc_ros.evaluation.map_check.views import ViewPainter
     from cliploc_ros.files.storage import make_folder
     from cliploc_ros.mapping.check.checking import check_map
 
@@ -140,7 +142,7 @@ def check(options: argparse.Namespace) -> int:
     detections, images = _read_recording(options) or (None, None)
     image_of = views = None
     if detections is not None and images is not None:
-        views = Views(landmark_map, detections, images.near)
+        views = ViewPainter(landmark_map, detections, images.near)
         if options.observations is None:  # the layer's own: judged by those of other times
             image_of = partial(_image_of, detections, images)
     if detections is not None and (note := tilt_note(detections.map_from_camera)):

@@ -27,7 +27,7 @@ from cliploc_ros.cli.sources import (
     read_named_folder,
     source_of,
 )
-from cliploc_ros.command import not_negative, positive_int, run_main, within
+from cliploc_ros.command import SEEDS, finite, limit, not_negative, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.evaluation.methods import ALL, AUTO, PAPER_METHODS
@@ -37,15 +37,10 @@ if TYPE_CHECKING:
 
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.datasets.bag_poses import ReadPoses
     from cliploc_ros.datasets.frames import Frames
     from cliploc_ros.datasets.queries import Queries
     from cliploc_ros.evaluation.methods import Method
     from cliploc_ros.evaluation.trials import Query
-
-# Poses of a watched localizer are interpolated over gaps up to this [ns]: AMCL speaks as the robot
-# moves, its transforms at its own rate.
-_WATCHED_GAP_NS = 1_000_000_000
 
 EPILOG = f"""\
 methods: {', '.join(PAPER_METHODS)};
@@ -62,8 +57,6 @@ examples:
   evaluate --queries office.npz --map office.yaml --methods auto --fuse --odometry-noise 0.01 0.5
   evaluate --bag case_20260101T120000.000_refused --map office.yaml
       answers a request again that ~/record stored; exit code 1: another verdict
-  evaluate --bag office --map office.yaml --watch /amcl_pose --odometry /odom
-      watches the poses of a localizer: when they are lost, and whether that is true
 """
 
 
@@ -90,7 +83,8 @@ def make_parser() -> argparse.ArgumentParser:
                         help=f'default: {ALL}; see below')
     parser.add_argument('--trials', type=positive_int, default=5,
                         help="the paper's %(default)s by default")
-    parser.add_argument('--seed', type=int, default=0, help='of the first trial (%(default)s)')
+    parser.add_argument('--seed', type=within(*SEEDS), default=0,
+                        help='of the first trial (%(default)s)')
     parser.add_argument('--frames', choices=('main', 'all'), default='main',
                         help="of a query file; 'all' includes the neighbours of the queries")
     parser.add_argument('--crops', type=lambda text: text.replace('-', '_'), choices=CROPS,
@@ -114,10 +108,10 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _add_paper_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("options of the paper's methods")
-    group.add_argument('--iterations', type=int, default=500, help='(%(default)s)')
-    group.add_argument('--k', type=int, default=3, help='(%(default)s)')
-    group.add_argument('--iou-threshold', type=float, default=0.2, help='(%(default)s)')
-    group.add_argument('--time-budget-ms', type=float, default=float('inf'), metavar='MS',
+    group.add_argument('--iterations', type=positive_int, default=500, help='(%(default)s)')
+    group.add_argument('--k', type=positive_int, default=3, help='(%(default)s)')
+    group.add_argument('--iou-threshold', type=within(0.0, 1.0), default=0.2, help='(%(default)s)')
+    group.add_argument('--time-budget-ms', type=limit, default=float('inf'), metavar='MS',
                        help='limit of each search (none); with one, results vary')
     group.add_argument('--sweep', type=positive_int, nargs='*', metavar='N',
                        default=[50, 100, 200, 1000],
@@ -131,10 +125,10 @@ def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
                        'methods do not use it')
     group.add_argument('--gravity-noise-deg', type=within(0.0, 45.0), default=0.0, metavar='DEG',
                        help='standard deviation of the vertical (0)')
-    group.add_argument('--height-range', type=float, nargs=2, metavar=('LOW', 'HIGH'),
+    group.add_argument('--height-range', type=limit, nargs=2, metavar=('LOW', 'HIGH'),
                        default=(-math.inf, math.inf),
                        help='heights that the camera may have in the map [m]')
-    group.add_argument('--tilt-deviation', type=float, default=40.0, metavar='DEG',
+    group.add_argument('--tilt-deviation', type=not_negative, default=40.0, metavar='DEG',
                        help=f"of the camera off upright, for '{AUTO}' without vertical; 0 where "
                        "the map's z axis is not up (%(default)s)")
     group.add_argument('--fuse', action='store_true',
@@ -170,16 +164,8 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
                        help="take ground truth from /tf: the map's coordinate frame (map)")
     group.add_argument('--max-gap', type=not_negative, default=0.5, metavar='SECONDS',
                        help='of tf: interpolate between poses so far apart (%(default)s)')
-    group.add_argument('--body-from-camera', type=float, nargs=7, metavar='V',
+    group.add_argument('--body-from-camera', type=finite, nargs=7, metavar='V',
                        help='x y z qx qy qz qw of the camera on the body of the ground truth')
-    group.add_argument('--watch', metavar='TOPIC',
-                       help='watch these poses of a localizer by objects, in place of methods; '
-                       'they and those of --odometry are of the same body; writes watch.json and '
-                       'figures')
-    group.add_argument('--watch-period', type=not_negative, default=2.0, metavar='SECONDS',
-                       help='least time between two looks (%(default)s)')
-    group.add_argument('--odometry', metavar='TOPIC',
-                       help='of --watch: which looks are independent')
 
 
 def evaluate(options: argparse.Namespace) -> int:
@@ -187,12 +173,14 @@ def evaluate(options: argparse.Namespace) -> int:
     # imported late, so that --help is fast
     from cliploc_ros.core.map.joined_map import join_maps
     from cliploc_ros.core.map.landmark_map import LandmarkMap
+    from cliploc_ros.datasets.bags import BagReader
+    from cliploc_ros.datasets.cases import is_case
     from cliploc_ros.evaluation.methods import parse_methods
     from cliploc_ros.evaluation.recording import with_features
     from cliploc_ros.evaluation.run import compare_methods
+    from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
     from cliploc_ros.evaluation.trials import join_cameras, make_queries
     from cliploc_ros.files.storage import make_folder
-    from cliploc_ros.simulation.sensors import with_neighbours, with_vertical
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):
@@ -200,13 +188,14 @@ def evaluate(options: argparse.Namespace) -> int:
     check_folder_options(options)
     if options.level and folder_of(options) is None:
         raise OptionsError('--level is for folders of images only')
-    of_case = options.watch is None and options.bag is not None and _is_case(options)
+    of_case = False
+    if options.bag is not None:  # or it has ground truth, and is no request alone
+        with BagReader(options.bag) as reader:
+            of_case = _truth(options) not in reader.topics and is_case(options.bag)
     if options.queries is None and not of_case:
         find_topics(options, options.bag)
     landmark_map = join_maps([LandmarkMap.from_file(file) for file in options.map],
                              [str(file) for file in options.map])
-    if options.watch is not None:
-        return _watch(options, landmark_map)
     if of_case:
         return _replay_case(options, landmark_map)
     paper = RelocalizerOptions(
@@ -277,40 +266,6 @@ def _notes_on_maps(options: argparse.Namespace) -> list[str]:
             and recording.source is not None and recording.source.resolve() == images]
 
 
-def _watch(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
-    """Watch the poses of a localizer in a recording; return the exit code."""
-    from cliploc_ros.core.relocalizer import Relocalizer
-    from cliploc_ros.core.watch.watch import Watch
-    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames, bag_odometry
-    from cliploc_ros.datasets.bag_poses import pose_sources, poses_of_topic
-    from cliploc_ros.evaluation.watching import watch_recording, write_watch
-    from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
-
-    if options.bag is None or options.cameras != [''] or len(options.map) > 1:
-        raise OptionsError('--watch is for --bag, with one map and one camera')
-
-    def read(topic: str) -> 'ReadPoses':
-        return poses_of_topic(topic, _WATCHED_GAP_NS, mount_of(options.body_from_camera))
-    reading = repr([options.watch, options.odometry, options.image, options.camera_info,
-                    options.body_from_camera, options.rectified])
-    odometry, truth = (bag_odometry(options.bag, options.image, read(topic))
-                       if (topic and topic in pose_sources(options.bag)) or required else None
-                       for topic, required in ((options.odometry, bool(options.odometry)),
-                                               (_truth(options), False)))
-    recorded = record_once(
-        bag_frames(options.bag, BagTopics(options.image, options.camera_info, options.rectified),
-                   read(options.watch)),
-        RecordingOptions(detector_options(options), None, EVERY_FRAME, reading,
-                         options.workers or 1, options.scheduler),
-        odometry=None if odometry is None else {'': odometry})
-    relocalizer = Relocalizer(landmark_map, RelocalizerOptions(
-        matching='class', tilt_deviation_deg=options.tilt_deviation,
-        height_range_m=tuple(options.height_range)))
-    looks = watch_recording(recorded, Watch(relocalizer), truth, options.watch_period)
-    print(write_watch(options.out, looks, options.figures), flush=True)
-    return 0
-
-
 def _needs_clip(options: argparse.Namespace, methods: 'Sequence[Method]') -> bool:
     """Return whether crops are compared with labels; OptionsError: they are, and CLIP may not run.
 
@@ -348,15 +303,6 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
     if wanted is None and layer_path(options.map[0]).exists():
         print(f'without keyframes: {problem}', flush=True)
     return None
-
-
-def _is_case(options: argparse.Namespace) -> bool:
-    """Return whether --bag is a recorded request, without ground truth."""
-    from cliploc_ros.datasets.bags import BagReader
-    from cliploc_ros.datasets.cases import is_case
-
-    with BagReader(options.bag) as reader:
-        return _truth(options) not in reader.topics and is_case(options.bag)
 
 
 def _truth(options: argparse.Namespace) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cliploc_ros.command import positive, printable, run_main
+from cliploc_ros.command import finite, positive, printable, run_main
 from cliploc_ros.errors import DatasetError, MapError, OptionsError
 
 if TYPE_CHECKING:
@@ -58,9 +58,9 @@ def make_parser() -> argparse.ArgumentParser:
                         help='a class name in each line, for formats with indices (COCO)')
     place = parser.add_argument_group('where the map lies')
     place.add_argument('--frame-id', default='map', help='of the map (%(default)s)')
-    place.add_argument('--scale', type=float, default=1.0, metavar='METRES',
+    place.add_argument('--scale', type=positive, default=1.0, metavar='METRES',
                        help='metres in a unit of length of the file (%(default)s)')
-    place.add_argument('--transform', type=float, nargs=7, metavar='V',
+    place.add_argument('--transform', type=finite, nargs=7, metavar='V',
                        default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
                        help="x y z [m] qx qy qz qw of the file's coordinate frame in the map's")
     place.add_argument('--errors', type=positive, nargs=2, metavar=('METRES', 'DEGREES'),

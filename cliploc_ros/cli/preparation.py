@@ -22,7 +22,7 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.errors import ImageError, OptionsError
 from cliploc_ros.models.clip_towers import keep_text_tower
-from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.models.clip_weights import resolve_clip_weights
 from cliploc_ros.models.devices import import_openvino
 from cliploc_ros.models.openvino_networks import ConversionError
 from cliploc_ros.models.protocols import ObjectDetector
@@ -90,20 +90,17 @@ def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bo
     if (parameters.options().needs_similarities and localizer.device == 'cpu'
             and parameters.inference != 'pytorch' and import_openvino() is not None):
         with _step("CLIP's text tower, for the labels of other maps"):
-            _convert_text_tower(clip_options_of(parameters))
+            clip = clip_options_of(parameters)
+            try:
+                keep_text_tower(resolve_clip_weights(clip), clip)
+            except ConversionError as error:
+                print(f'    {error}: without PyTorch, a robot knows the labels of this map only')
     with _step(f'{_REQUESTS} requests for {picture or "a picture of the demo"}'):
         requests = [answer(image_rgb, detector, localizer, parameters) for _ in range(_REQUESTS)]
     print(cost_table(requests), flush=True)
     print('ready: with these parameters, start and requests need neither network nor compiler')
     if cache_dir is not None:
         print('\n'.join(carrying(cache_dir, used)))
-
-
-def _convert_text_tower(options: ClipOptions) -> None:
-    try:
-        keep_text_tower(resolve_clip_weights(options), options)
-    except ConversionError as error:
-        print(f'    {error}: without PyTorch, a robot knows the labels of this map only')
 
 
 def answer(image_rgb: NDArray[np.uint8], detector: ObjectDetector | None,

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from cliploc_ros.command import positive
+from cliploc_ros.command import finite, not_negative, positive, positive_int, within
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES, with_detector, with_encoder
@@ -173,7 +173,7 @@ def _add_pose_options(parser: argparse.ArgumentParser) -> None:
                        help="the camera's optical coordinate frame in /tf (that of the images)")
     group.add_argument('--trajectory', type=Path, metavar='FILE',
                        help='take poses from a file in TUM format')
-    group.add_argument('--mount', type=float, nargs='+', metavar='V',
+    group.add_argument('--mount', type=finite, nargs='+', metavar='V',
                        help='x y z qx qy qz qw of the camera (z forward) on what the poses of a '
                        'topic or file are of; 7 numbers for each of --cameras, in their order')
     odometry = group.add_mutually_exclusive_group()
@@ -182,7 +182,7 @@ def _add_pose_options(parser: argparse.ArgumentParser) -> None:
                           'Odometry, or another type of pose')
     odometry.add_argument('--odometry-frame', metavar='FRAME',
                           help='take odometry of --bag from /tf: its coordinate frame')
-    group.add_argument('--max-gap', type=float, default=0.5, metavar='SECONDS',
+    group.add_argument('--max-gap', type=not_negative, default=0.5, metavar='SECONDS',
                        help='interpolate between poses at most so far apart (%(default)s)')
 
 
@@ -203,28 +203,28 @@ def _add_image_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--depth', metavar='TOPIC', help='depth registered to the images of --bag')
     group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE',
                        help='camera of TUM RGB-D and 7-Scenes, where the folder does not say it')
-    group.add_argument('--depth-unit', type=float, metavar='METRES',
+    group.add_argument('--depth-unit', type=positive, metavar='METRES',
                        help='one count of a depth image (0.001; 0.0002 for TUM; 1 for floats)')
-    group.add_argument('--depth-intrinsics', type=float, nargs=4,
+    group.add_argument('--depth-intrinsics', type=finite, nargs=4,
                        metavar=('FX', 'FY', 'CX', 'CY'),
                        help='of a depth camera that is not registered to the images')
-    group.add_argument('--depth-baseline', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
+    group.add_argument('--depth-baseline', type=finite, nargs=3, metavar=('X', 'Y', 'Z'),
                        help='its origin, seen from the colour camera [m] (0 0 0)')
 
 
 def _add_network_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('detector and CLIP, which run once on a recording')
-    group.add_argument('--keyframes', type=float, nargs=2, default=(0.1, 5.0),
+    group.add_argument('--keyframes', type=not_negative, nargs=2, default=(0.1, 5.0),
                        metavar=('METRES', 'DEGREES'),
                        help='look at an image this far from the last one (0.1 5; 0 0: at all)')
     add_network_options(group)
-    group.add_argument('--conf', type=float, default=0.25,
+    group.add_argument('--conf', type=within(0.0, 1.0), default=0.25,
                        help='least confidence of a detection (%(default)s)')
     group.add_argument('--no-clip', dest='clip', action='store_false',
                        help='classes and boxes only; no embeddings')
     group.add_argument('--record-to', type=Path, metavar='NPZ',
                        help='the observation file (next to the recording)')
-    group.add_argument('--workers', type=int, default=1, metavar='N',
+    group.add_argument('--workers', type=positive_int, default=1, metavar='N',
                        help='local processes (%(default)s)')
     group.add_argument('--scheduler', default='', metavar='ADDRESS',
                        help='of a Dask cluster, instead of local processes')
@@ -275,8 +275,6 @@ def read_source(options: argparse.Namespace) -> Source:
     find_topics(options, options.bag)
     if options.observations is not None:
         return Source(load_recorded(options.observations), options.observations, None)
-    if options.workers < 1:
-        raise OptionsError(f'--workers {options.workers}: give 1 or more')
     frames = read_frames(options)
     print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
     recording = RecordingOptions(

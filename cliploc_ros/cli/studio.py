@@ -119,12 +119,12 @@ def follow(options: argparse.Namespace) -> 'AbstractContextManager[LiveRelocaliz
 
 def open_studio(options: argparse.Namespace) -> 'Studio':
     """Return the studio that the command line asks for."""
-    from cliploc_ros.core.map.occupancy_grid import read_occupancy_grid
     from cliploc_ros.datasets.bag_frames import BagTopics
     from cliploc_ros.datasets.folders import find_layout
     from cliploc_ros.datasets.map_recording import load_recording
     from cliploc_ros.datasets.observations import load_observations
     from cliploc_ros.studio.document import Document
+    from cliploc_ros.studio.floor import read_occupancy_grid
     from cliploc_ros.studio.images import images_of_recording, open_images, views_of_folder
     from cliploc_ros.studio.recording import Recording
     from cliploc_ros.studio.studio import Studio
@@ -155,8 +155,7 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     document = Document(options.map or next(
         path for path in map(Path, names) if not path.exists()))
     layer = read_layer(document.path, document.to_map(), None) if document.landmarks else None
-    grid = (None if options.occupancy_grid is None
-            else read_occupancy_grid(options.occupancy_grid, document.frame_id))
+    grid = None if options.occupancy_grid is None else read_occupancy_grid(options.occupancy_grid)
     return Studio(document, recording, images, finder, layer, grid)
 
 

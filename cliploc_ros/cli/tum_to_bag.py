@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from cliploc_ros.command import run_main
+from cliploc_ros.command import positive_int, run_main
 from cliploc_ros.datasets.bags import STORAGES
 
 EPILOG = """\
@@ -39,7 +39,7 @@ def make_parser() -> argparse.ArgumentParser:
         'nodes, without depth. Needs no sourced ROS.')
     parser.add_argument('folder', type=Path, help='the folder')
     parser.add_argument('output', type=Path, help='folder of the recording; must not exist')
-    parser.add_argument('--every', type=int, default=1, metavar='N',
+    parser.add_argument('--every', type=positive_int, default=1, metavar='N',
                         help='take every N-th image only (default: 1)')
     parser.add_argument('--detections', type=Path, metavar='FILE',
                         help='also write these recorded detections (JSON)')

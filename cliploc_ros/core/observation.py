@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.map.occupancy_grid import OccupancyGrid
 from cliploc_ros.core.map.similarities import Similarities
 from cliploc_ros.errors import OptionsError
 
@@ -115,7 +114,6 @@ class Observation:
     #: (n,): standard deviation of each depth [m]; None for those of a usual RGB-D camera
     depth_deviations: NDArray[np.float64] | None = None
     region: Region | None = None  #: Where the robot probably is; None where nothing is known
-    grid: OccupancyGrid | None = None  #: Walls; None where they are not known
 
     @property
     def similarity_rows(self) -> NDArray[np.int64]:

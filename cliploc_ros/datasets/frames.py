@@ -31,7 +31,7 @@ _MOST_PLACES = 1_000_000
 
 
 @dataclass(frozen=True)
-class Frame:
+class PosedImage:
     """An image (h, w, 3) uint8, red first, with its camera, pose and depth.
 
     ``map_from_camera`` is None where no pose is known at ``stamp_ns``.
@@ -60,14 +60,14 @@ class RawFrame:
         of = f' of {self.camera}' if self.camera else ''
         return f'image {self.place}{of} at {self.stamp_ns / NS_PER_S:.6f} s'
 
-    def decode(self) -> Frame:
+    def decode(self) -> PosedImage:
         """Return the frame.
 
         DatasetError: the image cannot be decoded, or its camera is invalid.
         """
         image_rgb, camera = self.color()
-        return Frame(self.stamp_ns, image_rgb, camera, self.map_from_camera,
-                     None if self.depth is None else self.depth())
+        return PosedImage(self.stamp_ns, image_rgb, camera, self.map_from_camera,
+                          None if self.depth is None else self.depth())
 
 
 #: Tells whether the frame of a place, stamp [ns] and pose is to be read.
@@ -94,7 +94,7 @@ class Frames:
         """Return the frames of each camera, one at least."""
         return self.of_cameras or (self,)
 
-    def read(self) -> Iterator[Frame]:
+    def read(self) -> Iterator[PosedImage]:
         """Yield all frames, decoded."""
         for raw in self.read_raw(lambda place, stamp_ns, pose: True):
             yield raw.decode()

@@ -4,7 +4,6 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any
 
 from cliploc_ros.core.map.parameter_file import read_parameter_file
@@ -58,7 +57,11 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
         if word == ALL:
             found = [_named(name, paper, landmarks) for name in PAPER_METHODS]
         elif word.endswith(('.yaml', '.yml')):
-            found = _read(Path(word), paper, landmarks)
+            content = read_parameter_file(word)
+            if not content:
+                raise OptionsError(f'{word}: is not a mapping of names to options')
+            found = [_made(f'{word}: {name}', name, options, paper, landmarks)
+                     for name, options in content.items()]
         else:
             found = [_named(word, paper, landmarks)]
         for method in found:
@@ -86,14 +89,6 @@ def _named(name: str, paper: RelocalizerOptions, landmarks: int) -> Method:
         raise OptionsError(f"'{name}' is none of {', '.join(PAPER_METHODS)}, {ALL}, {AUTO}, "
                            f'nor a YAML file{did_you_mean(name, [*PAPER_METHODS, ALL, AUTO])}')
     return Method(name, replace(options, k=min(options.k, landmarks)), name == AUTO)
-
-
-def _read(path: Path, paper: RelocalizerOptions, landmarks: int) -> list[Method]:
-    content = read_parameter_file(path)
-    if not content:
-        raise OptionsError(f'{path}: is not a mapping of names to options')
-    return [_made(f'{path}: {name}', name, options, paper, landmarks)
-            for name, options in content.items()]
 
 
 def _made(where: str, name: str, values: Any, paper: RelocalizerOptions, landmarks: int) -> Method:

@@ -2,25 +2,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Independent tasks on this process, on local processes, or on a Dask cluster.
 
-A worker that dies costs time, not the run: its tasks run again, each alone. A task that kills
-its worker a second time is given up and reported.
+A worker that dies costs the time of its tasks: they run again after all others, each alone. A task
+that kills its worker a second time is given up and reported.
 """
 
 import ctypes
 import hashlib
-import importlib.metadata
 import logging
 import multiprocessing
 import signal
 import threading
-import time
+from collections import deque
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cliploc_ros.errors import CliplocError, OptionsError
 
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# Tasks that wait beside each worker: enough to keep it busy, few enough to hold in memory.
+# Tasks at each worker: the next one waits there, and few are held in memory.
 _TASKS_A_WORKER = 2
-# So many dead workers in a row, each with another task, are no accident.
-_MOST_DEATHS_IN_A_ROW = 3
+# So many times the tasks at all workers lost in a row, without a result, are no accident.
+_MOST_LOSSES = 3
 # A cluster that lost all its workers starts new ones in this time, or never.
 _CHECK_S, _RESTART_S = 5.0, 60.0
 _CONNECT_S = 10
@@ -43,14 +43,19 @@ class WorkersError(CliplocError):
     """Workers cannot be started, or die again and again."""
 
 
-class MakeWork(Protocol):
-    """Makes the function that does a task; holds or loads what it needs.
+#: Makes the function that does a task; holds or loads what it needs. Each worker gets it once, and
+#: each thread that does tasks makes a function of its own.
+MakeWork = Callable[[], Callable[[Any], Any]]
 
-    Each worker gets it once, and each thread that does tasks makes a function of its own.
-    """
 
-    def __call__(self) -> Callable[[Any], Any]:
-        """Return the function."""
+class _Pool(NamedTuple):
+    """Processes that do tasks, here or on a cluster."""
+
+    most: int  #: Tasks that may be there at once
+    deaths: tuple[type[Exception], ...]  #: Exceptions of a task whose worker died
+    submit: Callable[[Any], Any]  #: Hands over a task; returns its future
+    #: Returns those of some futures that are done, as soon as there are any
+    wait: Callable[[list[Any]], Collection[Any]]
 
 
 def run_tasks(make_work: MakeWork, tasks: Iterable[Any], *, workers: int = 1, scheduler: str = ''
@@ -73,102 +78,54 @@ def run_tasks(make_work: MakeWork, tasks: Iterable[Any], *, workers: int = 1, sc
     Yields
     ------
     task, result : object
-        In no particular order. A task at which workers died again and again has the result None.
+        In no particular order. A task at which workers died twice has the result None.
 
     Raises
     ------
     WorkersError
         Workers cannot be started, die again and again, or have another version of this package.
     """
-    if scheduler:
-        yield from _on_dask(make_work, iter(tasks), scheduler)
-    elif workers == 1:
+    if workers == 1 and not scheduler:
         work = make_work()
         for task in tasks:
             yield task, work(task)
-    else:
-        yield from _on_processes(make_work, iter(tasks), workers)
+        return
+    with _cluster(make_work, scheduler) if scheduler else _processes(make_work, workers) as pool:
+        again: list[Any] = []
+        given_up: list[Any] = []
+        yield from _stream(pool, iter(tasks), pool.most, again)
+        if again:
+            logger.warning('workers died; %d tasks run again', len(again))
+        # a cluster blames all tasks that were at a dead worker, not only the one that killed
+        yield from _stream(pool, iter(again), 1, given_up)
+    for task in given_up:
+        logger.warning('left out: workers died again and again at %.200s', task)
+        yield task, None
 
 
-def _on_processes(make_work: MakeWork, tasks: Iterator[Any], workers: int
-                  ) -> Iterator[tuple[Any, Any]]:
-    suspects: list[Any] = []  # a worker died while these waited for their results
-    deaths = 0
+def _stream(pool: _Pool, tasks: Iterator[Any], most: int, lost: list[Any]
+            ) -> Iterator[tuple[Any, Any]]:
+    """Yield tasks with their results; add those whose worker died to `lost`."""
+    in_flight: dict[Any, Any] = {}
+    losses = 0
     while True:
-        alone = bool(suspects)
-        source = iter(suspects) if alone else tasks
-        with _local_pool(make_work, 1 if alone else workers) as pool:
-            stream = _Stream(_LocalPool(pool), source, 1 if alone else _TASKS_A_WORKER * workers)
-            try:
-                for finished in stream:
-                    deaths = 0
-                    yield finished
-                suspects = []
-            except BrokenProcessPool:
-                deaths += 1
-                suspects = stream.unfinished
-                if alone:
-                    yield _given_up(suspects.pop(0))
-                    suspects += source
-                else:
-                    logger.warning('a worker process died; its tasks run again')
-        if deaths > _MOST_DEATHS_IN_A_ROW:
-            raise WorkersError(f'{deaths} worker processes died in a row, perhaps out of memory; '
-                               'run again with fewer --workers')
-        if not (alone or suspects):
+        for task in islice(tasks, most - len(in_flight)):
+            in_flight[pool.submit(task)] = task
+        if not in_flight:
             return
-
-
-def _given_up(task: Any) -> tuple[Any, Any]:
-    logger.warning('left out: workers died again and again at %.200s', task)
-    return task, None
-
-
-class _Workers(Protocol):
-    """What tasks are handed to."""
-
-    #: Exceptions of a task that say that its workers died.
-    deaths: tuple[type[Exception], ...]
-
-    def submit(self, task: Any) -> Any:
-        """Hand over a task; return its future."""
-
-    def wait(self, futures: list[Any]) -> Collection[Any]:
-        """Return those of some futures that are done, as soon as there are any."""
-
-
-class _Stream:
-    """Tasks on their way through workers, a bounded number at once."""
-
-    def __init__(self, workers: _Workers, tasks: Iterator[Any], most: int) -> None:
-        self._workers, self._tasks, self._most = workers, tasks, most
-        self._in_flight: dict[Any, Any] = {}
-        self._next: list[Any] = []
-        #: Tasks whose workers died.
-        self.lost: list[Any] = []
-
-    @property
-    def unfinished(self) -> list[Any]:
-        """Return the tasks that were taken and have no result."""
-        return [*self._in_flight.values(), *self._next]
-
-    def __iter__(self) -> Iterator[tuple[Any, Any]]:
-        """Yield each task with its result."""
-        while True:
-            room = self._most - len(self._in_flight)
-            self._next = list(islice(self._tasks, room))
-            while self._next:
-                future = self._workers.submit(self._next[0])
-                self._in_flight[future] = self._next.pop(0)
-            if not self._in_flight:
-                return
-            for future in self._workers.wait([*self._in_flight]):
-                try:
-                    result = future.result()
-                except self._workers.deaths:
-                    self.lost.append(self._in_flight.pop(future))
-                else:
-                    yield self._in_flight.pop(future), result
+        for future in pool.wait([*in_flight]):
+            task = in_flight.pop(future)
+            try:
+                result = future.result()
+            except pool.deaths as error:
+                lost.append(task)
+                losses += 1
+                if losses > _MOST_LOSSES * most:
+                    raise WorkersError('workers die again and again, perhaps out of memory; run '
+                                       'again with fewer') from error
+            else:
+                losses = 0
+                yield task, result
 
 
 class _Work:
@@ -189,46 +146,14 @@ class _Work:
         return self._of_thread.work(task)
 
 
-# ---- local processes ----------------------------------------------------------------------------
-
-
-@contextmanager
-def _local_pool(make_work: MakeWork, workers: int) -> Iterator[ProcessPoolExecutor]:
-    # spawned, since forking a process that has run PyTorch's threads may hang
-    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context('spawn'),
-                               initializer=_begin_worker, initargs=(make_work,))
-    processes = pool._processes  # the pool forgets them when it shuts down
-    try:
-        yield pool
-    except BaseException:
-        for process in [*(processes or {}).values()]:
-            process.terminate()  # a task may take minutes
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-class _LocalPool:
-    deaths: tuple[type[Exception], ...] = ()  # the death of one breaks the pool
-
-    def __init__(self, pool: ProcessPoolExecutor) -> None:
-        self._pool = pool
-
-    def submit(self, task: Any) -> Any:
-        return self._pool.submit(_do, task)
-
-    def wait(self, futures: list[Any]) -> Collection[Any]:
-        return wait(futures, return_when=FIRST_COMPLETED).done
-
-
-_work: _Work
+_work: _Work  # of a local worker, which has no other memory
 
 
 def _begin_worker(make_work: MakeWork) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     # a killed parent cannot end its workers, so the kernel does
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    global _work  # a pool's workers have no other memory
+    global _work
     _work = _Work(make_work)  # makes it later: an error here would only break the pool
 
 
@@ -236,118 +161,102 @@ def _do(task: Any) -> Any:
     return _work(task)
 
 
-# ---- a Dask cluster -----------------------------------------------------------------------------
+@contextmanager
+def _processes(make_work: MakeWork, workers: int) -> Iterator[_Pool]:
+    """Yield local processes, each a pool of its own: the death of one breaks no other."""
+    # spawned, since forking a process that has run PyTorch's threads may hang
+    start = partial(ProcessPoolExecutor, 1, mp_context=multiprocessing.get_context('spawn'),
+                    initializer=_begin_worker, initargs=(make_work,))
+    pools = [start() for _ in range(workers)]
+    free = deque([*range(workers)] * _TASKS_A_WORKER)
+    places: dict[Any, int] = {}
 
-
-def _on_dask(make_work: MakeWork, tasks: Iterator[Any], address: str
-             ) -> Iterator[tuple[Any, Any]]:
-    try:
-        from distributed import KilledWorker
-    except ImportError as error:
-        raise OptionsError('--scheduler needs Dask: pip install distributed') from error
-    with _connect(address) as client:
-        _check_package(client, address)
-        cluster = _Cluster(client, address, make_work, (KilledWorker,))
-        threads = sum(client.nthreads().values())
+    def submit(task: Any) -> Any:
+        place = free.popleft()
         try:
-            together = _Stream(cluster, tasks, _TASKS_A_WORKER * threads)
-            yield from together
-            # Dask itself runs again what a dead worker had. After some deaths it blames all the
-            # tasks that waited there, not only the one that killed.
-            alone = _Stream(cluster, iter(together.lost), 1)
-            yield from alone
-        except CancelledError as error:
-            raise WorkersError(f'the Dask scheduler at {address} is gone; start it and run again '
-                               'to go on') from error
-    yield from map(_given_up, alone.lost)
+            future = pools[place].submit(_do, task)
+        except BrokenProcessPool:
+            pools[place] = start()
+            future = pools[place].submit(_do, task)
+        places[future] = place
+        return future
 
+    def wait_for_some(futures: list[Any]) -> Collection[Any]:
+        done = wait(futures, return_when=FIRST_COMPLETED).done
+        free.extend(map(places.pop, done))
+        return done
 
-class _Cluster:
-    # Client.get_executor loses results of workers that die right after a task.
-
-    def __init__(self, client: 'Client', address: str, make_work: MakeWork,
-                 deaths: tuple[type[Exception], ...]) -> None:
-        self.deaths = deaths
-        self._client, self._address = client, address
-        # a task of its own: what makes the work reaches each worker once, and Dask makes it again
-        # if the workers that hold it die
-        self._work = client.submit(_Work, make_work, pure=False)
-        self._last_seen = time.monotonic()
-
-    def submit(self, task: Any) -> Any:
-        return self._client.submit(_call, self._work, task, pure=False)
-
-    def wait(self, futures: list[Any]) -> Collection[Any]:
-        from distributed import TimeoutError as NoneYet
-        from distributed import wait
-
-        while True:
-            try:
-                with self._client.as_current():
-                    return wait(futures, timeout=_CHECK_S, return_when='FIRST_COMPLETED').done
-            except NoneYet:
-                self._look_for_workers()
-
-    def _look_for_workers(self) -> None:
-        if self._client.nthreads():
-            self._last_seen = time.monotonic()
-        elif time.monotonic() - self._last_seen > _RESTART_S:
-            raise WorkersError(f'all workers of the Dask scheduler at {self._address} are gone; '
-                               'start some and run again to go on')
-
-
-def _call(work: _Work, task: Any) -> Any:
-    return work(task)
+    try:
+        yield _Pool(len(free), (BrokenProcessPool,), submit, wait_for_some)
+    except BaseException:
+        for pool in pools:
+            for process in [*(pool._processes or {}).values()]:
+                process.terminate()  # a task may take minutes
+        raise
+    finally:
+        for pool in pools:
+            pool.shutdown(cancel_futures=True)
 
 
 @contextmanager
-def _connect(address: str) -> Iterator['Client']:
-    """Yield a client of a scheduler that has workers."""
-    from distributed import Client
-
+def _cluster(make_work: MakeWork, address: str) -> Iterator[_Pool]:
+    """Yield a Dask cluster. Client.get_executor would lose results of workers that die soon."""
+    try:
+        from distributed import Client, KilledWorker
+        from distributed import wait as wait_on_dask
+    except ImportError as error:
+        raise OptionsError('--scheduler needs Dask: pip install distributed') from error
     try:
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)
-    except (OSError, ValueError, TimeoutError) as error:
+    except (OSError, ValueError) as error:
         raise WorkersError(f'no Dask scheduler answers at {address}: {error}; start one with '
                            '"dask scheduler", or check address and firewall') from error
+
+    def wait_for_some(futures: list[Any]) -> Collection[Any]:
+        while True:
+            try:
+                with client.as_current():
+                    return wait_on_dask(futures, timeout=_CHECK_S,
+                                        return_when='FIRST_COMPLETED').done
+            except TimeoutError:
+                _wait_for_workers(client, address, _RESTART_S)
+
     with client:
+        _wait_for_workers(client, address, _CONNECT_S)
+        _check_sources(client, address)
+        # a task of its own: what makes the work reaches each worker once, and Dask makes it again
+        # if the workers that hold it die
+        work = client.submit(_Work, make_work, pure=False)
         try:
-            client.wait_for_workers(1, timeout=_CONNECT_S)
-        except TimeoutError as error:
-            raise WorkersError(f'the Dask scheduler at {address} has no workers; start some with '
-                               f'"dask worker {address}"') from error
-        yield client
+            yield _Pool(_TASKS_A_WORKER * sum(client.nthreads().values()), (KilledWorker,),
+                        partial(client.submit, _Work.__call__, work, pure=False), wait_for_some)
+        except CancelledError as error:
+            raise WorkersError(f'the Dask scheduler at {address} is gone; start it and run again '
+                               'to go on') from error
 
 
-def _check_package(client: 'Client', address: str) -> None:
-    """Refuse workers whose results may differ.
+def _wait_for_workers(client: 'Client', address: str, time_s: float) -> None:
+    try:
+        client.wait_for_workers(1, timeout=time_s)
+    except TimeoutError as error:
+        raise WorkersError(f'the Dask scheduler at {address} has no workers; start some with '
+                           f'"dask worker {address}"') from error
 
-    WorkersError: a worker has other sources of this package, or none.
-    """
-    def look() -> str | None:
-        # sent by value, so that it runs where this package is missing
-        from importlib.util import find_spec
-        if find_spec('cliploc_ros') is None:
-            return None
-        from cliploc_ros.files import parallel
-        return getattr(parallel, 'package_state', lambda: 'of another version')()
 
-    ours = package_state()
-    for worker, theirs in client.run(look, on_error='return').items():
+def _check_sources(client: 'Client', address: str) -> None:
+    """Refuse workers whose results may differ: with other sources of this package, or none."""
+    ours = digest_of_sources()
+    for worker, theirs in client.run(digest_of_sources, on_error='return').items():
         if theirs != ours:
             raise WorkersError(
-                f'the Dask worker {worker} has cliploc_ros {theirs}, this is {ours}; install the '
-                f'same on all workers of {address} and restart them')
+                f'the Dask worker {worker} has sources {theirs} of cliploc_ros, here are {ours}; '
+                f'install the same on all workers of {address} and restart them')
 
 
-def package_state() -> str:
-    """Return the version of this package, and a digest of its sources."""
+def digest_of_sources() -> str:
+    """Return a digest of the sources of this package."""
     folder = Path(__file__).parents[1]
     digest = hashlib.sha256()
     for path in sorted(folder.rglob('*.py')):
         digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
-    try:
-        version = importlib.metadata.version('cliploc_ros')
-    except importlib.metadata.PackageNotFoundError:
-        version = 'not installed'
-    return f'{version} (sources {digest.hexdigest()[:8]})'
+    return digest.hexdigest()[:8]

@@ -10,7 +10,6 @@ in common with all crops, or with those of its class.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.mapping.landmarks import classes_of, group_boxes
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.views import number_viewpoints
+from cliploc_ros.vocabulary.vocabulary import Phrases
 
 # The best phrase and the next five.
 _LABELS = 6
@@ -30,13 +30,6 @@ _CLIP_SCALE = 100.0
 _MOST_CROPS = 512
 # A further medoid brings each crop nearer to one by this cosine on average. A guess.
 _LEAST_MEDOID_GAIN = 0.005
-
-
-class Phrases(NamedTuple):
-    """Some phrases: P texts and their embeddings (P, d), unit rows."""
-
-    texts: tuple[str, ...]
-    embeddings: NDArray[np.float32]
 
 
 def embed_landmarks(landmark_ids: Sequence[str], detections: PosedDetections,

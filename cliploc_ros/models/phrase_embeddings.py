@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.mapping.labelling import Phrases
 from cliploc_ros.models.clip_encoder import encode_labels
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights
 from cliploc_ros.models.label_embeddings import LabelCache
+from cliploc_ros.vocabulary.vocabulary import Phrases
 
 # The COCO classes and as many of a user; a file of ViT-L-14 takes 3 MB at most.
 _MOST_FILES = 200

@@ -24,7 +24,7 @@ from cliploc_ros.core.keyframes.layer import (
 from cliploc_ros.core.keyframes.triangulation import PosedFeatures, triangulate
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.depth import depths_of_points
-from cliploc_ros.datasets.frames import Frame, Frames, undistorted
+from cliploc_ros.datasets.frames import Frames, PosedImage, undistorted
 from cliploc_ros.errors import MappingError, OptionsError
 
 # Features that are found in an image, before those without a point are left out.
@@ -60,7 +60,7 @@ class LayerOptions:
 _DEFAULT = LayerOptions()
 
 
-class _Seen(NamedTuple):
+class _Keyframe(NamedTuple):
     """A keyframe: its features (strongest first), their depths, its JPEG, and its camera."""
 
     posed: PosedFeatures
@@ -108,7 +108,7 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
                    image_offsets=np.cumsum([0, *map(len, jpegs)]))
 
 
-def _chosen(frames: Frames, options: LayerOptions) -> Iterator[Frame]:
+def _chosen(frames: Frames, options: LayerOptions) -> Iterator[PosedImage]:
     """Yield the images whose view no earlier one of them has, decoded."""
     size = options.distance_m or 1.0  # of the cells that poses lie in; no pose is nearer than 0
     cells: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
@@ -131,7 +131,7 @@ def _chosen(frames: Frames, options: LayerOptions) -> Iterator[Frame]:
         yield raw.decode()
 
 
-def _look(frame: Frame, options: LayerOptions) -> _Seen:
+def _look(frame: PosedImage, options: LayerOptions) -> _Keyframe:
     """Return the features of an image; with depth, only those that have some."""
     assert frame.map_from_camera is not None
     features = extract(frame.image_rgb, _MOST_FOUND)
@@ -142,12 +142,12 @@ def _look(frame: Frame, options: LayerOptions) -> _Seen:
         depths = depths_of_points(frame.depth, frame.camera, features.pixels).astype(np.float64)
         known &= np.isfinite(depths)
         known &= np.cumsum(known) <= options.most_points
-    return _Seen(PosedFeatures(frame.map_from_camera, bearings[known],
-                               features.descriptors[known]), depths[known],
-                 _small_jpeg(frame) if options.images else b'', frame.camera.pinhole)
+    return _Keyframe(PosedFeatures(frame.map_from_camera, bearings[known],
+                                   features.descriptors[known]), depths[known],
+                     _small_jpeg(frame) if options.images else b'', frame.camera.pinhole)
 
 
-def _small_jpeg(frame: Frame) -> bytes:
+def _small_jpeg(frame: PosedImage) -> bytes:
     """Return an image, undistorted and small, as JPEG."""
     camera = frame.camera
     scale = min(1.0, _IMAGE_PX / max(camera.width, camera.height))

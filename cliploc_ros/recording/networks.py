@@ -85,11 +85,11 @@ class LoadNetworks:
             set_threads(self.threads)
         encoder = (None if self.clip is None
                    else ClipEncoder(resolve_clip_weights(self.clip), self.clip))
-        return Look(load_detector(self.detector).detect, encoder)
+        return RunNetworks(load_detector(self.detector).detect, encoder)
 
 
 @dataclass(frozen=True)
-class Look:
+class RunNetworks:
     """Runs detector and encoder on a raw frame."""
 
     #: ObjectDetector.detect, or another function that returns the objects in an image

@@ -32,7 +32,7 @@ from cliploc_ros.datasets.observations import (
     save_recorded,
 )
 from cliploc_ros.datasets.poses import Poses
-from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.mapping.options import MappingOptions
@@ -181,7 +181,9 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
             if recorded.described == described:
                 logger.warning('using the observations of an earlier run: %s', file)
                 linked = _with_odometry(recorded, odometry)
-                if _adds_odometry(recorded, linked):
+                old = recorded.detections.odom_from_camera
+                new = linked.detections.odom_from_camera
+                if new is not None and (old is None or not np.array_equal(old, new, True)):
                     save_recorded(file, linked)
                 return linked
             logger.warning('recording again, with other options: %s', file)
@@ -207,11 +209,6 @@ def _with_odometry(recorded: Recorded, odometry: Mapping[str, Poses] | None) -> 
     return replace(recorded, detections=replace(recorded.detections, odom_from_camera=placed))
 
 
-def _adds_odometry(before: Recorded, after: Recorded) -> bool:
-    old, new = before.detections.odom_from_camera, after.detections.odom_from_camera
-    return new is not None and (old is None or not np.array_equal(old, new, equal_nan=True))
-
-
 def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame]) -> Recorded:
     """Return what networks at hand say of every frame with a pose; nothing is written."""
     with _read_keyframes(frames, EVERY_FRAME) as (raws, filters):
@@ -231,16 +228,28 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log)
         log.restart([run])
     if seen:
         logger.warning('going on after %d frames of an unfinished run', len(seen))
-    with _read_keyframes(frames, options.keyframes) as (raws, filters):
-        tasks = (raw for raw in raws if raw.place not in seen)
-        for _, result in run_tasks(options.networks, tasks, workers=options.workers,
-                                   scheduler=options.scheduler):
-            if result is not None:
-                log.append({'frame': base64.b64encode(result.to_bytes()).decode()})
-                seen[result.place] = result
-                _judge_depth(seen, frames.source)
+    try:
+        with _read_keyframes(frames, options.keyframes) as (raws, filters):
+            tasks = (raw for raw in raws if raw.place not in seen)
+            for _, result in run_tasks(options.networks, tasks, workers=options.workers,
+                                       scheduler=options.scheduler):
+                if result is not None:
+                    log.append({'frame': base64.b64encode(result.to_bytes()).decode()})
+                    seen[result.place] = result
+                    _judge_depth(seen, frames.source)
+    except BaseException:
+        if seen:
+            logger.warning('%d frames are kept in %s: run again to go on from there, or delete it',
+                           len(seen), log.path)
+        else:
+            log.remove()
+        raise
     encoder_key = '' if options.clip is None else resolve_clip_weights(options.clip).key
-    return _assemble(list(seen.values()), frames, filters, encoder_key, described)
+    try:
+        return _assemble(list(seen.values()), frames, filters, encoder_key, described)
+    except CliplocError:
+        log.remove()  # the same frames fail again
+        raise
 
 
 def _parse_entry(line: bytes) -> Any:

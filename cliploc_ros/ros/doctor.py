@@ -62,7 +62,7 @@ from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.outputs.handoff import HandOff
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 from cliploc_ros.ros.request import time_is_up
-from cliploc_ros.ros.running import NotRunningError, ask, parameters_of_files
+from cliploc_ros.ros.running import NotRunningError, ask, parameters_of_files, whole_name
 from cliploc_ros.units import NS_PER_S
 from cliploc_ros.vocabulary.vocabulary import misspelt_classes
 
@@ -405,8 +405,9 @@ def _check_request(node: Doctor, parameters: RelocalizerParameters,
 def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) -> None:
     """Check the relocalizer of parameter files, or without any, the running one of a name.
 
-    CliplocError: a parameter file cannot be read.
+    CliplocError: a parameter file cannot be read, or no node can have this name.
     """
+    name = whole_name(name)
     if files:
         given, topics = parameters_of_files(files, name), []
     else:

@@ -44,9 +44,8 @@ from cliploc_ros.core.localizer import (
 )
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.map.occupancy_grid import OccupancyGrid, read_occupancy_grid
 from cliploc_ros.core.map.similarities import Similarities, split_similarities
-from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.observation import Detections, Observation, Region
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization, in_its_map
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -66,12 +65,11 @@ from cliploc_ros.models.profiles import with_encoder
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.frame_faults import faults_of_axes, faults_of_frame
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.prior import Known
 from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.map_parameters import load_hashed_map, map_files, path_of
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.outputs.debug_image import SeenImage
-from cliploc_ros.ros.parameters import BY_TOPIC, RelocalizerParameters
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 logger = logging.getLogger(__name__)
 
@@ -80,7 +78,6 @@ logger = logging.getLogger(__name__)
 _SEARCHES, _MOST_SHARE, _ANSWER_S = 2.0, 0.2, 0.1
 #: Value of keyframes_file for the layer next to the map, if there is one.
 NEXT_TO_MAP = 'auto'
-NOTHING_KNOWN = Known()
 # With less time left, the objects' answer stands: extracting features cannot be stopped.
 _LEAST_S = 0.5
 
@@ -147,7 +144,7 @@ class Localized(NamedTuple):
     #: the new information, see cliploc_ros.core.localizer.
     for_filter: NDArray[np.float64] | None
     cameras: int  #: Number of cameras whose frames of this instant were used
-    left_out: tuple[str, ...]  #: Names of those that had none
+    left_out: tuple[str, ...]  #: Names of those that had none, or of another run of odometry
 
 
 class FrameLocalizer:
@@ -163,18 +160,14 @@ class FrameLocalizer:
         See cliploc_ros.ros.map_parameters.
     keyframes : Keyframes, optional
         The layer of keyframes of the map.
-    grid : OccupancyGrid, optional
-        Walls, in the coordinate frame of the first map.
     """
 
     def __init__(self, landmark_map: LandmarkMap, observer: Observer | None,
                  relocalizer: Relocalizer, options: RelocalizerOptions, device: str,
-                 map_hash: str, keyframes: Keyframes | None = None,
-                 grid: OccupancyGrid | None = None) -> None:
+                 map_hash: str, keyframes: Keyframes | None = None) -> None:
         self.device = device
         self.map_hash = map_hash
         self._keyframes = keyframes
-        self._grid = grid
         self._map = landmark_map
         self._observer = observer
         self._options = options
@@ -243,18 +236,17 @@ class FrameLocalizer:
             observer = observer.with_labels(embed_map(
                 clip_options_of(parameters), landmark_map, files, parameters.landmark_embeddings))
         return FrameLocalizer(landmark_map, observer, relocalizer, options, self.device, map_hash,
-                              load_keyframes(parameters, landmark_map),
-                              load_grid(parameters, landmark_map))
+                              load_keyframes(parameters, landmark_map))
 
     def localize(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
                  times: StageTimes, deadline: float = math.inf,
-                 beside: Sequence[tuple[Frame, RobotState]] = (), known: Known = NOTHING_KNOWN
+                 beside: Sequence[tuple[Frame, RobotState]] = (), region: Region | None = None
                  ) -> Localized:
         """Find where the camera was, with a frame and those that odometry links to it.
 
         `parameters` are as they are now, `state` is that at the stamp of the frame, `beside` are
-        frames of other cameras at this instant, `known` is what is known before. No crops are
-        compared after `deadline` (monotonic clock) [s].
+        frames of other cameras at this instant, `region` is where the robot probably is. No crops
+        are compared after `deadline` (monotonic clock) [s].
 
         CliplocError: names what to fix in the frame or in the parameters.
         """
@@ -265,11 +257,14 @@ class FrameLocalizer:
         run = None if state.place is None else state.place.run
         image, observation = self._observed(frame, parameters, state,
                                             run is not None or not frame.camera)
-        observation = replace(observation, region=known.region,
-                              grid=self._grid if known.grid is None else known.grid)
+        observation = replace(observation, region=region)
+        linked = [(one, its) for one, its in beside
+                  if run == (None if its.place is None else its.place.run)]
         others = [
             self._known_crops(*self._observed(one, parameters, its, run is not None), options)
-            for one, its in beside if run == (None if its.place is None else its.place.run)]
+            for one, its in linked]
+        names = [one.camera for one, _ in linked]
+        left_out = (*frame.left_out, *(one.camera for one, _ in beside if one.camera not in names))
         camera, detections = observation.camera, observation.detections
         crops, observation = self._crops(image, observation, options, times, deadline)
         recognizer = None if self._keyframes is None else self._keyframes.recognizer(
@@ -294,7 +289,7 @@ class FrameLocalizer:
         found, landmark_map, seen = _in_its_map(self._explained(found), self._map, seen)
         layer = None if self._keyframes is None else self._keyframes.layer
         return Localized(found, landmark_map, SeenImage(image, seen, layer), compared, is_cut,
-                         for_filter, 1 + len(others), frame.left_out)
+                         for_filter, 1 + len(others), left_out)
 
     def look(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
              frame_id: str, map_from_camera: NDArray[np.float64]) -> WatchReport:
@@ -304,6 +299,11 @@ class FrameLocalizer:
 
         CliplocError: names what to fix in the frame or in the parameters.
         """
+        shift = next((part.shift for part in parts_of(self._map)
+                      if part.landmark_map.frame_id == frame_id), None)
+        if shift is None:
+            raise MapError(f"no map is in frame '{frame_id}', but in {', '.join(self.frame_ids)}: "
+                           "correct the map's frame_id")
         options = parameters.options()
         self._localizer_for(options)
         image, observation = self._observed(frame, parameters, state, True)
@@ -314,8 +314,7 @@ class FrameLocalizer:
         recognizer = None if self._keyframes is None else self._keyframes.recognizer(
             image, observation.camera, math.inf, StageTimes('keyframes', time.monotonic()))
         pose = map_from_camera.copy()
-        pose[:3, 3] += next(part.shift for part in parts_of(self._map)
-                            if part.landmark_map.frame_id == frame_id)
+        pose[:3, 3] += shift
         return self._watch.look(observation, pose, image, recognizer)
 
     def forget_looks(self) -> None:
@@ -462,8 +461,7 @@ def load_localizer(node: Node, parameters: RelocalizerParameters) -> FrameLocali
         observer, device = Observer(encoder, embeddings), encoder.device
         observer.measure()
     return FrameLocalizer(landmark_map, observer, relocalizer, options, device, map_hash,
-                          load_keyframes(parameters, landmark_map),
-                          load_grid(parameters, landmark_map))
+                          load_keyframes(parameters, landmark_map))
 
 
 def read_frame(frame: Frame, parameters: RelocalizerParameters
@@ -520,17 +518,4 @@ def load_keyframes(parameters: RelocalizerParameters, landmark_map: LandmarkMap
         return Keyframes(KeyframeLocalizer(layer), str(path), layer_hash(path))
     except MapError as error:
         logger.error('localizing without keyframes: %s', error)
-        return None
-
-
-def load_grid(parameters: RelocalizerParameters, landmark_map: LandmarkMap
-              ) -> OccupancyGrid | None:
-    """Return the walls of a file; None without one, or where it is bad, which is logged."""
-    if parameters.occupancy_grid in ('', BY_TOPIC):
-        return None
-    try:
-        return read_occupancy_grid(Path(path_of(parameters.occupancy_grid)),
-                                   parts_of(landmark_map)[0].landmark_map.frame_id)
-    except MapError as error:
-        logger.error('localizing without walls: %s', error)
         return None

@@ -27,8 +27,6 @@ TRANSPORTS = ('raw', 'compressed')
 MODES = ('on_request', 'continuous')
 VERTICAL_SOURCES = ('none', 'base_frame', 'imu')
 WATCHES = ('none', 'tf', 'amcl_pose')
-#: Value of occupancy_grid for the topic `map`.
-BY_TOPIC = 'topic'
 REACTIONS = ('report', 'relocalize')
 
 # Of timeout_s, for algorithms other than auto.
@@ -122,9 +120,6 @@ class RelocalizerParameters(CommonParameters):
     keyframes_file: str = parameter('auto',
         "Layer of keyframes of the map, read with it: a file, or 'auto': NAME.keyframes.npz "
         'next to map_file NAME.yaml, where there is one; empty: none.')
-    occupancy_grid: str = parameter('',
-        "Walls, evidence against a pose: a YAML file of map_server in the first map's frame, or "
-        "'topic': the topic map; empty: none.")
     prior_probability: float = parameter(0.9,
         'Probability that what ~/prior tells is right.', low=0.0, high=0.99)
     last_pose_file: str = parameter('',

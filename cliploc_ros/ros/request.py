@@ -7,7 +7,7 @@ import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import count
@@ -69,6 +69,8 @@ class Pipeline:
         self._jumps = jumps
         self._robot = robot
         self.localizer: FrameLocalizer | None = None
+        #: Called in the worker's thread after another map is searched.
+        self.on_map: Callable[[], None] = lambda: None
         self._pose = node.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
         self._map_to_odom = MapToOdom(node, robot.transforms)
         robot.odometry.on_restart(self._map_to_odom.forget)
@@ -129,9 +131,9 @@ class Pipeline:
         state = self._robot.at(image, parameters.of_camera(frame.camera), deadline,
                                frame.depth_frame)
         beside = self._beside(frame, parameters, deadline)
-        known = self._robot.prior.known(image.stamp, parameters, state.camera_from_base,
-                                        localizer.frame_ids, localizer.map_hash)
-        localized = localizer.localize(frame, parameters, state, times, deadline, beside, known)
+        region = self._robot.prior.region(image.stamp, parameters, state.camera_from_base,
+                                          localizer.frame_ids, localizer.map_hash)
+        localized = localizer.localize(frame, parameters, state, times, deadline, beside, region)
         stages_ms = times.ms
         self._node.stages.add(stages_ms)
         if faults := '; '.join(fault.text for fault in localizer.faults):
@@ -172,6 +174,7 @@ class Pipeline:
         self.localizer = localizer
         self._visualization.set_map(localizer.landmark_map, None if localizer.keyframes is None
                                     else localizer.keyframes.layer)
+        self.on_map()
         return localizer.description
 
     def _publish(self, header: Header, localized: Localized, state: RobotState,
@@ -286,7 +289,7 @@ class Requests:
                 if last is not None:
                     is_up = True
                     break
-                if isinstance(error, NoFrameError):
+                if problem is not None or isinstance(error, NoFrameError):
                     raise problem or error from error
                 return Answer(Verdict.REFUSED, time_is_up(times.ms), kind=RefusalKind.TIME_UP)
             may_go_on = may_go_on and self._robot.is_linked_soon(frame.image.header.stamp,

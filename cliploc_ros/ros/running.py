@@ -3,8 +3,9 @@
 """What other programs learn of a relocalizer: its diagnostics, its parameters, its topics."""
 
 import math
+import re
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -115,16 +116,27 @@ class Running:
     topics: list[str]  #: Its remappings, NAME:=TOPIC
 
 
-def ask(name: str, patience_s: float) -> Running:
-    """Return parameters, topics and state of a relocalizer; finding it may take `patience_s`.
+def whole_name(name: str) -> str:
+    """Return the name of a node with its namespace: this program's where it is relative.
 
-    NotRunningError: it does not answer. OptionsError: no node can have this name.
+    OptionsError: no node can have this name.
     """
     check_name(name)
     node = Node('doctor_asks', start_parameter_services=False)
+    try:
+        return str(node.resolve_service_name(name))
+    finally:
+        node.destroy_node()
+
+
+def ask(name: str, patience_s: float) -> Running:
+    """Return parameters, topics and state of a relocalizer; finding it may take `patience_s`.
+
+    NotRunningError: it does not answer.
+    """
+    node = Node('doctor_asks', start_parameter_services=False)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    name = node.resolve_service_name(name)
     status, client = RelocalizerStatus(node, name), AsyncParameterClient(node, name)
     deadline = time.monotonic() + patience_s
     try:
@@ -150,20 +162,39 @@ def ask(name: str, patience_s: float) -> Running:
 
 
 def parameters_of_files(files: Sequence[Path], name: str) -> list[Parameter]:
-    """Return the relocalizer's parameters in files; the later ones count more.
+    """Return the parameters in files that ROS gives to a node; the later ones count more.
+
+    Parameters
+    ----------
+    name : str
+        Of the node, with its namespace.
 
     CliplocError: names the file and what is wrong with it.
     """
     found: dict[str, Any] = {}
-    base = name.rpartition('/')[2]
+    others: list[str] = []
     for file in files:
-        for node, content in read_parameter_file(file).items():
-            if node.rpartition('/')[2] in ('**', '*', base) and isinstance(content, dict):
-                found |= _flat(content.get('ros__parameters') or {})
+        for pattern, values in _nodes_of(read_parameter_file(file)):
+            # of the whole name, ** is any number of words, and * is one
+            words = ['(/[^/]+)*' if word == '**' else '/[^/]+' if word == '*' else
+                     f'/{re.escape(word)}' for word in pattern.split('/') if word]
+            if re.fullmatch(''.join(words), name):
+                found |= _flat(values)
+            else:
+                others.append(pattern)
     if not found:
-        raise OptionsError(f'{", ".join(map(str, files))}: no parameters of {base} or /**; name '
-                           'the node with --relocalizer')
+        raise OptionsError(f'{", ".join(map(str, files))}: no parameters of {name}, but of '
+                           f'{", ".join(others) or "no node"}; name the node with --relocalizer')
     return [Parameter(name, value=value) for name, value in found.items() if value is not None]
+
+
+def _nodes_of(tree: dict[str, Any], prefix: str = '') -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the nodes of a file, whose namespaces may be nested, and their parameters."""
+    for key, content in tree.items():
+        if key == 'ros__parameters':
+            yield prefix, content if isinstance(content, dict) else {}
+        elif isinstance(content, dict):
+            yield from _nodes_of(content, f'{prefix}/{key.strip("/")}')
 
 
 def _flat(tree: dict[str, Any], prefix: str = '') -> dict[str, Any]:

@@ -31,7 +31,7 @@ from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
 from cliploc_ros.ros.inputs.localizer_pose import LaterError, LocalizerPose
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
-from cliploc_ros.ros.node.diagnostics import Health
+from cliploc_ros.ros.node.diagnostics import Health, join_names
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -95,6 +95,7 @@ class Watcher:
         self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
         if self.is_on:
             handoff.on_shown(self._pose.hear)
+            pipeline.on_map = lambda: self._drop('a map was loaded')
             robot.odometry.on_restart(lambda _: self._drop('odom restarted'))
             self._localized = node.create_publisher(Bool, '~/localized', qos.LATCHED)
             self._state = node.create_publisher(String, '~/localization_state', qos.LATCHED)
@@ -145,7 +146,7 @@ class Watcher:
             health.values |= {
                 'watch probability': f'{report.probability:.3f}', 'watch looks': report.looks,
                 'watch matched': f'{report.matched} of {report.expected} expected',
-                'watch missing': ', '.join(report.missing), 'watch fault': report.fault,
+                'watch missing': join_names(report.missing), 'watch fault': report.fault,
                 'watch camera': turned,
                 'watch last look [s]': f'{time.monotonic() - known.looked_at:.1f}'}
             for problem in filter(None, (report.fault, turned)):

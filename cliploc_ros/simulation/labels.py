@@ -96,14 +96,11 @@ def similarities_of(crops: NDArray[np.float64], strength: float, noise: NDArray[
 def _label_vector(landmark_map: LandmarkMap, row: int) -> NDArray[np.float64]:
     """Return the mean vector of a landmark's labels."""
     labels = landmark_map.details[row].labels if landmark_map.details else None
-    vectors = [weight * _text_vector(text)
-               for text, weight in labels or ((landmark_map.labels[row], 1.0),)]
+    vectors = []
+    for text, weight in labels or ((landmark_map.labels[row], 1.0),):
+        words = [word for word in re.findall(r'\w+', text.lower()) if word not in _STOP_WORDS]
+        vectors.append(weight * _unit(np.sum([*map(_direction, words or [text])], axis=0)))
     return _unit(np.sum(vectors, axis=0))
-
-
-def _text_vector(text: str) -> NDArray[np.float64]:
-    words = [word for word in re.findall(r'\w+', text.lower()) if word not in _STOP_WORDS]
-    return _unit(np.sum([_direction(word) for word in words or [text]], axis=0))
 
 
 def _direction(text: str) -> NDArray[np.float64]:

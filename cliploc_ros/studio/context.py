@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, KeyframeLayer
-from cliploc_ros.core.map.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from cliploc_ros.datasets.depth import points_in_color
 from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.studio.floor import FREE, OCCUPIED, OccupancyGrid
 from cliploc_ros.studio.images import Images
-from cliploc_ros.studio.viewpoint import Extent, wxyz_of
+from cliploc_ros.studio.viewpoint import Bounds, wxyz_of
 
 #: More points slow the browser down.
 MAX_POINTS = 100_000
@@ -46,7 +46,7 @@ class Cloud(NamedTuple):
 
 
 def find_cloud(detections: PosedDetections | None, images: Images | None,
-               layer: KeyframeLayer | None, extent: Extent) -> Cloud | None:
+               layer: KeyframeLayer | None, extent: Bounds) -> Cloud | None:
     """Return the points of a map's surfaces; None where nothing is known of them.
 
     CliplocError: an image or depth image cannot be read.
@@ -113,7 +113,7 @@ def draw_cloud(scene: viser.SceneApi, cloud: Cloud) -> viser.PointCloudHandle:
                                  point_shape='square')
 
 
-def draw_lines(scene: viser.SceneApi, extent: Extent) -> viser.GridHandle:
+def draw_lines(scene: viser.SceneApi, extent: Bounds) -> viser.GridHandle:
     """Draw the lines of the floor, half a metre apart."""
     side = 2.0 * float(np.ceil(1.3 * extent.radius_m)) + 2.0
     below = extent.middle - (extent.middle @ extent.up - extent.floor_m) * extent.up

@@ -27,7 +27,7 @@ from cliploc_ros.studio.map_file import ChangedOnDiskError
 from cliploc_ros.studio.panels import Actions
 from cliploc_ros.studio.sightings import SightingFinder, crop_of
 from cliploc_ros.studio.tool_panels import LivePanel, PlacesPanel
-from cliploc_ros.studio.web import Answer
+from cliploc_ros.studio.web import Content
 
 if TYPE_CHECKING:
     from cliploc_ros.studio.live import LiveRelocalizer
@@ -330,7 +330,7 @@ class Desk:
 
     # ---- pictures -------------------------------------------------------------------------------
 
-    def picture(self, path: str) -> Answer | None:
+    def picture(self, path: str) -> Content | None:
         """Return the image of a view, or a crop: /image/ANY/VIEW, /crop/ANY/VIEW/X,Y,X,Y."""
         kind, *words = path.strip('/').split('/')
         studio = self._studio
@@ -355,10 +355,10 @@ class Desk:
         return None if image is None else _jpeg(image)
 
 
-def _jpeg(image: NDArray[np.uint8]) -> Answer:
+def _jpeg(image: NDArray[np.uint8]) -> Content:
     done, content = cv2.imencode('.jpg', image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     assert done
-    return Answer(content.tobytes(), '.jpg', True)
+    return Content(content.tobytes(), '.jpg', True)
 
 
 def _axes_of(outline: Outline) -> list[float]:

@@ -19,8 +19,8 @@ from cliploc_ros.files.log import Log
 from cliploc_ros.studio.edits import Change, EditError, Landmarks, change_from_json
 from cliploc_ros.studio.landmark import (
     KNOWN_FIELDS,
+    Encoded,
     Landmark,
-    Look,
     Marks,
     look_from_json,
     map_of,
@@ -340,7 +340,7 @@ class Document:
         if count and not self.is_saved:
             self.notes += (f'restored {count} edits that were not saved; undo takes them back',)
 
-    def _restore_start(self, entries: list[dict[str, Any]], looks: Mapping[str, Look]) -> None:
+    def _restore_start(self, entries: list[dict[str, Any]], looks: Mapping[str, Encoded]) -> None:
         """Restore the state that belongs to the file's content: its marks and looks.
 
         Marks before a content that was written come from the header and the edits up to it. A

@@ -18,8 +18,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.studio.landmark import (
     LEAST_SEMI_AXIS_M,
+    Encoded,
     Landmark,
-    Look,
     Marks,
     map_of,
     merge_looks,
@@ -80,7 +80,7 @@ class Change:
         return {'what': self.what, 'before': side(self.before), 'after': side(self.after)}
 
 
-def change_from_json(tree: Any, looks: Mapping[str, Look]) -> Change:
+def change_from_json(tree: Any, looks: Mapping[str, Encoded]) -> Change:
     """Return a change from JSON; looks are found by key, and missing ones are left out.
 
     ValueError, MapError: it is none, or a landmark is invalid.
@@ -183,7 +183,7 @@ def mark(landmarks: Landmarks, landmark_ids: Iterable[str], what: str, **marks: 
 
 
 def create(landmarks: Landmarks, label: str, class_id: str, center: NDArray[np.float64],
-           basis: NDArray[np.float64], look: Look | None = None) -> Change:
+           basis: NDArray[np.float64], look: Encoded | None = None) -> Change:
     """Add a landmark of a centre (3,) and a basis (3, 3), whose columns are the semi-axes [m].
 
     The change has one id, that of the new landmark.

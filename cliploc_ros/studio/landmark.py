@@ -33,7 +33,7 @@ LEAST_SEMI_AXIS_M = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class Encoded:
     """What an image encoder saw of one landmark."""
 
     mean: NDArray[np.float16]  #: (d,): the mean direction of its crops, of unit length
@@ -54,18 +54,18 @@ class Look:
                 'medoids': base64.b64encode(self.medoids.tobytes()).decode()}
 
 
-def look_from_json(tree: Mapping[str, Any]) -> Look | None:
+def look_from_json(tree: Mapping[str, Any]) -> Encoded | None:
     """Return a look from JSON; None where it is damaged."""
     try:
         mean, medoids = (np.frombuffer(base64.b64decode(tree[name], validate=True), np.float16)
                          for name in ('mean', 'medoids'))
-        look = Look(mean, medoids.reshape(-1, len(mean)), str(tree['encoder']))
+        look = Encoded(mean, medoids.reshape(-1, len(mean)), str(tree['encoder']))
     except (KeyError, TypeError, ValueError):
         return None
     return look if look.key == tree.get('look') else None
 
 
-def merge_looks(looks: Sequence[Look | None], weights: Sequence[float]) -> Look | None:
+def merge_looks(looks: Sequence[Encoded | None], weights: Sequence[float]) -> Encoded | None:
     """Return the look of one landmark that several become; None where no look is known.
 
     The weights are, for example, the numbers of boxes. Looks of another encoder than the first
@@ -85,16 +85,17 @@ def merge_looks(looks: Sequence[Look | None], weights: Sequence[float]) -> Look 
     crops = np.concatenate([look.medoids for look, _ in known]).astype(np.float32)
     shares = np.concatenate([np.full(len(look.medoids), weight / max(1, len(look.medoids)))
                              for look, weight in known])
-    return Look((mean / length).astype(np.float16),
-                crops[choose_medoids(crops, shares)].astype(np.float16), known[0][0].encoder_key)
+    return Encoded(
+        (mean / length).astype(np.float16),
+        crops[choose_medoids(crops, shares)].astype(np.float16), known[0][0].encoder_key)
 
 
-def looks_of(embeddings: LandmarkEmbeddings) -> dict[str, Look]:
+def looks_of(embeddings: LandmarkEmbeddings) -> dict[str, Encoded]:
     """Return the known looks by id of the landmark."""
     offsets = embeddings.medoid_offsets
-    return {landmark_id: Look(embeddings.means[row],
-                              embeddings.medoids[offsets[row]:offsets[row + 1]],
-                              embeddings.encoder_key)
+    return {landmark_id: Encoded(embeddings.means[row],
+                                 embeddings.medoids[offsets[row]:offsets[row + 1]],
+                                 embeddings.encoder_key)
             for row, landmark_id in enumerate(embeddings.landmark_ids)
             if embeddings.is_known[row]}
 
@@ -122,7 +123,7 @@ class Landmark:
 
     fields: Mapping[str, Any]  #: As in the map file, below the landmark's id
     marks: Marks = Marks()
-    look: Look | None = field(default=None, compare=False)  #: From the file next to the map
+    look: Encoded | None = field(default=None, compare=False)  #: From the file next to the map
 
     @cached_property
     def details(self) -> LandmarkDetails:

@@ -27,6 +27,7 @@ from std_srvs.srv import Trigger
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.ros import qos
+from cliploc_ros.ros.node.diagnostics import split_names
 
 # The relocalizer reports once a second. While it loads libraries it may be late (a guess).
 _SILENCE_S = 10.0
@@ -198,7 +199,7 @@ class LiveRelocalizer:
                          map_file=values.get('map file', ''),
                          base_frame=values.get('base frame', ''),
                          watch=values.get('watch reason', ''),
-                         missing=tuple(filter(None, values.get('watch missing', '').split(', '))))
+                         missing=split_names(values.get('watch missing', '')))
 
     def _change(self, **values: Any) -> None:
         with self._lock:

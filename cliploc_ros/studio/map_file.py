@@ -31,7 +31,7 @@ from cliploc_ros.core.map.map_file import quoted
 from cliploc_ros.core.map.parameter_file import parse_parameters, read_text
 from cliploc_ros.errors import MapError
 from cliploc_ros.files.storage import replace_file
-from cliploc_ros.studio.landmark import DECIMALS, Landmark, Look, looks_of, map_of
+from cliploc_ros.studio.landmark import DECIMALS, Encoded, Landmark, looks_of, map_of
 
 _PARAMETERS = 'ros__parameters'
 _GEOMETRY = ('center', 'semi_axes', 'orientation')
@@ -309,7 +309,7 @@ class LookFile(NamedTuple):
 
     path: Path
     encoder_key: str
-    looks: Mapping[str, Look]
+    looks: Mapping[str, Encoded]
     state: tuple[int, int] | None
 
     def write(self, landmarks: Mapping[str, Landmark]) -> tuple['LookFile', str]:
@@ -329,7 +329,7 @@ class LookFile(NamedTuple):
         if _state_of(self.path) != self.state:
             return self, (f'{self.path.name}: another program changed this file, so the studio '
                           'leaves it as it is; build the map again, or remove the file')
-        nothing = Look(np.zeros(size, np.float16), np.empty((0, size), np.float16), '')
+        nothing = Encoded(np.zeros(size, np.float16), np.empty((0, size), np.float16), '')
         rows = [known.get(key, nothing) for key in looks]
         save_landmark_embeddings(self.path, LandmarkEmbeddings(
             self.encoder_key, tuple(looks), np.array([one.mean for one in rows]),
@@ -351,7 +351,7 @@ def read_look_file(map_path: Path) -> tuple[LookFile, str]:
     return LookFile(path, embeddings.encoder_key, looks_of(embeddings), state), ''
 
 
-def _keys_of(looks: Mapping[str, Look]) -> dict[str, str]:
+def _keys_of(looks: Mapping[str, Encoded]) -> dict[str, str]:
     return {key: look.key for key, look in looks.items()}
 
 

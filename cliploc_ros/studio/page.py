@@ -28,7 +28,7 @@ from cliploc_ros.studio.panels import Actions
 from cliploc_ros.studio.scene import Answers, Ellipsoids, Labels, ViewImage, draw_recording
 from cliploc_ros.studio.scene_panel import ScenePanel
 from cliploc_ros.studio.studio import SELECTED_RGB, Studio
-from cliploc_ros.studio.web import Answer, Board, Gate
+from cliploc_ros.studio.web import Board, Content, Gate
 
 if TYPE_CHECKING:
     from cliploc_ros.studio.live import LiveRelocalizer
@@ -203,7 +203,7 @@ def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | 
     """
     gate, pages = Gate(host), list[Page]()
 
-    def answer(path: str) -> Answer | None:
+    def answer(path: str) -> Content | None:
         return pages[0].desk.picture(path) if pages else None
 
     async def talk(connection: Any, person: str) -> None:

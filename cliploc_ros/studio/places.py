@@ -39,7 +39,7 @@ LIMIT_S = 60.0
 _OPTIONS = CheckOptions(max_positions=100, headings=8)
 
 
-class Places(NamedTuple):
+class Coverage(NamedTuple):
     """The coverage and the look-alikes of a map."""
 
     landmarks: Landmarks  #: That were checked
@@ -59,7 +59,7 @@ class Places(NamedTuple):
                 'views misled': f'{verdicts["misled"]} of {views}',
                 'pairs of places that look alike': str(len(self.look_alikes))}
 
-    def lines(self, before: 'Places | None') -> list[str]:
+    def lines(self, before: 'Coverage | None') -> list[str]:
         """Return the figures in lines, with those of the time before."""
         old = before.figures if before is not None else {}
         lines = [f'{name}: {value}' + (f' (was {old[name]})' if old else '')
@@ -69,8 +69,8 @@ class Places(NamedTuple):
         return [*lines, f'{self.detector}; similarities are simulated']
 
 
-def find_places(landmarks: Landmarks, recording: Recording | None, before: Places | None,
-                tell: Callable[[float], None], limit_s: float = LIMIT_S) -> Places:
+def find_places(landmarks: Landmarks, recording: Recording | None, before: Coverage | None,
+                tell: Callable[[float], None], limit_s: float = LIMIT_S) -> Coverage:
     """Return the places of a map where a robot would be accepted, refused or misled.
 
     The recording gives the camera's height and the detector's errors. The positions of the time
@@ -93,8 +93,8 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Place
         if is_whole and time.monotonic() - begin > limit_s:
             break
     look_alikes = find_look_alikes(landmark_map)
-    return Places(landmarks, grid, judge_grid(grid, model, trials, _OPTIONS.headings),
-                  tuple(look_alikes), detector)
+    return Coverage(landmarks, grid, judge_grid(grid, model, trials, _OPTIONS.headings),
+                    tuple(look_alikes), detector)
 
 
 def _detector(landmark_map: LandmarkMap, recording: Recording | None
@@ -115,7 +115,7 @@ def _detector(landmark_map: LandmarkMap, recording: Recording | None
                              recording.options), 'the detector is as in the recording')
 
 
-def _grid(landmark_map: LandmarkMap, recording: Recording | None, before: Places | None) -> Grid:
+def _grid(landmark_map: LandmarkMap, recording: Recording | None, before: Coverage | None) -> Grid:
     """Return positions all over the map, those of the time before if their corners agree."""
     poses = None if recording is None else recording.detections.of_first_camera
     grid = make_grid(landmark_map, poses, _OPTIONS)
@@ -144,8 +144,8 @@ class PlacesSearch:
         self._lock = threading.Lock()
         self.share = 0.0
         # the last two results, and why the last search found nothing
-        self.before: Places | None = None
-        self.last: Places | None = None
+        self.before: Coverage | None = None
+        self.last: Coverage | None = None
         self.failure = ''
 
     @property

@@ -43,7 +43,7 @@ from cliploc_ros.mapping.views import Views, camera_centers, make_views
 from cliploc_ros.simulation.labels import LabelModel
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.edits import Change, EditError, Landmarks
-from cliploc_ros.studio.landmark import Look, looks_of, map_of
+from cliploc_ros.studio.landmark import Encoded, looks_of, map_of
 
 #: Fewer boxes leave an ellipsoid open.
 LEAST_BOXES = 3
@@ -55,7 +55,7 @@ _STRETCH = 2.0
 WRONG_M = 1.0
 
 
-class Answer(NamedTuple):
+class ViewAnswer(NamedTuple):
     """The relocalizer's answer in one view; the errors are of the best pose, accepted or not."""
 
     view: int
@@ -110,7 +110,7 @@ class Recording:
         first, last = self.detections.frame_offsets[view:view + 2]
         return self.detections.bboxes_xyxy[first:last]
 
-    def look_of(self, rows: NDArray[np.int64], encoder_key: str) -> Look | None:
+    def look_of(self, rows: NDArray[np.int64], encoder_key: str) -> Encoded | None:
         """Return the look that an encoder has of some boxes; None where it saw none of them."""
         detections = self.detections
         if detections.encoder_key != encoder_key or detections.embeddings is None or not len(rows):
@@ -165,7 +165,7 @@ class Recording:
         return check_landmarks(landmark_map, witness, overlaps, self.options), overlaps
 
     def relocalize(self, landmarks: Landmarks, views: Sequence[int],
-                   keyframes: RecordedKeyframes | None = None) -> list[Answer]:
+                   keyframes: RecordedKeyframes | None = None) -> list[ViewAnswer]:
         """Return the relocalizer's answers in some views; MapError without landmarks.
 
         An accepted pose that is off by more than a metre is wrong. Keyframes of a view's time are
@@ -191,13 +191,13 @@ class Recording:
                 similarities)], None if keyframes is None
                 else keyframes.recognizer(detections, view))
             if result.map_from_camera is None:
-                answers.append(Answer(view, 'refused', None, None, result))
+                answers.append(ViewAnswer(view, 'refused', None, None, result))
                 continue
             error_m, error_deg = pose_error(result.map_from_camera,
                                             detections.map_from_camera[view])
-            answers.append(Answer(view, 'refused' if not result.accepted else
-                                  'wrong' if error_m > WRONG_M else 'accepted',
-                                  error_m, error_deg, result))
+            answers.append(ViewAnswer(view, 'refused' if not result.accepted else
+                                      'wrong' if error_m > WRONG_M else 'accepted',
+                                      error_m, error_deg, result))
         return answers
 
 

@@ -23,7 +23,7 @@ from cliploc_ros.studio.landmark import map_of
 from cliploc_ros.studio.recording import Recording
 
 
-class Review:
+class ReviewQueue:
     """The queue of landmarks, and the decisions on them."""
 
     def __init__(self, document: Document, recording: Recording | None):
@@ -104,8 +104,11 @@ class Review:
         if self._recording is None or not self.has_boxes:
             raise EditError(f'{landmark_id}: there are no boxes to fit it to: edit, accept or '
                             'delete it')
-        landmarks, partner = self._document.landmarks, self._partner(landmark_id)
-        if partner is not None:
+        landmarks = self._document.landmarks
+        pairs = [pair for pair in self._duplicates if landmark_id in pair
+                 and all(key in landmarks for key in pair)]
+        if pairs:  # the nearest first
+            partner = pairs[0][pairs[0][0] == landmark_id]
             change, how = self._recording.merged(landmarks, [landmark_id, partner])
             what = f'merged {landmark_id} with {partner} {how}'
         else:
@@ -155,12 +158,6 @@ class Review:
             return f'{what}; the review is complete'
         self._document.select(rest[:1])
         return what
-
-    def _partner(self, landmark_id: str) -> str | None:
-        """Return the nearest landmark of which this one is a duplicate."""
-        pairs = [pair for pair in self._duplicates if landmark_id in pair
-                 and all(key in self._document.landmarks for key in pair)]
-        return None if not pairs else pairs[0][pairs[0][0] == landmark_id]
 
     def _judge(self) -> None:
         landmarks = self._document.landmarks

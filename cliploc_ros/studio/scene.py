@@ -17,7 +17,7 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.studio.edits import Landmarks
 from cliploc_ros.studio.landmark import Landmark
-from cliploc_ros.studio.recording import Answer
+from cliploc_ros.studio.recording import ViewAnswer
 from cliploc_ros.studio.viewpoint import pixels_of, wxyz_of
 
 # More labels than these hide the map.
@@ -254,9 +254,9 @@ class Answers:
 
     def __init__(self, scene: viser.SceneApi, detections: PosedDetections):
         self._scene, self._poses = scene, detections.map_from_camera
-        self._shown: tuple[Answer, ...] = ()
+        self._shown: tuple[ViewAnswer, ...] = ()
 
-    def show(self, answers: tuple[Answer, ...]) -> None:
+    def show(self, answers: tuple[ViewAnswer, ...]) -> None:
         """Show these answers instead of the last ones."""
         if answers is self._shown:
             return

@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.map.occupancy_grid import OccupancyGrid
 from cliploc_ros.mapping.check.relocalization import RecordedKeyframes, sample_frames
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
 from cliploc_ros.studio.edits import EditError
+from cliploc_ros.studio.floor import OccupancyGrid
 from cliploc_ros.studio.images import Images, Outline, Pixel, landmark_at, outlines_of
 from cliploc_ros.studio.landmark import Landmark
 from cliploc_ros.studio.new_landmark import NewLandmark
 from cliploc_ros.studio.phrases import FoundPhrases, PhraseFinder, Question
-from cliploc_ros.studio.recording import Answer, Recording
-from cliploc_ros.studio.review import Review
-from cliploc_ros.studio.viewpoint import Extent, extent_of
+from cliploc_ros.studio.recording import Recording, ViewAnswer
+from cliploc_ros.studio.review import ReviewQueue
+from cliploc_ros.studio.viewpoint import Bounds, extent_of
 
 Rgb = tuple[int, int, int]
 SELECTED_RGB: Rgb = (255, 220, 0)
@@ -66,11 +66,11 @@ class Studio:
         self.finder = finder
         self.recording = recording
         self.images = images
-        self.review = Review(document, recording)
+        self.review = ReviewQueue(document, recording)
         self.new = None if recording is None else NewLandmark(document, recording)
         self.view = 0
         #: The relocalizer's answers that are shown; an edit leaves them as they are.
-        self.answers: tuple[Answer, ...] = ()
+        self.answers: tuple[ViewAnswer, ...] = ()
         # of the last run over the whole recording, by verdict
         self._counts: dict[str, int] = {}
         self._colors: dict[str, Rgb] = {}
@@ -79,7 +79,7 @@ class Studio:
         if recording is not None and recording.detections.encoder_key:
             document.take_encoder(recording.detections.encoder_key)
 
-    def extent(self) -> Extent:
+    def extent(self) -> Bounds:
         """Return where the map is, by its landmarks and by the cameras that saw it."""
         poses = (self.recording.detections.map_from_camera if self.recording is not None
                  else self.layer.map_from_camera if self.layer is not None

@@ -17,7 +17,7 @@ from cliploc_ros.evaluation.map_check.page import LOOK_ALIKE, MISLED
 from cliploc_ros.mapping.check.places import RADIUS_M
 from cliploc_ros.mapping.check.report import GridCheck
 from cliploc_ros.studio.panels import Actions
-from cliploc_ros.studio.places import Places, PlacesSearch
+from cliploc_ros.studio.places import Coverage, PlacesSearch
 from cliploc_ros.studio.scene import Ellipsoids, linear
 from cliploc_ros.studio.viewpoint import wxyz_of
 
@@ -63,7 +63,7 @@ class PlacesPanel:
     def __init__(self, actions: Actions):
         self._actions = actions
         self.search = PlacesSearch(actions.studio, actions.changed.set)
-        self._shown: Places | None = None
+        self._shown: Coverage | None = None
         self._coverage: list[Any] = []
         self._links: list[Any] = []
         self.shows_coverage = self.shows_links = True
@@ -110,7 +110,7 @@ class PlacesPanel:
             for handle in handles:
                 handle.visible = is_shown and self._is_wanted
 
-    def _draw_coverage(self, places: Places) -> list[Any]:
+    def _draw_coverage(self, places: Coverage) -> list[Any]:
         scene, check = self._actions.server.scene, places.check
         if not len(check.positions):
             return []
@@ -138,7 +138,7 @@ class PlacesPanel:
                                         thickness_units='screen')
         return [tiles, lines]
 
-    def _draw_links(self, places: Places) -> list[Any]:
+    def _draw_links(self, places: Coverage) -> list[Any]:
         """Draw circles around places that look alike, and lines between their landmarks."""
         angles = np.linspace(0.0, 2.0 * np.pi, _CIRCLE_POINTS + 1)
         ring = RADIUS_M * np.column_stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)])
@@ -167,7 +167,7 @@ def tile_colors(check: GridCheck) -> NDArray[np.uint8]:
     return np.asarray(colors.round(), dtype=np.uint8)
 
 
-def _floor(places: Places) -> float:
+def _floor(places: Coverage) -> float:
     """Return the height of the floor: 0 where the landmarks begin a storey above it or less."""
     low = np.quantile([one.center[2] - one.semi_axes.max() for one in places.landmarks.values()],
                       0.03)

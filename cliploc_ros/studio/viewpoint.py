@@ -35,7 +35,7 @@ USUAL_ASPECT = 0.6
 _FLIGHTS: WeakKeyDictionary[Any, object] = WeakKeyDictionary()
 
 
-class Extent(NamedTuple):
+class Bounds(NamedTuple):
     """Where the map is."""
 
     middle: NDArray[np.float64]  #: (3,) [m]
@@ -61,7 +61,7 @@ def up_direction(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return z if found is None or found[1] < _SAME_UP_DEG else np.asarray(found[0].T @ z)
 
 
-def extent_of(centers: NDArray[np.float64], poses: NDArray[np.float64]) -> Extent:
+def extent_of(centers: NDArray[np.float64], poses: NDArray[np.float64]) -> Bounds:
     """Return the extent of landmarks (n, 3) and the cameras (m, 4, 4) that saw them [m]."""
     up = up_direction(poses)
     points = np.concatenate([centers, poses[:, :3, 3]])
@@ -76,11 +76,11 @@ def extent_of(centers: NDArray[np.float64], poses: NDArray[np.float64]) -> Exten
     aside = aside - (aside @ up) * up
     if np.linalg.norm(aside) < 0.3:
         aside = rotation_to_z(up)[0].T @ [-1.0, -1.0, 0.0]
-    return Extent(middle, max(1.0, float(np.quantile(distances, _EXTENT_SHARE))), up, floor_m,
+    return Bounds(middle, max(1.0, float(np.quantile(distances, _EXTENT_SHARE))), up, floor_m,
                   float((points @ up).max()), aside / np.linalg.norm(aside))
 
 
-def overview(extent: Extent, aspect: float, is_from_above: bool = False) -> NDArray[np.float64]:
+def overview(extent: Bounds, aspect: float, is_from_above: bool = False) -> NDArray[np.float64]:
     """Return the position (3,) that sees all of a map, from the side of its cameras or from above.
 
     ``aspect`` is the width of the page by its height. From above, y is up on the page.

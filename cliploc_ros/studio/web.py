@@ -36,7 +36,7 @@ _POLICY = ("default-src 'self'; img-src 'self' data:; style-src 'self' 'unsafe-i
            "frame-ancestors 'self'")
 
 
-class Answer(NamedTuple):
+class Content(NamedTuple):
     """What a path has: a file's content, and the ending of its name."""
 
     content: bytes
@@ -124,7 +124,7 @@ class Gate:
         return f'/{rest}' if is_known else None
 
     @contextmanager
-    def guard(self, answer: Callable[[str], Answer | None],
+    def guard(self, answer: Callable[[str], Content | None],
               talk: Callable[[Any, str], Any]) -> Iterator[None]:
         """Let a viser server that starts inside of the block ask this gate first.
 
@@ -143,7 +143,7 @@ class Gate:
             async def process(connection: Any, request: Request) -> Any:
                 path = self.admit(request)
                 if path is None:
-                    return _response(http.HTTPStatus.FORBIDDEN, Answer(
+                    return _response(http.HTTPStatus.FORBIDDEN, Content(
                         b'refused: use the address that the studio printed\n', '', False))
                 request.path = path
                 if request.headers.get('Upgrade', '').lower() == 'websocket':
@@ -156,7 +156,7 @@ class Gate:
                 found = _file(path) or (None if is_foreign else
                                         await asyncio.to_thread(answer, path))
                 if found is None:
-                    return _response(http.HTTPStatus.NOT_FOUND, Answer(b'not found\n', '', False))
+                    return _response(http.HTTPStatus.NOT_FOUND, Content(b'not found\n', '', False))
                 return _response(http.HTTPStatus.OK, found)
 
             return serve(handle, *args, process_request=process, **options)
@@ -168,15 +168,15 @@ class Gate:
             websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
-def _file(path: str) -> Answer | None:
+def _file(path: str) -> Content | None:
     """Return one of the page's own files."""
     name = path.lstrip('/') or 'studio.html'
     if name not in ('studio.html', 'studio.css', 'studio.js'):
         return None
-    return Answer((_FILES / name).read_bytes(), Path(name).suffix, False)
+    return Content((_FILES / name).read_bytes(), Path(name).suffix, False)
 
 
-def _response(status: http.HTTPStatus, answer: Answer) -> Response:
+def _response(status: http.HTTPStatus, answer: Content) -> Response:
     headers = Headers({
         'Content-Type': _TYPES.get(answer.suffix, 'text/plain'),
         'Content-Length': str(len(answer.content)), 'Content-Security-Policy': _POLICY,

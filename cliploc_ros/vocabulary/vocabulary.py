@@ -10,7 +10,10 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import OptionsError, did_you_mean
@@ -32,6 +35,13 @@ _GENERAL = 'general'
 _ALIKE = 0.75
 # More pairs of classes take seconds to compare.
 _MOST_PAIRS = 100_000
+
+
+class Phrases(NamedTuple):
+    """Some phrases: P texts and their embeddings (P, d), unit rows."""
+
+    texts: tuple[str, ...]
+    embeddings: NDArray[np.float32]
 
 
 def expand_phrases(rules: Rules) -> tuple[str, ...]:

@@ -257,7 +257,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
                           help='families whose name contains one of these')
     families.add_argument('--matching', choices=fit.MATCHINGS,
                           help='(by labels for changed maps, else by classes)')
-    priors = add('priors', _priors, 'what regions and walls known before add, right and wrong')
+    priors = add('priors', _priors, 'what regions known before add, right and wrong')
     add_arguments(priors, worlds=20, first_seed=1100)
     robustness = add('robustness', _robustness, 'success and false accepts over growing troubles',
                      'draw them')

@@ -17,8 +17,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.evaluation.sensors import with_neighbours
 from cliploc_ros.evaluation.trials import Query
-from cliploc_ros.simulation.sensors import with_neighbours
 from studies.acceptance.places import (
     STEP_DEG,
     STEP_M,
@@ -106,7 +106,8 @@ class Answer(NamedTuple):
     accepted: bool
 
 
-class MakeWalker(NamedTuple):
+@dataclass(frozen=True)
+class MakeWalker:
     """Makes the function that answers at a place after one image, two and so on."""
 
     vertical: bool

@@ -12,14 +12,15 @@ import numpy as np
 
 from cliploc_ros.command import positive_int
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.datasets.queries import Queries, load_queries
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.sensors import simulate_depths, with_neighbours, with_vertical
 from cliploc_ros.evaluation.trials import Query, make_queries
-from cliploc_ros.evaluation.watching import observation_of
 from cliploc_ros.mapping.building import build_map
-from cliploc_ros.simulation.sensors import simulate_depths, with_neighbours, with_vertical
+from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.units import NS_PER_S
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
@@ -237,3 +238,16 @@ def chosen_places(options: argparse.Namespace) -> list[AnyPlace]:
         raise OptionsError('nothing to test: give --queries and --map, --observations, or '
                            '--worlds')
     return places
+
+
+def observation_of(recorded: PosedDetections, row: int, stamp_ns: int) -> Observation:
+    """Return a frame of a recording as an observation by class."""
+    boxes = slice(recorded.frame_offsets[row], recorded.frame_offsets[row + 1])
+    odom = None if recorded.odom_from_camera is None else recorded.odom_from_camera[row]
+    return Observation(
+        recorded.camera_of(row), Detections(
+            recorded.bboxes_xyxy[boxes],
+            tuple(recorded.class_names[one] for one in recorded.classes[boxes]),
+            recorded.scores[boxes]), stamp_ns=stamp_ns, camera_name=recorded.name_of(row),
+        depths=None if recorded.depths is None else recorded.depths[boxes].astype(np.float64),
+        odom_from_camera=None if odom is None or np.isnan(odom).any() else odom)

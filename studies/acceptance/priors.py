@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a robot knows before its camera shows anything: right, wrong, and at a twin; walls."""
+"""What a robot knows before its camera shows anything: right, wrong, and at a twin."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance.look_alikes import find_alike
 from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.map.occupancy_grid import OCCUPIED, OccupancyGrid
 from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Region
 from cliploc_ros.evaluation.trials import Query
 from studies.acceptance.places import ALL, LEVEL, ONE
@@ -21,8 +20,6 @@ from studies.acceptance.troubles import Trouble, World, unchanged
 # A wrong region is further from the truth than this, where the map is large enough [m].
 _WRONG_M, _TRIES = 2.5, 50
 _PROBABILITY = 0.9
-# Cells of the grid, and the height of a lidar's plane [m].
-_CELL_M, _PLANE_M = 0.05, 0.25
 _MODES = (ONE, LEVEL, ALL)
 
 
@@ -74,27 +71,6 @@ def tell_twin(landmark_map: LandmarkMap, queries: Sequence[Query], wrong: float,
     return landmark_map, found
 
 
-def see_walls(landmark_map: LandmarkMap, queries: Sequence[Query], wrong_m: float,
-              rng: np.random.Generator) -> World:
-    """Add an occupancy grid of the place, with what stands on its floor; it is off by a step."""
-    low, high = landmark_map.centers[:, :2] - 0.3, landmark_map.centers[:, :2] + 0.3
-    cameras = np.array([one.map_from_camera[:2, 3] for one in queries])
-    first = np.minimum(low.min(axis=0), cameras.min(axis=0) - 0.3)
-    count = np.ceil((np.maximum(high.max(axis=0), cameras.max(axis=0) + 0.3) - first) / _CELL_M)
-    columns, rows = count.astype(int)
-    x, y = (first[:, None, None] + _CELL_M * np.indices((columns, rows))).transpose(0, 2, 1)
-    cells = np.zeros((rows, columns), dtype=np.int8)
-    sizes = landmark_map.semi_axes
-    for row in np.nonzero(landmark_map.centers[:, 2] - sizes.max(axis=1) < _PLANE_M)[0]:
-        cells[np.hypot(x - landmark_map.centers[row, 0], y - landmark_map.centers[row, 1])
-              < np.median(sizes[row])] = OCCUPIED
-    cells[[0, 1, -2, -1]] = cells[:, [0, 1, -2, -1]] = OCCUPIED
-    step = wrong_m * rng.choice((-1.0, 1.0), 2) / np.sqrt(2.0)
-    grid = OccupancyGrid(landmark_map.frame_id, cells, _CELL_M, (*(first + step).tolist(), 0.0))
-    return landmark_map, [replace(one, observation=replace(one.observation, grid=grid))
-                          for one in queries]
-
-
 _REGION, _POSE = (1.0, 1.0, 10.0), (0.3, 0.3, np.radians(15.0))
 
 
@@ -107,6 +83,5 @@ PRIORS = {
     'nothing told': Trouble(unchanged, modes=_MODES),
     'region of 1 m': Trouble(_of(tell, _REGION), (0.0, 0.1, 1.0), _MODES),
     'pose to .3 m and 15 degrees': Trouble(_of(tell, _POSE), (0.0, 0.1, 1.0), _MODES),
-    'walls, off by [m]': Trouble(see_walls, (0.0, 2.0), _MODES),
     'a twin exists, nothing told': Trouble(tell_twin, modes=_MODES),
     'a twin exists, told the twin': Trouble(_of(tell_twin, _POSE), (1.0,), _MODES)}

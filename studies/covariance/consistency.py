@@ -25,9 +25,9 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.evaluation.sensors import with_neighbours
 from cliploc_ros.evaluation.summary import wilson_interval
 from cliploc_ros.evaluation.trials import Query, make_queries
-from cliploc_ros.simulation.sensors import with_neighbours
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_world

@@ -42,8 +42,7 @@ from cliploc_ros.mapping.building import build_map
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
-from cliploc_ros.recording.networks import MAX_DETECTIONS
-from cliploc_ros.recording.networks import Look as Networks
+from cliploc_ros.recording.networks import MAX_DETECTIONS, RunNetworks
 from cliploc_ros.recording.recorder import record_every_frame
 from studies.keyframes.cases import (
     Case,
@@ -198,7 +197,7 @@ def _build(place: Place, folder: Path, looker: Looker) -> tuple[LandmarkMap, Key
             raw for raw in place.mapped
             if is_wanted(raw.place, raw.stamp_ns, raw.map_from_camera)))
         landmark_map = build_map(
-            record_every_frame(frames, Networks(looker.detect)).detections).landmark_map \
+            record_every_frame(frames, RunNetworks(looker.detect)).detections).landmark_map \
             if place.map_file is None else LandmarkMap.from_file(place.map_file)
         layer = build_layer(frames, landmark_map, LayerOptions(0.0, 0.0))
         print(f'{place.name}: {len(landmark_map)} landmarks, {len(layer)} keyframes, '

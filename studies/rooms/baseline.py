@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.datasets.depth import depths_of_points
-from cliploc_ros.datasets.frames import Frame
+from cliploc_ros.datasets.frames import PosedImage
 
 _MOST_FEATURES, _RATIO = 2000, 0.8
 # Nearest features vote for images; those with most votes are matched one by one.
@@ -22,7 +22,7 @@ _LEAST_INLIERS, _REPROJECTION_PX, _ITERATIONS = 12, 4.0, 2000
 class SiftMap:
     """The SIFT features of posed images with depth; those without depth are left out."""
 
-    def __init__(self, frames: Iterable[Frame]) -> None:
+    def __init__(self, frames: Iterable[PosedImage]) -> None:
         self._sift = cv2.SIFT.create(_MOST_FEATURES)
         self._points: list[NDArray[np.float64]] = []
         self._descriptors: list[NDArray[np.float32]] = []

@@ -23,14 +23,14 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.datasets.folders import FolderOptions, find_layout, read_folder
 from cliploc_ros.datasets.frames import DepthFormat, Frames, ImageFile, RawFrame, folder_frames
 from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.evaluation.sensors import with_vertical
 from cliploc_ros.evaluation.trials import ImageFeatures, Query
-from cliploc_ros.evaluation.watching import observation_of
 from cliploc_ros.files.storage import make_folder, write_file
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
-from cliploc_ros.simulation.sensors import with_vertical
 from cliploc_ros.units import NS_PER_S
+from studies.acceptance.places import observation_of
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]

@@ -4,7 +4,8 @@
 
 A simulated localizer drifts along with the robot, gets displaced, or the robot is carried away.
 ``judge`` does so in simulated worlds, ``recorded`` with recorded boxes, ``mount`` with a camera
-that is turned on its robot. ``cost`` measures time and memory. ``fit`` fits the evidence of looks.
+that is turned on its robot. ``localizer`` judges recorded poses of a real one. ``cost`` measures
+time and memory. ``fit`` fits the evidence of looks.
 """
 
 import argparse
@@ -15,14 +16,19 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from cliploc_ros.command import positive_int, run_command
+from cliploc_ros.command import not_negative, positive_int, run_command
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.datasets.observations import load_observations
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.watch.watch import Watch
+from cliploc_ros.datasets.observations import load_observations, load_recorded
+from cliploc_ros.datasets.tum import read_tum_trajectory
 from cliploc_ros.mapping.building import build_map
 from studies.acceptance.fit import FITTED_KINDS
 from studies.watch import fit
 from studies.watch.judge import Alarm, Right, alarm_table, judge, right_table
 from studies.watch.localizers import Drive, recorded_drive, simulated_drive
+from studies.watch.recordings import watch_recording, write_watch
 from studies.watch.sensors import measure_cost, mount_table
 from studies.worlds.places import KINDS
 
@@ -63,6 +69,15 @@ def _recorded(options: argparse.Namespace) -> None:
             drives.append(recorded_drive(name, recorded, built, sorted(
                 frame for _, is_main, frame in rows['queries'] if is_main)))
         _print(drives, len(drives), True, 'maps of the splits')
+
+
+def _localizer(options: argparse.Namespace) -> None:
+    truth = None if options.truth is None else read_tum_trajectory(options.truth)
+    relocalizer = Relocalizer(LandmarkMap.from_file(options.map), RelocalizerOptions(
+        matching='class', tilt_deviation_deg=options.tilt_deviation))
+    looks = watch_recording(load_recorded(options.observations), Watch(relocalizer), truth,
+                            options.period)
+    print(write_watch(options.out, looks))
 
 
 def _print(drives: Iterable[Drive], count: int, wrong_poses: bool, title: str) -> None:
@@ -106,6 +121,16 @@ def run(arguments: Sequence[str] | None = None) -> int:
     recorded.add_argument('--splits', type=Path, metavar='JSON', help='rows to map and to query')
     recorded.add_argument('--every', type=positive_int, default=4, metavar='N',
                           help='begin a drive at every N-th frame (%(default)s)')
+    own = add('localizer', _localizer, 'alarms at the recorded poses of a localizer')
+    own.add_argument('--observations', type=Path, required=True, metavar='NPZ',
+                     help='of build_map --record-to: boxes, poses of the localizer and odometry')
+    own.add_argument('--map', type=Path, required=True, metavar='YAML')
+    own.add_argument('--truth', type=Path, metavar='TUM', help='true poses of the camera')
+    own.add_argument('--period', type=not_negative, default=2.0, metavar='SECONDS',
+                     help='least time between two looks (%(default)s)')
+    own.add_argument('--tilt-deviation', type=float, default=40.0, metavar='DEG',
+                     help='of the camera off upright (%(default)s)')
+    own.add_argument('--out', type=Path, default=Path('watched'), metavar='DIR')
     mount = add('mount', lambda options: print(mount_table(
         options.kinds, range(options.first_seed, options.first_seed + options.worlds))),
         'the angle of a camera that is turned on its robot')

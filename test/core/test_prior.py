@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is known before: a region decides between look-alikes, and walls only lower."""
+"""What is known before: a region decides between look-alikes."""
 
 import math
 from dataclasses import replace
@@ -14,10 +14,8 @@ from test_joined_map import floor, join
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.confidence import confidences
-from cliploc_ros.core.acceptance.prior import Walls, region_odds, walls_against
-from cliploc_ros.core.acceptance.verdict import Evidence
+from cliploc_ros.core.acceptance.prior import region_odds
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.map.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Observation, Region
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -25,7 +23,6 @@ from cliploc_ros.errors import OptionsError
 
 TERMS = CALIBRATION.prior
 OPTIONS = RelocalizerOptions(matching='class')
-STRICT = replace(OPTIONS, min_confidence=0.96)
 TWINS = doubled_room(np.array([10.0, 0.0, 0.0]))
 LACKING = TWINS.select(range(21))
 ANY_YAW = 100.0
@@ -147,59 +144,3 @@ def test_no_prior_gives_more_than_the_objects_give_without_rivals(contenders):
     alone = [confidences(odds[[row]], poses[[row]], 2.0)[0] for row in range(len(odds))]
     assert (told <= np.array(alone) + 1e-9).all()
     assert told.sum() <= 1.0 + 1e-9
-
-
-def walled(cells, resolution_m=0.1, origin=(-3.0, -3.0, 0.0), frame_id='map'):
-    return OccupancyGrid(frame_id, cells, resolution_m, origin)
-
-
-OPEN = np.zeros((60, 160), dtype=np.int8)
-
-
-def test_walls_lower_the_confidence_and_are_named():
-    assert ask(make_room(), grid=walled(OPEN)).confidence == ask(make_room()).confidence
-    block, outside = OPEN.copy(), OPEN.copy()
-    block[20:40, 20:45] = OCCUPIED
-    outside[:] = UNKNOWN
-    for cells, text in ((block, 'in a wall'), (outside, 'outside of the known area')):
-        found = ask(make_room(), 4, STRICT, grid=walled(cells))
-        assert found.refusal_kind == 'obstructed'
-        assert text in found.reason
-        assert ask(make_room(), 12, STRICT, grid=walled(cells)).accepted
-    assert ask(make_room(), grid=walled(block, frame_id='else')).evidence.walls is None
-
-
-def test_a_wrong_grid_decides_between_no_twins():
-    wrong = OPEN.copy()
-    wrong[:, :80] = OCCUPIED  # where the camera is
-    assert not ask(grid=walled(wrong)).accepted
-
-
-def test_an_object_in_its_own_cells_is_seen_and_one_behind_a_wall_is_not():
-    room = make_room()
-    behind = OPEN.copy()
-    behind[:, 27:29] = OCCUPIED  # x from -.3 to -.1 m
-    hidden = [row for row in range(12) if room.centers[row, 0] < -1.0]
-    assert len(hidden) > TERMS.most_blocked
-    found = walls_against(room, walled(behind), MAP_FROM_CAMERA, hidden)
-    assert (found.blocked, found.seen) == (len(hidden), 0)
-    assert found.odds == TERMS.blocked * min(len(hidden), TERMS.most_blocked)
-    for row in range(12):
-        at_it = OPEN.copy()
-        x, y = ((room.centers[row, :2] + 3.0) / 0.1).astype(int)
-        at_it[y, x] = OCCUPIED
-        assert walls_against(room, walled(at_it), MAP_FROM_CAMERA, [row]).blocked == 0
-
-
-def test_free_ways_count_against_blocked_ones_and_no_more_than_the_limit():
-    ways = {(3, 0): 3, (3, 2): 1, (3, 3): 0, (1, 4): 0, (9, 0): 3, (9, 8): 1}
-    for (blocked, seen), counted in ways.items():
-        assert Walls(blocked=blocked, seen=seen).odds == counted * TERMS.blocked
-
-
-def test_walls_take_log_odds_from_the_probability():
-    for likely in (0.2, 0.9, 0.9999):
-        plain = Evidence(5, likely)
-        walls = replace(plain, walls=Walls(is_inside=True))
-        odds = [one.confidence / (1 - one.confidence) for one in (plain, walls)]
-        assert math.log(odds[1] / odds[0]) == pytest.approx(TERMS.in_wall)

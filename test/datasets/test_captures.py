@@ -30,7 +30,7 @@ from cliploc_ros.mapping.building import build_map
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.recording.networks import Look
+from cliploc_ros.recording.networks import RunNetworks
 from cliploc_ros.recording.recorder import (
     RecordingOptions,
     observation_file,
@@ -52,7 +52,7 @@ def look():
         if key not in seen:
             seen[key] = detect(image)
         return seen[key]
-    return Look(once)
+    return RunNetworks(once)
 
 
 @pytest.fixture(scope='session')

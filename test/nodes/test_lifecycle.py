@@ -210,6 +210,10 @@ def test_the_manager_hears_by_a_bond_whether_a_node_lives(manage, tester, room_m
         manager.do('deactivate', 'cleanup')
         tester.wait(lambda: KeyValue(key='relocalizer', value='dead') in heard, 'its end')
         heard.clear()
+    manager.do('configure', 'activate')
+    tester.wait(lambda: KeyValue(key='relocalizer', value='alive') in heard, 'its heartbeat')
+    assert process.stop(signal.SIGTERM)[0] == 0
+    tester.wait(lambda: KeyValue(key='relocalizer', value='dead') in heard, 'its last word')
     assert 'Traceback' not in process.output()
 
 

@@ -3,14 +3,16 @@
 """The relocalizer as a process: its inputs, modes and frames, floods, and its end."""
 
 import math
+import os
 import signal
 
 import cv2
 import numpy as np
 import pytest
+from processes import PROJECT
 from scene import MAP_FROM_CAMERA
 from sensor_msgs.msg import CompressedImage
-from tester import make_frame, transform_of
+from tester import class_matching, make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,
@@ -103,3 +105,26 @@ def test_signals_end_the_node(own_relocalizer, tester, signal_number, asked):
     assert code == 0, process.output()
     assert seconds < 2.0
     assert 'Traceback' not in process.output()
+
+
+def test_a_missing_transform_is_named_when_the_time_ends_in_the_next_look(start, tester, room_map):
+    path = f'{PROJECT / "test/nodes/stand_ins"}:{os.environ.get("PYTHONPATH", "")}'
+    process = start('nodes.relocalizer', parameters=class_matching(
+        room_map, base_frame='nowhere', timeout_s=2.0), PYTHONPATH=path)
+    process.wait_for_output('ready after')
+    tester.connect()
+    answer = tester.relocalize(make_frame())
+    assert "no transform from 'nowhere'" in answer.message
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_request_is_answered_when_its_node_is_told_to_stop(own_relocalizer, tester, number):
+    process = own_relocalizer(timeout_s=30.0)
+    future = tester.ask()
+    tester.wait(tester.listened_to, 'the request to wait for images')
+    process.send(number)
+    answer = tester.answer(future)
+    assert not answer.success and 'the node is shutting down' in answer.message
+    tester.wait(lambda: not process.alive, 'its end')
+    assert process.stop()[0] == 0
+    assert 'internal error' not in process.output() and 'Traceback' not in process.output()

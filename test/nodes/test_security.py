@@ -47,7 +47,7 @@ def check(tester, node, *absent):
 
 def test_the_relocalizer_does_what_its_policy_allows(own_relocalizer, tester):
     process = own_relocalizer(mode='continuous', gravity='imu', depth_transport='raw',
-                              watch='amcl_pose', occupancy_grid='topic')
+                              watch='amcl_pose')
     tester.feed_until(lambda: tester.poses, make_frame(), 'a pose')
     tester.ask()  # odometry is listened to during a request
     check(tester, 'relocalizer', '/image/compressed', '/depth/compressedDepth', '/clock')
@@ -56,7 +56,7 @@ def test_the_relocalizer_does_what_its_policy_allows(own_relocalizer, tester):
     own_relocalizer(image_transport='compressed', use_sim_time='true',
                     depth_transport='compressed')
     tester.ask()
-    check(tester, 'relocalizer', '/image', '/depth', '/imu', '/map', '/relocalizer/localized',
+    check(tester, 'relocalizer', '/image', '/depth', '/imu', '/relocalizer/localized',
           '/relocalizer/localization_state')
 
 

@@ -3,10 +3,12 @@
 """The watch of a localizer: right, kidnapped, silent and broken ones, with real nodes."""
 
 import signal
+from dataclasses import replace
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from processes import wait_for
+from scene import make_room, write_map
 from std_msgs.msg import Bool, Header, String
 from std_srvs.srv import Trigger
 from tester import transform_of
@@ -187,6 +189,19 @@ def test_a_map_that_is_read_again_is_watched_anew(watch, tester):
     assert answer.success, answer.message
     watched.until(lambda: watched.values.get('watch looks') == '1', 'a new watch')
     watched.until_state('localized')
+
+
+def test_a_map_of_another_frame_ends_the_verdict_of_the_one_before(watch, tester, tmp_path):
+    """No image comes meanwhile: the verdict falls with its map, not with the next look."""
+    watched = watch()
+    watched.until_state('localized')
+    write_map(replace(make_room(), frame_id='elsewhere'), tmp_path / 'elsewhere.yaml')
+    assert tester.set_parameter('map_file', str(tmp_path / 'elsewhere.yaml'))
+    assert tester.call(Trigger, 'relocalizer/reload_map', Trigger.Request()).success
+    tester.wait(lambda: 'a map was loaded' in watched.values['watch reason'], 'the end')
+    assert watched.states[-1] == 'uncertain'
+    watched.until_reason("the localizer's pose is in frame 'map'")
+    assert 'internal error' not in watched.process.output()
 
 
 @pytest.mark.full

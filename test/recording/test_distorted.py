@@ -21,7 +21,7 @@ from cliploc_ros.datasets.observations import load_recorded
 from cliploc_ros.demo.truth import read_objects
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import make_views
-from cliploc_ros.recording.networks import Look
+from cliploc_ros.recording.networks import RunNetworks
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--device', 'cpu')
@@ -95,7 +95,7 @@ def test_boxes_of_an_ideal_fisheye_are_undistorted():
     found = Detections(np.array([[400.0, 210.0, 480.0, 270.0], [600.0, 230.0, 638.0, 250.0]]),
                        ('cup', 'tv'), np.array([0.9, 0.9]))
     raw = RawFrame(0, 0, np.eye(4), lambda: (np.zeros((480, 640, 3), dtype=np.uint8), lens))
-    seen = Look(lambda image: found)(raw)
+    seen = RunNetworks(lambda image: found)(raw)
     assert seen.class_ids.tolist() == ['cup'] and seen.open_edges.tolist() == [[False] * 4]
     across = np.hypot(120.0, 30.0) / 200.0  # of the middle of the upper edge
     np.testing.assert_allclose(seen.bboxes_xyxy[0], [

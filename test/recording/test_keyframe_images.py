@@ -15,7 +15,7 @@ from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, load_layer_of_map, sav
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.depth import DepthImage
 from cliploc_ros.datasets.folders import tum_frames
-from cliploc_ros.datasets.frames import Frame, Frames, RawFrame
+from cliploc_ros.datasets.frames import Frames, PosedImage, RawFrame
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.errors import MappingError
@@ -96,7 +96,7 @@ def test_a_stored_image_is_undistorted_as_its_points_are(frame, demo_map):
     marked = frame.image_rgb // 2
     at = np.array([camera.width // 6, camera.height // 6])
     cv2.circle(marked, at.tolist(), 12, (255, 255, 255), cv2.FILLED)
-    layer = build_layer(wall(Frame(1, marked, bent, np.eye(4))), demo_map, WITH_IMAGES)
+    layer = build_layer(wall(PosedImage(1, marked, bent, np.eye(4))), demo_map, WITH_IMAGES)
     image = layer.image_rgb(0)
     scale = camera.width / image.shape[1]
     spot = (np.argwhere(image.mean(axis=2) > 215)[:, ::-1].mean(axis=0) + 0.5) * scale - 0.5

@@ -17,8 +17,10 @@ import pytest
 
 from cliploc_ros.cli.build_map import main
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
-from cliploc_ros.datasets.frames import Frames
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.datasets.frames import Frames, RawFrame
 from cliploc_ros.datasets.observations import load_recorded
+from cliploc_ros.errors import DatasetError
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.recording.recorder import (
@@ -26,6 +28,7 @@ from cliploc_ros.recording.recorder import (
     KeyframeOptions,
     RecordingOptions,
     observation_file,
+    record_once,
 )
 
 PROJECT = Path(__file__).resolve().parents[2]
@@ -115,6 +118,25 @@ def test_observations_lie_next_to_the_recording(walk, recorded, capsys):
                      for name in ('second.yaml', 'third.yaml'))
     assert [line for line in second if 'center' in line] == [
         line for line in third if 'center' in line]
+
+
+@pytest.mark.parametrize('seen', [0, 2])
+def test_a_run_that_fails_leaves_no_more_than_it_says(tmp_path, caplog, seen):
+    """Before the first image it leaves nothing; later what the next run goes on from."""
+    image = cv2.imread(str(min((ASSETS / 'sequence/rgb').iterdir())))
+    camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+
+    def read(wanted):
+        for place in range(seen):
+            yield RawFrame(place, place, np.eye(4), lambda: (image, camera), None)
+        raise DatasetError('the recording ends here')
+    options = RecordingOptions(DetectorOptions(str(ASSETS / 'yolo.pt'), device='cpu'), None)
+    with pytest.raises(DatasetError, match='the recording ends here'):
+        record_once(Frames(tmp_path / 'walk', 3, read), options, tmp_path / 'seen.npz')
+    left = tmp_path / '.seen.npz.unfinished'
+    assert left.exists() == bool(seen)
+    assert (str(left) in caplog.text) == bool(seen)
+    assert len(list(tmp_path.iterdir())) == bool(seen)
 
 
 @pytest.mark.full
@@ -219,8 +241,6 @@ def test_a_bag_says_the_same_and_its_topics_are_found(walk, recorded, tmp_path, 
     (('--tum', '{walk}', '--pose-topic', '/pose'), 'are for --bag'),
     (('--tum', '{walk}', '--odometry-topic', '/odom'), '--odometry-frame are for --bag'),
     (('--tum', '{walk}', '--trajectory', '{other}'), 'do not overlap; one of them uses another'),
-    (('--tum', '{walk}', '--workers', '0'), '--workers 0: give 1 or more'),
-    (('--tum', '{walk}', '--keyframes', '-1', '5'), 'give 0 or more'),
     (('--tum', '{walk}', '--depth-baseline', '0', '0', '0'), 'needs --depth-intrinsics'),
     (('--rgbd', '{folder}'), 'has neither rgb.txt'),
     (('--tum', '{walk}', '--record-to', '/proc/none.npz'), 'cannot be written'),

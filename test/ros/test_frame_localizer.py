@@ -109,6 +109,20 @@ def test_options_hold_from_the_next_frame_on(localizer, values):
     assert found.accepted and localizer.description.endswith('matching class, algorithm ransac')
 
 
+def test_a_camera_of_another_run_of_odometry_is_left_out_and_named(localizer, values):
+    places = [RobotState(np.eye(4), place=CameraPlace(np.eye(4), run, 0.0)) for run in (1, 1, 2)]
+    frames = [replace(make_frame(), camera=name) for name in ('front', 'left', 'back')]
+    first = replace(frames[0], left_out=('right',))
+    found = localizer.localize(first, values, places[0], timer(),
+                               beside=list(zip(frames[1:], places[1:], strict=True)))
+    assert (found.cameras, found.left_out) == (2, ('right', 'back'))
+
+
+def test_a_look_at_a_pose_in_another_frame_names_the_frames(localizer, values):
+    with pytest.raises(MapError, match="'elsewhere'"):
+        localizer.look(make_frame(), values, RobotState(np.eye(4)), 'elsewhere', MAP_FROM_CAMERA)
+
+
 def test_more_detections_than_allowed_are_not_searched(localizer, values):
     assert not localize(localizer, make_frame(), replace(values, max_detections=3)).accepted
 

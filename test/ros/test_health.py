@@ -4,6 +4,8 @@ import time
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from cliploc_ros.ros.node.diagnostics import (
     Diagnostics,
@@ -12,6 +14,8 @@ from cliploc_ros.ros.node.diagnostics import (
     Stages,
     StageTimes,
     in_words,
+    join_names,
+    split_names,
 )
 
 
@@ -22,6 +26,13 @@ def test_the_worst_problem_gives_the_level_and_comes_first():
     health.fail('broken')
     health.warn('slow')
     assert (health.level, health.message) == (DiagnosticStatus.ERROR, 'broken; late; slow')
+
+
+@given(st.lists(st.text(st.characters(exclude_characters='\0', exclude_categories=['Cs']),
+                        min_size=1)))
+@example(['a chair, broken', 'the "best" one', 'line\nbreak', ' mug '])
+def test_names_of_any_text_survive_the_diagnostics(names):
+    assert split_names(join_names(names)) == tuple(names)
 
 
 def test_stages_in_numbers():

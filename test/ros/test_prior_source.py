@@ -1,22 +1,20 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is known before an image: from the topic, from the file of the last pose, and walls."""
+"""What is known before an image: from the topic, and from the file of the last pose."""
 
 import json
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from nav_msgs.msg import OccupancyGrid
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.core.map.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from cliploc_ros.core.observation import OPTICAL_FROM_BODY
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
-from cliploc_ros.ros.inputs.prior import PriorSource, grid_from_msg, planar_of
+from cliploc_ros.ros.inputs.prior import PriorSource, planar_of
 from cliploc_ros.ros.node.worker import Worker
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -46,15 +44,15 @@ def source(make_node):
     node.worker.stop()
 
 
-def known(source, map_hash='one', frame_ids=('map',), **changes):
+def region_of(source, map_hash='one', frame_ids=('map',), **changes):
     parameters = RelocalizerParameters(**{'base_frame': 'base_link', 'tf_timeout_s': 0.0,
                                           **changes})
-    return source.known(Time(sec=5), parameters, CAMERA_FROM_BASE, frame_ids, map_hash)
+    return source.region(Time(sec=5), parameters, CAMERA_FROM_BASE, frame_ids, map_hash)
 
 
 def test_a_pose_is_a_region_with_the_covariance_of_x_y_and_yaw(source):
     source.hear(pose('/map'))
-    region = known(source, prior_probability=0.8).region
+    region = region_of(source, prior_probability=0.8)
     assert (region.frame_id, region.probability) == ('map', 0.8)
     np.testing.assert_allclose(region.mean, [1.0, -2.0, 0.7])
     np.testing.assert_allclose(region.covariance, [[0.25, 0.05, 0], [0.05, 0.5, 0], [0, 0, 0.1]])
@@ -65,7 +63,7 @@ def test_without_a_base_a_region_is_of_the_cameras_body(source):
     level = turned(0.7, 1.0, -2.0)
     for at in (level, level @ np.linalg.inv(OPTICAL_FROM_BODY)):
         source.hear(pose(at=at))
-        region = known(source, base_frame='').region
+        region = region_of(source, base_frame='')
         np.testing.assert_allclose(region.mean, [1.0, -2.0, 0.7])
         np.testing.assert_array_equal(region.camera_from_body, OPTICAL_FROM_BODY)
 
@@ -75,10 +73,9 @@ def test_a_message_withdraws_the_one_before(source):
     invalid.pose.pose.orientation.w = 5.0
     for other in (pose(''), invalid, pose('elsewhere'), pose(covariance=-COVARIANCE)):
         source.hear(pose())
-        assert known(source).region is not None
+        assert region_of(source) is not None
         source.hear(other)
-        assert known(source).region is None
-    assert known(source).grid is None
+        assert region_of(source) is None
 
 
 def test_planar_of_an_invalid_pose_is_refused():
@@ -87,27 +84,6 @@ def test_planar_of_an_invalid_pose_is_refused():
     for wrong in (invalid, pose(covariance=np.zeros((6, 6)))):
         with pytest.raises(CliplocError):
             planar_of(wrong)
-
-
-def grid(data, frame_id='map', width=3):
-    msg = OccupancyGrid(header=Header(frame_id=frame_id), data=data)
-    msg.info.width, msg.info.height, msg.info.resolution = width, len(data) // width, 0.5
-    msg.info.origin.position.x, msg.info.origin.position.y = -1.0, 2.0
-    msg.info.origin.orientation.z, msg.info.origin.orientation.w = np.sin(0.2), np.cos(0.2)
-    return msg
-
-
-def test_cells_are_those_of_map_server(source):
-    source.hear_grid(grid([-1, 0, 25, 26, 64, 65], '/map'))
-    found = known(source).grid
-    assert found.frame_id == 'map'
-    assert found.cells.tolist() == [[UNKNOWN, FREE, FREE], [UNKNOWN, UNKNOWN, OCCUPIED]]
-    assert found.resolution_m == 0.5
-    np.testing.assert_allclose(found.origin, [-1.0, 2.0, 0.4], atol=1e-7)
-    source.hear_grid(grid([0, 0, 0], width=2))
-    assert known(source).grid is None, 'an invalid one takes its place, too'
-    with pytest.raises(CliplocError):
-        grid_from_msg(grid([0, 0, 0], width=2))
 
 
 def test_the_last_accepted_pose_holds_at_the_next_start_until_another_is_accepted(
@@ -127,17 +103,17 @@ def test_the_last_accepted_pose_holds_at_the_next_start_until_another_is_accepte
     node = make_node('next_start')
     woken = PriorSource(node, CoordinateFrames(node))
     woken.open(parameters)
-    region = known(woken, 'one', last_pose_probability=0.6).region
+    region = region_of(woken, 'one', last_pose_probability=0.6)
     np.testing.assert_allclose(region.mean, [3.0, -2.0, 0.7])
     assert region.probability == 0.6
     np.testing.assert_allclose(np.diag(region.covariance), [0.25, 0.5, 0.1])
-    assert known(woken, 'another map').region is None
+    assert region_of(woken, 'another map') is None
     woken.hear(pose())
-    np.testing.assert_allclose(known(woken).region.mean, [1.0, -2.0, 0.7], err_msg='told')
+    np.testing.assert_allclose(region_of(woken).mean, [1.0, -2.0, 0.7], err_msg='told')
     woken.hear(pose(''))
     node.worker = source._node.worker
     woken.keep(pose(), parameters, 'one')
-    assert known(woken, 'one').region is None
+    assert region_of(woken, 'one') is None
     woken.close()
 
 
@@ -148,16 +124,15 @@ def test_a_file_that_is_none_is_not_used(make_node, tmp_path, content):
     node = make_node()
     source = PriorSource(node, CoordinateFrames(node))
     source.open(RelocalizerParameters(last_pose_file=str(tmp_path / 'last.json')))
-    assert known(source).region is None
+    assert region_of(source) is None
     source.close()
 
 
 def test_it_listens_from_open_to_close(make_node, source):
-    node, asking = source._node, RelocalizerParameters(occupancy_grid='topic')
-    for parameters, walls in ((RelocalizerParameters(), 0), (asking, 1)):
-        source.open(parameters)
-        source.open(parameters)
+    node = source._node
+    for _ in range(2):
+        source.open(RelocalizerParameters())
+        source.open(RelocalizerParameters())
         assert node.count_subscribers(node.resolve_topic_name('~/prior')) == 2
-        assert node.count_subscribers('/map') == walls
         source.close()
         assert node.count_subscribers(node.resolve_topic_name('~/prior')) == 0

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames of several cameras at one instant: which belong together, and which are left out."""
 
+import math
 import threading
 import time
 
@@ -14,7 +15,7 @@ from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.errors import StoppedError
 from cliploc_ros.ros.inputs.frame_source import FrameSource, NoFrameError
-from cliploc_ros.ros.inputs.rig import Rig, frames_of
+from cliploc_ros.ros.inputs.rig import frames_of
 from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -46,11 +47,11 @@ def cameras(make_node):
     return publish
 
 
-@pytest.fixture
-def rig(make_node, context, heard):
+@pytest.fixture(params=[60.0])
+def rig(request, make_node, context, heard):
     """A rig whose node is spun by another thread."""
     node = make_node()
-    rig = frames_of(node, PARAMETERS, 60.0, heard.append)
+    rig = frames_of(node, PARAMETERS, request.param, heard.append)
     rig.open()
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
@@ -135,20 +136,75 @@ def test_nothing_in_time_and_a_rig_that_is_closed(rig, cameras, wait):
         rig.next_frame(now, now + 30.0)
 
 
-def test_the_first_camera_of_an_instant_passes_it_on_once(rig, cameras, wait, heard):
-    ask(rig, cameras, ALL, wait)
-    heard.clear()
-    now = time.monotonic()
-    with pytest.raises(NoFrameError):  # it listens on meanwhile
-        rig.next_frame(now + 1e6, now + 0.01)
-    for number in range(5):  # the stamps have jumped: some of them show that they go on
-        cameras(500.0 + 0.1 * number, ALL)
-        time.sleep(0.1)
-    wait(lambda: heard, 'the instant')
+def now_s():
+    """Return a stamp; stamps that go on evenly are at once known to be images' own."""
+    return 100.0 + time.monotonic()
+
+
+def in_turn(cameras, heard, order, gap_s=0.0, skew_s=0.0):
+    """Publish six instants, whose detections come one camera after another; return the heard."""
+    begun_s = now_s()
+    for _ in range(6):
+        at_s = now_s()
+        for name in order:
+            cameras(at_s, {name: 0.0}, (CameraInfo, Image))
+            time.sleep(skew_s)
+        for name in order:
+            time.sleep(gap_s)
+            cameras(at_s, {name: 0.0}, (Detection2DArray,))
+        time.sleep(0.05)
+    time.sleep(0.7)  # all patience is over
     stamps = [one.image.header.stamp for one in heard]
-    assert {one.camera for one in heard} == {'front'}
-    assert len({(one.sec, one.nanosec) for one in stamps}) == len(stamps)
-    assert isinstance(rig, Rig)
+    assert len({(one.sec, one.nanosec) for one in stamps}) == len(stamps), 'each once'
+    return [one for one, at in zip(heard, stamps, strict=True)
+            if at.sec + 1e-9 * at.nanosec >= begun_s - 1e-6]
+
+
+@pytest.fixture
+def known(rig, cameras, wait, heard):
+    """Publish until the cameras are known, and their stamps for their own."""
+    wait(lambda: any(not one.left_out for one in heard), 'the first whole instant',
+         lambda: cameras(now_s(), ALL) or time.sleep(0.05))
+
+
+@pytest.mark.usefixtures('known')
+@pytest.mark.parametrize('rig', [math.inf], indirect=True)
+@pytest.mark.parametrize(('gap_s', 'skew_s'), [(0.0, 0.0), (0.1, 0.0), (0.0, 0.06), (0.1, 0.06)])
+def test_instants_are_passed_on_with_all_cameras_once(cameras, heard, gap_s, skew_s):
+    """Whoever comes first, and however late the others arrive."""
+    for order in (NAMES, NAMES[::-1]):
+        found = in_turn(cameras, heard, order, gap_s, skew_s)
+        assert [names(one) for one in found] == [list(NAMES)] * 6
+
+
+@pytest.mark.usefixtures('known')
+@pytest.mark.parametrize('rig', [math.inf], indirect=True)
+def test_a_silent_camera_holds_no_instant_up(cameras, heard):
+    found = in_turn(cameras, heard, ('back', 'left'))
+    assert [names(one) for one in found] == [['left', 'back']] * 6
+    assert {one.left_out for one in found} == {('front',)}
+
+
+@pytest.mark.parametrize('rig', [0.2], indirect=True)
+def test_a_request_stays_subscribed_until_the_last_cameras_detections(rig, cameras, wait):
+    """Each camera's detections come 1.2 s after those of the camera before."""
+    now, found = time.monotonic(), []
+    asking = threading.Thread(target=lambda: found.append(rig.next_frame(now, now + 60.0)))
+    asking.start()
+
+    def images():
+        cameras(now_s(), ALL, (CameraInfo, Image))
+        time.sleep(0.05)
+    wait(lambda: rig.main._pairing.received['image'] >= 5
+         and all(one._pairing.received['image'] >= 5 for one in rig._sources.values()),
+         'images', images)
+    at_s = now_s()
+    cameras(at_s, ALL, (CameraInfo, Image))
+    for name in NAMES:
+        time.sleep(1.2)
+        cameras(at_s, {name: 0.0}, (Detection2DArray,))
+    asking.join(30.0)
+    assert names(found[0]) == list(NAMES)
 
 
 def test_one_camera_needs_no_rig(make_node):

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
-from cliploc_ros.core.map.occupancy_grid import OCCUPIED, UNKNOWN
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.evaluation import sensors
 from cliploc_ros.evaluation.trials import make_queries
-from cliploc_ros.simulation import sensors
 from studies import wrong_sensors
 from studies.acceptance import priors, troubles
 from studies.acceptance.__main__ import run
@@ -225,15 +224,3 @@ def test_regions_are_near_the_truth_or_elsewhere(wrong):
     away = [np.linalg.norm(one.observation.region.mean[:2] - one.map_from_camera[:2, 3])
             for one in told]
     assert min(away) > 2.0 if wrong else max(away) < 0.5
-
-
-def test_walls_stand_where_no_robot_does():
-    place = Simulated('room', 3).load()
-    _, known = priors.see_walls(place.landmark_map, place.frames, 0.0, np.random.default_rng(0))
-    grid = known[0].observation.grid
-    cameras = np.array([one.map_from_camera[:2, 3] for one in known])
-    assert (grid.at(cameras) != UNKNOWN).all()
-    assert (grid.at(grid.origin[:2] + np.zeros((1, 2))) == OCCUPIED).all()
-    _, shifted = priors.see_walls(place.landmark_map, place.frames, 2.0, np.random.default_rng(0))
-    step = np.subtract(shifted[0].observation.grid.origin, grid.origin)[:2]
-    assert np.linalg.norm(step) == pytest.approx(2.0)

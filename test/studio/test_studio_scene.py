@@ -14,11 +14,11 @@ from studio_map import demo_studio
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.core.map.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from cliploc_ros.datasets.depth import DepthImage
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.studio import viewpoint
 from cliploc_ros.studio.context import MAX_POINTS, draw_walls, find_cloud
+from cliploc_ros.studio.floor import OCCUPIED, UNKNOWN, OccupancyGrid
 from cliploc_ros.studio.images import Images, open_images, views_of_folder
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
@@ -82,7 +82,7 @@ def test_the_cloud_of_a_room_is_thin_and_quick(shared_data):
 def test_walls_lie_where_the_grid_has_them(server, yaw):
     cells = np.full((30, 40), UNKNOWN, dtype=np.int8)
     cells[4, 33] = cells[20, 7] = OCCUPIED
-    grid = OccupancyGrid('map', cells, 0.1, (-1.0, 2.0, yaw))
+    grid = OccupancyGrid(cells, 0.1, (-1.0, 2.0, yaw))
     handle = draw_walls(server.scene, grid)
     rows, columns = np.nonzero(handle.image[..., 3])
     height, width = handle.image.shape[:2]
@@ -91,7 +91,9 @@ def test_walls_lie_where_the_grid_has_them(server, yaw):
                               np.zeros(len(rows))])
     turn = Rotation.from_quat(np.roll(handle.wxyz, -1))
     points = turn.apply(across) + handle.position
-    assert len(points) and (grid.at(points[:, :2]) == OCCUPIED).all()
+    in_grid = Rotation.from_euler('z', -yaw).apply(points - [-1.0, 2.0, 0.0])
+    cells = {(int(y), int(x)) for x, y in np.floor(in_grid[:, :2] / 0.1)}
+    assert cells == {(4, 33), (20, 7)}
     assert turn.apply([0.0, 0.0, 1.0])[2] == pytest.approx(-1.0), 'its face is up'
 
 

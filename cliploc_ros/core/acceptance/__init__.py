@@ -9,7 +9,7 @@ contenders
 support
     The evidence of the objects for a pose.
 prior
-    What a region and walls that are known before say of a pose.
+    What a region that is known before says of a pose.
 depth_check
     Whether the depths of a request can be right.
 confidence

@@ -74,15 +74,11 @@ class Places(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """What a region and an occupancy grid say."""
+    """What a region says."""
 
     most: float
     least_m: float
     least_deg: float
-    in_wall: float
-    outside: float
-    blocked: float
-    most_blocked: float
 
 
 class Search(NamedTuple):

@@ -35,7 +35,6 @@ from cliploc_ros.core.acceptance.genuine import Motion, Signs, compare_motion, s
 from cliploc_ros.core.acceptance.look_alikes import find_twins, lead_over_twin, turned_about_axis
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.mirror import chance_not_mirrored
-from cliploc_ros.core.acceptance.prior import walls_against
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, is_exhaustive
 from cliploc_ros.core.fit.covariance import fuse, share_within
 from cliploc_ros.core.fit.finalists import (
@@ -248,10 +247,8 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
         motion=_motion(joined, compared, looks, recognizer),
         not_mirrored=_not_mirrored(joined, compared, by_points),
         uncontradicted=_uncontradicted(joined, compared),
-        recognized=place and place.recognized, walls=None if last.grid is None else walls_against(
-            joined.landmark_map, last.grid, compared.poses[0],
-            [one.landmark for one in best.matches[-1]]),
-        prior=compared.contenders[0].prior, earlier=looks.confidences_in(last, compared.poses[0]),
+        recognized=place and place.recognized, prior=compared.contenders[0].prior,
+        earlier=looks.confidences_in(last, compared.poses[0]),
         crops_left=0 if last.compared is None else len(last.detections) - len(last.compared))
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, chance_genuine
-from cliploc_ros.core.acceptance.prior import Walls
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.options import RelocalizerOptions
 
@@ -44,8 +43,6 @@ class RefusalKind(StrEnum):
     CONTRADICTION = auto()
     #: Keyframes show signs of a picture of the place, of wrong intrinsics, or of a changed place.
     CHANGED = auto()
-    #: The occupancy grid has a wall at the pose, or before most of the matched objects.
-    OBSTRUCTED = auto()
     #: Boxes, camera_info and map do not agree, or no look has verified that they do.
     WRONG_CAMERA = auto()
     #: The time of the request ended before a frame was localized.
@@ -109,7 +106,6 @@ class Evidence:
     #: Probability that keyframes are wrong which recognize another place only
     uncontradicted: float = 1.0
     recognized: RecognizedPlace | None = None  #: What keyframes show at the pose
-    walls: Walls | None = None  #: What an occupancy grid says; None without one
     prior: float = 0.0  #: Log odds that a region known before gives the pose
     #: Confidence of each earlier look in this pose, see cliploc_ros.core.acceptance.looks
     earlier: tuple[float, ...] = ()
@@ -131,29 +127,15 @@ class Evidence:
         return 1.0 if self.signs is None else chance_genuine(self.signs, self.motion)
 
     @property
-    def unobstructed(self) -> float:
-        """Return the factor by which walls lower the probability, 0 to 1.
-
-        They take from the log odds, so a pose that is nearly certain stays.
-        """
-        if self.walls is None:
-            return 1.0
-        return 1.0 / (1.0 + (1.0 - self._by_poses) * math.expm1(-self.walls.odds))
-
-    @property
-    def _by_poses(self) -> float:
-        return max(self.likely * self.found, self.by_points)
-
-    @property
     def certainty(self) -> float:
         """Return the probability that nothing besides the poses found makes it wrong."""
         return (self.distinct * self.near * self.camera * self.genuine * self.not_mirrored
-                * self.uncontradicted * self.unobstructed)
+                * self.uncontradicted)
 
     @property
     def confidence(self) -> float:
         """Return the probability that the leading pose is within 1 m of the truth."""
-        return self._by_poses * self.certainty
+        return max(self.likely * self.found, self.by_points) * self.certainty
 
     @property
     def with_right_camera(self) -> 'Evidence':
@@ -237,7 +219,7 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
     weakest = min({'likely': likely, 'distinct': evidence.distinct, 'near': evidence.near,
                    'camera': evidence.camera, 'genuine': evidence.genuine,
                    'mirror': evidence.not_mirrored, 'keyframes': evidence.uncontradicted,
-                   'found': found, 'walls': evidence.unobstructed}.items(),
+                   'found': found}.items(),
                   key=lambda item: item[1])[0]
     # the twin may be among the rivals, too
     if evidence.twin is not None and evidence.distinct < options.min_confidence and (
@@ -261,9 +243,6 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
     if weakest == 'mirror':
         return Refusal(RefusalKind.AMBIGUOUS, f'{compared}; mirrored, the image fits another '
                                               'pose; turn the camera to more objects')
-    if weakest == 'walls' and evidence.walls is not None:
-        return Refusal(RefusalKind.OBSTRUCTED, f'{compared}; {evidence.walls.in_words()}; '
-                                               'check its origin, or turn to more objects')
     if weakest == 'found':
         return Refusal(RefusalKind.SEARCH_CUT_SHORT,
                        f'{compared}; pose met only {evidence.meetings:g} times in '

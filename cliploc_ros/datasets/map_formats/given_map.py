@@ -51,7 +51,7 @@ class GivenLandmark(NamedTuple):
     details: LandmarkDetails = LandmarkDetails()
 
 
-class LeftOut(NamedTuple):
+class Skipped(NamedTuple):
     """A landmark of the file that is not in the map, and why."""
 
     landmark_id: str
@@ -62,7 +62,7 @@ class GivenMap(NamedTuple):
     """The content of a file: landmarks, what could not be read as one, and notes on the file."""
 
     landmarks: list[GivenLandmark]
-    left_out: list[LeftOut]
+    left_out: list[Skipped]
     notes: list[str]
 
 
@@ -70,7 +70,7 @@ class ImportedMap(NamedTuple):
     """A map of ours, what was left out and why, and what to say about it."""
 
     landmark_map: LandmarkMap
-    left_out: tuple[LeftOut, ...]
+    left_out: tuple[Skipped, ...]
     notes: tuple[str, ...]
 
 
@@ -103,7 +103,7 @@ def place(given: GivenMap, source: str, frame_id: str, scale: float,
         if reason is None:
             kept[landmark.landmark_id] = landmark
         else:
-            left_out.append(LeftOut(landmark.landmark_id, reason))
+            left_out.append(Skipped(landmark.landmark_id, reason))
     if not kept:
         why = f'; the first one: {left_out[0].reason}' if left_out else ''
         raise DatasetError(f'none of its {len(left_out)} landmarks can be used{why}')
@@ -146,7 +146,7 @@ def refit(imported: ImportedMap, observations: Path, keep_unsupported: bool) -> 
         if reason is None or (keep_unsupported and fit.part_of[row] == row):
             kept.append(row)
         else:
-            left_out.append(LeftOut(before.landmark_ids[row], reason))
+            left_out.append(Skipped(before.landmark_ids[row], reason))
     fitted = [row for row, reason in enumerate(fit.reasons) if reason is None]
     moved_m = np.linalg.norm(fit.landmark_map.centers - before.centers, axis=1)
     far = [row for row in fitted if moved_m[row] > 2.0 * before.semi_axes[row].max()]

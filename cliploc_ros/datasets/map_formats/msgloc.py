@@ -20,7 +20,7 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.datasets.map_formats.given_map import (
     GivenLandmark,
     GivenMap,
-    LeftOut,
+    Skipped,
     class_name,
     make_id,
     read_bytes,
@@ -66,7 +66,7 @@ def read_msgloc(path: Path, class_names: Sequence[str]) -> GivenMap:
             given.landmarks.append(_landmark(node, place, class_names))
             negative += any(radius < 0.0 for radius in node['radii'])
         except _NodeError as error:
-            given.left_out.append(LeftOut(f'node {place}', str(error)))
+            given.left_out.append(Skipped(f'node {place}', str(error)))
     if negative:
         given.notes.append(f'{negative} landmarks have negative radii; their signs are ignored')
     return given

@@ -26,7 +26,7 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.datasets.map_formats.given_map import (
     GivenLandmark,
     GivenMap,
-    LeftOut,
+    Skipped,
     class_name,
     make_id,
     read_bytes,
@@ -66,7 +66,7 @@ def read_goreloc(path: Path, class_names: Sequence[str]) -> GivenMap:
             counts = [one for value in item.get(4, ()) for one in _integers(value)]
             quadric = _quadric(item)
             if len(categories) != len(counts) or not sum(counts):
-                given.left_out.append(LeftOut(
+                given.left_out.append(Skipped(
                     f'object {number}',
                     f'it has {len(categories)} categories with the counts {counts[:5]}'))
                 continue
@@ -132,7 +132,7 @@ def _read_saved_map(path: Path, class_names: Sequence[str]) -> GivenMap:
         for item in _messages(path):
             track, quadric = _integer(item, 2), _quadric(item)
             if track not in tracks:
-                given.left_out.append(LeftOut(
+                given.left_out.append(Skipped(
                     f'track {track}', f'{tracks_path.name} has no such track, and so no class'))
                 continue
             category, support = tracks[track]
@@ -150,7 +150,7 @@ def _add(given: GivenMap, shown: str, landmark_id: str, name: str, quadric: list
     try:
         ellipsoid = decompose(quadric)
     except QuadricError as error:
-        given.left_out.append(LeftOut(shown, str(error)))
+        given.left_out.append(Skipped(shown, str(error)))
     else:
         given.landmarks.append(GivenLandmark(landmark_id, name, name, *ellipsoid, details))
 

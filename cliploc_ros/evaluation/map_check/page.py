@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from cliploc_ros.evaluation.map_check.views import Views
+from cliploc_ros.evaluation.map_check.views import ViewPainter
 from cliploc_ros.files.page import (
     ACCEPTED,
     MISLED,
@@ -61,7 +61,8 @@ def grade(landmark: LandmarkCheck) -> str:
 
 
 def write_report(folder: Path, name: str, report: CheckReport,
-                 pictures: Iterable[tuple[str, str, bytes]], views: Views | None = None) -> None:
+                 pictures: Iterable[tuple[str, str, bytes]], views: ViewPainter | None = None
+                 ) -> None:
     """Write the page and the JSON file of a check of a named map, each in one step.
 
     Pictures have a name, a caption and a PNG each; the first one is on the first screen. Views are
@@ -82,7 +83,7 @@ def _finite(value: Any) -> Any:
 
 
 def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, bytes]],
-          views: Views | None) -> str:
+          views: ViewPainter | None) -> str:
     missed = len(report.failures)
     said = verdict('The map reaches all thresholds.' if report.passed else
                    f'The map misses {missed} of {len(report.measures)} thresholds.', report.passed)
@@ -117,7 +118,7 @@ def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, byt
                 fold('What these figures rest on', items(report.notes)))
 
 
-def _card(number: int, advice: Advice, views: Views | None) -> str:
+def _card(number: int, advice: Advice, views: ViewPainter | None) -> str:
     view = None if views is None else views.of(advice)
     text = f'{number}. {advice.text}'
     return card(text) if view is None else card(text, view.jpeg, view.caption)

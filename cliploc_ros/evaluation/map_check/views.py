@@ -38,20 +38,20 @@ _WIDTH_PX, _JPEG_QUALITY = 480, 75
 _BOX_RGB, _OUTLINE_RGB = (255, 255, 255), (230, 159, 0)
 
 
-class View(NamedTuple):
+class Picture(NamedTuple):
     """A picture of a recorded view."""
 
     jpeg: bytes
     caption: str
 
 
-class Views:
+class ViewPainter:
     """Draws views of a recording, with its boxes and the outlines of landmarks."""
 
     def __init__(self, landmark_map: LandmarkMap, detections: PosedDetections, read: ReadImage):
         self._map, self._detections, self._read = landmark_map, detections, read
 
-    def of(self, advice: Advice) -> View | None:
+    def of(self, advice: Advice) -> Picture | None:
         """Return the view that shows best what an advice is about; None where there is none."""
         if advice.landmarks:
             rows = [self._map.landmark_ids.index(one) for one in advice.landmarks]
@@ -63,7 +63,7 @@ class Views:
         for frame, words in found:
             if (picture := self._draw(frame, rows)) is not None:
                 seconds = self._detections.stamps_s[frame] - self._detections.stamps_s[0]
-                return View(picture, f'{words}; image at {seconds:.0f} s')
+                return Picture(picture, f'{words}; image at {seconds:.0f} s')
         return None
 
     def _showing(self, row: int, words: str) -> Iterator[tuple[int, str]]:

@@ -54,7 +54,7 @@ _LOSS_SCALE = 2.0
 _MEDIAN_LENGTH, _SIGNIFICANT = 1.54, 22.5
 
 
-class Known(NamedTuple):
+class OldMap(NamedTuple):
     """L landmarks of the old map as the recording's classes name them."""
 
     landmarks: Landmarks  #: Class -1: no box of the recording has a class of this landmark
@@ -81,13 +81,13 @@ class Known(NamedTuple):
         return rows[associate(views, join_landmarks(self.landmarks.select(kept), others), min_iou)]
 
 
-def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...]) -> Known:
+def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...]) -> OldMap:
     """Return the landmarks of a map for a recording with some classes."""
     details = old.details or (LandmarkDetails(),) * len(old)
     sigmas = np.array([_UNKNOWN_SIGMA_M if one.position_sigma is None
                        else one.position_sigma for one in details])
-    return Known(landmarks_of_map(old, class_names), np.maximum(sigmas, _LEAST_SIGMA_M), details,
-                 old.landmark_ids, old.class_ids)
+    return OldMap(landmarks_of_map(old, class_names), np.maximum(sigmas, _LEAST_SIGMA_M), details,
+                  old.landmark_ids, old.class_ids)
 
 
 class Refits(NamedTuple):
@@ -129,7 +129,7 @@ def refit(views: Views, landmarks: Landmarks, shown: NDArray[np.int64], min_view
     return Refits(landmarks._replace(centers=centers, bases=bases), covariances)
 
 
-class Alignment(NamedTuple):
+class Aligned(NamedTuple):
     """The recording in the coordinate frame of the map."""
 
     views: Views
@@ -143,7 +143,7 @@ class Alignment(NamedTuple):
     estimated: PoseErrors | None  #: The errors of the poses, where they were estimated
 
 
-def align(given: Views, known: Known, options: MappingOptions) -> Alignment:
+def align(given: Views, known: OldMap, options: MappingOptions) -> Aligned:
     """Return the views with poses in the coordinate frame of the old map."""
     views, total = given, np.eye(4)
     for number in range(_ROUNDS):
@@ -168,11 +168,11 @@ def align(given: Views, known: Known, options: MappingOptions) -> Alignment:
         found = refit(views, known.landmarks, shown, options.min_viewpoints)
         errors = estimated = significant_pose_errors(views, found.landmarks, shown)
     refined = views if errors is None else _refine(views, known, errors, options)
-    return Alignment(refined, offset_m, offset_deg, *pose_changes(views, refined),
-                     pose_errors(views, refined), estimated)
+    return Aligned(refined, offset_m, offset_deg, *pose_changes(views, refined),
+                   pose_errors(views, refined), estimated)
 
 
-def _offset(known: Known, refits: Refits) -> NDArray[np.float64]:
+def _offset(known: OldMap, refits: Refits) -> NDArray[np.float64]:
     """Return map_from_recording (4, 4): the rigid motion of fitted landmarks onto old ones."""
     rows = refits.is_known
     fitted, old = refits.landmarks.centers[rows], known.landmarks.centers[rows]
@@ -198,7 +198,7 @@ def _offset(known: Known, refits: Refits) -> NDArray[np.float64]:
     return step
 
 
-def _refine(aligned: Views, known: Known, errors: PoseErrors, options: MappingOptions) -> Views:
+def _refine(aligned: Views, known: OldMap, errors: PoseErrors, options: MappingOptions) -> Views:
     """Return the views with poses refined against the old landmarks that are in their place."""
     views = aligned
     anchors = Anchors(known.landmarks.centers, known.sigmas)

@@ -20,8 +20,8 @@ from scipy.sparse.csgraph import connected_components
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.mapping.labelling import embed_landmarks
 from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.update.alignment import Known, has_moved
-from cliploc_ros.mapping.update.judging import Judged, Objects
+from cliploc_ros.mapping.update.alignment import OldMap, has_moved
+from cliploc_ros.mapping.update.judging import Judgement, Shown
 
 # Gains, in nats. Guesses: no look outweighs an object that is seen in its place, but two looks
 # that are exchanged do; and looks decide whether a new object is a missing one.
@@ -54,7 +54,7 @@ class Fates(NamedTuple):
     rivals: dict[int, tuple[int, ...]]  #: Old landmarks that an object could be as well
 
 
-def decide_fates(known: Known, judged: Judged, objects: Objects, looks: 'Looks | None'
+def decide_fates(known: OldMap, judged: Judgement, objects: Shown, looks: 'Likeness | None'
                  ) -> Fates:
     """Return what became of each old landmark."""
     numbers, rivals = _identify(known, objects, judged, looks)
@@ -73,7 +73,7 @@ def decide_fates(known: Known, judged: Judged, objects: Objects, looks: 'Looks |
         np.setdiff1d(np.arange(len(objects.owners)), numbers[found]), numbers, rivals)
 
 
-class Looks(NamedTuple):
+class Likeness(NamedTuple):
     """How landmarks and objects look, in one encoder's space: unit rows, zero if unknown."""
 
     landmarks: NDArray[np.float32]  #: (L, d): of the old map
@@ -103,12 +103,12 @@ def why_not_comparable(old: LandmarkEmbeddings | None, detections: PosedDetectio
 
 
 def compare_looks(old: LandmarkEmbeddings, landmark_ids: Sequence[str],
-                  detections: PosedDetections, objects: Objects) -> Looks:
+                  detections: PosedDetections, objects: Shown) -> Likeness:
     """Return the looks of the old landmarks, by their ids, and of the recording's objects."""
     of_objects = embed_landmarks([str(number) for number in range(len(objects.owners))],
                                  detections, objects.shown)
-    return Looks(old.in_order(landmark_ids).means.astype(np.float32),
-                 of_objects.means.astype(np.float32))
+    return Likeness(old.in_order(landmark_ids).means.astype(np.float32),
+                    of_objects.means.astype(np.float32))
 
 
 def renew_embeddings(old: LandmarkEmbeddings | None, landmark_ids: Sequence[str],
@@ -150,7 +150,7 @@ class _LookModel(NamedTuple):
         return np.nan_to_num(np.clip(gains, -_MAX_LOOK_GAIN, _MAX_LOOK_GAIN), nan=0.0)
 
 
-def _identify(known: Known, objects: Objects, judged: Judged, looks: Looks | None
+def _identify(known: OldMap, objects: Shown, judged: Judgement, looks: Likeness | None
               ) -> tuple[NDArray[np.int64], dict[int, tuple[int, ...]]]:
     """Return the object (L,) that each old landmark is, -1 for none, and the rivals of objects.
 
@@ -189,7 +189,7 @@ def _identify(known: Known, objects: Objects, judged: Judged, looks: Looks | Non
     return result, rivals
 
 
-def _class_groups(known: Known, objects: Objects) -> NDArray[np.int64]:
+def _class_groups(known: OldMap, objects: Shown) -> NDArray[np.int64]:
     """Return a group for each class: the classes of one landmark belong together."""
     count = 1 + max(int(one.names[:, 1].max(initial=0))
                     for one in (objects.landmarks, known.landmarks))
@@ -199,7 +199,7 @@ def _class_groups(known: Known, objects: Objects) -> NDArray[np.int64]:
     return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
 
 
-def _learn_looks(objects: Objects, looks: Looks, groups: NDArray[np.int64]) -> _LookModel | None:
+def _learn_looks(objects: Shown, looks: Likeness, groups: NDArray[np.int64]) -> _LookModel | None:
     """Return how looks compare, learned from the landmarks in their place; None if too few."""
     held = np.nonzero(objects.owners >= 0)[0]
     own, other = [np.empty(0)], [np.empty(0)]
@@ -221,7 +221,7 @@ def _learn_looks(objects: Objects, looks: Looks, groups: NDArray[np.int64]) -> _
     return _LookModel(middle, elsewhere, max(*spreads, 1e-3))
 
 
-def _gains(known: Known, objects: Objects, judged: Judged, rows: NDArray[np.int64],
+def _gains(known: OldMap, objects: Shown, judged: Judgement, rows: NDArray[np.int64],
            columns: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the gains (k, j) by place, class and size; -inf where a pair is impossible."""
     sizes = [np.log(np.sort(np.linalg.norm(one.bases, axis=1), axis=1)[:, 1:]).mean(axis=1)

@@ -30,8 +30,8 @@ from cliploc_ros.mapping.pose_noise import left_by_poses
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.update.alignment import (
     LEAST_MOVE_SHAPES,
-    Alignment,
-    Known,
+    Aligned,
+    OldMap,
     Refits,
     has_moved,
     refit,
@@ -87,7 +87,7 @@ class Finds(NamedTuple):
                 for row, reason in enumerate(reasons) if reason is not None))
 
 
-class Judged(NamedTuple):
+class Judgement(NamedTuple):
     """What the recording says: L old landmarks, m finds, n boxes."""
 
     #: (n,): the old landmark that each box shows in its place, L + the find, or -1 for none
@@ -100,8 +100,8 @@ class Judged(NamedTuple):
     is_doubtful: NDArray[np.bool_]
 
 
-def judge(detections: PosedDetections, views: Views, known: Known, options: MappingOptions
-          ) -> Judged:
+def judge(detections: PosedDetections, views: Views, known: OldMap, options: MappingOptions
+          ) -> Judgement:
     """Return what the recording says of each place of the map, and what else it shows.
 
     The views have poses in the coordinate frame of the map.
@@ -154,10 +154,10 @@ def judge(detections: PosedDetections, views: Views, known: Known, options: Mapp
     is_doubtful = (is_gone & ~_is_absent(known, own, limits)) | (
         ~is_there & ~is_gone & (is_rare | _is_absent(known, own, _STAYS))
         & (known.landmarks.classes >= 0))
-    return Judged(shown, finds, sight, is_gone, is_there, is_doubtful)
+    return Judgement(shown, finds, sight, is_gone, is_there, is_doubtful)
 
 
-def _is_absent(known: Known, sight: Sight, limits: NDArray[np.float64] | float
+def _is_absent(known: OldMap, sight: Sight, limits: NDArray[np.float64] | float
                ) -> NDArray[np.bool_]:
     """Tell which objects (L,) are in their place with less than some probabilities.
 
@@ -167,7 +167,7 @@ def _is_absent(known: Known, sight: Sight, limits: NDArray[np.float64] | float
     return np.asarray(is_told & (_probability_there(known, sight) < limits))
 
 
-def _probability_there(known: Known, sight: Sight) -> NDArray[np.float64]:
+def _probability_there(known: OldMap, sight: Sight) -> NDArray[np.float64]:
     """Return for each place (L,) the probability that its object is there.
 
     The recording should show an object in a usual share of the views: that of the old recording,
@@ -205,7 +205,7 @@ def _log_evidence(sight: Sight, ratios: NDArray[np.float64], views: float) -> ND
     return np.asarray(betaln(a + sight.seen, b + sight.expected - sight.seen) - betaln(a, b))
 
 
-def _look(views: Views, known: Known, finds: Finds, is_gone: NDArray[np.bool_],
+def _look(views: Views, known: OldMap, finds: Finds, is_gone: NDArray[np.bool_],
           options: MappingOptions) -> tuple[NDArray[np.int64], Sight]:
     """Return the landmark or find that each box shows, and the sight of all their places."""
     shown = known.shown(views, options.association_iou, is_gone, finds.landmarks)
@@ -221,7 +221,7 @@ def _boxes(shown: NDArray[np.int64], count: int, finds: Finds
     return boxes[:count], boxes[count:]
 
 
-def _free(views: Views, known: Known, options: MappingOptions) -> NDArray[np.bool_]:
+def _free(views: Views, known: OldMap, options: MappingOptions) -> NDArray[np.bool_]:
     """Tell which boxes (n,) may show new objects: those that no old landmark fits well.
 
     Nor is a box free on a landmark that has at least as many of its own: it may be another name
@@ -269,7 +269,7 @@ def _with_displaced(finds: Finds, refits: Refits, displaced: NDArray[np.bool_],
         details=finds.details + (LandmarkDetails(),) * len(rows))
 
 
-def _without_copies(views: Views, finds: Finds, old: Landmarks, known: Known,
+def _without_copies(views: Views, finds: Finds, old: Landmarks, known: OldMap,
                     shown: NDArray[np.int64], sight: Sight, majority: float) -> Finds:
     """Return the new landmarks without those that are an old one in its place.
 
@@ -297,7 +297,7 @@ def _pairs_between(new: Landmarks, old: Landmarks) -> list[tuple[int, int, float
             in close_pairs(join_landmarks(new, old)) if first < count <= second]
 
 
-class Objects(NamedTuple):
+class Shown(NamedTuple):
     """The objects that the recording shows: m, old landmarks in their places and finds."""
 
     refits: Refits  #: Where they are
@@ -314,8 +314,8 @@ class Objects(NamedTuple):
         return self.refits.landmarks
 
 
-def gather_objects(aligned: Alignment, known: Known, judged: Judged, options: MappingOptions
-                   ) -> Objects:
+def gather_objects(aligned: Aligned, known: OldMap, judged: Judgement, options: MappingOptions
+                   ) -> Shown:
     """Return the objects that the recording shows."""
     views, count, finds = aligned.views, len(known.sigmas), judged.finds
     in_place = np.nonzero(judged.is_there)[0]
@@ -333,7 +333,7 @@ def gather_objects(aligned: Alignment, known: Known, judged: Judged, options: Ma
     for new, row, _ in _pairs_between(finds.landmarks, known.landmarks):
         if not judged.is_there[row] and (row, int(finds.landmarks.classes[new])) in names:
             near[len(in_place) + new].add(row)
-    return Objects(
+    return Shown(
         refits, np.concatenate([in_place, np.full(len(finds.details), -1, dtype=np.int64)]),
         tuple(map(frozenset, near)), shown, judged.sight.select(places),
         (LandmarkDetails(),) * len(in_place) + finds.details)

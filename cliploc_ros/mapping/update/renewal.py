@@ -20,17 +20,17 @@ from cliploc_ros.mapping.building import LeftOut, left_out_lines, rounded
 from cliploc_ros.mapping.doubles import find_doubles
 from cliploc_ros.mapping.evidence import Evidence, gather_evidence
 from cliploc_ros.mapping.landmarks import ellipsoid_numbers, landmarks_of_map, unused_ids
-from cliploc_ros.mapping.update.alignment import LEAST_MOVE_SIGMAS, Known, deviations
+from cliploc_ros.mapping.update.alignment import LEAST_MOVE_SIGMAS, OldMap, deviations
 from cliploc_ros.mapping.update.identity import Fates
-from cliploc_ros.mapping.update.judging import Judged, Objects
+from cliploc_ros.mapping.update.judging import Judgement, Shown
 from cliploc_ros.mapping.update.sight import Sight
 from cliploc_ros.mapping.views import Views
 
 _ROWS_SHOWN = 40
 
 
-def renew(old: LandmarkMap, known: Known, views: Views, objects: Objects, fates: Fates,
-          judged: Judged, class_names: tuple[str, ...]) -> LandmarkMap:
+def renew(old: LandmarkMap, known: OldMap, views: Views, objects: Shown, fates: Fates,
+          judged: Judgement, class_names: tuple[str, ...]) -> LandmarkMap:
     """Return the new map: the old landmarks that are left, in their order, then new ones.
 
     The class names are those of the recording; the views have its poses in the map.
@@ -104,7 +104,7 @@ def one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], fi
     ).select(kept.tolist()), numbers[shown], int(np.sum(kept < first_new)), notes
 
 
-def _refitted(known: Known, objects: Objects, fates: Fates) -> dict[int, float]:
+def _refitted(known: OldMap, objects: Shown, fates: Fates) -> dict[int, float]:
     """Return the weight of the new centre for the confirmed landmarks that are fitted again."""
     rows = np.array([row for row in fates.confirmed
                      if known.details[row].position_sigma is not None
@@ -208,8 +208,8 @@ class UpdateReport:
         return rows + left_out_lines(self.left_out)
 
 
-def describe(old: LandmarkMap, updated: LandmarkMap, objects: Objects, fates: Fates,
-             judged: Judged) -> dict[str, tuple[UpdatedLandmark, ...]]:
+def describe(old: LandmarkMap, updated: LandmarkMap, objects: Shown, fates: Fates,
+             judged: Judgement) -> dict[str, tuple[UpdatedLandmark, ...]]:
     """Return the lists of an UpdateReport."""
     places = dict(zip(updated.landmark_ids, range(len(updated)), strict=True))
 

@@ -15,8 +15,8 @@ from cliploc_ros.mapping.pose_noise import estimated_note
 from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.mapping.update.alignment import (
     MIN_CONFIRMED,
-    Alignment,
-    Known,
+    Aligned,
+    OldMap,
     align,
     known_landmarks,
 )
@@ -26,7 +26,7 @@ from cliploc_ros.mapping.update.identity import (
     renew_embeddings,
     why_not_comparable,
 )
-from cliploc_ros.mapping.update.judging import LEAST_VIEWS, Judged, gather_objects, judge
+from cliploc_ros.mapping.update.judging import LEAST_VIEWS, Judgement, gather_objects, judge
 from cliploc_ros.mapping.update.renewal import UpdateReport, describe, one_of_each, renew
 from cliploc_ros.mapping.views import check_input, make_views, map_from_cameras
 
@@ -115,7 +115,7 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
                                        shown))
 
 
-def _check_belongs(judged: Judged, well_share: float) -> None:
+def _check_belongs(judged: Judgement, well_share: float) -> None:
     """Refuse a recording that shows hardly any landmark in its place, or most of them badly."""
     count, there = len(judged.is_there), int(judged.is_there.sum())
     in_view = int((judged.is_there | (judged.sight.expected[:count] >= LEAST_VIEWS)).sum())
@@ -128,7 +128,7 @@ def _check_belongs(judged: Judged, well_share: float) -> None:
             'errors, or build a new map')
 
 
-def _notes(old: LandmarkMap, known: Known, aligned: Alignment, detections: PosedDetections
+def _notes(old: LandmarkMap, known: OldMap, aligned: Aligned, detections: PosedDetections
            ) -> list[str]:
     """Return what the user should know of the input."""
     notes = []

@@ -308,15 +308,21 @@ class FrameSource:
         return receive
 
     def _take_depth(self, msg: Image | CompressedImage) -> None:
-        """Keep a depth image until its frame is complete, and the newest ones of all."""
+        """Keep depth images as long as images wait; of those that do not fit, each n-th."""
         with self.changed:
             if not self._subscriptions:
                 return
             self._heard_at['depth'] = time.monotonic()
             self._depths.append(msg)
+            oldest = self._pairing.oldest('image')
+            # with no image that waits, the next one is about as new as this
+            useful_ns = (stamp_ns(msg.header.stamp) if oldest is None
+                         else stamp_ns(oldest[0].header.stamp)) - self._depth_tolerance_ns
             while len(self._depths) > 1 and sum(
                     len(one.data) for one in self._depths) > _MAX_DEPTH_BYTES:
-                self._depths.popleft()
+                stamps = [stamp_ns(one.header.stamp) for one in self._depths]
+                del self._depths[0 if stamps[0] < useful_ns or len(stamps) < 3 else 1 + min(
+                    range(len(stamps) - 2), key=lambda row: stamps[row + 2] - stamps[row])]
 
     def _depth_at(self, image_ns: int) -> Image | CompressedImage | None:
         """Return the depth image nearest to a time; older ones are of no more use."""

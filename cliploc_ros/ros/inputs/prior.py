@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is known before an image: where the robot probably is, and walls.
+"""What is known before an image: where the robot probably is.
 
 The topic `~/prior` tells where the robot is, until another message does. Without one it is where
 it was last: the pose of the last accepted request, and what the localizer showed after it, are
@@ -12,24 +12,17 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
 from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.subscription import Subscription
+from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import SAME_SPOT, is_rigid
-from cliploc_ros.core.map.occupancy_grid import (
-    FREE,
-    OCCUPIED,
-    UNKNOWN,
-    OccupancyGrid,
-    check_size,
-)
 from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Region, check_planar
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.files.storage import write_text
@@ -37,37 +30,27 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_from_msg, pose_with_covariance_msg
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.node.lifecycle import ManagedNode
-from cliploc_ros.ros.parameters import BY_TOPIC, RelocalizerParameters
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 _LOG_PERIOD_S = 5.0
 # Between two poses of a localizer that are written [s].
 _WRITE_PERIOD_S = 1.0
 _PLANAR = np.array([0, 1, 5])  # x, y and yaw in a covariance of ROS
 _LEVEL_COSINE = 0.7
-# Values of a cell as of map_server [percent].
-_OCCUPIED_FROM, _FREE_TO = 65, 25
 
 
 class NoPriorError(CliplocError):
     """A prior is invalid; the message says what to do."""
 
 
-class Known(NamedTuple):
-    """What is known before an image."""
-
-    region: Region | None = None
-    grid: OccupancyGrid | None = None
-
-
 class PriorSource:
-    """Hears where the robot is and where walls are, and keeps its last pose."""
+    """Hears where the robot is, and keeps its last pose."""
 
     def __init__(self, node: ManagedNode[RelocalizerParameters], transforms: CoordinateFrames
                  ) -> None:
         self._node, self._transforms = node, transforms
         self._heard: PoseWithCovarianceStamped | None = None  # also an invalid one
         self._told: PoseWithCovarianceStamped | None = None
-        self._grid: OccupancyGrid | None = None
         # Until a pose is accepted: the last one before, and the hash of its map.
         self._last: tuple[PoseWithCovarianceStamped, str] | None = None
         # From then on: what was written last, when, and the hash of the map.
@@ -80,13 +63,10 @@ class PriorSource:
         if self._subscriptions:
             return
         # a volatile publisher does not match a transient local subscription
-        heard = [(PoseWithCovarianceStamped, '~/prior', self.hear, profile)
-                 for profile in (qos.LATCHED, qos.POSE)]
-        if parameters.occupancy_grid == BY_TOPIC:
-            heard.append((OccupancyGridMsg, 'map', self.hear_grid, qos.LATCHED))
         group = MutuallyExclusiveCallbackGroup()
         self._subscriptions = [self._node.create_subscription(
-            *one, callback_group=group) for one in heard]
+            PoseWithCovarianceStamped, '~/prior', self.hear, profile, callback_group=group)
+            for profile in (qos.LATCHED, qos.POSE)]
         if parameters.last_pose_file and self._written is None:
             self._last = self._read(Path(parameters.last_pose_file))
 
@@ -109,33 +89,20 @@ class PriorSource:
         except CliplocError as error:
             self._node.get_logger().warning(f'localizing without a prior: ~/prior: {error}')
 
-    def hear_grid(self, msg: OccupancyGridMsg) -> None:
-        """Take in walls; an invalid grid takes the place of the one before, too."""
-        self._grid = None
-        try:
-            self._grid = grid_from_msg(msg)
-        except CliplocError as error:
-            self._node.get_logger().warning(f'localizing without the topic map: {error}')
-
-    def known(self, stamp: Time, parameters: RelocalizerParameters,
-              camera_from_base: NDArray[np.float64], frame_ids: Sequence[str], map_hash: str
-              ) -> Known:
-        """Return what is known of a robot at a stamp, in maps of some frames and a hash."""
+    def region(self, stamp: Time, parameters: RelocalizerParameters,
+               camera_from_base: NDArray[np.float64], frame_ids: Sequence[str], map_hash: str
+               ) -> Region | None:
+        """Return where the robot is at a stamp, in maps of some frames; None if unknown."""
         told, probability = self._told, parameters.prior_probability
         if told is None and self._last is not None and self._last[1] == map_hash:
             told, probability = self._last[0], parameters.last_pose_probability
-        region = None
-        if told is not None:
-            try:
-                region = self._region(told, probability, stamp, parameters, camera_from_base,
-                                      frame_ids)
-            except CliplocError as error:
-                self._warn(f'localizing without the prior: {error}')
-        grid = self._grid
-        if grid is not None and grid.frame_id not in frame_ids:
-            self._warn(f"localizing without the topic map: it is in frame '{grid.frame_id}', the "
-                       f"landmarks in '{', '.join(frame_ids)}'")
-        return Known(region, grid)
+        if told is None:
+            return None
+        try:
+            return self._region(told, probability, stamp, parameters, camera_from_base, frame_ids)
+        except CliplocError as error:
+            self._warn(f'localizing without the prior: {error}')
+            return None
 
     def keep(self, accepted: PoseWithCovarianceStamped, parameters: RelocalizerParameters,
              map_hash: str) -> None:
@@ -179,7 +146,7 @@ class PriorSource:
             pose = np.array(fields['map_from_robot'], dtype=np.float64)
             if not is_rigid(pose):
                 raise ValueError('map_from_robot is no pose')
-            msg = pose_with_covariance_msg(OccupancyGridMsg().header, pose, np.array(
+            msg = pose_with_covariance_msg(Header(), pose, np.array(
                 fields['covariance'], dtype=np.float64).reshape(6, 6))
             msg.header.frame_id = str(fields['frame_id'])
             planar_of(msg)
@@ -232,20 +199,3 @@ def planar_of(msg: PoseWithCovarianceStamped
     covariance[2, :2] = covariance[:2, 2] = 0.0
     check_planar(covariance)
     return pose, covariance
-
-
-def grid_from_msg(msg: OccupancyGridMsg) -> OccupancyGrid:
-    """Return the walls of a message. MapError: names the field."""
-    info, origin = msg.info, msg.info.origin
-    check_size(info.width, info.height)
-    values = np.asarray(msg.data, dtype=np.int8)
-    if len(values) != info.width * info.height:
-        raise NoPriorError(f'{len(values)} cells instead of {info.width} x {info.height}')
-    cells = np.full(len(values), UNKNOWN, dtype=np.int8)
-    cells[values >= _OCCUPIED_FROM] = OCCUPIED
-    cells[(values >= 0) & (values <= _FREE_TO)] = FREE
-    q = origin.orientation
-    yaw = float(np.arctan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y ** 2 + q.z ** 2)))
-    return OccupancyGrid(msg.header.frame_id.lstrip('/'), cells.reshape(info.height, info.width),
-                         info.resolution, (origin.position.x, origin.position.y, yaw))
-

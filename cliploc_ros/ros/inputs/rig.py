@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several cameras of one robot: the frames of one instant."""
 
+import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from cliploc_ros.ros.conversions import stamp_ns
@@ -19,6 +22,42 @@ from cliploc_ros.units import NS_PER_S
 
 # The images of other cameras come at most this much later, or not at all.
 _PATIENCE_S = 0.3
+# A frame of an instant that was passed on comes at most this much late; time has jumped back else.
+_LATE_NS = 5 * NS_PER_S
+_MOST_PENDING = 4
+_CHECK_PERIOD_S = 0.1
+
+
+class _Instant:
+    """Frames of one instant, by camera, while others may come.
+
+    Parameters
+    ----------
+    first : Frame
+        The first one that is complete.
+    count : int
+        Number of cameras.
+    """
+
+    def __init__(self, first: Frame, count: int) -> None:
+        self.frames = {first.camera: first}
+        self.image_until = first.received_at + _PATIENCE_S
+        # a detector that serves the cameras in turn is done with the last one after this time
+        self.until = first.detected_at + _PATIENCE_S + count * (
+            first.detected_at - first.received_at)
+
+    @property
+    def stamps_ns(self) -> list[int]:
+        """Return the stamps of its images [ns]."""
+        return [_stamp_ns(one) for one in self.frames.values()]
+
+    def take(self, frame: Frame, tolerance_ns: float) -> bool:
+        """Take a frame of this instant; return whether it is one."""
+        stamps = [*self.stamps_ns, _stamp_ns(frame)]
+        if frame.camera in self.frames or max(stamps) - min(stamps) > tolerance_ns:
+            return False
+        self.frames[frame.camera] = frame
+        return True
 
 
 class Rig:
@@ -43,6 +82,11 @@ class Rig:
             node, parameters.image_transport, linger_s, self._take, parameters.detections_type,
             parameters.depth_transport, parameters.depth_tolerance_s, name, self._changed)
             for name in parameters.camera_names}
+        self._pending: deque[_Instant] = deque()
+        self._passed_ns = -_LATE_NS
+        if linger_s == math.inf:  # a camera that is silent completes no instant
+            node.create_timer(_CHECK_PERIOD_S, self._pass_on, MutuallyExclusiveCallbackGroup(),
+                              Clock(clock_type=ClockType.STEADY_TIME))
 
     @property
     def topics(self) -> list[str]:
@@ -73,14 +117,28 @@ class Rig:
         """Drop the messages received so far."""
         for source in self._sources.values():
             source.forget()
+        with self._changed:
+            self._pending.clear()
+            self._passed_ns = -_LATE_NS
 
     def next_frame(self, after: float, deadline: float) -> Frame:
         """Return the first instant whose images arrived after a moment; see FrameSource."""
         sources = list(self._sources.values())
+        with self._changed:  # subscribed until the last camera's frame is there
+            for source in sources:
+                source.want(deadline)
+        try:
+            return self._next_instant(sources, after, deadline)
+        finally:
+            with self._changed:
+                for source in sources:
+                    if not source.is_closed:
+                        source.want_no_more(deadline)
+
+    def _next_instant(self, sources: list[FrameSource], after: float, deadline: float) -> Frame:
         frame = next_of_any(sources, after, deadline)
         begun_at = time.monotonic()
-        # a detector that serves the cameras in turn is done with the last one after this time
-        in_turn_s = _PATIENCE_S + len(sources) * (frame.detected_at - frame.received_at)
+        until = begun_at + _Instant(frame, len(sources)).until - frame.detected_at
 
         def is_all(awaited: Callable[[FrameSource], bool]) -> bool:
             return sources[0].is_closed or not any(
@@ -92,7 +150,7 @@ class Rig:
             self._changed.wait_for(
                 lambda: is_all(lambda source: source.awaits_detections(
                     _stamp_ns(frame), self._tolerance_s)),
-                max(0.0, min(begun_at + in_turn_s, deadline) - time.monotonic()))
+                max(0.0, min(until, deadline) - time.monotonic()))
             return self._instant(frame, after)
 
     def missing(self) -> list[str]:
@@ -112,22 +170,46 @@ class Rig:
             health.add(own, name)
 
     def _take(self, frame: Frame) -> None:
-        """Pass on an instant with its first camera's frame."""
+        """Take in a frame of continuous mode, and pass on the instants that are complete."""
         with self._changed:
-            instant = self._instant(frame, frame.received_at - self._tolerance_s)
-        if instant.camera == frame.camera:
-            self._on_frame(instant)
+            if 0 <= self._passed_ns - _stamp_ns(frame) < _LATE_NS:
+                return
+            if not any(one.take(frame, self._tolerance_s * NS_PER_S) for one in self._pending):
+                self._pending.append(_Instant(frame, len(self._sources)))
+        self._pass_on()
+
+    def _pass_on(self) -> None:
+        """Pass on the instants, in their order, that no other frame can complete."""
+        ready = []
+        with self._changed:
+            while self._pending and (len(self._pending) > _MOST_PENDING
+                                     or not self._may_grow(self._pending[0])):
+                instant = self._pending.popleft()
+                self._passed_ns = max(instant.stamps_ns)
+                ready.append(self._joined(instant.frames))
+        for frame in ready:
+            self._on_frame(frame)
+
+    def _may_grow(self, instant: _Instant) -> bool:
+        """Return whether a frame of another camera may still come; holds the condition."""
+        now, at_ns = time.monotonic(), max(instant.stamps_ns)
+        return now < instant.until and any(
+            now < instant.image_until or source.awaits_detections(at_ns, self._tolerance_s)
+            for name, source in self._sources.items() if name not in instant.frames)
+
+    def _joined(self, frames: Mapping[str, Frame]) -> Frame:
+        """Return frames of one instant as the first camera's, with those of others beside it."""
+        first, *others = (frames[name] for name in self._sources if name in frames)
+        return replace(first, beside=tuple(others), left_out=tuple(
+            name for name in self._sources if name not in frames))
 
     def _instant(self, frame: Frame, after: float) -> Frame:
         """Return the frames of the newest instant, as the first camera's and those beside it."""
         found = {name: newest for name, source in self._sources.items()
                  if (newest := source.newest_since(after)) is not None} or {frame.camera: frame}
         last_ns = max(_stamp_ns(one) for one in found.values())
-        near = [one for one in found.values()
-                if last_ns - _stamp_ns(one) <= self._tolerance_s * NS_PER_S]
-        left_out = tuple(name for name in self._sources if name not in {
-            one.camera for one in near})
-        return replace(near[0], beside=tuple(near[1:]), left_out=left_out)
+        return self._joined({name: one for name, one in found.items()
+                             if last_ns - _stamp_ns(one) <= self._tolerance_s * NS_PER_S})
 
 
 def frames_of(node: Node, parameters: RelocalizerParameters, linger_s: float,

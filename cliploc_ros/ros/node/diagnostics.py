@@ -5,12 +5,14 @@
 diagnostic_updater does this on an installed ROS, but has no package on PyPI.
 """
 
+import csv
+import io
 import os
 import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -25,6 +27,18 @@ _PERIOD_S = 1.0
 _MIN_RATE_PERIOD_S = 0.5
 # Results that means and percentiles cover.
 _WINDOW = 200
+
+
+def join_names(names: Sequence[str]) -> str:
+    """Return names as one value, separated by commas; those with a comma or a quote are quoted."""
+    text = io.StringIO()
+    csv.writer(text).writerow(names)
+    return text.getvalue().removesuffix('\r\n')
+
+
+def split_names(text: str) -> tuple[str, ...]:
+    """Return the names that join_names joined."""
+    return tuple(next(csv.reader(io.StringIO(text, newline='')), ()))
 
 
 @dataclass

@@ -58,17 +58,6 @@ def start_bond(node: Node) -> Any:
     return bond
 
 
-def end_bond(node: Node, bond: Any) -> None:
-    """Tell the manager that the node ends its work.
-
-    bondpy destroys its publisher and subscription, but leaves them to the node: its executor
-    would come upon them for ever, and do nothing else.
-    """
-    bond.shutdown()
-    node.destroy_publisher(bond.pub)
-    node.destroy_subscription(bond.sub)
-
-
 class RosLogHandler(logging.Handler):
     """Logs the records of Python's logging through a node."""
 
@@ -162,6 +151,18 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
 
     def release(self) -> None:
         """Release requests that wait: the process ends."""
+
+    def end_bond(self) -> None:
+        """Tell the manager that the node ends its work; a bond needs the node to do so.
+
+        bondpy destroys its publisher and subscription, but leaves them to the node: its executor
+        would come upon them for ever, and do nothing else.
+        """
+        bond, self._bond = self._bond, None
+        if bond is not None:
+            bond.shutdown()
+            self.destroy_publisher(bond.pub)
+            self.destroy_subscription(bond.sub)
 
     # ---- state ----------------------------------------------------------------------------------
 
@@ -293,9 +294,7 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
 
     def _deactivate(self) -> None:
         self.active = False
-        if self._bond is not None:
-            end_bond(self, self._bond)
-            self._bond = None
+        self.end_bond()
         self.close()
 
     def _free(self) -> None:

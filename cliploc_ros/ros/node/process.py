@@ -12,13 +12,16 @@ from contextlib import suppress
 from typing import NoReturn
 
 import rclpy
+from rclpy.signals import SignalHandlerOptions
 
 from cliploc_ros.command import Interruption, split_ros_args
 from cliploc_ros.ros.node.executor import NodeExecutor, log_failure
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 
 _M_ARENA_MAX = -8  # malloc.h
-# Time for callbacks to end before their node is destroyed.
+# Python handles a signal between two waits.
+_SPIN_S = 0.2
+# Time for callbacks to end before their node is destroyed: requests are answered meanwhile.
 _GRACE_S = 1.0
 _HELP = """\
 usage: ros2 run cliploc_ros {name} --ros-args [--params-file FILE] [-p NAME:=VALUE] [-r OLD:=NEW]
@@ -42,11 +45,12 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoR
     # slows the other process tenfold. PyTorch reads this when it is loaded.
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
     _bound_arenas()
-    # Python would raise KeyboardInterrupt anywhere, even in the middle of a callback.
+    # Python would raise KeyboardInterrupt anywhere, even in the middle of a callback. rclpy would
+    # end its context at once: a request under way could not be answered, nor a bond be ended.
     interrupted = Interruption()
-    interrupted.catch(signal.SIGINT)
+    interrupted.catch(signal.SIGINT, signal.SIGTERM)
     try:
-        rclpy.init(args=sys.argv)
+        rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rcl has its own types, for arguments and for missing folders
         sys.exit(f'error: ROS does not start: {error} (is HOME or ROS_LOG_DIR set?)')
     executor = NodeExecutor()
@@ -57,14 +61,12 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoR
         executor.add_node(node)
         while node.context.ok() and not interrupted.is_set():
             try:
-                # rclpy sometimes loses the wake-up of a shutdown: check twice a second.
-                executor.spin_once(timeout_sec=0.5)
+                executor.spin_once(timeout_sec=_SPIN_S)
             except Exception as error:
                 log_failure(error, node)
     except Exception:
         if rclpy.ok():
             raise
-        # a signal arrived while the node was constructed
     finally:
         if node is not None:
             node.release()
@@ -72,6 +74,7 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoR
             # A callback that runs on in a destroyed node causes a segmentation fault. rclpy's
             # own shutdown should wait for callbacks, but does not.
             executor._work_tracker.wait(_GRACE_S)
+            node.end_bond()
             # The executor's pending handlers keep references to all entities it waited for.
             executor.shutdown(0.0)
             # Without this, other nodes take it for alive for 20 s, and requests to it are lost.

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The watch over a recording: what it says of the poses of a localizer, and when."""
+"""The watch over a recording: what it says of the poses of a localizer, and when.
+
+The poses of the observation file are those of the localizer, the truth is a trajectory.
+"""
 
 import json
 from collections.abc import Sequence
@@ -10,17 +13,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from cliploc_ros.core.geometry.transforms import SAME_ANSWER, pose_error
-from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, pose_error
 from cliploc_ros.core.watch.watch import Watch, WatchState
 from cliploc_ros.datasets.observations import Recorded
 from cliploc_ros.datasets.poses import Poses
-from cliploc_ros.evaluation.watch_figures import draw_roc, draw_timeline
+from cliploc_ros.evaluation.figures import add_legend, new_axes, save_figure
 from cliploc_ros.files.storage import make_folder, write_text
-from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.units import NS_PER_S
+from studies.acceptance.places import observation_of
+
+# Okabe and Ito, see cliploc_ros.evaluation.figures.
+_COLORS = {'localized': '#009E73', 'uncertain': '#E69F00', 'lost': '#D55E00'}
+_ERROR, _PROBABILITY = '#555555', '#0072B2'
 
 
 @dataclass(frozen=True)
@@ -46,19 +54,6 @@ class WatchedLook:
         if self.error_m is None or self.error_deg is None:
             return None
         return self.error_m < SAME_ANSWER.distance_m and self.error_deg < SAME_ANSWER.angle_deg
-
-
-def observation_of(recorded: PosedDetections, row: int, stamp_ns: int) -> Observation:
-    """Return a frame of a recording as an observation by class."""
-    boxes = slice(recorded.frame_offsets[row], recorded.frame_offsets[row + 1])
-    odom = None if recorded.odom_from_camera is None else recorded.odom_from_camera[row]
-    return Observation(
-        recorded.camera_of(row), Detections(
-            recorded.bboxes_xyxy[boxes],
-            tuple(recorded.class_names[one] for one in recorded.classes[boxes]),
-            recorded.scores[boxes]), stamp_ns=stamp_ns, camera_name=recorded.name_of(row),
-        depths=None if recorded.depths is None else recorded.depths[boxes].astype(np.float64),
-        odom_from_camera=None if odom is None or np.isnan(odom).any() else odom)
 
 
 def watch_recording(recorded: Recorded, watch: Watch, truth: Poses | None, period_s: float
@@ -146,16 +141,16 @@ def summarize_watch(looks: Sequence[WatchedLook]) -> dict[str, Any]:
         'area_under_roc': area, 'wrong_stretches': times_to_alarm(looks)}
 
 
-def write_watch(folder: Path, looks: Sequence[WatchedLook], figures: bool) -> str:
+def write_watch(folder: Path, looks: Sequence[WatchedLook]) -> str:
     """Write watch.json and the figures; return a summary in a few lines."""
     summary = summarize_watch(looks)
     make_folder(folder)
     write_text(folder / 'watch.json', json.dumps(
         {**summary, 'every_look': [asdict(one) for one in looks]}, indent=1))
-    if figures and looks:
-        draw_timeline(folder / 'watch_timeline.png', looks, alarms_of(looks))
+    if looks:
+        _draw_timeline(folder / 'watch_timeline.png', looks)
         if len(curve := roc(looks)):
-            draw_roc(folder / 'watch_roc.png', curve, summary['area_under_roc'])
+            _draw_roc(folder / 'watch_roc.png', curve, summary['area_under_roc'])
     states = ', '.join(f'{name} {count}' for name, count in summary['states'].items())
     lines = [f'{len(looks)} looks in {60.0 * summary["hours"]:.1f} min and '
              f'{summary["way_m"]:.0f} m: {states}; {summary["alarms"]} alarms']
@@ -168,3 +163,46 @@ def write_watch(folder: Path, looks: Sequence[WatchedLook], figures: bool) -> st
                      f'wrong poses: called lost after {one["looks"]} looks, '
                      f'{one["seconds"]:.1f} s, {one["metres"]:.1f} m')
     return '\n'.join(lines)
+
+
+def _draw_timeline(path: Path, looks: Sequence[WatchedLook]) -> Path:
+    """Draw pose error, probability, state and alarms over time; return the path."""
+    figure = Figure(figsize=(8.0, 4.4), layout='constrained')
+    above, below = figure.subplots(2, 1, sharex=True)
+    times = np.array([one.stamp_s for one in looks]) - looks[0].stamp_s
+    ends = np.append(times[1:], times[-1] + (times[-1] - times[-2] if len(times) > 1 else 1.0))
+    named = set[str]()
+    for one, begin, end in zip(looks, times, ends, strict=True):
+        below.axvspan(begin, end, color=_COLORS[one.state], alpha=0.3, linewidth=0.0,
+                      label=None if one.state in named else one.state)
+        named.add(one.state)
+    errors = np.array([np.nan if one.error_m is None else one.error_m for one in looks])
+    above.plot(times, errors, color=_ERROR, marker='.', markersize=3, linewidth=1.0)
+    above.axhline(RIGHT_M, color=_ERROR, linestyle=':', linewidth=1.0)
+    above.set_ylabel('error of the pose [m]')
+    if np.isnan(errors).all():
+        above.text(0.5, 0.5, 'the truth is unknown', transform=above.transAxes, ha='center')
+    below.plot(times, [one.probability for one in looks], color=_PROBABILITY, marker='.',
+               markersize=3, linewidth=1.0, label='probability')
+    for limit in (CALIBRATION.watch.lost, CALIBRATION.watch.localized):
+        below.axhline(limit, color=_PROBABILITY, linestyle=':', linewidth=1.0)
+    for number, one in enumerate(alarms_of(looks)):
+        for axes in (above, below):
+            axes.axvline(one.stamp_s - looks[0].stamp_s, color='black', linewidth=1.2,
+                         label='alarm' if number == 0 and axes is below else None)
+    below.set(xlabel='time [s]', ylabel='probability that\nthe pose is right',
+              ylim=(-0.03, 1.03))
+    for axes in (above, below):
+        axes.grid(alpha=0.3)
+    add_legend(figure)
+    return save_figure(figure, path)
+
+
+def _draw_roc(path: Path, shares: NDArray[np.float64], area: float) -> Path:
+    """Draw the shares (k, 2) of right and wrong poses below each probability; return the path."""
+    figure, axes = new_axes('share of right poses below', 'share of wrong poses below')
+    axes.plot([0, 1], [0, 1], color='#888888', linewidth=1.0)
+    axes.step(shares[:, 0], shares[:, 1], where='post', color=_PROBABILITY)
+    axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02),
+             title=f'each probability as a limit of alarms; area {area:.3f}')
+    return save_figure(figure, path)

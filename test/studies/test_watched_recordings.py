@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The watch over a recording: ``evaluate --bag BAG --watch TOPIC``."""
+"""The watch over a recorded localizer: ``python -m studies.watch localizer``."""
 
 import json
 import shutil
@@ -9,20 +9,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cliploc_ros.cli.evaluate import main as evaluate
 from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames, bag_odometry
 from cliploc_ros.datasets.bag_messages import map_from_camera_of, pose_message, stamp_ns
+from cliploc_ros.datasets.bag_poses import poses_of_topic
 from cliploc_ros.datasets.bags import BagReader, BagWriter
 from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum
-from cliploc_ros.evaluation.watching import (
+from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
+from studies.watch.__main__ import run
+from studies.watch.recordings import (
     WatchedLook,
     alarms_of,
     roc,
     summarize_watch,
     write_watch,
 )
+
+pytestmark = pytest.mark.full
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 IMAGES = 24
@@ -59,14 +65,14 @@ def test_without_truth_nothing_is_false(tmp_path):
     found = summarize_watch(looks)
     assert found['false_alarms'] is None
     assert found['wrong_stretches'] == []
-    assert 'false' not in write_watch(tmp_path, looks, figures=True)
+    assert 'false' not in write_watch(tmp_path, looks)
     assert (tmp_path / 'watch_timeline.png').exists()
     assert not (tmp_path / 'watch_roc.png').exists()
     assert summarize_watch([])['looks'] == 0
 
 
 @pytest.fixture(scope='module')
-def bag(tmp_path_factory):
+def observations(tmp_path_factory):
     """The first images of the demo's walk; half way the localizer jumps by 2 m."""
     folder = tmp_path_factory.mktemp('watched')
     shutil.copytree(ASSETS / 'sequence', folder / 'tum')
@@ -90,18 +96,24 @@ def bag(tmp_path_factory):
                 writer.write('/wheels', message.stamp_ns, pose_message(stamp, 'odom', pose))
                 writer.write('/localizer', message.stamp_ns, pose_message(
                     stamp, 'map', make_transform(np.eye(3), np.array([jump, 0.1, 0.0])) @ pose))
-    return folder / 'bag'
+    frames = bag_frames(folder / 'bag', BagTopics('/image/compressed', '/camera_info'),
+                        poses_of_topic('/localizer', 10**9))
+    record_once(frames, RecordingOptions(DetectorOptions(str(ASSETS / 'yolo.pt')), None,
+                                         EVERY_FRAME, ''), folder / 'seen.npz',
+                {'': bag_odometry(folder / 'bag', '/image/compressed',
+                                  poses_of_topic('/wheels', 10**9))})
+    return folder / 'seen.npz'
 
 
-def watch(bag, out, *arguments):
-    return evaluate(list(map(str, (
-        '--bag', bag, '--map', ASSETS / 'map.yaml', '--model', ASSETS / 'yolo.pt', '--image',
-        '/image/compressed', '--watch-period', 0.5, '--out', out, *arguments))))
+def watch(observations, out, *arguments):
+    run(list(map(str, ('localizer', '--observations', observations, '--map', ASSETS / 'map.yaml',
+                       '--out', out, *arguments))))
+    return json.loads((out / 'watch.json').read_text())
 
 
-def test_a_localizer_that_jumps_is_noticed(bag, tmp_path, capsys):
-    assert watch(bag, tmp_path, '--watch', '/localizer', '--odometry', '/wheels') == 0
-    found = json.loads((tmp_path / 'watch.json').read_text())
+def test_a_localizer_that_jumps_is_noticed(observations, tmp_path):
+    found = watch(observations, tmp_path, '--period', 0.5, '--truth',
+                  ASSETS / 'sequence/groundtruth.txt')
     assert found['looks'] == len(found['every_look']) == IMAGES
     assert found['alarms'] == 1
     assert found['false_alarms'] == 0
@@ -114,9 +126,7 @@ def test_a_localizer_that_jumps_is_noticed(bag, tmp_path, capsys):
     assert found['every_look'][-1]['error_m'] == pytest.approx(2.0, abs=0.1)
 
 
-def test_longer_periods_and_no_truth(bag, tmp_path, capsys):
-    assert watch(bag, tmp_path, '--watch', '/localizer', '--watch-period', 2, '--no-figures',
-                 '--ground-truth', '/nowhere') == 0
-    assert json.loads((tmp_path / 'watch.json').read_text())['looks'] == IMAGES / 4
+def test_longer_periods_and_no_truth(observations, tmp_path, capsys):
+    assert watch(observations, tmp_path)['looks'] == IMAGES / 4
     assert 'false alarms' not in capsys.readouterr().out
-    assert [path.name for path in tmp_path.iterdir()] == ['watch.json']
+    assert not (tmp_path / 'watch_roc.png').exists()

@@ -1,0 +1,43 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""No executable takes what is no number for a number."""
+
+import argparse
+from importlib import import_module
+
+import pytest
+
+PROGRAMS = ('build_map', 'check_map', 'demo', 'doctor', 'evaluate', 'import_map', 'prepare',
+            'replay', 'studio', 'tum_to_bag', 'wake_up')
+#: Options without a limit may say so.
+MAY_BE_INFINITE = {'--time-budget-ms', '--height-range'}
+
+
+def options_of(program):
+    parser = import_module(f'cliploc_ros.cli.{program}').make_parser()
+    return [action for action in parser._actions if action.option_strings and action.type]
+
+
+def takes(action, text):
+    try:
+        return isinstance(action.type(text), int | float)
+    except (ValueError, argparse.ArgumentTypeError):
+        return False
+
+
+@pytest.mark.parametrize('program', PROGRAMS)
+def test_options_that_are_numbers_refuse_nan_and_infinity(program):
+    for action in options_of(program):
+        name = action.option_strings[-1]
+        assert not takes(action, 'nan'), name
+        assert takes(action, 'inf') == (name in MAY_BE_INFINITE), name
+
+
+@pytest.mark.parametrize(('program', 'name'), [
+    ('build_map', '--max-gap'), ('build_map', '--seed'), ('build_map', '--keyframes'),
+    ('build_map', '--depth-unit'), ('build_map', '--workers'), ('check_map', '--folds'),
+    ('evaluate', '--max-gap'), ('evaluate', '--seed'), ('import_map', '--scale'),
+    ('tum_to_bag', '--every')])
+def test_what_is_counted_or_measured_is_not_negative(program, name):
+    action = next(one for one in options_of(program) if name in one.option_strings)
+    assert takes(action, '2') and not takes(action, '-1')
