@@ -114,8 +114,9 @@ def search_world(world: Simulated) -> list[Searched]:
                               vertical_deg if 'vertical' in mode else math.inf)
             shown = place.landmark_map
             if shared:
-                shown, queries = FAMILIES[shared].change(shown, queries, level,
+                shown, changed = FAMILIES[shared].change(shown, queries, level,
                                                          np.random.default_rng([seed, 8]))
+                queries = list(changed)
             maps = [(shown, False)]
             if mode in (ONE, ALL):
                 maps.append((exchange_landmarks(shown, queries, 1.0, rng)[0], True))
