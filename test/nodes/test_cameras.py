@@ -15,7 +15,7 @@ from tester import RELIABLE, transform_of
 from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.cli.evaluate import main as evaluate
-from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.ros.conversions import detections_to_msg
 
 BASE_FROM_CAMERA = [float(number) for mount in MOUNTS for number in (
@@ -121,18 +121,6 @@ def test_the_doctor_looks_at_each_camera(four_cameras, start):
     assert {('detector', 'pass'), ('time', 'pass')} <= found
 
 
-def test_a_mount_that_contradicts_the_others_is_named(four_cameras):
-    process, ask = four_cameras
-    turned = make_transform(Rotation.from_euler('y', 60.0, degrees=True).as_matrix(), np.zeros(3))
-    mounts = [MOUNTS[0], MOUNTS[1] @ turned, *MOUNTS[2:]]
-    said = 'what left sees does not fit the other cameras: check its mount'
-    for _ in range(30):
-        ask(mounts=mounts)
-        if said in process.output():
-            break
-    assert process.output().count(said) == 1
-
-
 def test_a_recorded_request_of_four_cameras_replays(four_cameras, tester, surroundings_map,
                                                     tmp_path, capsys):
     _, ask = four_cameras
@@ -148,8 +136,7 @@ def test_a_recorded_request_of_four_cameras_replays(four_cameras, tester, surrou
 
 
 @pytest.mark.parametrize(('working', 'late_s'), [
-    (NAMES[1:], {}), (NAMES[:-1], {}), (NAMES, {'back': 1.0}), (NAMES, {'left': NEVER})],
-    ids=['first silent', 'last silent', 'one late', 'one without stamps'])
+    (NAMES[1:], {}), (NAMES, {'left': NEVER})])
 def test_a_camera_that_is_late_or_silent_is_left_out_and_named(four_cameras, working, late_s):
     process, ask = four_cameras
     missing = next(iter(late_s), None) or next(one for one in NAMES if one not in working)

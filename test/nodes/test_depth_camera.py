@@ -102,8 +102,6 @@ def test_compressed_depth(own_relocalizer, depth_camera):
 
 @pytest.mark.parametrize(('depths', 'encoding', 'said'), [
     (depth_image(), '16UC1', r'pass +of 12 of 12 boxes, \d\.\d to \d\.\d m'),
-    (0.0 * depth_image(), '16UC1', 'not checked +none of 12 boxes has depth'),
-    (np.nan * depth_image(), '32FC1', 'not checked +none of 12 boxes has depth'),
     (depth_image()[:, ::2], '16UC1', 'fail +depth has 320x480 px, the image 640x480.*')])
 def test_the_doctor_looks_at_depth(own_relocalizer, depth_camera, start, depths, encoding, said):
     own_relocalizer(depth_transport='raw')
@@ -116,10 +114,7 @@ def test_the_doctor_looks_at_depth(own_relocalizer, depth_camera, start, depths,
 @pytest.mark.parametrize(('given', 'said'), [
     ({'depths': depth_image(1.0), 'encoding': '32FC1', 'frame_id': 'other'},
      "depth is in the coordinate frame 'other', the image in 'camera_optical_frame'"),
-    ({'depths': depth_image(), 'encoding': '32FC1'}, '16UC1 is in millimetres, 32FC1 in metres'),
-    ({'depths': depth_image()[:, ::2]}, 'depth has 320x480 px, the image 640x480'),
-    ({'depths': 1.7 * depth_image()}, 'times what boxes and map say, and is used no more'),
-])
+    ({'depths': 1.7 * depth_image()}, 'times what boxes and map say, and is used no more')])
 def test_depth_that_cannot_be_right_is_left_out_and_named(own_relocalizer, depth_camera, given,
                                                           said):
     process = own_relocalizer(depth_transport='raw', algorithm='auto')

@@ -87,19 +87,6 @@ def test_a_detector_of_other_classes_is_an_error(own_relocalizer, tester, status
     status.wait(ERROR, '62, which are numbers; the map has a, b, c')
 
 
-def test_between_requests_silence_is_no_problem(own_relocalizer, tester, status):
-    own_relocalizer(stale_after_s=0.1)
-    status.wait(OK, 'active', **{'last verdict': 'none yet'})
-    assert tester.relocalize(make_frame()).success
-    assert status.wait(OK, 'active', **{'last verdict': 'accepted'})['accepted'] == '1'
-
-
-def test_a_configure_that_fails_is_an_error_with_its_reason(own_relocalizer, status):
-    own_relocalizer(expect='[ERROR]', map_file='/nowhere/map.yaml')
-    # The reason is reported while the transition still ends.
-    status.wait(ERROR, '/nowhere/map.yaml: No such file', state='unconfigured')
-
-
 def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):
     detector = start('nodes.detector', parameters={
         'model': PROJECT / 'cliploc_ros/demo/assets/yolo.pt', 'stale_after_s': 1.0})

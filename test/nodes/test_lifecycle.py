@@ -130,17 +130,6 @@ def test_sigterm_ends_a_node_in_every_state(manage, room_map, name, state):
     assert 'Traceback' not in process.output()
 
 
-@pytest.mark.full
-def test_sigterm_while_weights_load(start, tmp_path):
-    for name in ('detector', 'relocalizer'):
-        process = start(f'nodes.{name}', fresh=True, parameters=with_networks(name, tmp_path))
-        process.wait_for_import('openvino')
-        code, seconds = process.stop(signal.SIGTERM)
-        assert code == 0, process.output()
-        assert seconds < 2.0
-        assert 'Traceback' not in process.output()
-
-
 def processor_share(process, tester, seconds=3.0):
     """The share of a core that a process uses while a camera publishes at 30 Hz."""
     frame = make_frame()
@@ -183,20 +172,6 @@ def test_deactivation_answers_the_request_that_waits(manage, tester, room_map):
     tester.wait(lambda: tester.listened_to() == 0, 'the subscriptions to end')
 
 
-def test_a_failing_configure_can_be_tried_again(manage, tester, room_map, tmp_path):
-    path = tmp_path / 'map.yaml'
-    process, manager = manage('relocalizer', **class_matching(path))
-    tester.connect()
-    assert not manager.change(IDS['configure'])
-    assert manager.state == 'unconfigured'
-    assert f'{path}: No such file' in process.output()
-    assert f'{path}: No such file' in tester.answer(tester.ask()).message
-    path.write_text(room_map.read_text())
-    assert not tester.answer(tester.ask()).success
-    manager.do('configure', 'activate')
-    assert tester.relocalize(make_frame()).success
-
-
 def test_the_manager_hears_by_a_bond_whether_a_node_lives(manage, tester, room_map):
     """On the topic and with the name that Nav2's manager listens for, by a stand-in for bondpy."""
     heard = []
@@ -213,16 +188,6 @@ def test_the_manager_hears_by_a_bond_whether_a_node_lives(manage, tester, room_m
     assert 'Traceback' not in process.output()
 
 
-def test_who_takes_over_a_node_that_started_itself_is_its_manager(own_relocalizer, tester):
-    own_relocalizer()
-    assert tester.relocalize(make_frame()).success
-    manager = Manager(tester, 'relocalizer')
-    manager.do('deactivate', 'cleanup')
-    assert not tester.answer(tester.ask()).success
-    assert manager.state == 'unconfigured'
-    manager.close()
-
-
 @pytest.mark.full
 def test_a_detector_mends_itself_when_its_weights_come(start, tester, tmp_path):
     weights = tmp_path / 'yolo.pt'
@@ -233,21 +198,6 @@ def test_a_detector_mends_itself_when_its_weights_come(start, tester, tmp_path):
     process.wait_for_output('ready after')
     with tester.hearing_detections() as detected:
         tester.feed_until(lambda: detected, [make_frame()[0]], 'detections')
-
-
-@pytest.mark.full
-def test_an_inactive_detector_costs_nothing(manage, tester):
-    process, manager = manage('detector', **with_networks('detector', ''))
-    with tester.hearing_detections() as detected:
-        manager.do('configure')
-        assert tester.images.get_subscription_count() == 0
-        manager.do('activate')
-        tester.feed_until(lambda: detected, [make_frame()[0]], 'detections')
-        manager.do('deactivate')
-        tester.wait(lambda: tester.images.get_subscription_count() == 0, 'the detector to rest')
-    share = processor_share(process, tester)
-    print(f'\ninactive beside a camera: {100 * share:.1f} % of a core')
-    assert share < 0.05
 
 
 @pytest.mark.full

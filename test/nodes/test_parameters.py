@@ -98,16 +98,6 @@ def test_the_map_is_read_anew_and_a_bad_one_changes_nothing(own_relocalizer, tes
         assert tester.relocalize(make_frame()).message.count(' in hall,') == 1
 
 
-def test_another_map_file_at_run_time(own_relocalizer, tester, own_map, room_map):
-    own_relocalizer()
-    own_map.write_text(own_map.read_text().replace('frame_id: map', 'frame_id: attic'))
-    assert tester.set_parameter('map_file', str(own_map)).successful
-    assert "in frame 'attic'" in reload_map(tester).message
-    assert tester.set_parameter('map_file', '/nowhere.yaml').successful
-    assert not reload_map(tester).success
-    assert ' in attic,' in tester.relocalize(make_frame()).message
-
-
 def test_a_map_reload_while_a_request_waits(own_relocalizer, tester, own_map):
     own_relocalizer(map_file=own_map)
     future = tester.ask()

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The studio's live view: real nodes, and the page in a real browser."""
 
-import shutil
-import signal
 import subprocess
 import sys
 import threading
@@ -11,48 +9,18 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from browser import Person, running_chromium
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from processes import PROJECT, wait_for
 from tester import RELIABLE, make_frame
 
-from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
-from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.studio.document import Document
-from cliploc_ros.studio.images import open_images, views_of_folder
 from cliploc_ros.studio.live import LiveError, follow_relocalizer
-from cliploc_ros.studio.recording import Recording
-from cliploc_ros.studio.studio import Studio
-
-ASSETS = PROJECT / 'cliploc_ros/demo/assets'
-
-
-def in_a_browser(test):
-    return pytest.mark.clock(pytest.mark.needs('viser', 'playwright', 'chromium')(test))
 
 
 @pytest.fixture
 def live(ros):
     with follow_relocalizer('relocalizer') as live:
         yield live
-
-
-@pytest.fixture
-def person(live, tmp_path):
-    """A person at the page of a studio with the demo's map, who opened the tab of the robot."""
-    from cliploc_ros.studio.page import serve_studio
-
-    path = tmp_path / 'map.yaml'
-    shutil.copy(ASSETS / 'map.yaml', path)
-    folder = ASSETS / 'sequence'
-    studio = Studio(Document(path), Recording(views_of_folder(folder)), open_images(folder, None))
-    with (running_chromium() as chromium,
-          serve_studio(studio, '127.0.0.1', 0, live) as (url, _)):
-        person = Person(chromium, url)
-        person.mode('Test')
-        yield person
-    studio.document.close()
 
 
 @contextmanager
@@ -70,38 +38,6 @@ def in_a_thread(action):
     thread.start()
     yield outcome
     thread.join(60.0)
-
-
-@in_a_browser
-def test_the_robot_relocalizes_and_the_map_shows_where(person, live, tmp_path, start,
-                                                       monkeypatch):
-    walk = tmp_path / 'walk'
-    monkeypatch.setattr('sys.argv', ['tum_to_bag', str(ASSETS / 'sequence'), str(walk)])
-    assert tum_to_bag() == 0
-    start('nodes.detector', parameters={'model': ASSETS / 'yolo.pt'}).wait_for_output(
-        'ready after')
-    start('nodes.relocalizer', parameters={
-        'map_file': ASSETS / 'map.yaml', 'matching': 'hybrid', 'require_localizer': False,
-        'clip_model': ASSETS / 'clip.json', 'clip_pretrained': ASSETS / 'clip.safetensors',
-        'cache_dir': tmp_path}).wait_for_output('ready after')
-    start('cli.replay', walk, '--loop', '--rate', '0.5')
-    person.mode('Test')
-    person.page.get_by_text('landmarks in frame').wait_for()
-    person.page.get_by_text('which is not the map of this studio').wait_for()
-    while not live.state.is_current:  # single frames are refused
-        count = person.page.get_by_text('last answer').count()
-        person.click('Relocalize the robot')
-        wait_for(lambda: live.state.verdict and not live.state.is_busy, 'an answer')
-        assert count <= 1
-    wait_for(lambda: live.state.pose is not None, 'the pose')
-    truth = read_tum(ASSETS / 'sequence').trajectory.positions_xyz
-    position = live.state.pose.map_from_body[:3, 3]
-    assert np.linalg.norm(truth - position, axis=1).min() < 0.5
-    person.click('Look at its pose')
-    person.page.get_by_text('pose of the camera').wait_for()
-    person.picture('live')
-    person.click('Let it reload its map')
-    person.page.get_by_text('loaded: 60 landmarks').wait_for()
 
 
 def test_without_a_relocalizer(live):
@@ -158,26 +94,6 @@ def test_invalid_poses_are_left_out(live, tester):
 
 
 @pytest.mark.full
-def test_a_relocalizer_that_is_stopped_or_killed_and_starts_again(live, own_relocalizer, tester):
-    for number, text in ((signal.SIGINT, None), (signal.SIGKILL, 'has not reported')):
-        process = own_relocalizer(timeout_s=60.0)
-        wait_for(live._relocalize.service_is_ready, 'the service')
-        with in_a_thread(live.relocalize) as outcome:
-            wait_for(lambda: live.state.is_busy, 'the request')
-            tester.wait(lambda: tester.listened_to() > 0, 'the request to arrive')
-            process.stop(number)
-        assert isinstance(outcome[0], LiveError)
-        assert text is None or text in str(outcome[0])
-    own_relocalizer()
-    # DDS takes the killed one for alive for up to 20 s: a request may be for that one alone
-    wait_for(lambda: live.state.is_heard, 'the new one to report')
-    wait_for(lambda: live._node.count_publishers('/relocalizer/pose') == 1, 'the killed one to go')
-    with in_a_thread(live.relocalize) as outcome:
-        tester.feed_until(lambda: outcome, make_frame())
-    assert str(outcome[0]).startswith('accepted')
-
-
-@pytest.mark.full
 def test_the_studio_ends_while_a_request_waits(own_relocalizer):
     own_relocalizer(timeout_s=60.0)
     with follow_relocalizer('relocalizer') as live:
@@ -192,17 +108,6 @@ def test_the_studio_ends_while_a_request_waits(own_relocalizer):
 def test_names_that_are_none(name):
     with pytest.raises(OptionsError, match='--ros'), follow_relocalizer(name):
         pass
-
-
-@pytest.mark.full
-@pytest.mark.needs('viser')
-def test_the_executable_follows_and_ends_on_ctrl_c(own_relocalizer, start, tmp_path):
-    own_relocalizer()
-    process = start('cli.studio', tmp_path / 'map.yaml', '--ros', '--no-browser', '--port', '0')
-    process.wait_for_output('studio: http')
-    code, seconds = process.stop(signal.SIGINT)
-    assert code == 130 and seconds < 10.0
-    assert 'Traceback' not in process.output() and 'error' not in process.output()
 
 
 @pytest.mark.full
