@@ -14,7 +14,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
-from cliploc_ros.errors import CameraError, ImageError, MapError, OptionsError
+from cliploc_ros.errors import CameraError
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import load_localizer
 from cliploc_ros.ros.inputs.frame_source import Frame
@@ -113,12 +113,6 @@ def test_more_detections_than_allowed_are_not_searched(localizer, values):
     assert not localize(localizer, make_frame(), replace(values, max_detections=3)).accepted
 
 
-def test_nothing_seen_is_no_pose_and_no_error(localizer, values):
-    nothing = see_room(make_room()).select(np.array([], dtype=np.int64))
-    found = localize(localizer, make_frame(detections=nothing), values)
-    assert not found.accepted and found.hypotheses == () and found.reason
-
-
 def test_depth_of_another_camera_is_registered(localizer, values, caplog):
     """Of half the resolution, 20 cm to the left of the colour camera: a wall at 4 m."""
     height, width = CAMERA.height // 2, CAMERA.width // 2
@@ -143,20 +137,6 @@ def test_depth_of_another_camera_is_registered(localizer, values, caplog):
             (CameraInfo(), left, 'camera_info: K')):
         assert depths(wrong, pose) is None
         assert said in caplog.text
-
-
-def test_a_bad_image_is_named(localizer, values):
-    with pytest.raises(ImageError, match="encoding 'yuv422'"):
-        localize(localizer, make_frame(encoding='yuv422'), values)
-
-
-@pytest.mark.parametrize(('changes', 'error', 'message'), [
-    ({'map_file': ''}, MapError, 'no map: set map_file'),
-    ({'map_file': '/nowhere/room.yaml'}, MapError, '/nowhere/room.yaml'),
-    ({'algorithm': 'b-prosac'}, OptionsError, 'needs similarities')])
-def test_a_bad_start_is_named(make_node, values, changes, error, message):
-    with pytest.raises(error, match=message):
-        load_localizer(make_node(), replace(values, **changes))
 
 
 def test_heights_and_verticals_reach_the_search(localizer, values):

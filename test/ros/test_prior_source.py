@@ -16,7 +16,7 @@ from cliploc_ros.core.observation import OPTICAL_FROM_BODY
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
-from cliploc_ros.ros.inputs.prior import PriorSource, grid_from_msg, planar_of
+from cliploc_ros.ros.inputs.prior import PriorSource, grid_from_msg
 from cliploc_ros.ros.node.worker import Worker
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -79,14 +79,6 @@ def test_a_message_withdraws_the_one_before(source):
         source.hear(other)
         assert known(source).region is None
     assert known(source).grid is None
-
-
-def test_planar_of_an_invalid_pose_is_refused():
-    invalid = pose()
-    invalid.pose.pose.position.x = np.nan
-    for wrong in (invalid, pose(covariance=np.zeros((6, 6)))):
-        with pytest.raises(CliplocError):
-            planar_of(wrong)
 
 
 def grid(data, frame_id='map', width=3):

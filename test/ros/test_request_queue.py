@@ -3,7 +3,6 @@
 """Requests in a real node with a real frame source; the localizer is the test's own function."""
 
 import array
-import logging
 import re
 import threading
 import time
@@ -284,19 +283,3 @@ def test_a_failing_start_is_logged_once_and_retried_by_requests(node, capfd, wai
     node.loads = lambda: 'a map'
     set_values(node, timeout_s=0.2)
     assert 'no fresh frame' in node.requests.answer().message
-
-
-def test_a_finalized_node_asks_to_be_restarted(node, wait):
-    wait(lambda: node.active, 'the node to be active')
-    node.trigger_shutdown()
-    assert node.requests.answer().message == 'the node is finalized: restart it'
-
-
-def test_a_destroyed_node_leaves_no_log_handler(node):
-    handlers = logging.getLogger('cliploc_ros').handlers
-    before = len(handlers)
-    other = Answering()
-    assert len(handlers) == before + 1
-    other.worker.stop()
-    other.destroy_node()
-    assert len(handlers) == before
