@@ -105,7 +105,6 @@ def test_the_layer_of_another_map_is_named(file, other, message):
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'version': 2}, 'version 2, expected 1'),
     ({'descriptors': 'orb-32'}, "kind 'orb-32', expected 'rootsift"),
-    ({'camera': {'width': 0, 'height': 1, 'fx': 1, 'fy': 1, 'cx': 0, 'cy': 0}}, 'camera'),
     ({'camera': 7}, 'camera')])
 def test_other_versions_descriptors_and_cameras_are_named(file, changes, message):
     change_header(file, **changes)
@@ -116,24 +115,12 @@ def test_other_versions_descriptors_and_cameras_are_named(file, changes, message
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'points': None}, 'points'),
     ({'points': np.zeros((3, 3), np.float32)}, r'points has shape \(3, 3\)'),
-    ({'points': np.zeros((KEYFRAMES * POINTS, 3))}, 'points has type float64'),
     ({'offsets': np.zeros(KEYFRAMES + 1, np.int64)}, 'offsets'),
-    ({'offsets': np.array([0, 200, 40, 80, 120, 160, 240])}, 'offsets'),
     ({'map_from_camera': np.full((KEYFRAMES, 4, 4), np.nan)}, 'no rigid transform in row 0'),
-    ({'words': np.full(KEYFRAMES * POINTS, 60_000, np.uint16)}, 'words'),
-    ({'descriptors': np.empty((0, DIMENSIONS), np.uint8)}, 'descriptors has shape'),
-    ({'landmark_ids': np.array([object()])}, 'landmark_ids|complete')])
+    ({'words': np.full(KEYFRAMES * POINTS, 60_000, np.uint16)}, 'words')])
 def test_malformed_arrays_are_named(file, changes, message):
     rewrite(file, **changes)
     with pytest.raises(MapError, match=message):
-        load_layer_of_map(file, ROOM)
-
-
-@pytest.mark.parametrize('share', [0.0, 0.1, 0.5, 0.9, 0.999])
-def test_a_truncated_file_is_named(file, share):
-    content = file.read_bytes()
-    file.write_bytes(content[:int(share * len(content))])
-    with pytest.raises(MapError, match=r'no complete npz file|cannot be read'):
         load_layer_of_map(file, ROOM)
 
 

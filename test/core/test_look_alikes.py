@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Places that look alike, found in the map, and what tells them apart."""
 
-import time
 
 import numpy as np
 import pytest
@@ -124,20 +123,6 @@ def test_poses_that_a_search_met_are_compared_too():
     assert len(find_twins(piles, np.eye(4), np.arange(6), lying[None])[0]) == 0
 
 
-@pytest.mark.parametrize('count', [1, 2, 3])
-def test_maps_of_few_landmarks(count):
-    few = make_map([[float(row), 0, 0] for row in range(count)], ['chair'] * count)
-    for matched in (np.arange(count), np.empty(0, dtype=np.int64)):
-        assert find_twins(few, np.eye(4), matched, np.eye(4)[None])[0].shape == (0, 4, 4)
-
-
-def test_landmarks_at_one_spot_and_far_away():
-    """No pair has a direction; coordinates are as large as a map may have."""
-    spot = make_map(np.full((200, 3), 1e7), ['chair'] * 200)
-    pose = move_of(0, (1e7, 1e7, 1e7))
-    assert find_twins(spot, pose, np.arange(5), NOWHERE)[0].shape == (0, 4, 4)
-
-
 def test_what_was_matched_must_look_alike_too():
     """Half a room has a twin; the camera saw the other half."""
     rooms, move = two_rooms(missing=6)
@@ -198,28 +183,3 @@ def test_duplicates_are_of_one_class_and_overlap():
     beside = make_map([[0, 0, 0], [0.2, 0, 0]], ['book', 'book'])
     assert beside.objects.tolist() == [0, 1]
     assert make_map([[0, 0, 0]], ['book']).objects.tolist() == [0]
-
-
-@pytest.mark.clock
-def test_a_large_map_costs_little(record_property):
-    rng = np.random.default_rng(0)
-    centers = rng.uniform((0, 0, 0), (200, 200, 3), (100_000, 3))
-    large = make_map(centers, rng.choice([f'class {number}' for number in range(20)],
-                                         len(centers)))
-    start = time.process_time()
-    large.prepare()
-    prepared = time.process_time() - start
-    poses = np.tile(np.eye(4), (12, 1, 1))
-    poses[:, :3, 3] = rng.uniform(20, 180, (12, 3))
-    find_twins(large, poses[0], np.arange(12), poses[1:])
-    start = time.process_time()
-    for pose in poses:
-        find_twins(large, pose, large.tree.query(pose[:3, 3], 12)[1], poses[:3])
-    took = (time.process_time() - start) / len(poses)
-    pairs = large.pairs
-    size = sum(one.nbytes for one in pairs) - centers.nbytes
-    record_property('figures', f'100,000 landmarks: prepared in {prepared:.2f} s, '
-                               f'{size / 1e6:.0f} MB of pairs; twins in {1e3 * took:.1f} ms')
-    assert prepared < 2.0
-    assert size < 40e6
-    assert took < 0.01

@@ -134,13 +134,6 @@ def test_a_robot_that_is_carried_away_is_noticed(watch, room):
     assert report.probability < 0.05
 
 
-def test_a_localizer_that_finds_itself_is_right_again(watch, room):
-    poses = drive(25)
-    follow(watch, room, poses[:10])
-    assert follow(watch, room, poses[10:15], moved(np.eye(4), 2.0, 0.0), 10)[-1].state == 'lost'
-    assert follow(watch, room, poses[15:], first=15)[-1].state == WatchState.LOCALIZED
-
-
 def test_minutes_without_objects_end_in_uncertain(watch, room):
     follow(watch, room, drive(10))
     reports = follow(watch, room, drive(18) * 20, first=10, rows=[])
@@ -256,13 +249,6 @@ def test_invalid_inputs_are_named(watch, room):
     with pytest.raises(OptionsError, match='has no pixels'):
         watch.look(see(room, pose), pose, np.zeros((0, 0, 3), np.uint8))
     assert watch.look(see(room, pose), pose).looks == 1
-
-
-def test_forgetting_and_time_that_goes_back_begin_again(watch, room):
-    assert follow(watch, room, drive(5))[-1].looks == 5
-    assert follow(watch, room, drive(1))[-1].looks == 1
-    watch.forget()
-    assert follow(watch, room, drive(2), first=9)[-1].looks == 2
 
 
 def test_a_pose_against_the_vertical_is_less_likely():
