@@ -3,14 +3,12 @@
 """Read recordings in the format of Jazzy's `ros2 bag record` (jazzy_bags), and damaged ones."""
 
 import struct
-from types import SimpleNamespace
 
 import jazzy_bags
 import pytest
 from rosbags.interfaces import QosDurability, QosHistory, QosReliability
 
-from cliploc_ros.datasets.bag_messages import stamp_ns
-from cliploc_ros.datasets.bags import BagMessage, BagReader, typestore
+from cliploc_ros.datasets.bags import BagMessage, BagReader
 from cliploc_ros.errors import DatasetError
 
 START_NS = 1_700_000_000_123_456_789
@@ -96,27 +94,14 @@ def test_selects_topics_and_times(tmp_path, storage):
     assert found == as_bag_messages([expected])
 
 
-@pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
-def test_reads_a_single_file(tmp_path, storage):
-    messages = make_messages(0, 6)
-    bag = jazzy_bags.write_bag(tmp_path / 'bag', storage, TOPICS, [messages])
-    (file,) = (path for path in bag.iterdir() if path.name != 'metadata.yaml')
-    with BagReader(file) as reader:
-        assert list(reader.messages()) == as_bag_messages([messages])
-
-
 @pytest.mark.parametrize(
     ('damage', 'reason'),
     [
-        (lambda bag: (bag / 'metadata.yaml').unlink(), 'ros2 bag reindex'),
-        (lambda bag: (bag / 'metadata.yaml').write_text('{'), 'cannot be read'),
-        (lambda bag: (bag / 'metadata.yaml').write_text('version: 9'), 'rosbag2_bagfile_informa'),
-        (lambda bag: (bag / 'metadata.yaml').write_bytes(b'\xff\xfe\x00'), 'cannot be read'),
-        (lambda bag: (bag / 'bag_0.mcap').unlink(), 'bag_0.mcap'),
-        (lambda bag: (bag / 'bag_0.mcap').write_bytes(b''), 'empty'),
-        (lambda bag: truncate(bag / 'bag_0.mcap', -20), 'magic'),
-        (lambda bag: overwrite(bag / 'bag_0.mcap', 700), 'checksum'),
-    ],
+    (lambda bag: (bag / 'metadata.yaml').unlink(), 'ros2 bag reindex'),
+    (lambda bag: (bag / 'metadata.yaml').write_text('version: 9'), 'rosbag2_bagfile_informa'),
+    (lambda bag: (bag / 'bag_0.mcap').unlink(), 'bag_0.mcap'),
+    (lambda bag: truncate(bag / 'bag_0.mcap', -20), 'magic'),
+    (lambda bag: overwrite(bag / 'bag_0.mcap', 700), 'checksum')],
 )
 def test_broken_recordings_are_refused(tmp_path, damage, reason):
     bag = jazzy_bags.write_bag(tmp_path / 'bag', 'mcap', TOPICS, [make_messages(0, 30)])
@@ -135,29 +120,6 @@ def overwrite(path, offset):
     path.write_bytes(data)
 
 
-@pytest.mark.parametrize('keep', [100, 5000, 9000])
-def test_truncated_database_is_refused(tmp_path, keep):
-    bag = jazzy_bags.write_bag(tmp_path / 'bag', 'sqlite3', TOPICS, [make_messages(0, 300)])
-    truncate(bag / 'bag_0.db3', keep)
-    with pytest.raises(DatasetError, match=r'bag: cannot be read'), BagReader(bag) as reader:
-        list(reader.messages())
-
-
-@pytest.mark.parametrize('compression', ['FILE', 'MESSAGE'])
-def test_damaged_compression_is_refused(tmp_path, compression):
-    bag = jazzy_bags.write_bag(
-        tmp_path / 'bag', 'sqlite3', TOPICS, [make_messages(0, 3)], compression
-    )
-    (file,) = bag.glob('bag_0*')
-    data = file.read_bytes()
-    damaged = data[:40] + b'\0' * 40 if compression == 'FILE' else data.replace(
-        b'\x28\xb5\x2f\xfd', b'\x28\xb5\x2f\xfe'
-    )
-    file.write_bytes(damaged)
-    with pytest.raises(DatasetError, match='cannot be read'), BagReader(bag) as reader:
-        list(reader.messages())
-
-
 def test_missing_recording_and_topic_are_named(tmp_path):
     with pytest.raises(DatasetError, match='no such recording'), BagReader(tmp_path / 'none'):
         pass
@@ -167,35 +129,3 @@ def test_missing_recording_and_topic_are_named(tmp_path):
     bag = jazzy_bags.write_bag(tmp_path / 'bag', 'mcap', TOPICS, [make_messages(0, 3)])
     with BagReader(bag) as reader, pytest.raises(DatasetError, match=r'/chatter \(std_msgs/msg'):
         reader.topic('/image')
-
-
-def test_other_definition_of_a_type_is_refused(tmp_path):
-    other = jazzy_bags.Topic('/chatter', 'std_msgs/msg/String', 'string text\n',
-                             'RIHS01_' + '0' * 64)
-    unknown = jazzy_bags.Topic('/odd', 'my_msgs/msg/Odd', 'int32 x\n', 'RIHS01_' + '1' * 64)
-    messages = [
-        jazzy_bags.Message('/chatter', START_NS, string_cdr('x')),
-        jazzy_bags.Message('/odd', START_NS + 1, b'\x00\x01\x00\x00\x01\x00\x00\x00'),
-    ]
-    bag = jazzy_bags.write_bag(tmp_path / 'bag', 'mcap', [other, unknown], [messages])
-    with BagReader(bag) as reader:
-        first, second = reader.messages()
-        with pytest.raises(DatasetError, match='another definition of std_msgs/msg/String'):
-            reader.deserialize(first)
-        with pytest.raises(DatasetError, match='unknown type, my_msgs/msg/Odd'):
-            reader.deserialize(second)
-
-
-def test_type_hashes_are_the_published_ones():
-    """ROS compares the hashes on the wire; the values are from its own generator for Jazzy."""
-    store = typestore()
-    assert store.hash_rihs01('std_msgs/msg/String') == STRING_HASH
-    assert store.hash_rihs01('vision_msgs/msg/Detection2DArray') == (
-        'RIHS01_214274120007f4a683866481336b70310268cfa107aebe9d594a6acf75bda968'
-    )
-
-
-def test_stamp_is_exact():
-    time = typestore().types['builtin_interfaces/msg/Time'](sec=1341847980, nanosec=722988001)
-    header = typestore().types['std_msgs/msg/Header'](stamp=time, frame_id='camera')
-    assert stamp_ns(SimpleNamespace(header=header)) == 1341847980722988001
