@@ -3,7 +3,6 @@
 """Weights and model configs that are missing, damaged or of another model."""
 
 import os
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -37,28 +36,13 @@ def refusal(clip_options: ClipOptions) -> str:
     (b'', 'is empty'),
     (b'version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 3\n', 'git lfs pull'),
     (b'\n<!DOCTYPE html><html><body>Sign in</body></html>', 'is a web page'),
-    (b'just text', 'holds no weights'),
-    (bytes(range(256)) * 40, 'holds no weights'),
-    (b'PK\x03\x04' + bytes(1000), 'truncated or corrupt'),
-    (b'\x80\x02garbage', 'is no checkpoint of CLIP'),
-    (pickle.dumps([1, 2, 3], protocol=2), 'weights.pt'),
-])
+    (b'just text', 'holds no weights'), (b'PK\x03\x04' + bytes(1000), 'truncated or corrupt'),
+    (b'\x80\x02garbage', 'is no checkpoint of CLIP')])
 def test_files_that_are_no_weights(tmp_path, content, message):
     file = tmp_path / 'weights.pt'
     file.write_bytes(content)
     text = refusal(options('ViT-B-32', file, tmp_path))
     assert message in text and str(file) in text
-
-
-@pytest.mark.parametrize('share', [0.00002, 0.5, 0.999])
-def test_truncated_safetensors(small_clip, truncated, tmp_path, share):
-    from safetensors.torch import save_file
-
-    whole = tmp_path / 'weights.safetensors'
-    save_file({name: tensor.contiguous()
-               for name, tensor in small_clip.model.state_dict().items()}, whole)
-    text = refusal(options(small_clip.name, truncated(whole, share), tmp_path))
-    assert 'truncated or corrupt' in text
 
 
 def test_weights_of_another_clip(small_clip, tmp_path):
@@ -87,15 +71,6 @@ def test_pickled_code_is_never_run(tmp_path, zipped):
     with pytest.raises(ModelError, match='is no detection model'):
         YoloDetector(DetectorOptions(str(file), device='cpu'))
     assert not proof.exists()
-
-
-@pytest.mark.parametrize('loaded_before', [False, True])
-def test_a_detector_is_no_clip(shared_data, tmp_path, loaded_before):
-    file = shared_data / 'weights/yolov8n_coco.pt'
-    if loaded_before:  # from here on PyTorch unpickles the classes of ultralytics
-        YoloDetector(DetectorOptions(str(file), device='cpu'))
-    text = refusal(options('ViT-B-32', file, tmp_path))
-    assert 'is no checkpoint of CLIP' in text and 'ultralytics' in text
 
 
 def test_fingerprint(tmp_path):
