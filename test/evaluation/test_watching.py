@@ -112,11 +112,3 @@ def test_a_localizer_that_jumps_is_noticed(bag, tmp_path, capsys):
         assert (tmp_path / f'{name}.png').stat().st_size > 10_000
     assert 'localized' in {one['state'] for one in found['every_look'][2:7]}
     assert found['every_look'][-1]['error_m'] == pytest.approx(2.0, abs=0.1)
-
-
-def test_longer_periods_and_no_truth(bag, tmp_path, capsys):
-    assert watch(bag, tmp_path, '--watch', '/localizer', '--watch-period', 2, '--no-figures',
-                 '--ground-truth', '/nowhere') == 0
-    assert json.loads((tmp_path / 'watch.json').read_text())['looks'] == IMAGES / 4
-    assert 'false alarms' not in capsys.readouterr().out
-    assert [path.name for path in tmp_path.iterdir()] == ['watch.json']
