@@ -33,7 +33,6 @@ ROOM = make_room()
 RELOCALIZER = Relocalizer(ROOM, RelocalizerOptions(matching='class', tilt_deviation_deg=0.0))
 SIZE = np.array([CAMERA.width, CAMERA.height])
 LOOKS = 24
-NO_ERRORS = np.zeros(ERRORS)
 
 
 def place(rng):

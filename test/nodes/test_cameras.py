@@ -99,15 +99,6 @@ def test_four_cameras_see_enough_at_once(four_cameras, tester):
     assert 'Traceback' not in process.output()
 
 
-def test_a_watch_looks_with_the_first_camera_alone(start, tester, surroundings_map):
-    process = start('nodes.relocalizer', parameters={
-        'map_file': surroundings_map, 'matching': 'class', 'base_frame': 'base_link',
-        'cameras': list(NAMES), 'base_from_camera': BASE_FROM_CAMERA, 'watch': 'amcl_pose'})
-    process.wait_for_output('ready after')
-    tester.wait(lambda: tester.count_subscribers(f'/{NAMES[0]}/image'), 'a look')
-    assert not any(tester.count_subscribers(f'/{name}/image') for name in NAMES[1:])
-
-
 def test_the_doctor_looks_at_each_camera(four_cameras, start):
     _, ask = four_cameras
     doctor = start('cli.doctor', '--timeout', 4)

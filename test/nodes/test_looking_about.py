@@ -121,16 +121,6 @@ def looking(start_shared, tester, room_map):
     assert process.alive and 'Traceback' not in process.output()
 
 
-def test_continuous_mode_joins_frames(own_relocalizer, tester, robot):
-    # first of all: those below share one process
-    process = own_relocalizer(mode='continuous', **PARAMETERS)
-    wait_for(lambda: tester.poses or not process.alive, 'a pose',
-             work=lambda: robot.step(20.0, lambda odometry, now_s: None))
-    error = error_of(tester.poses[0], 20.0)
-    assert np.linalg.norm(error[:3]) < 0.05
-    assert not tester.initial_poses
-
-
 def error_of(pose, turn_deg_s):
     """The error of a pose published: of x, y, z [m] and about the map's axes [rad]."""
     stamp_s = pose.header.stamp.sec + 1e-9 * pose.header.stamp.nanosec

@@ -96,14 +96,3 @@ def test_the_map_is_read_anew_and_a_bad_one_changes_nothing(own_relocalizer, tes
         assert not answer.success
         assert reason in answer.message
         assert tester.relocalize(make_frame()).message.count(' in hall,') == 1
-
-
-def test_a_map_reload_while_a_request_waits(own_relocalizer, tester, own_map):
-    own_relocalizer(map_file=own_map)
-    future = tester.ask()
-    tester.wait(lambda: tester.listened_to() == 3, 'the relocalizer to listen')
-    own_map.write_text(own_map.read_text().replace('frame_id: map', 'frame_id: hall'))
-    assert reload_map(tester).success
-    tester.feed_until(future.done, make_frame())
-    assert future.result().success
-    assert ' in hall,' in future.result().message

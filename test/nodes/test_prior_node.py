@@ -7,7 +7,6 @@ import json
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid
 from scene import doubled_room, write_map
 from tester import RELIABLE, make_frame
 
@@ -118,24 +117,3 @@ def test_a_robot_wakes_where_it_was(own_relocalizer, tester, tell, twins_map, tm
         assert 'look_alike' in answer.message and 'prior' not in answer.message
         assert text in process.output() and 'Traceback' not in process.output()
         process.stop()
-
-
-def test_walls_of_the_topic_speak_against_a_pose(own_relocalizer, tester, tell, room_map):
-    process = own_relocalizer(occupancy_grid='topic', min_confidence=0.9985)
-    assert tester.relocalize(make_frame()).success
-    grid = OccupancyGrid()
-    grid.header.frame_id = 'map'
-    grid.info.width = grid.info.height = 40
-    grid.info.resolution = 0.1
-    grid.info.origin.position.x = grid.info.origin.position.y = -2.0
-    grid.info.origin.orientation.w = 1.0
-    grid.data = [100] * 1600
-    tell(process, grid, topic='map')
-    answer = relocalized(tester, 'refused')
-    assert 'in a wall of the occupancy grid' in answer.message
-    assert 'kind obstructed' in answer.message
-    grid.data = [0] * 1600
-    tell(process, grid, topic='map')
-    relocalized(tester, 'accepted')
-    grid.data = [0] * 7
-    tell(process, grid, 'localizing without the topic map: 7 cells', topic='map')

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 from processes import PROJECT
-from tester import make_frame, transform_of
+from tester import transform_of
 from wake_ups import judge, wake_up_on_frames
 
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
@@ -77,26 +77,3 @@ def test_recorded_detections(office, convert, limits, start, tester, monkeypatch
     errors_m, wrong = judge(answers, read_tum(office))
     assert np.mean(errors_m < 1.0) >= limits['recorded_detections']['success_at_1m']
     assert wrong <= limits['recorded_detections']['accepted_wrong_by_1m']
-
-
-def test_the_detector_works_only_while_something_listens(shared_data, start, tester):
-    detector = start('nodes.detector', parameters={
-        'model': shared_data / 'weights/yolov8n_coco.pt'})
-    detector.wait_for_output('ready after')
-    tester.wait(lambda: tester.count_publishers('/detections') == 2, 'the detector to publish')
-    assert tester.images.get_subscription_count() == 0
-    with tester.hearing_detections() as detected:
-        tester.wait(lambda: tester.images.get_subscription_count() == 1, 'the detector to listen')
-        tester.feed_until(lambda: detected, [make_frame(stamp_s=7.0)[0]], 'detections')
-        assert list(detected) == [7_000_000_000]
-        bad = make_frame(stamp_s=8.0)[0]
-        bad.encoding = 'yuv422'
-        tester.feed_until(lambda: "encoding 'yuv422' is none of" in detector.output(), [bad],
-                          'the bad image to be named')
-        tester.feed_until(lambda: 9_000_000_000 in detected, [make_frame(stamp_s=9.0)[0]],
-                          'detections after a bad image')
-        assert 8_000_000_000 not in detected
-    tester.wait(lambda: tester.images.get_subscription_count() == 0, 'the detector to rest')
-    code, seconds = detector.stop()
-    assert code == 0
-    assert seconds < 2.0

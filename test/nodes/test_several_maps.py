@@ -93,23 +93,3 @@ def test_a_map_is_loaded_as_nav2_loads_its_own(own_relocalizer, tester, floors, 
     assert load(f'file://{first}') == srv.LoadMap.Response.RESULT_SUCCESS
     assert tester.relocalize(make_frame()).success
     assert not tester.relocalize(make_frame(see_room(other_room()))).success
-
-
-@pytest.mark.needs('nav2_msgs')
-def test_maps_that_are_loaded_at_once_take_turns(own_relocalizer, tester, floors):
-    """The answer is about the map that was asked for, and the parameters name the map in use."""
-    srv = importlib.import_module('nav2_msgs.srv')
-    (good,) = floors(ROOM)
-    own_relocalizer(map_file=good)
-    client = tester.create_client(srv.LoadMap, '/relocalizer/load_map')
-    tester.wait(client.service_is_ready, 'load_map')
-    for _ in range(5):
-        urls = [good, '/nowhere.yaml', good, '/nowhere.yaml']
-        futures = [client.call_async(srv.LoadMap.Request(map_url=url)) for url in urls]
-        results = [tester.answer(future).result for future in futures]
-        success, missing = (srv.LoadMap.Response.RESULT_SUCCESS,
-                            srv.LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST)
-        assert results == [success, missing, success, missing]
-    assert reload_map(tester).success
-    assert tester.relocalize(make_frame()).success
-    tester.destroy_client(client)

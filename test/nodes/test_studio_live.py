@@ -2,15 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The studio's live view: real nodes, and the page in a real browser."""
 
-import subprocess
-import sys
 import threading
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from processes import PROJECT, wait_for
+from processes import wait_for
 from tester import RELIABLE, make_frame
 
 from cliploc_ros.errors import OptionsError
@@ -93,33 +91,7 @@ def test_invalid_poses_are_left_out(live, tester):
     tester.destroy_publisher(publisher)
 
 
-@pytest.mark.full
-def test_the_studio_ends_while_a_request_waits(own_relocalizer):
-    own_relocalizer(timeout_s=60.0)
-    with follow_relocalizer('relocalizer') as live:
-        wait_for(live._relocalize.service_is_ready, 'the service')
-        with in_a_thread(live.relocalize) as outcome:
-            wait_for(lambda: live.state.is_busy, 'the request')
-            live.close()
-    assert 'the studio ends' in str(outcome[0])
-
-
 @pytest.mark.parametrize('name', ['two words', '1st', 'a//b', ''])
 def test_names_that_are_none(name):
     with pytest.raises(OptionsError, match='--ros'), follow_relocalizer(name):
         pass
-
-
-@pytest.mark.full
-@pytest.mark.needs('viser')
-def test_without_ros_the_studio_runs_and_says_what_is_missing(tmp_path):
-    """Its core imports no ROS; --ros names what to source."""
-    code = ('import sys\nsys.modules["rclpy"] = None\n'
-            'import cliploc_ros.studio.page\n'
-            'assert not [name for name in sys.modules if name.endswith("_msgs")]\n'
-            'from cliploc_ros.cli.studio import main\n'
-            f'sys.exit(main([{str(tmp_path / "map.yaml")!r}, "--ros", "--no-browser"]))')
-    done = subprocess.run([sys.executable, '-c', code], cwd=PROJECT, capture_output=True,
-                          text=True, timeout=120)
-    assert done.returncode == 1 and done.stdout == ''
-    assert done.stderr.startswith('error: --ros needs ROS') and 'setup.bash' in done.stderr

@@ -143,20 +143,6 @@ def test_a_lost_robot_is_relocalized_once_it_stands(watch):
 
 
 @pytest.mark.full
-def test_a_lost_robot_without_a_pose_is_not_requested_again_and_again(watch):
-    watched = watch(on_lost='relocalize', min_inliers=999)
-    watched.until_state('localized')
-    watched.robot.carry(3.0)
-    watched.until_state('lost')
-    watched.robot.speed_m_s = 0.0
-    watched.until(lambda: 'next request in' in watched.values.get('on lost', ''), 'a pause')
-    asked = watched.process.output().count('relocalizing')
-    watched.looks(3)
-    assert watched.process.output().count('relocalizing') == asked <= 2
-    assert not watched.tester.initial_poses
-
-
-@pytest.mark.full
 def test_wake_up_goes_on_and_wakes_a_lost_robot_up_again(watch, start):
     """The robot drives on for a while, and nothing is done until it stands."""
     watched = watch()

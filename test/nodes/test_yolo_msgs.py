@@ -32,12 +32,6 @@ def test_all_that_counts_is_kept():
     assert serialize_message(from_yolo_msg(as_yolo(expected))) == serialize_message(expected)
 
 
-def test_a_detection_without_a_name_keeps_its_number():
-    yolo = as_yolo(make_frame()[2])
-    yolo.detections[0].class_name, yolo.detections[0].class_id = '', 41
-    assert from_yolo_msg(yolo).detections[0].results[0].hypothesis.class_id == '41'
-
-
 @pytest.mark.needs('yolo_msgs')
 def test_a_request_with_detections_of_yolo_ros(own_relocalizer, tester):
     from yolo_msgs.msg import Detection, DetectionArray

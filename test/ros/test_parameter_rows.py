@@ -17,9 +17,7 @@ from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 TEXT = ParameterRow('text', 'a', 'Some text.')
 CHOICE = ParameterRow('choice', 'raw', 'One of two.', choices=('raw', 'compressed'))
 COUNT = ParameterRow('count', 3, 'How many.', low=1, high=10)
-SEED = ParameterRow('seed', 0, 'Any whole number.')
 LENGTH = ParameterRow('length', 0.5, 'How long.', unit='m', low=0.0, high=2.0)
-POSITIVE = ParameterRow('positive', 1.0, 'Not below 0.', low=0.0)
 SWITCH = ParameterRow('switch', False, 'On or off.')
 MOUNT = ParameterRow('mount', [0.0, 0.0], 'Two numbers.', unit='m')
 
