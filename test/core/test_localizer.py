@@ -166,8 +166,7 @@ def test_a_pose_that_earlier_looks_contradict_is_refused(session):
         assert not found.accepted and found.hypotheses
     found = drive(session, 5.0, 12.0)
     assert pose_error(found.map_from_camera, MAP_FROM_CAMERA)[0] < 0.01
-    assert found.reason.startswith('mean confidence 0.')
-    assert 'of the last 5 frames in this pose' in found.reason
+    assert 'last 5 frames' in found.reason
 
 
 def test_an_accepted_pose_ends_the_looks(session):

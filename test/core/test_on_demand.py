@@ -128,8 +128,7 @@ def test_without_time_for_all_crops_a_pose_must_be_as_sure():
     _, found = localize_on_demand(Relocalizer(ROOM, options), (), VIEW, crops)
     # one camera: all crops do not change what is known of it, but for rounding
     assert found.confidence == pytest.approx(sure, abs=1e-7) and sure > options.min_confidence
-    assert not found.accepted and 'without 12 crops; raise timeout_s' in found.reason
-    assert found.refusal_kind == 'not_all_crops'
+    assert not found.accepted and found.refusal_kind == 'not_all_crops'
 
 
 def test_real_boxes_need_a_part_of_their_crops(office_map, queries, observe):

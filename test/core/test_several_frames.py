@@ -114,8 +114,7 @@ def test_a_frame_that_shows_nothing_changes_nothing(room, walk):
         assert found.accepted
         assert pose_error(found.map_from_camera, walk[1]) < (0.01, 0.2)
     found = relocalizer.relocalize([see(room, walk[0], []), see(room, walk[1], [3])])
-    assert not found.solved
-    assert found.reason.startswith('1 detections give fewer than 3 distinct correspondence cand')
+    assert not found.solved and found.reason.startswith('1 detections')
 
 
 UP = np.array([0.0, 0.0, 1.0])

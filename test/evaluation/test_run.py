@@ -120,7 +120,7 @@ def test_an_unfinished_run_goes_on_if_it_is_the_same(results, tmp_path):
     whole = path.read_text()
     path.write_text(whole[:-20])
     assert read({'trials': 3}) == results[:2]
-    with pytest.raises(OptionsError, match='begun with another trials'):
+    with pytest.raises(OptionsError, match='another trials'):
         read({'trials': 4})
     lines = whole.splitlines()
     for damaged in (['rubbish', lines[1]], ['[{"method": 1}]'], ['3']):

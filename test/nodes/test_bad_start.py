@@ -8,10 +8,10 @@ from tester import make_frame
 
 
 @pytest.mark.parametrize(('parameters', 'reason'), [
-    ({'matching': 'magic'}, "matching: 'magic' is none of class, clip, hybrid"),
-    ({'iterations': 'x'}, 'iterations: must be of type int'),
-    ({'map_file': '/nowhere/map.yaml'}, '/nowhere/map.yaml: No such file'),
-    ({'matching': 'hybrid', 'algorithm': 'b-prosac', 'k': 13}, 'k = 13, but the map has 12')])
+    ({'matching': 'magic'}, "matching: 'magic'"),
+    ({'iterations': 'x'}, 'iterations: '),
+    ({'map_file': '/nowhere/map.yaml'}, '/nowhere/map.yaml: '),
+    ({'matching': 'hybrid', 'algorithm': 'b-prosac', 'k': 13}, 'k = 13')])
 def test_bad_parameters_at_start_up(own_relocalizer, tester, parameters, reason):
     process = own_relocalizer(expect='[ERROR]', **parameters)
     answer = tester.answer(tester.ask())

@@ -83,7 +83,7 @@ def test_depth_counts_and_a_recorded_request_keeps_it(own_relocalizer, tester, d
                                                       room_map, tmp_path, capsys):
     own_relocalizer(depth_transport='raw', algorithm='auto', record_folder=tmp_path)
     frame = make_frame()
-    answer = ask_until(depth_camera, message(frame, depth_image()), ', depth of 12 objects')
+    answer = ask_until(depth_camera, message(frame, depth_image()), 'depth of 12')
     stored = tester.call(Trigger, '/relocalizer/record', Trigger.Request())
     assert stored.success, stored.message
     (case,) = tmp_path.glob('case_*')
@@ -96,13 +96,12 @@ def test_depth_counts_and_a_recorded_request_keeps_it(own_relocalizer, tester, d
 
 def test_compressed_depth(own_relocalizer, depth_camera):
     own_relocalizer(depth_transport='compressed', algorithm='auto')
-    ask_until(depth_camera, compressed(make_frame(), depth_image()), ', depth of 12 objects')
+    ask_until(depth_camera, compressed(make_frame(), depth_image()), 'depth of 12')
 
 
 @pytest.mark.parametrize(('given', 'said'), [
-    ({'depths': depth_image(1.0), 'encoding': '32FC1', 'frame_id': 'other'},
-     "depth is in the coordinate frame 'other', the image in 'camera_optical_frame'"),
-    ({'depths': 1.7 * depth_image()}, 'times what boxes and map say, and is used no more')])
+    ({'depths': depth_image(1.0), 'encoding': '32FC1', 'frame_id': 'other'}, "'other'"),
+    ({'depths': 1.7 * depth_image()}, 'is used no more')])
 def test_depth_that_cannot_be_right_is_left_out_and_named(own_relocalizer, depth_camera, given,
                                                           said):
     process = own_relocalizer(depth_transport='raw', algorithm='auto')

@@ -82,7 +82,7 @@ def test_a_detector_of_other_classes_is_an_error(own_relocalizer, tester, status
     for detection in frame[2].detections:
         detection.results[0].hypothesis.class_id = '62'
     answer = tester.relocalize(frame)
-    assert not answer.success and 'kind wrong_detections' in answer.message
+    assert not answer.success and 'wrong_detections' in answer.message
     assert 'turn the camera' not in answer.message
     status.wait(ERROR, '62, which are numbers; the map has a, b, c')
 

@@ -72,8 +72,8 @@ def why_not_taken(tester, stamp_s=100.0):
 
 
 @pytest.mark.parametrize(('arguments', 'named'), [
-    ({'shows_x': 5.0}, r'/amcl_pose shows a pose 4\.70 m and \d+ degrees from it \(limits '),
-    ({'deaf': 99, 'at_x': 0.3}, r'/amcl_pose shows nothing since')])
+    ({'shows_x': 5.0}, r'.* 4\.70 m '),
+    ({'deaf': 99, 'at_x': 0.3}, '.* shows nothing ')])
 def test_a_localizer_that_shows_another_pose_or_none_has_not_taken_it(amcl, node, tester,
                                                                       arguments, named):
     """What it showed before does not count, though late subscribers get it."""

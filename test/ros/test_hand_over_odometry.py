@@ -53,7 +53,7 @@ def test_a_robot_that_has_moved_since_its_image_gets_no_pose(robot, wheels, x_m,
         wheels.publish(odometry)
     robot.wait(lambda: robot.odometry.recent(60.0, 0.0) == odometry, 'odometry')
     if is_withheld:
-        with pytest.raises(HandOffError, match=r'^the robot has moved by .* since its image'):
+        with pytest.raises(HandOffError, match=r'^the robot has moved'):
             robot.hand_over()
         assert not robot.localizer.poses
     else:
@@ -79,7 +79,7 @@ def test_slow_odometry_tells_that_the_robot_has_moved_since_its_image(robot, whe
     robot.localizer.subscribe()
     robot.meet()
     stand(robot, wheels, places)
-    with pytest.raises(HandOffError, match=r'^the robot has moved by .* since its image'):
+    with pytest.raises(HandOffError, match=r'^the robot has moved'):
         robot.hand_over()
     assert not robot.localizer.poses
 

@@ -103,8 +103,7 @@ def test_the_methods_options_are_parameters_of_equal_defaults_and_limits():
 
 
 @pytest.mark.parametrize(('changes', 'message'), [
-    ({'matching': 'class', 'algorithm': 'b-prosac'},
-     "algorithm 'b-prosac' needs similarities"),
+    ({'matching': 'class', 'algorithm': 'b-prosac'}, "'b-prosac' needs "),
     ({'height_range_m': [2.0, 1.0]}, 'height_range_m'),
     ({'gravity': 'base_frame'}, 'needs the parameter base_frame'),
     ({'base_from_camera': [0.0] * 6 + [2.0]}, 'base_from_camera: .* not of unit length'),
