@@ -12,17 +12,11 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from cameras import MAP, MOUNTS, NAMES, look
-from scene import CAMERA
+from scene import CAMERA, depth_image, make_layer
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
-from cliploc_ros.core.geometry.transforms import (
-    invert_transform,
-    make_transform,
-    pose_error,
-)
-from cliploc_ros.core.keyframes.features import DIMENSIONS, unit_rows
-from cliploc_ros.core.keyframes.layer import KeyframeLayer, learn_words, nearest_words
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.observation import Region
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -42,39 +36,7 @@ from cliploc_ros.ros.parameters import RelocalizerParameters
 ANY_YAW = 1e3
 KNOWN = ('nothing', 'depth', 'prior', 'keyframes', 'all')
 COMBINATIONS = [*product((1, 4), KNOWN)]
-
-
-def make_layer():
-    """Keyframes of another place: no image here shows their points."""
-    rng, keyframes, points = np.random.default_rng(0), 4, 40
-    descriptors = rng.integers(0, 120, (keyframes * points, DIMENSIONS)).astype(np.uint8)
-    vocabulary = learn_words(descriptors)
-    return KeyframeLayer(
-        MAP.frame_id, MAP.landmark_ids, MAP.centers.astype(np.float32), CAMERA,
-        np.tile(np.eye(4), (keyframes, 1, 1)), np.arange(0, keyframes * points + 1, points),
-        rng.integers(0, 10_000, (keyframes * points, 2)).astype(np.uint16),
-        rng.normal(size=(keyframes * points, 3)).astype(np.float32), descriptors,
-        nearest_words(unit_rows(descriptors), unit_rows(vocabulary)).astype(np.uint16), vocabulary)
-
-
-LAYER = make_layer()
-
-
-def depth_of(seen, header, map_from_camera):
-    """Return the depth image (h, w) of a camera: each box at its object, else a wall at 8 m."""
-    camera_from_map = invert_transform(map_from_camera)
-    depths_m = np.full((CAMERA.height, CAMERA.width), 8.0, dtype=np.float32)
-    at = MAP.centers @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
-    with np.errstate(invalid='ignore', divide='ignore'):
-        at_px = at[:, :2] / at[:, 2:] * 500.0 + (CAMERA.cx, CAMERA.cy)
-    at_px[at[:, 2] < 0.5] = np.inf
-    surfaces_m = at[:, 2] - 0.6 * np.cbrt(MAP.semi_axes.prod(axis=1))
-    for box in seen.detections.bboxes_xyxy:
-        nearest = np.linalg.norm(at_px - (box[:2] + box[2:]) / 2, axis=1).argmin()
-        left, top, right, bottom = box.astype(int)
-        depths_m[top:bottom, left:right] = surfaces_m[nearest]
-    return Image(header=header, height=CAMERA.height, width=CAMERA.width, encoding='32FC1',
-                 step=4 * CAMERA.width, data=depths_m.tobytes())
+LAYER = make_layer(MAP)
 
 
 class Drive:
@@ -112,7 +74,11 @@ class Drive:
                 CameraInfo(header=header, width=CAMERA.width, height=CAMERA.height,
                            k=CAMERA.matrix.ravel(), p=np.c_[CAMERA.matrix, np.zeros(3)].ravel()),
                 detections_to_msg(seen.detections, header), float(number), float(number),
-                depth=depth_of(seen, header, robot @ mount) if self.has_depth else None,
+                depth=Image(
+                    header=header, width=CAMERA.width, height=CAMERA.height, encoding='32FC1',
+                    step=4 * CAMERA.width, data=depth_image(
+                        MAP, robot @ mount, seen.detections.bboxes_xyxy).tobytes())
+                if self.has_depth else None,
                 camera=name if self.cameras > 1 else ''),
                 RobotState(invert_transform(mount), place=CameraPlace(
                     robot @ mount, 0, 0.05 * number))))
