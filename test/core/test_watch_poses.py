@@ -191,6 +191,15 @@ def test_the_way_and_the_time_make_a_sure_watch_unsure(way_m, time_s):
     assert not belief.has_jumped
 
 
+@pytest.mark.parametrize('change', [(2.0, 0.0, 0.0), (0.0, 0.0, 60.0)])
+def test_a_jump_in_place_or_in_heading_alone_speaks_against_the_new_pose(change):
+    belief, seen = Belief(), Observation(CAMERA, NOTHING, odom_from_camera=np.eye(4))
+    belief.wait(seen, np.eye(4))
+    belief.add(seen, 3.0, is_full=True)
+    belief.wait(seen, moved(np.eye(4), *change))
+    assert belief.has_jumped and belief.probability < 0.5
+
+
 def test_without_odometry_the_watch_learns_more_slowly(room):
     chances = []
     for odom in (True, False):
@@ -299,6 +308,22 @@ def test_a_landmark_is_missed_only_from_where_it_was_seen(side, is_missing):
         missing.add(Expected(np.array([0]), yes, yes, np.array([2])), 1.0)
     for _ in range(20):
         missing.add(Expected(np.array([0]), ~yes, yes, np.array([side])), 1.0)
+    assert missing.named() == [0] * is_missing
+
+
+@pytest.mark.parametrize(('seen_every', 'misses', 'is_missing'), [(1, 3, True), (3, 6, False)])
+def test_what_a_detector_finds_now_and_then_is_not_missing_at_once(seen_every, misses, is_missing):
+    """It finds the others in each look, or in every third."""
+    missing = Missing(things(*[(3, 0, 1)] * 9))
+
+    def look(landmarks, was_seen):
+        many = np.full(len(landmarks), True)
+        missing.add(Expected(landmarks, was_seen == many, many, 0 * landmarks), 1.0)
+    for number in range(12):
+        look(np.arange(1, 9), number % seen_every == 0)
+    look(np.arange(9), True)
+    for _ in range(misses):
+        look(np.array([0]), False)
     assert missing.named() == [0] * is_missing
 
 
