@@ -17,7 +17,7 @@ from cliploc_ros.evaluation.figures import within_ellipsoid
 from cliploc_ros.evaluation.methods import Method
 from cliploc_ros.evaluation.run import run_methods
 from cliploc_ros.evaluation.trials import make_queries
-from studies.acceptance.fit import Case, best_recall, fit, judge, outcomes
+from studies.acceptance.fit import Case, fit, judge, outcomes
 
 pytestmark = pytest.mark.full
 
@@ -67,19 +67,6 @@ def test_a_fit_finds_what_the_data_were_made_from():
     for low, high in ((0.0, 0.2), (0.2, 0.8), (0.8, 1.0)):
         chosen = (likely >= low) & (likely <= high)
         assert right[chosen].mean() == pytest.approx(likely[chosen].mean(), abs=0.07)
-
-
-def test_best_recall_at_a_precision():
-    likely = np.linspace(1.0, 0.0, 300)
-    right = np.ones(300, dtype=bool)
-    right[[100, 201, 202]] = False
-    # 200 right of 201 are precise enough, 297 of 300 as well
-    assert best_recall(likely, right) == (1.0, 0.0)
-    right[10] = False
-    recall, least = best_recall(likely, right)
-    assert recall == pytest.approx(199 / 296)
-    assert least == likely[200]
-    assert best_recall(likely[:3], np.array([False, True, True])) == (0.0, 1.0)
 
 
 @pytest.fixture(scope='module')

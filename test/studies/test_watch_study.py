@@ -6,8 +6,6 @@
 import numpy as np
 import pytest
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from studies.watch import fit
 from studies.watch.judge import KIDNAPPED, alarm_table, judge, right_table
 from studies.watch.localizers import (
     simulated_drive,
@@ -25,15 +23,6 @@ def test_wrong_poses_are_noticed_and_right_ones_are_not_lost():
     assert np.mean(jumps) > 0.9
     assert '| room |' in right_table([right])
     assert '| all |' in alarm_table(alarms)
-
-
-def test_the_fit_tells_right_from_wrong(record_property):
-    looks = [one for kind in ('room', 'office') for one in fit.looks_of(kind, 1)]
-    fitted = fit.fit(looks)
-    record_property('figures', fit.report(looks, fitted))
-    assert fitted.watch.utility > 0.0 > fitted.watch.unexplained
-    assert fitted.watch.lost == CALIBRATION.watch.lost  # chosen, not fitted
-    assert fit.report(looks, fitted).count('\n') == 4
 
 
 def test_the_cost_of_a_look(record_property):
