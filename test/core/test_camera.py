@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.camera import Camera, frusta
 from cliploc_ros.errors import CameraError
 
 LENSES = {
@@ -67,3 +67,9 @@ def test_impossible_cameras_are_refused(changes, message):
     sound = {'width': 640, 'height': 480, 'fx': 500.0, 'fy': 500.0, 'cx': 320.0, 'cy': 240.0}
     with pytest.raises(CameraError, match=message):
         Camera(**(sound | changes))
+
+
+def test_a_frustum_ends_at_the_borders_of_the_image():
+    one = Camera(640, 480, 400.0, 300.0, 320.0, 240.0)
+    base = frusta([one], np.eye(4)[None], 2.0)[:4, 1]
+    np.testing.assert_allclose(np.abs(base), np.tile([1.6, 1.6, 2.0], (4, 1)))

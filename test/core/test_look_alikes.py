@@ -84,6 +84,15 @@ def test_a_symmetric_hall_is_its_own_twin():
     assert pose_error(found[0], move_of(180, (0, 0, 0)) @ pose)[0] < 0.01
 
 
+def test_a_square_table_has_a_twin_at_each_quarter_turn():
+    corners = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]])
+    table = make_map(np.concatenate([corners, (corners + np.roll(corners, 1, axis=0)) / 2]),
+                     ['chair'] * 4 + ['cup'] * 4)
+    found = find_twins(table, move_of(0.0, (3, 0, 0)), np.arange(8), NOWHERE)[0]
+    at = np.degrees(np.arctan2(found[:, 1, 3], found[:, 0, 3]))
+    assert sorted(at % 360.0) == pytest.approx([90.0, 180.0, 270.0], abs=1.0)
+
+
 def test_the_bays_of_a_corridor_are_twins():
     bay, classes = one_room(count=6)
     corridor = make_map(np.concatenate([bay + shift_along(4.5 * number) for number in range(5)]),
@@ -94,6 +103,15 @@ def test_the_bays_of_a_corridor_are_twins():
     assert np.allclose(shifts[:, 0] / 4.5, np.round(shifts[:, 0] / 4.5), atol=1e-6)
     assert (np.abs(shifts[:, 0]) > 1.0).all()
     assert np.allclose(shifts[:, 1:], 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(('least_m', 'is_accepted'), [(-np.inf, False), (-1.0, True)])
+def test_a_twin_where_no_camera_can_be_counts_not(least_m, is_accepted):
+    """The other room is 5 m further down."""
+    room, seen = doubled_room(np.array([9.0, 0.0, -5.0])), see_room(make_room())
+    options = RelocalizerOptions(matching='class', height_range_m=(least_m, 1.0))
+    found = Relocalizer(room, options).relocalize([Observation(CAMERA, seen)])
+    assert found.accepted == is_accepted
 
 
 @pytest.mark.parametrize('offset_m', [0.01, 0.1, 0.5])
