@@ -77,9 +77,6 @@ class Person:
         self.page.get_by_role('option').filter(has_text=re.compile(f'^{landmark_id} ')).click()
         wait_for(lambda: document.selection == (landmark_id,), 'the selection')
 
-    def wait_for_card(self, landmark_id):
-        self.page.locator('#card').get_by_text(landmark_id, exact=True).wait_for()
-
     def show_view(self, studio, view):
         self.page.evaluate(f"send('view', {{view: {view}}})")
         wait_for(lambda: studio.view == view, 'the view')
@@ -105,11 +102,6 @@ class Person:
         self.drag(self.on_image(box[:2]), self.on_image(box[2:]))
         self.page.mouse.up()
         wait_for(lambda: view in studio.new.boxes, 'the box')
-
-    def name_new(self, label, class_id):
-        """Type label and class of the landmark that is to be created."""
-        self.type('Label', label)
-        self.type('Class', class_id)
 
     def picture(self, name):
         """Keep a picture of the page where the environment names a folder for it."""

@@ -4,8 +4,6 @@
 
 import os
 import signal
-import threading
-import time
 from contextlib import contextmanager
 
 import dask
@@ -28,25 +26,3 @@ def kill_a_worker(cluster):
     pid = min(nanny.pid for nanny in cluster.workers.values())
     os.kill(pid, signal.SIGKILL)
     return pid
-
-
-@contextmanager
-def killing_a_worker(cluster, when):
-    """Kill a worker as soon as a condition holds; yield what tells the processes killed."""
-    killed, stop = [], threading.Event()
-
-    def wait():
-        deadline = time.monotonic() + TIMEOUT_S
-        while not stop.is_set() and time.monotonic() < deadline:
-            if when():
-                killed.append(kill_a_worker(cluster))
-                return
-            time.sleep(0.005)
-
-    thread = threading.Thread(target=wait)
-    thread.start()
-    try:
-        yield killed
-    finally:
-        stop.set()
-        thread.join()

@@ -14,6 +14,8 @@ from cliploc_ros.core.geometry.ellipsoid import (
     project_ellipsoids,
 )
 from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
+from cliploc_ros.core.keyframes.features import DIMENSIONS, unit_rows
+from cliploc_ros.core.keyframes.layer import KeyframeLayer, learn_words, nearest_words
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 
@@ -50,6 +52,36 @@ def see_room(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA) -> Detections:
     outlines = project_ellipsoids(invert_transform(map_from_camera), room.centers, room.shapes)
     boxes = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
     return Detections(boxes, room.class_ids, np.full(len(room), 0.9))
+
+
+def depth_image(room: LandmarkMap, map_from_camera, bboxes_xyxy):
+    """Depth (h, w) [m]: boxes (n, 4) at the near side of their objects, before a wall at 8 m."""
+    camera_from_map = invert_transform(map_from_camera)
+    centers = room.centers @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
+    with np.errstate(invalid='ignore', divide='ignore'):
+        pixels = CAMERA.fx * centers[:, :2] / centers[:, 2:] + (CAMERA.cx, CAMERA.cy)
+    pixels[centers[:, 2] < 0.5] = np.inf
+    near_m = centers[:, 2] - 0.6 * np.cbrt(room.semi_axes.prod(axis=1))
+    seen = [(near_m[np.linalg.norm(pixels - (box[:2] + box[2:]) / 2, axis=1).argmin()],
+             *np.maximum(box.astype(int), 0)) for box in bboxes_xyxy]
+    depths_m = np.full((CAMERA.height, CAMERA.width), 8.0, dtype=np.float32)
+    for depth_m, left, top, right, bottom in sorted(seen, reverse=True):
+        depths_m[top:bottom, left:right] = depth_m
+    return depths_m
+
+
+def make_layer(room: LandmarkMap, keyframes=6, points=40) -> KeyframeLayer:
+    """Keyframes with random points: no image shows them."""
+    rng, total = np.random.default_rng(0), keyframes * points
+    descriptors = rng.integers(0, 120, (total, DIMENSIONS)).astype(np.uint8)
+    vocabulary = learn_words(descriptors)
+    return KeyframeLayer(
+        room.frame_id, room.landmark_ids, room.centers.astype(np.float32), CAMERA,
+        np.tile(np.eye(4), (keyframes, 1, 1)), np.arange(0, total + 1, points),
+        rng.integers(0, 10_000, (total, 2)).astype(np.uint16),
+        rng.normal(size=(total, 3)).astype(np.float32), descriptors,
+        nearest_words(unit_rows(descriptors), unit_rows(vocabulary)).astype(np.uint16),
+        vocabulary)
 
 
 def write_map(room: LandmarkMap, path) -> None:

@@ -4,23 +4,19 @@
 
 import argparse
 import importlib
-import os
 import re
 import runpy
 import subprocess
 import sys
-import textwrap
 import xml.etree.ElementTree as ElementTree
 from functools import cache
 
 import pytest
 import yaml
-from doc_commands import FOREIGN, PROJECT, Command, commands, commands_of, inline_commands, split
+from doc_commands import FOREIGN, PROJECT, Command, commands, inline_commands, split
 
 from cliploc_ros.command import split_ros_args
-from cliploc_ros.demo import ASSETS
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
-from cliploc_ros.vocabulary.vocabulary import load_vocabulary
 
 pytestmark = pytest.mark.full
 
@@ -166,38 +162,6 @@ def test_an_option_in_a_sentence_exists(command):
     for word in arguments:
         if word.startswith('--') and len(word) > 2 and word != '--ros-args':
             assert word.partition('=')[0] in parser._option_string_actions, word
-
-
-@pytest.fixture
-def room(tmp_path):
-    """A working folder with what earlier lines of the pages would have left."""
-    (tmp_path / 'room').mkdir()
-    (tmp_path / 'room/sequence').symlink_to(ASSETS / 'sequence')
-    return tmp_path
-
-
-def test_a_cheap_command_runs(room):
-    """The others take networks or minutes, and have tests of their own that run them."""
-    page = PROJECT / 'doc/first_relocalization.md'
-    (command,) = [one for one in commands_of(page) if 'tum_to_bag' in one.words]
-    module, arguments = program_of(command)
-    done = subprocess.run([sys.executable, '-m', module, *arguments], cwd=room, text=True,
-                          capture_output=True, timeout=300, env=environment())
-    assert done.returncode == 0, done.stderr
-    assert 'wrote room/walk: 48 images' in done.stdout
-
-
-def test_the_example_of_phrases_is_a_vocabulary(tmp_path):
-    example = re.search(r'    cup:\n(?: {4,}.*\n)+', (PROJECT / 'doc/mapping.md').read_text())
-    (tmp_path / 'our.yaml').write_text(textwrap.dedent(example.group()))
-    vocabulary = load_vocabulary(tmp_path / 'our.yaml')
-    assert 'our red team mug' in vocabulary.phrases('cup')
-    assert 'a red Alpha robot' in vocabulary.phrases('robot')
-
-
-def environment() -> dict[str, str]:
-    """Return the environment of a program that runs from the source tree."""
-    return os.environ | {'PYTHONPATH': f'{PROJECT}:{os.environ.get("PYTHONPATH", "")}'}
 
 
 def test_the_example_of_the_library_runs():

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 PROJECT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [PROJECT / 'README.md', *sorted((PROJECT / 'doc').glob('*.md'))]
@@ -37,10 +37,6 @@ def document():
 def test_documents_are_what_the_tables_say(document):
     for path, text in document.documents().items():
         assert path.read_text() == text, f'{path} is out of date: run script/document'
-
-
-def test_the_readme_is_read_in_a_minute():
-    assert len((PROJECT / 'README.md').read_text().splitlines()) < 150
 
 
 def test_the_readme_leads_to_every_page():
@@ -107,11 +103,6 @@ def test_the_messages_that_are_looked_up_exist():
             assert any(part in text for text in known), f'no program says: {part}'
 
 
-def test_the_default_parameters_are_valid_together():
-    DetectorParameters().check()
-    RelocalizerParameters().check()
-
-
 @pytest.mark.parametrize('node', ['detector', 'relocalizer'])
 def test_the_interface_has_every_topic_and_service_and_no_other(node):
     """The policy has them all; a test holds that equal to the graph."""
@@ -168,12 +159,3 @@ def test_foxglove_shows_what_is_published_and_calls_what_is_served():
     def names(node):
         return {node} if isinstance(node, str) else names(node['first']) | names(node['second'])
     assert names(tree['layout']) == set(panels)
-
-
-def test_robot_localization_reads_what_is_published():
-    tree = yaml.safe_load((PROJECT / 'config/robot_localization.yaml').read_text())
-    values = tree['ekf_filter_node_map']['ros__parameters']
-    assert f'/{values["pose0"]}' in published_topics()
-    assert [len(values[name]) for name in ('odom0_config', 'pose0_config')] == [15, 15]
-    defaults = RelocalizerParameters()
-    assert (values['odom_frame'], defaults.publish_tf) == (defaults.odom_frame, False)

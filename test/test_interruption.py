@@ -5,7 +5,6 @@
 import os
 import resource
 import signal
-import threading
 import time
 from pathlib import Path
 
@@ -65,9 +64,3 @@ def test_a_process_with_many_files_waits_and_drops_its_own():
         for descriptor in many:
             os.close(descriptor)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-
-
-def test_another_thread_may_set_it():
-    interruption = Interruption()
-    threading.Timer(0.02, interruption.set).start()
-    assert interruption.wait(60.0)

@@ -92,27 +92,6 @@ def test_the_documents_give_arguments_that_exist(arguments, of_wake_up):
     assert given <= arguments | of_wake_up.keys()
 
 
-def test_a_missing_parameter_file_is_refused(tmp_path):
-    """launch_ros would start the nodes with their defaults, and warn."""
-    functions = {one.name: one for one in relocalization_launch()
-                 if isinstance(one, ast.FunctionDef)}
-    namespace = {'Path': Path}
-    code = ast.Module([functions['check_parameter_file']], [])
-    exec(compile(code, 'relocalization.launch.py', 'exec'), namespace)
-    check = namespace['check_parameter_file']
-    missing = tmp_path / 'robot.yaml'
-    with pytest.raises(RuntimeError, match=f'parameters:={missing}: there is no such file'):
-        check(str(missing))
-    with pytest.raises(RuntimeError):
-        check(str(tmp_path))
-    missing.touch()
-    check(str(missing))
-    check('')
-    # before any node is made
-    assert ast.unparse(functions['_nodes'].body[1]) == (
-        "check_parameter_file(context.launch_configurations['parameters'])")
-
-
 def test_nav2_calls_our_service_and_waits_long_enough():
     text = (LAUNCH.parent / 'doc/nav2.md').read_text()
     tree = re.search(r'    <Parallel.*</Parallel>', text, re.DOTALL).group()

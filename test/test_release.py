@@ -28,11 +28,6 @@ def test_versions_are_equal():
     assert len(found) == 1, found
 
 
-def test_the_manifest_says_where_to_look_and_to_report():
-    urls = ElementTree.parse(PROJECT / 'package.xml').findall('url')
-    assert {url.get('type') for url in urls} == {'website', 'repository', 'bugtracker'}
-
-
 def test_rosdep_can_resolve_every_key():
     manifest = ElementTree.parse(PROJECT / 'package.xml').getroot()
     keys = {entry.text for entry in manifest if entry.tag.endswith('depend')}
@@ -68,8 +63,3 @@ def test_workflows_run_the_ci_with_and_without_ros():
     assert stages[1].startswith('ros:jazzy-ros-base ')
     (ci,) = [stage for stage in stages if ' AS ci\n' in stage]
     assert '/opt/ros/jazzy/setup.bash && exec .ci/run' in ci
-
-
-def test_bloom_finds_no_pyproject():
-    """With one, Debian's builder makes a wheel, whose executables land in /usr/bin."""
-    assert not (PROJECT / 'pyproject.toml').exists()

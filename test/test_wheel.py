@@ -12,7 +12,6 @@ import urllib.request
 import zipfile
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -110,42 +109,6 @@ def test_the_wheel_is_small(wheel):
 def test_commands_have_names_of_their_own(programs):
     installed = {path.name for path in programs.iterdir() if 'cliploc' in path.name}
     assert installed == {f'cliploc_{name}' for name in COMMANDS}
-
-
-def test_ros_is_not_there(programs, tmp_path):
-    code = ('import importlib.util as u\n'
-            "print([m for m in ('rclpy', 'std_msgs', 'torch') if u.find_spec(m)])")
-    assert run(programs / 'python', '-c', code, cwd=tmp_path).stdout == '[]\n'
-
-
-@pytest.mark.parametrize('name', sorted(COMMANDS - {'build_map', 'evaluate', 'studio'}))
-def test_help_is_printed(programs, name, tmp_path):
-    assert 'usage: ' in run(programs / f'cliploc_{name}', '--help', cwd=tmp_path).stdout
-
-
-def test_evaluate_runs(programs, tmp_path):
-    landmark_map = LandmarkMap.from_file(ROOM / 'map.yaml')
-    save_queries_of_classes(tmp_path / 'queries.npz', landmark_map, frames=3)
-    done = run(programs / 'cliploc_evaluate', '--queries', 'queries.npz', '--map',
-               ROOM / 'map.yaml', '--methods', 'auto', '--trials', '1', '--sweep', cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert '3 queries' in done.stdout
-    assert (tmp_path / 'evaluation/top_view.png').is_file()
-
-
-def save_queries_of_classes(path, landmark_map, frames):
-    """Write the first frames of the changed room, with similarities that say the class only."""
-    room = np.load(ROOM / 'after.npz')
-    offsets = room['frame_offsets'][:frames + 1]
-    classes = room['class_ids'][:offsets[-1]]
-    np.savez(path, landmark_ids=landmark_map.landmark_ids,
-             intrinsics_fx_fy_cx_cy=room['intrinsics_fx_fy_cx_cy'], frame_offsets=offsets,
-             boxes_xyxy=room['boxes_xyxy'][:offsets[-1]], class_ids=classes,
-             scores=room['scores'][:offsets[-1]],
-             similarities=(classes[:, None] == np.array(landmark_map.class_ids)) / 3.0,
-             true_landmark=np.full(len(classes), -1), timestamps=room['timestamps'][:frames],
-             map_from_camera=room['map_from_camera'][:frames], query_group=np.arange(frames),
-             is_main=np.ones(frames, dtype=bool))
 
 
 def test_build_map_runs_and_says_what_it_lacks(programs, tmp_path):

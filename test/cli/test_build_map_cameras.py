@@ -2,14 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """``build_map --bag --cameras``: the demo's rig, four cameras at six places, in one recording."""
 
-from pathlib import Path
 
 import numpy as np
 import pytest
 from rig_bag import MOUNTS, RIG, write_rig_bag
 
 from cliploc_ros.cli.build_map import main as build_map
-from cliploc_ros.cli.check_map import main as check_map
 from cliploc_ros.core.keyframes.layer import load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.datasets.observations import load_observations
@@ -96,18 +94,3 @@ def test_poses_of_each_camera_or_of_the_robot_give_the_same_map(bag, built, tmp_
     again, first = LandmarkMap.from_file(out), LandmarkMap.from_file(built[ALL])
     assert len(again) == len(first)
     np.testing.assert_allclose(again.centers, first.centers, atol=5e-3)
-
-
-def test_a_map_is_checked_and_updated_with_all_cameras(built, tmp_path, capsys):
-    npz = built[ALL].with_suffix('.npz')
-    run(check_map, ASSETS / 'map.yaml', '--observations', npz, '--out', tmp_path / 'check',
-        '--frames', 8, '--positions', 4, '--headings', 4)
-    assert 'wrote' in capsys.readouterr().out
-    assert run(build_map, '--observations', npz, '--update', ASSETS / 'map.yaml', '--no-clip',
-               '--out', tmp_path / 'new.yaml') == 0
-    assert len(LandmarkMap.from_file(tmp_path / 'new.yaml')) >= 50
-
-
-def test_cameras_are_those_of_a_bag(tmp_path, capsys):
-    assert run(build_map, '--tum', Path(RIG / 'front'), '--cameras', 'front', '--out',
-               tmp_path / 'a.yaml') == 1

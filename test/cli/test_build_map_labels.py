@@ -5,16 +5,15 @@
 import contextlib
 import io
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cliploc_ros.cli.build_map import main
-from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_embeddings_of_map
+from cliploc_ros.core.map.landmark_embeddings import load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.datasets.observations import load_observations, save_observations
+from cliploc_ros.datasets.observations import load_observations
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 CLIP = ('--clip-model', ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'clip.safetensors',
@@ -103,27 +102,3 @@ def test_phrases_of_a_user(observations, tmp_path, capsys):
     notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith('note:')]
     assert [note[:18] for note in notes] == ['note: no keyframes']
     assert any('bands' in text for details in built.details for text, _ in details.labels)
-
-
-def test_other_weights_of_the_same_name_do_not_label(observations, tmp_path, capsys):
-    other = tmp_path / 'other.npz'
-    seen = load_observations(observations)
-    save_observations(other, replace(seen, encoder_key=seen.encoder_key + '0'))
-    assert build('--observations', other, *CLIP, '--out', tmp_path / 'm.yaml') == 0
-    narrow = tmp_path / 'narrow.npz'
-    save_observations(narrow, replace(seen, embeddings=seen.embeddings[:, :64]))
-    assert build('--observations', narrow, *CLIP, '--out', tmp_path / 'm.yaml') == 0
-    assert 'the embeddings have 64 numbers, but' in capsys.readouterr().out
-
-
-def test_images_of_a_replaced_map_are_removed(observations, tmp_path, capsys):
-    path = tmp_path / 'm.yaml'
-    assert build('--observations', observations, *CLIP, '--out', path) == 0
-    assert embeddings_path(path).exists()
-    bare = tmp_path / 'bare.npz'
-    save_observations(bare, replace(load_observations(observations), embeddings=None))
-    assert build('--observations', bare, '--out', path) == 0
-    assert not embeddings_path(path).exists()
-    built = LandmarkMap.from_file(path)
-    assert built.labels == built.class_ids
-    assert all(details.labels is None for details in built.details)

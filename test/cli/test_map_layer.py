@@ -10,9 +10,9 @@ import pytest
 from cliploc_ros.cli.build_map import make_parser
 from cliploc_ros.cli.map_layer import make_layer, write_layer
 from cliploc_ros.cli.sources import read_frames
-from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map, remove_layer
+from cliploc_ros.core.keyframes.layer import load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import MapError, MappingError
+from cliploc_ros.errors import MappingError
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 WALK = ['--tum', str(ASSETS / 'mapping')]
@@ -45,14 +45,3 @@ def test_images_that_do_not_overlap_give_an_error_or_a_note(tmp_path):
     options.keyframe_layer = True
     with pytest.raises(MappingError, match=why):
         make_layer(options, read_frames(options), landmark_map)
-
-
-def test_the_layer_of_a_map_that_is_replaced_is_removed(tmp_path):
-    layer = layer_path(tmp_path / 'a.yaml')
-    layer.touch()
-    assert remove_layer(tmp_path / 'a.yaml') == (
-        f'removed {layer}: its keyframes belonged to the map before')
-    assert remove_layer(tmp_path / 'a.yaml') == ''
-    layer.mkdir()
-    with pytest.raises(MapError, match='cannot be removed: Is a directory; remove it'):
-        remove_layer(tmp_path / 'a.yaml')

@@ -41,7 +41,7 @@ def play_to_a_stopped(subscriber, start, tmp_path, *args):
     replay = start('replay', bag, '--wait-for-subscribers', *args)
     assert 'replaying' in replay.stdout.readline()
     subscriber.send_signal(signal.SIGSTOP)
-    assert 'published 3 messages' in replay.stdout.readline()
+    assert 'published 3 ' in replay.stdout.readline()
     return replay
 
 
@@ -61,10 +61,3 @@ def test_replay_names_topics_without_acknowledgement(subscriber, start, tmp_path
     assert replay.returncode == 0
     assert errors == (
         'warning: a subscriber of /pose did not acknowledge all messages within 0.5 s\n')
-
-
-def test_a_signal_ends_the_wait(subscriber, start, tmp_path):
-    replay = play_to_a_stopped(subscriber, start, tmp_path, '--wait-for-all-acked', 600)
-    replay.send_signal(signal.SIGTERM)
-    _, errors = replay.communicate(timeout=TIMEOUT_S)
-    assert (replay.returncode, errors) == (0, '')

@@ -67,16 +67,6 @@ def test_small_sequence_round_trip(make_sequence, tmp_path, storage, form):
     assert (bag_messages.stamp_ns(pose), pose.pose.position.x) == (stamps[1], 0)
 
 
-def test_jpeg_bytes_are_copied(make_sequence, tmp_path):
-    sequence = make_sequence(count=1, suffix='jpg')
-    done = run('tum_to_bag', sequence.folder, tmp_path / 'bag', '--compressed')
-    assert done.returncode == 0, done.stderr
-    (image,) = read_all(tmp_path / 'bag')['/image/compressed']
-    assert image.format == 'rgb8; jpeg compressed bgr8'
-    (file,) = (sequence.folder / 'rgb').iterdir()
-    assert image.data.tobytes() == file.read_bytes()
-
-
 def test_accelerations_become_an_imu(make_sequence, tmp_path):
     sequence = make_sequence()
     (sequence.folder / 'accelerometer.txt').write_text('# t a\n1.25 0.5 7 -5\n1.5 0.25 8 -6\n')
@@ -93,21 +83,6 @@ def test_accelerations_become_an_imu(make_sequence, tmp_path):
     done = run('tum_to_bag', sequence.folder, tmp_path / 'other')
     assert 'accelerometer.txt:1' in done.stderr
     assert not (tmp_path / 'other').exists()
-
-
-def test_options_reach_the_recording(make_sequence, tmp_path):
-    sequence = make_sequence(count=7)
-    (sequence.folder / 'groundtruth.txt').unlink()
-    done = run(
-        'tum_to_bag', sequence.folder, tmp_path / 'bag', '--every', 3,
-        '--camera-frame', 'front', '--intrinsics', sequence.folder / 'camera.json',
-        '--ros-args', '-r', '__node:=converter',
-    )
-    assert done.returncode == 0, done.stderr
-    topics = read_all(tmp_path / 'bag')
-    assert set(topics) == {'/image', '/camera_info'}
-    assert [one.header.stamp.nanosec for one in topics['/image']] == [0, 300_000_000, 600_000_000]
-    assert {one.header.frame_id for one in topics['/image']} == {'front'}
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])

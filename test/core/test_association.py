@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from reference import candidate_mask, same_class
+from reference import same_class
 
 from cliploc_ros.core.map.classes import ClassIndex
 from cliploc_ros.core.search.candidates import (
@@ -15,7 +14,6 @@ from cliploc_ros.core.search.candidates import (
     prosac_order,
     rarest_class_candidates,
 )
-from cliploc_ros.errors import OptionsError
 
 SIMILARITIES = np.array([[0.9, 0.1, 0.5], [0.2, 0.8, 0.7]], dtype=np.float32)
 
@@ -53,19 +51,6 @@ def test_equal_similarities_keep_the_map_order():
     assert found.landmarks.tolist() == [0, 1, 2, 3, 4]
 
 
-@pytest.mark.parametrize('k', [0, 4])
-def test_k_must_fit_the_map(k):
-    with pytest.raises(OptionsError, match='the map has 3 landmarks'):
-        nearest_candidates(SIMILARITIES, k)
-
-
-def test_classes_the_map_does_not_know_match_nothing():
-    index = ClassIndex.of(('chair', 'cup', 'cup'))
-    classes = index.classes_of(('cup', 'zebra', ''))
-    assert classes.tolist() == [1, -1, -1]
-    assert class_candidates(index, classes).pairs.tolist() == [[0, 1], [0, 2]]
-
-
 def test_rare_classes_come_first_and_nothing_twice():
     index = ClassIndex.of(('a', 'a', 'a', 'b'))
     rare = rarest_class_candidates(index, index.classes_of(('a', 'b', 'a')), 100)
@@ -73,21 +58,6 @@ def test_rare_classes_come_first_and_nothing_twice():
     similarities = np.array([[0.1, 0.9, 0.2, 0.3]] * 3, dtype=np.float32)
     both = joined(nearest_candidates(similarities, 1), rare, 4)
     assert both.pairs.tolist() == [[0, 1], [1, 1], [2, 1], [1, 3], [0, 0], [0, 2], [2, 0], [2, 2]]
-
-
-@given(st.lists(st.sampled_from('abc'), min_size=1, max_size=9),
-       st.lists(st.sampled_from('abcd'), max_size=6), st.integers(0, 20))
-def test_the_index_of_classes_agrees_with_their_mask(landmarks, detections, limit):
-    index = ClassIndex.of(landmarks)
-    mask = same_class(tuple(detections), tuple(landmarks))
-    classes = index.classes_of(detections)
-    assert (index.sizes_of(classes) == mask.sum(axis=1)).all()
-    found = class_candidates(index, classes)
-    assert (found.pairs == np.argwhere(mask)).all()
-    assert (candidate_mask(found, mask.shape) == mask).all()
-    rarest = rarest_class_candidates(index, classes, 100).pairs
-    assert sorted(rarest.tolist()) == np.argwhere(mask).tolist()
-    assert (rarest_class_candidates(index, classes, limit).pairs == rarest[:limit]).all()
 
 
 @given(st.lists(st.sampled_from('abc'), min_size=1, max_size=9),

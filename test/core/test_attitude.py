@@ -21,7 +21,6 @@ from cliploc_ros.core.acceptance.verdict import Evidence, refusal
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.errors import OptionsError
 
 WRONG_MOUNT = CALIBRATION.attitude.wrong_mount
 # Optical axes of a level camera that looks along the map's x axis: right, down, forward.
@@ -58,12 +57,6 @@ def test_a_handicap_takes_confidence_and_gives_it_to_the_rival():
     upside_down = confidences(odds - [WRONG_MOUNT, 0.0], poses, none)
     assert level[0] == pytest.approx(level[1])
     assert upside_down[0] < 0.02 < level[1] < upside_down[1]
-
-
-def test_the_deviation_of_the_tilt_is_checked():
-    for value in (-1.0, 61.0, np.nan):
-        with pytest.raises(OptionsError, match='tilt_deviation_deg'):
-            RelocalizerOptions(tilt_deviation_deg=value)
 
 
 @pytest.mark.parametrize('deviations_m', [(0.3, 0.3, 0.3), (0.5, 0.1, 0.02), (2.0, 1.0, 0.1),

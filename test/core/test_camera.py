@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.camera import Camera, frusta
 from cliploc_ros.errors import CameraError
 
 LENSES = {
@@ -47,23 +47,12 @@ def test_beyond_the_fold_of_a_lens_is_nan():
     assert np.isnan(folded.project_normalized(sides)).all(axis=1).tolist() == [True, True, False]
 
 
-def test_box_edges_go_where_their_midpoints_go():
-    box = camera('barrel').normalize_bboxes(np.array([[100.0, 50.0, 300.0, 250.0]]))[0]
-    left = camera('barrel').normalize_points(np.array([[100.0, 150.0]]))[0]
-    assert box[0] == left[0]
-    assert (box[2:] > box[:2]).all()
-
-
 def test_boxes_of_the_plane_come_back_as_pixels():
     boxes = np.array([[100.0, 50.0, 300.0, 250.0], [0.0, 10.0, 20.0, 40.0]])
     edges = camera('none').normalize_bboxes(boxes)
     np.testing.assert_allclose(edges[0], [
         (100 - 318.6) / 400, (50 - 255.3) / 401, (300 - 318.6) / 400, (250 - 255.3) / 401])
     np.testing.assert_allclose(camera('none').bboxes_in_pixels(edges), boxes, atol=1e-9)
-
-
-def test_no_boxes_stay_no_boxes():
-    assert camera('barrel').normalize_bboxes(np.empty((0, 4))).shape == (0, 4)
 
 
 @pytest.mark.parametrize(('changes', 'message'), [
@@ -78,3 +67,9 @@ def test_impossible_cameras_are_refused(changes, message):
     sound = {'width': 640, 'height': 480, 'fx': 500.0, 'fy': 500.0, 'cx': 320.0, 'cy': 240.0}
     with pytest.raises(CameraError, match=message):
         Camera(**(sound | changes))
+
+
+def test_a_frustum_ends_at_the_borders_of_the_image():
+    one = Camera(640, 480, 400.0, 300.0, 320.0, 240.0)
+    base = frusta([one], np.eye(4)[None], 2.0)[:4, 1]
+    np.testing.assert_allclose(np.abs(base), np.tile([1.6, 1.6, 2.0], (4, 1)))

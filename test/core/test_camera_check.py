@@ -5,6 +5,8 @@
 A simulated room, seen from many places.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scene import CAMERA, make_room
@@ -33,7 +35,6 @@ ROOM = make_room()
 RELOCALIZER = Relocalizer(ROOM, RelocalizerOptions(matching='class', tilt_deviation_deg=0.0))
 SIZE = np.array([CAMERA.width, CAMERA.height])
 LOOKS = 24
-NO_ERRORS = np.zeros(ERRORS)
 
 
 def place(rng):
@@ -191,6 +192,20 @@ def test_boxes_end_at_the_border_of_their_image(low, high, is_other, rng):
         extent.add(drawn(rng, 8, low, high))
     evidence = extent.log_odds(CAMERA)
     assert evidence == CALIBRATION.camera.extent if is_other else evidence < 1.0
+
+
+def test_the_check_hears_of_boxes_and_goes_on_with_slightly_other_intrinsics(rng):
+    check = CameraCheck()
+
+    def see(camera, high):
+        boxes = drawn(rng, 8, (0.0, 0.0), high)
+        check.see(Observation(camera, Detections(boxes, ('a',) * 8, np.full(8, 0.9))))
+        return len(check.faults)
+    faults = [see(CAMERA, (300.0, 300.0)) for _ in range(8)]
+    assert faults[-1] == 1
+    focused = replace(CAMERA, fx=1.005 * CAMERA.fx, fy=1.005 * CAMERA.fy)
+    assert see(focused, (300.0, 300.0)) == 1
+    assert see(replace(CAMERA, cx=CAMERA.cx + 20.0), (300.0, 300.0)) == 0, 'another camera'
 
 
 def test_a_view_that_stays_the_same_has_no_border(rng):

@@ -116,10 +116,3 @@ def test_the_first_candidates_are_done_before_the_next(room):
         assert step.coverage == pytest.approx(comb(step.reach, 3) / comb(count, 3))
     assert steps[-1].coverage == 1.0
     assert steps[-1].tried == comb(count, 3)
-
-
-def test_too_few_candidates_end_at_once(room):
-    scene = scene_of(room, slice(0, 1))
-    short = scene._replace(pairs=scene.pairs[:2])
-    steps = list(search_progressively(short, np.ones((2, 2), dtype=bool), Leaders.none_yet()))
-    assert steps == []

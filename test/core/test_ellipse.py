@@ -44,12 +44,6 @@ def test_iou_equals_quadrature(a, b, p, q, x, y, angle):
     assert iou == pytest.approx(iou_by_chords(a, b, (x, y), shape), abs=1e-5)
 
 
-@given(sizes, sizes, st.floats(-1e-6, 1e-6))
-def test_nearly_equal_ellipses_overlap_almost_wholly(a, b, nudge):
-    iou = ellipse_iou(0.0, 0.0, a, b, a * nudge, b * nudge, a * a * (1 + nudge), 0.0, b * b)
-    assert iou == pytest.approx(1.0, abs=1e-5)
-
-
 @pytest.mark.parametrize(('center', 'axes', 'shared'), [
     ((0.0, 0.0), (1.0, 1.0), np.pi),             # equal circles
     ((0.0, 0.0), (0.5, 0.25), np.pi / 8),        # inside
@@ -67,14 +61,6 @@ def test_shared_area_of_simple_cases(center, axes, shared):
         shared = iou_by_chords(1.0, 1.0, center, np.diag(np.square(axes)))
         shared = shared / (1 + shared) * 2 * np.pi
     assert unit_circle_overlap(*center, *axes) == pytest.approx(shared, abs=1e-7)
-
-
-def test_iou_of_boxes_that_do_not_meet_is_zero():
-    assert ellipse_iou(0.0, 0.0, 1.0, 1.0, 10.0, 0.0, 1.0, 0.0, 1.0) == 0.0
-
-
-def test_flat_ellipse_has_no_overlap():
-    assert ellipse_iou(0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 1.0) == 0.0
 
 
 @given(st.lists(st.floats(-10.0, 10.0), min_size=3, max_size=3))

@@ -58,19 +58,6 @@ def test_labels_and_images_spread_alike(world):
     assert np.abs(both).max() <= 1.0
 
 
-def test_both_find_more_than_either(world, rng):
-    """Where errors of labels and images have nothing to do with each other."""
-    labels, images, crops = world
-    wrong = rng.permutation(COUNT)
-    means, rows = images.means.copy(), labels.unique.copy()
-    means[wrong[:20]] = units(rng, 20) * 0.7 + 0.7 * means[wrong[20:40]]
-    rows[wrong[20:40]] = rows[wrong[:20]]
-    images = replace(images, means=units(rng, means).astype(np.float16))
-    labels = LabelEmbeddings.of(rows)
-    alone = top_1(labels, crops), top_1(with_images(labels, images, 'image'), crops)
-    assert top_1(with_images(labels, images, 'both'), crops) > max(alone)
-
-
 @pytest.mark.parametrize('compare', ['image', 'both'])
 def test_a_landmark_without_images_keeps_its_label(world, compare):
     labels, images, crops = world
@@ -92,12 +79,3 @@ def test_landmarks_that_share_a_label_differ_by_their_images(world):
     assert top_1(shared, crops) <= 2 / COUNT
     for compare in ('image', 'both'):
         assert top_1(with_images(shared, images, compare), crops) > 0.9
-
-
-@pytest.mark.parametrize('compare', ['image', 'both'])
-def test_one_landmark(world, compare):
-    labels, images, _ = world
-    rows = np.asarray(with_images(LabelEmbeddings.of(labels.unique[:1]), replace(
-        images, landmark_ids=('0',), means=images.means[:1],
-        medoid_offsets=np.zeros(2, np.int64)), compare))
-    assert rows.shape == (1, SIZE) and np.isfinite(rows).all()

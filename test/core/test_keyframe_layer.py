@@ -7,17 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene import CAMERA, make_room
+from scene import CAMERA, make_layer, make_room
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes import layer as layers
-from cliploc_ros.core.keyframes.features import DIMENSIONS, unit_rows
 from cliploc_ros.core.keyframes.layer import (
-    KeyframeLayer,
     layer_path,
-    learn_words,
     load_layer_of_map,
-    nearest_words,
     save_layer,
 )
 from cliploc_ros.errors import MapError
@@ -26,24 +22,10 @@ ROOM = make_room()
 KEYFRAMES, POINTS = 6, 40
 
 
-def make_layer(room=ROOM):
-    rng = np.random.default_rng(0)
-    total = KEYFRAMES * POINTS
-    descriptors = rng.integers(0, 120, (total, DIMENSIONS)).astype(np.uint8)
-    vocabulary = learn_words(descriptors)
-    return KeyframeLayer(
-        room.frame_id, room.landmark_ids, room.centers.astype(np.float32), CAMERA,
-        np.tile(np.eye(4), (KEYFRAMES, 1, 1)), np.arange(0, total + 1, POINTS),
-        rng.integers(0, 10_000, (total, 2)).astype(np.uint16),
-        rng.normal(size=(total, 3)).astype(np.float32), descriptors,
-        nearest_words(unit_rows(descriptors), unit_rows(vocabulary)).astype(np.uint16),
-        vocabulary)
-
-
 @pytest.fixture
 def file(tmp_path):
     path = layer_path(tmp_path / 'room.yaml')
-    save_layer(path, make_layer())
+    save_layer(path, make_layer(ROOM))
     return path
 
 
@@ -62,7 +44,7 @@ def change_header(path, **changes):
 
 def test_a_layer_comes_back_as_it_was(file):
     assert file.name == 'room.keyframes.npz'
-    before, after = make_layer(), load_layer_of_map(file, ROOM)
+    before, after = make_layer(ROOM), load_layer_of_map(file, ROOM)
     assert after.camera == before.camera
     assert after.landmark_ids == before.landmark_ids
     for name in ('map_from_camera', 'offsets', 'pixels', 'points', 'descriptors', 'words',
@@ -75,7 +57,7 @@ def test_the_arrays_of_a_large_file_stay_in_it(file, monkeypatch):
     monkeypatch.setattr(layers, '_SCHEMA', replace(layers._SCHEMA, largest_read=0))
     layer = load_layer_of_map(file, ROOM)
     assert isinstance(layer.descriptors, np.memmap)
-    assert np.array_equal(layer.descriptors, make_layer().descriptors)
+    assert np.array_equal(layer.descriptors, make_layer(ROOM).descriptors)
 
 
 def test_an_edited_map_keeps_its_layer(file):
@@ -85,7 +67,7 @@ def test_an_edited_map_keeps_its_layer(file):
 
 
 def test_the_most_similar_keyframe_has_the_same_words():
-    layer = make_layer()
+    layer = make_layer(ROOM)
     for keyframe in range(KEYFRAMES):
         similarities = layer.similarities(layer.unit_descriptors(keyframe))
         assert similarities.argmax() == keyframe
@@ -105,7 +87,6 @@ def test_the_layer_of_another_map_is_named(file, other, message):
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'version': 2}, 'version 2, expected 1'),
     ({'descriptors': 'orb-32'}, "kind 'orb-32', expected 'rootsift"),
-    ({'camera': {'width': 0, 'height': 1, 'fx': 1, 'fy': 1, 'cx': 0, 'cy': 0}}, 'camera'),
     ({'camera': 7}, 'camera')])
 def test_other_versions_descriptors_and_cameras_are_named(file, changes, message):
     change_header(file, **changes)
@@ -116,24 +97,12 @@ def test_other_versions_descriptors_and_cameras_are_named(file, changes, message
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'points': None}, 'points'),
     ({'points': np.zeros((3, 3), np.float32)}, r'points has shape \(3, 3\)'),
-    ({'points': np.zeros((KEYFRAMES * POINTS, 3))}, 'points has type float64'),
     ({'offsets': np.zeros(KEYFRAMES + 1, np.int64)}, 'offsets'),
-    ({'offsets': np.array([0, 200, 40, 80, 120, 160, 240])}, 'offsets'),
     ({'map_from_camera': np.full((KEYFRAMES, 4, 4), np.nan)}, 'no rigid transform in row 0'),
-    ({'words': np.full(KEYFRAMES * POINTS, 60_000, np.uint16)}, 'words'),
-    ({'descriptors': np.empty((0, DIMENSIONS), np.uint8)}, 'descriptors has shape'),
-    ({'landmark_ids': np.array([object()])}, 'landmark_ids|complete')])
+    ({'words': np.full(KEYFRAMES * POINTS, 60_000, np.uint16)}, 'words')])
 def test_malformed_arrays_are_named(file, changes, message):
     rewrite(file, **changes)
     with pytest.raises(MapError, match=message):
-        load_layer_of_map(file, ROOM)
-
-
-@pytest.mark.parametrize('share', [0.0, 0.1, 0.5, 0.9, 0.999])
-def test_a_truncated_file_is_named(file, share):
-    content = file.read_bytes()
-    file.write_bytes(content[:int(share * len(content))])
-    with pytest.raises(MapError, match=r'no complete npz file|cannot be read'):
         load_layer_of_map(file, ROOM)
 
 
@@ -159,11 +128,11 @@ def test_a_missing_or_compressed_file_and_a_failed_write_are_named(file, tmp_pat
     with pytest.raises(MapError, match='compressed'):
         load_layer_of_map(file, ROOM)
     with pytest.raises(MapError, match='cannot be written'):
-        save_layer(tmp_path / 'missing' / 'room.npz', make_layer())
+        save_layer(tmp_path / 'missing' / 'room.npz', make_layer(ROOM))
 
 
 def test_another_camera_is_noted():
-    layer = make_layer()
+    layer = make_layer(ROOM)
     assert layer.camera_note(CAMERA) == ''
     assert layer.camera_note(Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)) == ''
     assert 'fx 700.0' in layer.camera_note(Camera(640, 480, 700.0, 700.0, 320.0, 240.0))

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poses and points from matched features: exact cases, outliers, honest covariances."""
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -191,21 +190,3 @@ def test_features_are_found_in_any_image():
     for empty in (np.zeros((480, 640, 3), np.uint8), np.zeros((1, 1, 3), np.uint8),
                   np.full((1, 1, 3), 255, np.uint8), np.full((2, 3000, 3), 90, np.uint8)):
         assert len(extract(empty, 300)) == 0
-
-
-def test_features_of_half_the_size_match_those_of_keyframes():
-    rng = np.random.default_rng(14)
-    small = rng.integers(0, 255, (60, 80, 3)).astype(np.uint8)
-    texture = cv2.resize(small, (800, 600), interpolation=cv2.INTER_CUBIC)
-    full, half = extract(texture, 300), extract(texture, 300, 400)
-    pairs = match(unit_rows(half.descriptors), unit_rows(full.descriptors))
-    shifts = half.pixels[pairs[:, 0]] - full.pixels[pairs[:, 1]]
-    assert len(pairs) > 60
-    assert np.mean(np.abs(shifts).max(axis=1) < 1.0) > 0.9
-
-
-def test_a_large_image_gives_its_own_pixels():
-    rng = np.random.default_rng(7)
-    texture = rng.integers(0, 255, (15, 20, 3)).astype(np.uint8).repeat(80, 0).repeat(80, 1)
-    features = extract(texture, 500)  # 1600 px wide
-    assert features.pixels[:, 0].max() > 1300

@@ -17,7 +17,6 @@ from cliploc_ros.core.localizer import KeptInstant, Localizer, instants_to_fuse
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.errors import OptionsError
 
 ROOM = make_room()
 SEEN = see_room(ROOM)
@@ -154,13 +153,6 @@ def test_a_frame_without_odometry_is_localized_alone(session):
     assert fused(session, frame(4.0, 40.0)) == 4, 'and does not change the session'
 
 
-def test_a_frame_that_cannot_be_searched_is_dropped(session):
-    assert fused(session, frame(0.0)) == 1
-    with pytest.raises(OptionsError, match='unit vector'):
-        session.localize(replace(frame(1.0, 10.0), up_in_camera=np.zeros(3)), 0, 5, 5.0)
-    assert fused(session, frame(2.0, 20.0)) == 2
-
-
 def drive(session, seconds, metres, run=0, objects=12):
     """Localize with a view that never changes, although odometry says that the robot drives."""
     seen = SEEN.select(np.arange(objects))
@@ -174,8 +166,7 @@ def test_a_pose_that_earlier_looks_contradict_is_refused(session):
         assert not found.accepted and found.hypotheses
     found = drive(session, 5.0, 12.0)
     assert pose_error(found.map_from_camera, MAP_FROM_CAMERA)[0] < 0.01
-    assert found.reason.startswith('mean confidence 0.')
-    assert 'of the last 5 frames in this pose' in found.reason
+    assert 'last 5 frames' in found.reason
 
 
 def test_an_accepted_pose_ends_the_looks(session):
@@ -224,12 +215,6 @@ def camera():
     return Camera()
 
 
-def test_looks_that_agree(camera):
-    assert camera.look(0.0, 0.0) == 1.0
-    assert camera.look(0.1, 0.1) == 1.0
-    assert len(camera.looks) == 2
-
-
 def test_one_look_of_many_does_not_agree(camera):
     for number in range(6):
         camera.look(number / 10, 2.0 * number)
@@ -242,11 +227,6 @@ def test_sure_looks_outweigh_unsure_ones(camera):
     assert camera.look(0.1, 1.0) == 0.5
     assert camera.look(0.2, 1.2, confidence=0.8) == pytest.approx(0.6)
     assert camera.look(0.3, 9.0) == pytest.approx(0.3)
-
-
-def test_a_robot_that_keeps_looking_gains_nothing_from_unsure_looks(camera):
-    means = [camera.look(number / 10, 0.0, confidence=0.3) for number in range(40)]
-    assert max(means) == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize(('turned_deg', 'driven_m'), [(0.0, 0.0), (10.0, 0.0), (10.0, 0.8)])
@@ -271,13 +251,6 @@ def test_a_blocked_view_is_forgotten_after_twenty_looks(camera):
         camera.look(number / 10, 9.0)
     means = [camera.look(10.0 + number / 10, 1.0) for number in range(15)]
     assert [mean >= 0.5 for mean in means] == [False] * 9 + [True] * 6
-
-
-def test_a_look_without_odometry_stands_alone(camera):
-    camera.look(0.0, 9.0)
-    unlinked = replace(frame(1.0), odom_from_camera=None)
-    assert camera.looks.confidences_in(unlinked, pose()) == ()
-    assert len(camera.looks.with_look(Look(unlinked, pose(), 1.0))) == 1
 
 
 def test_a_filter_learns_nothing_from_a_standing_camera_until_a_new_run():

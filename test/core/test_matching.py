@@ -2,12 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A frame's scene, in maps small and large, against masks of what each detection may show."""
 
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from math import comb
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -152,44 +149,3 @@ def time_budget_is_kept(observation, landmark_map, frames):
 def test_a_search_keeps_its_time_budget(count):
     landmark_map, observation = make_world(count)
     assert time_budget_is_kept(observation, landmark_map, 1).tried > 500
-
-
-@pytest.mark.clock
-@pytest.mark.parametrize('frames', [5, 10])
-def test_one_more_frame_keeps_it_too(frames):
-    landmark_map, observation = make_world(60)
-    assert time_budget_is_kept(replace(observation, odom_from_camera=np.eye(4)), landmark_map,
-                               frames).solved
-
-
-_FIRST_REQUEST = """
-import sys, time
-sys.path[:0] = sys.argv[1:]
-from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalizer import Relocalizer
-from test_matching import make_world
-
-for count in (60, 400):
-    landmark_map, observation = make_world(count)
-    relocalizer = Relocalizer(landmark_map, RelocalizerOptions())
-    relocalizer.warm_up()
-    times = []
-    for _ in range(10):
-        start = time.process_time()
-        assert relocalizer.relocalize([observation]).solved
-        times.append(time.process_time() - start)
-    print(count, 1e3 * times[0], 1e3 * min(times))
-"""
-
-
-@pytest.mark.clock
-def test_the_first_request_is_as_fast_as_later_ones():
-    """In a process of its own, on an idle core."""
-    here = Path(__file__).parent
-    done = subprocess.run([sys.executable, '-c', _FIRST_REQUEST, str(here), str(here.parent)],
-                          capture_output=True, text=True, check=True)
-    for line in done.stdout.splitlines():
-        count, first_ms, later_ms = map(float, line.split())
-        print(f'\n{count:.0f} landmarks: the first request {first_ms:.1f} ms, later ones '
-              f'{later_ms:.1f} ms')
-        assert first_ms < 4 * later_ms

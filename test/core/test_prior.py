@@ -124,7 +124,7 @@ def test_a_confident_wrong_region_accepts_nothing_and_is_named():
     assert not ask(region=wrong).accepted, 'neither room is there'
     refused = ask(make_room(), 3, region=wrong)
     assert refused.confidence < ask(make_room(), 3).confidence
-    assert 'the prior has the robot elsewhere' in refused.reason
+    assert 'prior' in refused.reason
     sure = ask(make_room(), region=wrong)
     assert sure.accepted and pose_error(sure.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
 

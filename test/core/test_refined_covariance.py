@@ -135,13 +135,6 @@ def test_edges_off_by_the_error_of_the_map_fit_well():
     assert misfits[2] < 0.8 * misfits[1]
 
 
-def test_a_map_without_errors_gets_the_default():
-    assert (ROOM.position_sigmas == DEFAULT_SIGMA_M).all()
-    some = replace(ROOM, details=(LandmarkDetails(position_sigma=0.3),
-                                  *[LandmarkDetails()] * (len(ROOM) - 1)))
-    assert some.position_sigmas[0] == 0.3 and (some.position_sigmas[1:] == DEFAULT_SIGMA_M).all()
-
-
 @pytest.mark.parametrize('frames', [1, 4])
 def test_an_error_that_all_landmarks_share_is_that_of_the_pose(frames):
     rng, sigmas = np.random.default_rng(5), np.array([0.05, np.radians(2.0)])

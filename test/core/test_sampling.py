@@ -3,7 +3,6 @@
 from math import comb
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -53,8 +52,3 @@ def test_ransac_draws_all_candidates_alike():
     counts = np.bincount(draw_ransac(pairs, 30_000, np.random.default_rng(0)).ravel())
     # 9,000 each is expected, with a standard deviation of about 80
     assert np.abs(counts - 9_000).max() < 400
-
-
-@pytest.mark.parametrize('draw', [draw_ransac, draw_prosac])
-def test_two_candidates_give_no_sample(draw):
-    assert (draw(np.array([[0, 0], [1, 1]]), 5, np.random.default_rng(0)) == -1).all()

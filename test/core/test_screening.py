@@ -145,13 +145,3 @@ def test_pairs_and_a_vertical_find_the_pose(scene):
     assert (scene.pairs[leaders.samples[best, 0]] != scene.pairs[leaders.samples[best, 1]]).all()
     assert steps[-1].tried == np.tril(compatible_pairs(scene)).sum()
     assert (steps[-1].coverage, steps[-1].reach) == (1.0, len(scene.pairs))
-
-
-def test_pairs_mind_the_height(scene):
-    leaders = Leaders.none_yet()
-    list(search_progressively(scene, compatible_pairs(scene), leaders,
-                              upright(min_height=HEIGHT + 0.5), size=2))
-    for row in leaders.ranked():
-        pose = invert_transform(make_transform(leaders.rotations[row],
-                                               leaders.translations[row]))
-        assert pose[:3, 3] @ UP_IN_MAP >= HEIGHT + 0.5

@@ -97,28 +97,6 @@ def test_the_last_frame_is_the_one_asked_about(room, walk):
         assert pose_error(found.map_from_camera, walk[last]) < (0.01, 0.2)
 
 
-def test_frames_searched_one_by_one_give_the_same_result(room, walk):
-    relocalizer = Relocalizer(room, OPTIONS)
-    frames = [see(room, pose) for pose in walk]
-    searched = [relocalizer.search(one) for one in frames]
-    for count in range(1, 5):
-        at_once = relocalizer.relocalize(frames[:count])
-        one_by_one = relocalizer.locate(searched[:count])
-        np.testing.assert_array_equal(one_by_one.map_from_camera, at_once.map_from_camera)
-        np.testing.assert_array_equal(one_by_one.covariance, at_once.covariance)
-        assert (one_by_one.confidence, one_by_one.tried) == (at_once.confidence, at_once.tried)
-
-
-def test_one_frame_needs_no_odometry_and_is_not_changed_by_it(room, walk):
-    relocalizer, frame = Relocalizer(room, OPTIONS), see(room, walk[1])
-    without = relocalizer.relocalize([replace(frame, odom_from_camera=None)])
-    found = relocalizer.relocalize([frame])
-    np.testing.assert_array_equal(found.map_from_camera, without.map_from_camera)
-    np.testing.assert_array_equal(found.covariance, without.covariance)
-    assert (found.score, found.confidence, found.tried) == (
-        without.score, without.confidence, without.tried)
-
-
 @pytest.mark.parametrize('refine', [True, False])
 def test_the_same_view_again_is_no_more_evidence(refine, room):
     relocalizer = Relocalizer(room, replace(OPTIONS, refine=refine))
@@ -136,8 +114,7 @@ def test_a_frame_that_shows_nothing_changes_nothing(room, walk):
         assert found.accepted
         assert pose_error(found.map_from_camera, walk[1]) < (0.01, 0.2)
     found = relocalizer.relocalize([see(room, walk[0], []), see(room, walk[1], [3])])
-    assert not found.solved
-    assert found.reason.startswith('1 detections give fewer than 3 distinct correspondence cand')
+    assert not found.solved and found.reason.startswith('1 detections')
 
 
 UP = np.array([0.0, 0.0, 1.0])

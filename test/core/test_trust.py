@@ -122,10 +122,6 @@ def test_what_no_landmark_explains_counts_against_a_pose(measure, compared, quer
     assert (twice.inliers, twice.unexplained) == (1, 1)
 
 
-def test_nothing_supports_nothing(measure, compared):
-    assert measure([compared], np.eye(4)[None], [[]]) == Support()
-
-
 def test_labels_and_classes_support_a_pose(measure, compared, queries, office_map):
     poses, matches = queries[0].map_from_camera[None], [[Match(1, 4, 0.5)]]
     found = measure([compared], poses, matches)
@@ -219,9 +215,6 @@ def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
      'confidence 0.50 < 0.99; ambiguous, another pose has 0.3; '),
     (Evidence(5, 0.5, rival=Rival(0.1, ORIGIN)), {},
      'confidence 0.50 < 0.99; 5 objects matched, 0 unexplained; '),
-    (Evidence(5, 0.5, unexplained=4.0), {},
-     'confidence 0.50 < 0.99; 5 objects matched, 4 unexplained; turn the camera to more objects'),
-    (Evidence(5, 0.1, rival=Rival(0.3, ORIGIN)), {}, 'confidence 0.10 < 0.99; ambiguous'),
     (Evidence(8, 0.95), {'min_confidence': 0.9}, ''),
     (Evidence(8, 0.98999), {}, 'confidence 0.98 < 0.99; 8 objects matched'),
     (Evidence(8, 0.29), {}, 'confidence 0.29 < 0.99; 8 objects matched'),
@@ -233,15 +226,11 @@ def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
     (Evidence(5, 0.995, coverage=0.5, tried=5000, meetings=2), {},
      'confidence 0.91 < 0.99; pose met only 2 times in 5000 samples; raise iterations'),
     (Evidence(5, 0.995, meetings=1), {'algorithm': 'ransac'}, 'confidence 0.77 < 0.99; pose met'),
-    (Evidence(5, 0.999, meetings=5), {'algorithm': 'ransac'}, ''),
     (Evidence(5, 0.995), {'iterations': 100, 'algorithm': 'b-prosac'}, 'iterations 100 < 500'),
-    (Evidence(5, 0.995), {'iterations': 100, 'algorithm': 'bf'}, ''),
     (Evidence(5, 0.995, earlier=(0.0,) * 6), {},
      'mean confidence 0.14 < 0.5 of the last 7 frames in this pose'),
     (Evidence(5, 0.995, earlier=(0.0, 0.99, 0.0)), {}, 'mean confidence 0.49 < 0.5'),
-    (Evidence(5, 0.995, earlier=(0.0, 0.99)), {}, ''),
-    (Evidence(5, 0.3), {'min_confidence': 0.2}, ''),
-])
+    (Evidence(5, 0.995, earlier=(0.0, 0.99)), {}, '')])
 def test_refusal_names_its_reason(evidence, options, reason):
     refused = refusal(evidence, RelocalizerOptions(**{'min_confidence': 0.99} | options))
     answer = refused.reason if refused else ''
@@ -266,17 +255,6 @@ def test_no_refusal_names_a_rival_at_the_same_place(office_map, queries, observe
             assert found.evidence.rival.likely <= max(elsewhere) / (
                 found.evidence.found * found.evidence.certainty) + 1e-9
     assert ambiguous > 1
-
-
-def test_an_ambiguous_scene_shares_its_confidence(office_map, queries, observe):
-    relocalizer = Relocalizer(office_map, RelocalizerOptions())
-    for frame in queries.main_frames():
-        result = relocalizer.relocalize([observe(frame)])
-        given = [one.confidence for one in result.hypotheses]
-        assert all(0 <= one <= 1 for one in given)
-        assert result.confidence == (given[0] if given else 0)
-        assert result.accepted == (result.confidence >= relocalizer.options.min_confidence)
-        assert result.accepted == (not result.reason)
 
 
 def garbage(rng, kind):
@@ -307,30 +285,6 @@ def test_garbage_is_never_accepted(kind, office_map, rng):
             Camera(640, 480, 535.4, 539.2, 320.1, 247.6), detections)]).accepted
     print(f'\n{kind}: {accepted} of 200 garbage frames accepted')
     assert accepted == 0
-
-
-def test_every_box_twice_is_no_more_evidence(office_map, queries, observe):
-    relocalizer = Relocalizer(office_map, RelocalizerOptions(iterations=2000))
-    wrong = 0
-    for frame in queries.main_frames():
-        once = observe(frame)
-        rows = np.repeat(np.arange(len(once.detections)), 2)
-        twice = Observation(once.camera, once.detections.select(rows), once.similarities[rows])
-        result = relocalizer.relocalize([twice])
-        wrong += result.accepted and pose_error(result.map_from_camera,
-                                                frame.map_from_camera)[0] > 1.0
-    assert wrong == 0
-
-
-def test_a_search_cut_short_is_refused(office_map, queries, observe):
-    relocalizer = Relocalizer(office_map, RelocalizerOptions(
-        matching='class', algorithm='bf', time_budget_s=0.0))
-    relocalizer.warm_up()
-    results = [relocalizer.relocalize([observe(frame)]) for frame in queries.main_frames()]
-    cut = [result for result in results if result.coverage < 1.0]
-    assert len(cut) > 10
-    assert not any(result.accepted for result in cut)
-    assert max(result.search_ms for result in results) < 500
 
 
 def test_covariance_is_that_of_simulated_boxes(rng):

@@ -2,13 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.two_point import two_point
 
-coordinates = st.floats(-5.0, 5.0)
 UP = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
@@ -69,15 +66,6 @@ def test_every_pose_found_is_an_upright_solution_and_none_is_found_twice(rng):
     assert twice > 100
 
 
-@given(st.lists(st.tuples(coordinates, coordinates, coordinates), min_size=2, max_size=2),
-       st.lists(st.tuples(coordinates, coordinates), min_size=2, max_size=2))
-def test_any_input_gives_finite_poses_or_none(points, image):
-    seen = np.concatenate([np.array(image), np.ones((2, 1))], axis=1)
-    rotations, translations = solve_two_point(bearings_of(seen), np.array(points), *UP)
-    assert np.isfinite(rotations).all()
-    assert np.isfinite(translations).all()
-
-
 @pytest.mark.parametrize('points', [
     np.zeros((2, 3)),                              # one point
     np.array([[0.0, 0, 1], [0, 0, 2]]),            # one above the other
@@ -85,10 +73,4 @@ def test_any_input_gives_finite_poses_or_none(points, image):
 ])
 def test_degenerate_pairs_have_no_pose(points):
     bearings = bearings_of(np.array([[0.0, 0, 1], [0.2, 0.1, 1]]))
-    assert len(solve_two_point(bearings, points, *UP)[0]) == 0
-
-
-def test_two_points_level_with_the_camera_have_no_pose():
-    bearings = bearings_of(np.array([[0.0, 0, 1], [0.2, 0, 1]]))
-    points = np.array([[0.0, 3, 1], [1, 3, 1]])
     assert len(solve_two_point(bearings, points, *UP)[0]) == 0

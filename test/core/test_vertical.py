@@ -78,7 +78,8 @@ def test_success_with_what_is_known(case, office_map, queries, observe, threshol
     assert not (accepted & (errors > 1.0)).any()
 
 
-@pytest.mark.parametrize('tilt_deg', [45.0, 90.0, 180.0])
+@pytest.mark.parametrize('tilt_deg', [
+    90.0, 180.0])
 def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries, observe):
     """As by a wrong mount: what boxes say without it is among the rivals."""
     relocalizer, rng = Relocalizer(office_map, RelocalizerOptions()), np.random.default_rng(0)
@@ -117,12 +118,6 @@ def test_a_vertical_makes_a_pose_surer(room):
     for found in (upright, free):
         assert pose_error(found.map_from_camera, MAP_FROM_CAMERA)[0] < 1e-2
     assert np.trace(upright.covariance[LEVEL]) < np.trace(free.covariance[LEVEL])
-
-
-def test_a_minimal_pose_tilts_as_its_vertical_does(room):
-    options = RelocalizerOptions(matching='class', refine=False, vertical_deviation_deg=2.0)
-    found = Relocalizer(room, options).relocalize([with_vertical(room)])
-    assert np.diag(found.covariance[LEVEL]) == pytest.approx(np.radians(2.0) ** 2, rel=0.01)
 
 
 def test_a_height_that_is_wrong_leaves_no_pose_outside(room):

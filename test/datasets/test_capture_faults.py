@@ -16,7 +16,6 @@ from capture_folders import (
     shots_of,
     write_colmap,
     write_nerf,
-    write_polycam,
 )
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -97,17 +96,6 @@ def test_models_in_pieces_and_turned_images(shots, tmp_path):
     refuses(folder, '480x640 px, but the camera has 640x480 px; is it turned by its EXIF')
 
 
-@pytest.mark.parametrize('number', [7, 10, 17, 99])
-def test_unknown_camera_models(number, shots, tmp_path):
-    folder = write_colmap(tmp_path, shots[:1])
-    path = folder / 'sparse/0/cameras.bin'
-    data = bytearray(path.read_bytes())
-    data[12:16] = struct.pack('<i', number)
-    path.write_bytes(data)
-    refuses(folder, 'has the camera model .* which is not known here; undistort the images with '
-                    'colmap image_undistorter')
-
-
 def test_files_cut_short_and_false_counts_cost_nothing(shots, tmp_path):
     folder = write_colmap(tmp_path, shots)
     for name in ('cameras.bin', 'images.bin'):
@@ -129,30 +117,14 @@ def test_files_cut_short_and_false_counts_cost_nothing(shots, tmp_path):
     (lambda v: v.pop('fl_x'), 'has no intrinsics: neither fl_x nor camera_angle_x'),
     (lambda v: v.update(fl_x='wide'), 'fl_x is wide, not a finite number'),
     (lambda v: v.update(camera_model='EQUIRECTANGULAR'), 'EQUIRECTANGULAR is not known here'),
-    (lambda v: v.update(k4=0.1), 'with k4 is not known here'),
-    (lambda v: v.update(fl_x=0.0), 'focal lengths must be positive'),
     (lambda v: v['frames'][0].pop('file_path'), "frame 0: field 'file_path' is missing"),
-    (lambda v: v['frames'][1].update(v['frames'][0]), 'lists the image .* twice'),
     (lambda v: v['frames'][0].update(transform_matrix=[[1, 0], [0, 1]]), 'transform_matrix is'),
     (lambda v: v['frames'][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()),
      'it is a reflection'),
-    (lambda v: v['frames'][0].update(transform_matrix=np.zeros((4, 4)).tolist()),
-     'its axes have no unit length'),
     (lambda v: v['frames'][0].update(transform_matrix=(np.eye(4) * np.nan).tolist()),
-     'not numbers of shape'),
-    (lambda v: v['frames'].__setitem__(0, 3), "frame 0: expected a mapping, got '3'")])
+     'not numbers of shape')])
 def test_faults_of_transforms_json(edit, expected, shots, tmp_path):
     refuses(edited(write_nerf(tmp_path, shots), edit), expected)
-
-
-def test_a_lost_pose_is_none_and_a_false_one_refused(shots, tmp_path):
-    folder = write_polycam(tmp_path, shots)
-    first, second = sorted((folder / 'keyframes/corrected_cameras').iterdir())[:2]
-    edited(first.parent, lambda values: values.update(t_00=9.0), first.name)
-    refuses(folder, f'pose of {first.stem}.jpg is no rotation and translation: its axes have no')
-    first.unlink()
-    second.write_text('{')
-    refuses(folder, 'cannot be read as JSON')
 
 
 def test_the_memory_of_large_photos(tmp_path):

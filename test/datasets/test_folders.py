@@ -48,15 +48,6 @@ def test_seven_scenes(tmp_path):
     assert first.camera.fx == 525.0
 
 
-@pytest.mark.parametrize(('pose', 'expected'), [
-    (np.eye(4)[:3], r'is no 4x4 matrix, its shape is \(3, 4\)'),
-    (np.diag([2.0, 2.0, 2.0, 1.0]), 'is no rigid transform'),
-    (None, 'no image has a valid .pose.txt')])
-def test_poses_that_do_not_serve(tmp_path, pose, expected):
-    with pytest.raises(DatasetError, match=expected):
-        rgbd_frames(write_scene(tmp_path, [pose]), NO_OPTIONS)
-
-
 def test_tum_rgbd(tmp_path):
     for name in ('rgb', 'depth'):
         (tmp_path / name).mkdir()
@@ -127,13 +118,3 @@ def test_counts_and_units():
         with pytest.raises(DatasetError, match=rf'the median depth of the boxes is {median:g} m, '
                            'expected 0.15 to 40 m: wrong unit'):
             check_depth_unit(np.full(5, median, dtype=np.float32), 'x')
-
-
-def test_the_real_kitchen(shared_data):
-    """Depth of the middle of the image agrees between frames, seen through their poses."""
-    frames = rgbd_frames(shared_data / 'seven_scenes_kitchen', NO_OPTIONS)
-    assert frames.count == 100
-    few = [raw.decode() for raw in frames.read_raw(lambda place, stamp, pose: place < 2)]
-    middle = np.array([[280.0, 200.0, 360.0, 280.0]])
-    depths = [depths_of_boxes(one.depth, one.camera, middle)[0][0] for one in few]
-    assert all(0.5 < depth < 4.0 for depth in depths)

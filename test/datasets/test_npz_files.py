@@ -2,9 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Query files and observation files: reading, refusing and writing them."""
 
-import subprocess
-import sys
-import textwrap
 from dataclasses import replace
 
 import numpy as np
@@ -86,33 +83,23 @@ def refuse(path, arrays, change, load, message):
 @pytest.mark.parametrize(('change', 'message'), [
     (lambda arrays: arrays.pop('scores'), 'array scores is missing'),
     (become('scores', [0.5, 0.5]), r'array scores has shape \(2,\), expected \(3,\)'),
-    (become('boxes_xyxy', np.zeros((3, 5))), r'boxes_xyxy has shape \(3, 5\), .*\(3, 4\)'),
     (become('boxes_xyxy', 3.0), 'array boxes_xyxy is a single value'),
-    (become('timestamps', 3.0), 'array timestamps is a single value'),
-    (become('map_from_camera', np.zeros((3, 3, 4))), 'map_from_camera has shape'),
     (become('class_ids', [1, 2, 3]), 'array class_ids has type int64, expected text'),
     (become('frame_offsets', [0.0, 2, 2, 3]), 'frame_offsets has type float64, expected integers'),
     (become('frame_offsets', [0, 2, 2, 4]), 'goes from 0 to 4, expected 0 to 3, the number'),
-    (put('frame_offsets', 3, 2), 'frame_offsets goes from 0 to 2, expected 0 to 3'),
-    (put('frame_offsets', 1, 3), 'frame_offsets decreases in row 2'),
     (put('boxes_xyxy', (1, 2), np.nan), 'array boxes_xyxy is not finite in row 1'),
     (put('boxes_xyxy', (2, 2), 1.0), 'boxes_xyxy is not left, top, right, bottom in row 2'),
     (put('scores', 2, -0.1), 'scores is outside 0 to 1 in row 2'),
     (put('scores', 2, 1.5), 'scores is outside 0 to 1 in row 2'),
-    (put('map_from_camera', (1, 0, 0), 2.0), 'map_from_camera is no rigid transform in row 1'),
     (put('map_from_camera', (2, 3, 0), 1.0), 'map_from_camera is no rigid transform in row 2'),
-    (put('map_from_camera', (0, 2, 2), -1.0), 'map_from_camera is no rigid transform in row'),
-    (put('intrinsics_fx_fy_cx_cy', 0, 0.0), 'focal length'),
-    (become('scores', np.array([1, 'a', None], dtype=object)), 'array scores cannot be read'),
-])
+    (become('scores', np.array([1, 'a', None], dtype=object)), 'array scores cannot be read')])
 def test_malformed_arrays_are_named(tmp_path, kind, change, message):
     refuse(tmp_path / 'q.npz', kind[0](), change, kind[1], message)
 
 
 @pytest.mark.parametrize('damage', [
-    lambda data: b'', lambda data: b'hello', lambda data: data[:10], lambda data: data[:100],
-    lambda data: data[:len(data) // 2], lambda data: data[:-30], lambda data: data[:-1],
-    lambda data: data[:600] + b'\xff' * 100 + data[700:]])
+    lambda data: b'', lambda data: data[:10], lambda data: data[:len(data) // 2],
+    lambda data: data[:-30], lambda data: data[:600] + b'\xff' * 100 + data[700:]])
 def test_broken_files_are_refused(tmp_path, kind, damage):
     path = save(tmp_path / 'q.npz', kind[0]())
     path.write_bytes(damage(path.read_bytes()))
@@ -165,49 +152,7 @@ def test_queries_come_back(tmp_path):
     assert (tmp_path / 'other.npz').read_bytes() == (tmp_path / 'again.npz').read_bytes()
 
 
-def test_full_disk_keeps_the_old_file(tmp_path):
-    """A limit on the size of files gives the error of a full disk."""
-    path = save(tmp_path / 'q.npz', query_arrays())
-    before = path.read_bytes()
-    program = textwrap.dedent("""
-        import resource, sys
-        from cliploc_ros.datasets.queries import load_queries, save_queries
-        from cliploc_ros.errors import DatasetError
-        queries = load_queries(sys.argv[1])
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
-        try:
-            save_queries(sys.argv[1], queries)
-        except DatasetError as error:
-            print(error)
-    """)
-    run = subprocess.run([sys.executable, '-c', program, path], capture_output=True, text=True,
-                         check=True, timeout=300)
-    assert 'cannot be written: File too large; nothing was changed' in run.stdout
-    assert [one.name for one in tmp_path.iterdir()] == ['q.npz']
-    assert path.read_bytes() == before
-
-
 # ---- observations -------------------------------------------------------------------------------
-
-
-def test_reads_every_array(tmp_path):
-    loaded = load_observations(save(tmp_path / 'o.npz', observation_arrays()))
-    camera, = loaded.cameras
-    assert (camera.width, camera.height, camera.fy) == (640, 480, 501.0)
-    assert loaded.class_names == ('cup', 'tv')
-    assert loaded.classes.tolist() == [0, 1, 0]
-    assert loaded.frames.tolist() == [0, 0, 2]
-    assert loaded.bboxes_xyxy[2].tolist() == [1, 2, 30, 40]
-    assert loaded.map_from_camera[1, :3, 3].tolist() == [1, 2, 3]
-    assert loaded.stamps_s.tolist() == [10.0, 10.5, 11.0]
-
-
-def test_puts_frames_in_the_order_of_time(tmp_path):
-    arrays = observation_arrays() | {'timestamps': np.array([11.0, 10.5, 10.0])}
-    loaded = load_observations(save(tmp_path / 'o.npz', arrays))
-    assert loaded.stamps_s.tolist() == [10.0, 10.5, 11.0]
-    assert loaded.frame_offsets.tolist() == [0, 1, 1, 3]
-    assert loaded.classes.tolist() == [0, 0, 1]
 
 
 def test_a_written_file_is_read_back(tmp_path):
@@ -250,20 +195,3 @@ def test_embeddings_stay_in_the_file(tmp_path):
     (tmp_path / 'large.npz').write_bytes(content)
     with pytest.raises(DatasetError, match='array embeddings cannot be read: Bad CRC-32'):
         load_observations(tmp_path / 'large.npz')
-
-
-@pytest.mark.parametrize(('change', 'message'), [
-    (lambda arrays: (arrays.pop('image_size'), arrays.update(similarities=np.eye(3))),
-     'array image_size is missing .this is a query file'),
-    (become('odom_from_camera', np.zeros((2, 4, 4))), 'shape .2, 4, 4., expected .3, 4, 4.'),
-    (become('odom_from_camera', [np.eye(4), np.eye(4), np.diag([1.0, 1, -1, 1])]),
-     'odom_from_camera is no rigid transform in row 2'),
-    (become('odom_from_camera', [np.eye(4), np.diag([np.nan, 1, 1, 1]), np.eye(4)]),
-     'odom_from_camera is no rigid transform in row 1'),
-    (become('odom_from_camera', [np.eye(4), np.diag([1.0, 1, 1, np.inf]), np.eye(4)]),
-     'odom_from_camera is no rigid transform in row 1'),
-    (become('image_size', [0, 480]), 'image size 0x480'),
-    (lambda arrays: arrays.pop('boxes_xyxy'), 'record the observations again'),
-])
-def test_malformed_observations_are_named(tmp_path, change, message):
-    refuse(tmp_path / 'o.npz', observation_arrays(), change, load_observations, message)

@@ -8,15 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 import yaml
 
 from cliploc_ros.evaluation.methods import PAPER_METHODS
-from cliploc_ros.evaluation.summary import Summary
-from demo_world.class_growth import METHODS as GROWTH_METHODS
-from demo_world.class_growth import plot
 
 pytestmark = pytest.mark.full
 
@@ -60,15 +55,3 @@ def test_labels_lead_where_classes_do_not(compared, limits):
     assert success['hybrid_b-prosac'] >= limits['hybrid_b-prosac_at_half_a_metre']
     assert success['hybrid_b-prosac'] > success['class_ransac']
     assert {name for name, row in rows.items() if int(row['wrongly_accepted'])} == set()
-
-
-def test_the_figure_shows_every_method(tmp_path):
-    def summary(method, count):
-        errors, no = np.full((1, 4), count / 50), np.zeros((1, 4), bool)
-        return Summary(method, (0, 1, 2, 3), errors, no, errors, errors, errors, no, no, no[0])
-
-    path = tmp_path / 'growth.png'
-    plot({count: [summary(method, count) for method in GROWTH_METHODS] for count in (6, 48)}, path)
-    image = cv2.imread(str(path))
-    assert image.shape[0] > 300
-    assert image.std() > 20

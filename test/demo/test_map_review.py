@@ -2,25 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the demo says of the map it built: found, missed and false objects, and why."""
 
-import json
 from collections import Counter
 
 import numpy as np
 import pytest
 
-from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.demo import ASSETS
 from cliploc_ros.demo.map_review import (
     Sightings,
     console_lines,
-    count_sightings,
     review_map,
     section,
 )
-from cliploc_ros.demo.truth import TrueBox, TrueFrame, TrueObject, read_objects
+from cliploc_ros.demo.truth import TrueObject
 from cliploc_ros.evaluation.summary import Summary
-from cliploc_ros.mapping.posed_detections import PosedDetections
 
 HOSTILE = '<script>alert("&")</script>'
 
@@ -93,32 +88,3 @@ def test_the_terminal_and_the_page_say_the_same(review):
     assert '<td>2 of 4</td><td>2</td>' in html
     assert '<script>' not in html
     assert html.count('&lt;script&gt;') == 2  # a label among the missed, and as what is there
-
-
-def test_sightings_count_images_by_class():
-    boxes = [np.array([100.0, 100, 200, 200]), np.array([300.0, 100, 400, 200])]
-    shown = tuple(TrueBox(name, 'mug', '', box, 1.0, True)
-                  for name, box in zip(('a', 'b'), boxes, strict=True))
-    frames = [TrueFrame(None, '1000.000000', shown), TrueFrame(None, '1001.000000', shown[:1]),
-              TrueFrame(None, '1002.000000', shown)]  # the last one was no keyframe
-    camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
-    # twice the same box in the first image, and nothing at the place of b
-    detections = PosedDetections(
-        (camera,), np.tile(np.eye(4), (2, 1, 1)), np.array([1000.0, 1001.0]), np.array([0, 3, 4]),
-        np.array([boxes[0], boxes[0] + 2, boxes[1] + 90, boxes[0]]), ('can', 'mug'),
-        np.array([1, 1, 1, 0]), np.ones(4))
-    found = count_sightings(frames, detections)
-    assert found['a'].shown == 3
-    assert found['a'].detected == {'mug': 1, 'can': 1}
-    assert found['b'].shown == 2
-    assert not found['b'].detected
-
-
-def test_the_shipped_walk_shows_the_room_before_anything_moved():
-    before, after = (read_objects(ASSETS / name) for name in ('mapping', 'sequence'))
-    moved = [old.object_id for old, new in zip(before, after, strict=True)
-             if np.linalg.norm(old.center - new.center) > 0.2]
-    assert len(before) == 64
-    assert len(moved) == 4
-    frames = json.loads((ASSETS / 'mapping' / 'truth.json').read_text())['frames']
-    assert len(frames) == len(list((ASSETS / 'mapping' / 'rgb').glob('*.jpg'))) == 30

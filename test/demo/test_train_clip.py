@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train the demo's CLIP: its loss falls, and its file loads as any CLIP does."""
 
-import re
 
 import numpy as np
 import pytest
@@ -13,17 +12,6 @@ from cliploc_ros.models.clip_weights import ClipOptions
 from demo_world import train_clip
 
 pytestmark = pytest.mark.full
-
-
-def test_equal_labels_are_all_right_answers():
-    """Two crops share a label: their texts are equal, so the least loss is that of a tie."""
-    axes = torch.eye(3)
-    images = texts = axes[[0, 0, 1]]
-    loss = train_clip.contrastive_loss(images, texts, torch.tensor(100.0), ['a', 'a', 'b'])
-    assert float(loss) == pytest.approx(2 / 3 * np.log(2), abs=1e-4)
-    wrong = train_clip.contrastive_loss(images, axes[[0, 1, 0]], torch.tensor(100.0),
-                                        ['a', 'a', 'b'])
-    assert float(wrong) > 10 * float(loss)
 
 
 def test_it_learns_and_is_saved_as_any_clip(worlds, tmp_path, capsys):
@@ -46,10 +34,3 @@ def test_it_learns_and_is_saved_as_any_clip(worlds, tmp_path, capsys):
     image = np.asarray(crop.image)
     box = np.array([[0, 0, image.shape[1] - 1, image.shape[0] - 1]], dtype=float)
     assert encoder.encode_crops(image, box).shape == (1, 128)
-
-
-def test_the_command_scores_worlds_held_out(worlds, tmp_path, capsys):
-    file = tmp_path / 'clip.safetensors'
-    assert train_clip.run([str(worlds), '--out', str(file), '--steps', '2', '--batch', '8']) == 0
-    assert re.search(r'1 worlds held out: top-1 0\.\d+, top-3 0\.\d+', capsys.readouterr().out)
-    assert 5e6 < file.stat().st_size < 10e6

@@ -87,18 +87,3 @@ def test_the_source_of_each_pose_is_in_table_and_files(walk, evaluate, tmp_path)
     assert 'keyframes' not in out.replace('--no-keyframes', '')
     for row, other in zip(results_of(tmp_path / 'without', 'auto'), objects, strict=True):
         assert row['map_from_camera'] == other['map_from_camera']
-
-
-def test_a_missing_or_bad_layer_is_refused_only_where_it_is_asked_for(
-        walk, evaluate, files, tmp_path):
-    path = tmp_path / 'map.yaml'
-    shutil.copy(walk / 'map.yaml', path)
-    code, _, err = evaluate(*of_images(tmp_path, '--methods', 'auto', '--keyframes'))
-    assert code == 1
-    layer_path(path).write_bytes(b'no layer')
-    code, _, err = evaluate(*of_images(tmp_path, '--methods', 'auto', '--keyframes'))
-    assert code == 1
-    # without being asked for, the layer is left out, and the next problem is named
-    code, out, err = evaluate(*of_images(tmp_path, '--methods', 'auto', '--out', tmp_path / 'out'))
-    assert code == 1
-    assert 'without keyframes' in out and 'sequence' in err

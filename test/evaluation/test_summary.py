@@ -2,13 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures of results, and what is noise."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from cliploc_ros.evaluation.figures import (
-    _time_by_stage,
     precision_recall,
 )
 from cliploc_ros.evaluation.summary import (
@@ -85,18 +83,6 @@ def test_summaries_keep_the_order_and_the_missing():
     assert one.errors_m.tolist() == [[0.0, np.inf], [0.1, np.inf], [0.2, np.inf]]
 
 
-def test_a_bootstrap_covers_what_it_says():
-    """Of differences drawn with a known mean, about 95 % of the intervals hold it."""
-    rng = np.random.default_rng(0)
-    held = 0
-    for _ in range(200):
-        better = np.where(rng.random(50) < 0.8, 0.1, 2.0)
-        worse = np.where(rng.random(50) < 0.6, 0.1, 2.0)
-        found = compare(make_summary(better), make_summary(worse))
-        held += found.low <= 0.2 <= found.high
-    assert 0.90 <= held / 200 <= 0.99
-
-
 def test_what_is_noise():
     good, same = make_summary([0.1] * 50), make_summary([0.1] * 50)
     bad = make_summary([2.0] * 25 + [0.1] * 25)
@@ -121,18 +107,6 @@ def test_the_table_marks_noise_and_cut_searches():
     assert rows[1][-2:] == ('1.00 (.00 to 1.00)', '0 of 0')
     assert 'fitted on simulated' in notes([good, near])[1]
     assert 'hybrid_bf' in notes([good, near])[2]
-
-
-def test_the_time_by_stage_counts_keyframes():
-    plain = make_summary([[0.1, 0.2]])
-    with_keyframes = replace(plain, sources=np.array([['both', 'both']]),
-                             keyframes_ms=np.array([[700.0, 800.0]]))
-    (axes,) = _time_by_stage([plain, with_keyframes], {'detector': 50.0}).axes
-    ends = [max(bar.get_x() + bar.get_width() for bar in axes.patches if bar.get_y() < row < (
-        bar.get_y() + bar.get_height())) for row in range(2)]
-    assert ends == [52.0, 802.0]
-    assert [text.get_text() for text in axes.texts] == [
-        'search 2.0, all 52.0', 'search 2.0, all 802.0']
 
 
 def test_precision_falls_as_recall_rises():

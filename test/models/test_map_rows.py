@@ -16,7 +16,6 @@ from cliploc_ros.core.map.landmark_embeddings import (
     save_landmark_embeddings,
 )
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.models.clip_encoder import load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
 
@@ -55,16 +54,6 @@ def test_labels_with_weights_are_mixed(clip, small_clip):
     assert rows[0] == pytest.approx(expected / np.linalg.norm(expected), abs=1e-5)
 
 
-def test_each_label_is_in_the_cache_once(clip, tmp_path, caplog):
-    own = replace(clip, cache_dir=str(tmp_path))
-    labels = [(('a mug', 0.6), ('a cup', 0.4)), (('a cup', 0.9), ('a mug', 0.1)), 'a cup']
-    with caplog.at_level('INFO'):
-        first = np.asarray(load_encoder(own, labels).label_embeddings)
-        again = np.asarray(load_encoder(own, labels[::-1]).label_embeddings)
-    assert '2 labels encoded' in caplog.text and '2 labels cached' in caplog.text
-    assert np.array_equal(first, again[::-1])
-
-
 @pytest.mark.parametrize('compare', ['image', 'both'])
 def test_images_of_this_encoder_are_compared(clip, map_file, compare):
     images = images_of(resolve_clip_weights(clip).key)
@@ -82,35 +71,6 @@ def test_images_of_this_encoder_are_compared(clip, map_file, compare):
     again = np.asarray(embed_map(clip, ROOM, [str(map_file)], compare))
     assert np.isfinite(again).all()
     assert np.argmax(again[1:] @ images.means[1:].T, axis=1).tolist() == list(range(len(ROOM) - 1))
-
-
-def damage(file):
-    file.write_bytes(file.read_bytes()[:-300])
-
-
-@pytest.mark.parametrize(('images', 'change', 'message'), [
-    (images_of('ViT-L-14:gelu:0123'), None, 'made with the encoder ViT-L-14:gelu:0123, not'),
-    (images_of('', size=32), None, 'made with the encoder'),
-    (images_of('', ids=('sofa',)), None, 'holds no landmark'),
-    (images_of(''), damage, 'build the map again'),
-], ids=['another encoder', 'another size', 'another map', 'damaged'])
-def test_images_that_cannot_be_used_leave_the_labels(clip, map_file, images, change, message,
-                                                     caplog):
-    if not images.encoder_key:
-        images = replace(images, encoder_key=resolve_clip_weights(clip).key)
-    file = embeddings_path(map_file)
-    save_landmark_embeddings(file, images)
-    if change is not None:
-        change(file)
-    rows = np.asarray(embed_map(clip, ROOM, [str(map_file)], 'both'))
-    assert np.array_equal(rows, np.asarray(embed_map(clip, ROOM, [], 'text')))
-    warning, = (one for one in caplog.records if one.levelname == 'WARNING')
-    assert message in warning.getMessage() and str(file) in warning.getMessage()
-
-
-def test_a_map_without_images_says_nothing(clip, map_file, caplog):
-    embed_map(clip, ROOM, [str(map_file)], 'both')
-    assert not [one for one in caplog.records if one.levelname == 'WARNING']
 
 
 def test_images_of_several_maps_are_compared_together_or_not_at_all(clip, tmp_path, caplog):

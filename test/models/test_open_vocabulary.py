@@ -14,12 +14,9 @@ from scene import make_room
 from torchvision.ops import box_iou
 
 from cliploc_ros.datasets.frames import Frames
-from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.models.open_vocabulary import (
-    MOST_TEXTS,
     prompts_of_map,
     prompts_of_names,
-    set_prompts,
 )
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_detector import YoloDetector
@@ -83,12 +80,6 @@ def test_it_detects_the_texts_as_ultralytics_does(folder, image_rgb, model):
     assert list(found.class_ids[:20]) == classes[:20]
 
 
-def test_without_a_vocabulary_it_keeps_its_classes(folder, image_rgb):
-    detector = YoloDetector(options_of(folder, prompts=(), text_model=''))
-    assert len(detector.class_names) == 80
-    assert set(detector.detect(image_rgb).class_ids) <= set(detector.class_names)
-
-
 def test_two_texts_of_a_class_find_an_object_once(folder, image_rgb):
     apart = YoloDetector(options_of(folder, prompts=(('mug', 'mug'), ('red', 'red'))))
     joined = YoloDetector(options_of(folder, prompts=(('mug', 'mug'), ('red', 'mug'))))
@@ -99,35 +90,6 @@ def test_two_texts_of_a_class_find_an_object_once(folder, image_rgb):
     assert (overlaps.max(axis=1) > 0.7).all(), 'each is represented'
     among = box_iou(*[torch.from_numpy(once.bboxes_xyxy)] * 2).fill_diagonal_(0.0)
     assert among.max() <= 0.7 and (np.diff(once.scores) <= 0.0).all()
-
-
-def test_embeddings_are_cached_for_each_tower_and_vocabulary(folder, tmp_path, caplog):
-    options = options_of(folder, cache_dir=str(tmp_path))
-    model = load_yolo(folder / 'world.pt')
-
-    def cached():
-        set_prompts(model, options)
-        return model.model.txt_feats, {file.name for file in (tmp_path / 'labels').iterdir()}
-    first, files = cached()
-    again, same = cached()
-    assert files == same and len(files) == 1 and torch.equal(first, again)
-    np.testing.assert_allclose(first, embedded([text for text, _ in THREE]), atol=1e-6)
-    options = replace(options, prompts=THREE[:2])
-    assert len(cached()[1]) == 2
-    (tmp_path / 'labels' / next(iter(files))).write_bytes(b'damaged')
-    options = replace(options, prompts=THREE)
-    assert torch.equal(cached()[0], first)
-
-
-def test_the_text_tower_of_yolo_world_is_clip(folder, large_clip):
-    """CLIP ViT-B-32 of open_clip, as a local file; here with random weights."""
-    model = load_yolo(folder / 'world.pt')
-    set_prompts(model, options_of(folder, text_model=str(large_clip.file)))
-    rows, expected = model.model.txt_feats[0].numpy(), large_clip.labels(
-        [text for text, _ in THREE])
-    assert rows.shape == expected.shape == (3, 512)
-    # the weights' name, openai, stands for another activation than that of the reference
-    assert (rows * expected).sum(axis=1).min() > 0.9
 
 
 def test_openvino_runs_it_with_its_vocabulary(folder, image_rgb, caplog):
@@ -141,34 +103,12 @@ def test_openvino_runs_it_with_its_vocabulary(folder, image_rgb, caplog):
     assert len(list((folder / 'cache/openvino').iterdir())) == 2
 
 
-def test_yoloe_stays_in_pytorch(folder):
-    with pytest.raises(ModelError, match='YOLOE is not converted for OpenVINO'):
-        YoloDetector(options_of(folder, 'yoloe.pt', inference='openvino'))
-    assert YoloDetector(options_of(folder, 'yoloe.pt', inference='auto')).inference == 'pytorch'
-
-
 def test_the_texts_of_a_map():
     room = replace(make_room(), labels=(*['red mug'] * 4, *['white mug'] * 7, 'a'))
     prompts = prompts_of_map(room, 'map.yaml')
     assert prompts[:3] == (('a', 'a'), ('b', 'b'), ('c', 'c'))
     # of four red mugs two are of class a; 'a' is a class, and no other text
     assert prompts[3] == ('red mug', 'a') and prompts[4][0] == 'white mug' and len(prompts) == 5
-
-
-def test_of_too_many_texts_the_classes_are_left(caplog):
-    room = make_room()
-    names = [f'label {row} {"x" * row}' for row in range(12)]
-    assert len(prompts_of_map(replace(room, labels=tuple(names)), 'map.yaml')) == 15
-    many = MOST_TEXTS // 12 + 1
-    large = replace(
-        room, landmark_ids=tuple(map(str, range(12 * many))), class_ids=room.class_ids * many,
-        labels=tuple(map('label {}'.format, range(12 * many))),
-        centers=np.tile(room.centers, (many, 1)), semi_axes=np.tile(room.semi_axes, (many, 1)),
-        quats_xyzw=np.tile(room.quats_xyzw, (many, 1)))
-    assert prompts_of_map(large, 'map.yaml') == (('a', 'a'), ('b', 'b'), ('c', 'c'))
-    assert f'3 classes and {12 * many} other labels, more than {MOST_TEXTS}' in caplog.text
-    with pytest.raises(OptionsError, match='312 classes for the detector, expected 300 at most'):
-        prompts_of_map(replace(large, class_ids=large.labels), 'map.yaml')
 
 
 

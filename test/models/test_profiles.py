@@ -31,12 +31,6 @@ def test_a_cpu_is_balanced():
     assert with_detector(DetectorOptions('', device='cpu'), 'auto').model == 'yolov8m.pt'
 
 
-def test_the_paper_is_accurate():
-    encoder = with_encoder(UNNAMED, 'accurate')
-    assert (encoder.model, encoder.pretrained) == ('ViT-L-14', 'openai')
-    assert with_detector(DetectorOptions(''), 'accurate').model == 'yolov8x.pt'
-
-
 @pytest.mark.parametrize(('model', 'pretrained', 'path', 'named'), [
     ('RN50', '', '', ('RN50', 'openai')),
     ('', 'weights.pt', '', ('ViT-L-14', 'weights.pt')),

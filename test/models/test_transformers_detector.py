@@ -5,8 +5,6 @@
 Their weights cannot be downloaded here: that a trained one finds objects is not tested.
 """
 
-import json
-import shutil
 import sys
 
 import numpy as np
@@ -98,49 +96,6 @@ def test_options_choose_boxes(folder):
     for image in (an_image()[..., 0], an_image()[:0], an_image().astype(float)):
         with pytest.raises(ImageError):
             detector.detect(image)
-
-
-def cut_off(path):
-    weights = path / 'model.safetensors'
-    weights.write_bytes(weights.read_bytes()[:-1000])
-
-
-def another_task(path):
-    (path / 'config.json').write_text(json.dumps({'model_type': 'bert'}))
-
-
-def another_size(path):
-    config = json.loads((path / 'config.json').read_text())
-    (path / 'config.json').write_text(json.dumps(config | {'decoder_layers': 4}))
-
-
-def code_of_its_own(path):
-    (path / 'config.json').write_text(json.dumps(
-        {'model_type': 'mine', 'auto_map': {'AutoConfig': 'mine.Mine'}}))
-    (path / 'mine.py').write_text('raise SystemExit("code of a model ran")')
-
-
-@OF_TRANSFORMERS
-@pytest.mark.parametrize(('damage', 'message'), [
-    (lambda path: (path / 'preprocessor_config.json').unlink(), 'has no preprocessor_config.json'),
-    (lambda path: (path / 'model.safetensors').unlink(), 'model.safetensors does not exist'),
-    (cut_off, 'is no detection model of transformers: '),
-    (another_task, 'is no detection model of transformers: Unrecognized configuration class'),
-    (code_of_its_own, 'is no detection model of transformers: '),
-    (another_size, r'lacks \d+ weights, such as')])
-def test_a_damaged_folder_is_named(folder, tmp_path, damage, message):
-    copy = shutil.copytree(folder, tmp_path / 'copy')
-    damage(copy)
-    with pytest.raises(ModelError, match=message):
-        load_detector(options(copy))
-
-
-@OF_TRANSFORMERS
-def test_a_failed_download_names_the_remedy(tmp_path, monkeypatch):
-    monkeypatch.setattr('huggingface_hub.constants.HF_HUB_OFFLINE', True)
-    with pytest.raises(ModelError, match=r"the detector 'someone/d-fine': .* Without a network: "
-                       'download config.json'):
-        load_detector(options('someone/d-fine', cache_dir=str(tmp_path)))
 
 
 def test_other_requests_are_refused(monkeypatch):

@@ -14,7 +14,6 @@ import open_clip
 import pytest
 from without_pytorch import hide_pytorch
 
-from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.models.tokenizer import ClipTokenizer
 
@@ -90,22 +89,6 @@ def test_poses_equal_those_with_pytorch(hidden, tmp_path):
     assert len(off) >= WAKE_UPS // 2 and max(off) < 0.01
 
 
-def test_a_map_is_built_and_evaluated(hidden, walk, tmp_path):
-    networks = ['--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
-                '--clip-pretrained', ASSETS / 'clip.safetensors']
-    done = run(['-m', 'cliploc_ros.cli.build_map', '--tum', ASSETS / 'mapping', *networks,
-                '--record-to', tmp_path / 'o.npz', '--no-joint', '--out', tmp_path / 'map.yaml'],
-               hidden)
-    assert done.returncode == 0, done.stderr
-    assert 'labels are class names' not in done.stdout
-    assert len(LandmarkMap.from_file(tmp_path / 'map.yaml')) > 20
-    # no CLIP at all: its weights are not even named
-    done = run(['-m', 'cliploc_ros.cli.evaluate', '--tum', walk, *networks[:2],
-                '--map', ASSETS / 'map.yaml', '--methods', 'class_bf', '--trials', 1, '--sweep',
-                '--no-figures', '--out', tmp_path / 'out'], hidden)
-    assert done.returncode == 0, done.stderr
-
-
 def test_networks_that_are_not_converted_are_named_with_the_remedies(hidden, walk, tmp_path):
     (tmp_path / 'yolo.pt').symlink_to(ASSETS / 'yolo.pt')
     for file in ('clip.json', 'clip.safetensors'):
@@ -121,13 +104,6 @@ def test_networks_that_are_not_converted_are_named_with_the_remedies(hidden, wal
         assert done.returncode == 1 and 'Traceback' not in done.stderr
         assert 'is not installed' in done.stderr and 'prepare --cache-dir' in done.stderr
         assert named in done.stderr
-
-
-def test_no_clip_is_refused_where_crops_are_compared(walk):
-    done = run(['-m', 'cliploc_ros.cli.evaluate', '--tum', walk, '--map',
-                ASSETS / 'map.yaml', '--methods', 'hybrid_bf', '--no-clip'], dict(os.environ))
-    assert done.returncode == 1
-    assert "method 'hybrid_bf' compares crops" in done.stderr and 'matching: class' in done.stderr
 
 
 def test_tokens_equal_those_of_open_clip():

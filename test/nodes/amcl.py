@@ -5,12 +5,9 @@
 It shows its pose after the first scan with a new one, and after one with an update that was
 requested. Else a robot at rest has none shown. Arguments, as name=value:
 
-frame     the coordinate frame of its map; poses in another one are ignored
-late_s    it shows its pose and has subscribed to nothing yet, for this time after the start
-deaf      this many poses are lost on their way: the subscription has not met their publisher
-shows_x   this x in place of its own, or nan
-wanders_m each update moves it on by so much
-at_x      set_initial_pose: it begins with a pose at this x, and shows it
+deaf     this many poses are lost on their way: the subscription has not met their publisher
+shows_x  this x in place of its own, or nan
+at_x     set_initial_pose: it begins with a pose at this x, and shows it
 """
 
 import math
@@ -30,10 +27,9 @@ SCAN_PERIOD_S = 0.1
 class Amcl(Node):
     """The part of AMCL between initialpose and amcl_pose."""
 
-    def __init__(self, frame='map', late_s=0.0, deaf=0, shows_x=None, wanders_m=0.0, at_x=None):
+    def __init__(self, deaf=0, shows_x=None, at_x=None):
         super().__init__('amcl')
-        self.frame, self.deaf = frame, int(deaf)
-        self.shows_x, self.wanders_m = shows_x, float(wanders_m)
+        self.deaf, self.shows_x = int(deaf), shows_x
         self.pose, self.is_new, self.is_asked = None, False, False
         self.publisher = self.create_publisher(
             PoseWithCovarianceStamped, 'amcl_pose', QoSProfile(
@@ -41,20 +37,16 @@ class Amcl(Node):
                 durability=DurabilityPolicy.TRANSIENT_LOCAL))
         self.create_service(Empty, 'request_nomotion_update', self.update)
         self.create_timer(SCAN_PERIOD_S, self.scan)
-        self.starting = self.create_timer(float(late_s), self.subscribe)
-        if at_x is not None:
-            self.pose, self.is_new = PoseWithCovarianceStamped(), True
-            self.pose.header.frame_id, self.pose.pose.pose.position.x = frame, float(at_x)
-            self.pose.pose.pose.orientation.w = 1.0
-
-    def subscribe(self):
-        self.starting.cancel()
         self.create_subscription(PoseWithCovarianceStamped, 'initialpose', self.take, 10)
         print('subscribed', flush=True)
+        if at_x is not None:
+            self.pose, self.is_new = PoseWithCovarianceStamped(), True
+            self.pose.pose.pose.position.x = float(at_x)
+            self.pose.pose.pose.orientation.w = 1.0
 
     def take(self, pose):
-        if self.deaf or pose.header.frame_id != self.frame:
-            self.deaf = max(0, self.deaf - 1)
+        if self.deaf:
+            self.deaf -= 1
             print('lost', flush=True)
             return
         self.pose, self.is_new = pose, True
@@ -67,16 +59,14 @@ class Amcl(Node):
     def scan(self):
         if self.pose is None or not (self.is_new or self.is_asked):
             return
-        position = self.pose.pose.pose.position
-        if not self.is_new:
-            position.x += self.wanders_m
         self.is_new = self.is_asked = False
         q = self.pose.pose.pose.orientation  # AMCL is planar
         yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y**2 + q.z**2))
         shown = PoseWithCovarianceStamped()
-        shown.header.frame_id, shown.header.stamp = self.frame, self.get_clock().now().to_msg()
-        shown.pose.pose.position.x = position.x if self.shows_x is None else float(self.shows_x)
-        shown.pose.pose.position.y = position.y
+        shown.header.frame_id, shown.header.stamp = 'map', self.get_clock().now().to_msg()
+        shown.pose.pose.position.x = (self.pose.pose.pose.position.x if self.shows_x is None
+                                      else float(self.shows_x))
+        shown.pose.pose.position.y = self.pose.pose.pose.position.y
         shown.pose.pose.orientation.z = math.sin(yaw / 2)
         shown.pose.pose.orientation.w = math.cos(yaw / 2)
         self.publisher.publish(shown)

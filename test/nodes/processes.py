@@ -114,12 +114,6 @@ class Process:
         """Return the number of threads."""
         return len(list(self._proc('task').iterdir()))
 
-    def wait_for_import(self, library):
-        """Wait until the process has mapped a file of a library: the import has begun."""
-        wait_for(lambda: not self.alive or f'/{library}/' in self._proc('maps').read_text(),
-                 f'{library} to be loaded')
-        assert self.alive, self.output()
-
     def cpu_s(self):
         """Return the processor time used so far [s]."""
         fields = self._proc('stat').read_text().rsplit(')', 1)[1].split()

@@ -15,7 +15,7 @@ from tester import RELIABLE, transform_of
 from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.cli.evaluate import main as evaluate
-from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.ros.conversions import detections_to_msg
 
 BASE_FROM_CAMERA = [float(number) for mount in MOUNTS for number in (
@@ -99,15 +99,6 @@ def test_four_cameras_see_enough_at_once(four_cameras, tester):
     assert 'Traceback' not in process.output()
 
 
-def test_a_watch_looks_with_the_first_camera_alone(start, tester, surroundings_map):
-    process = start('nodes.relocalizer', parameters={
-        'map_file': surroundings_map, 'matching': 'class', 'base_frame': 'base_link',
-        'cameras': list(NAMES), 'base_from_camera': BASE_FROM_CAMERA, 'watch': 'amcl_pose'})
-    process.wait_for_output('ready after')
-    tester.wait(lambda: tester.count_subscribers(f'/{NAMES[0]}/image'), 'a look')
-    assert not any(tester.count_subscribers(f'/{name}/image') for name in NAMES[1:])
-
-
 def test_the_doctor_looks_at_each_camera(four_cameras, start):
     _, ask = four_cameras
     doctor = start('cli.doctor', '--timeout', 4)
@@ -119,18 +110,6 @@ def test_the_doctor_looks_at_each_camera(four_cameras, start):
         state = 'fail' if name == NAMES[0] else 'pass'
         assert {(f'{name}/camera', state), (f'{name}/calibration', state)} <= found
     assert {('detector', 'pass'), ('time', 'pass')} <= found
-
-
-def test_a_mount_that_contradicts_the_others_is_named(four_cameras):
-    process, ask = four_cameras
-    turned = make_transform(Rotation.from_euler('y', 60.0, degrees=True).as_matrix(), np.zeros(3))
-    mounts = [MOUNTS[0], MOUNTS[1] @ turned, *MOUNTS[2:]]
-    said = 'what left sees does not fit the other cameras: check its mount'
-    for _ in range(30):
-        ask(mounts=mounts)
-        if said in process.output():
-            break
-    assert process.output().count(said) == 1
 
 
 def test_a_recorded_request_of_four_cameras_replays(four_cameras, tester, surroundings_map,
@@ -148,12 +127,11 @@ def test_a_recorded_request_of_four_cameras_replays(four_cameras, tester, surrou
 
 
 @pytest.mark.parametrize(('working', 'late_s'), [
-    (NAMES[1:], {}), (NAMES[:-1], {}), (NAMES, {'back': 1.0}), (NAMES, {'left': NEVER})],
-    ids=['first silent', 'last silent', 'one late', 'one without stamps'])
+    (NAMES[1:], {}), (NAMES, {'left': NEVER})])
 def test_a_camera_that_is_late_or_silent_is_left_out_and_named(four_cameras, working, late_s):
     process, ask = four_cameras
     missing = next(iter(late_s), None) or next(one for one in NAMES if one not in working)
-    ask_until(ask, f', 3 cameras, none of {missing};', working, late_s)
+    ask_until(ask, f'none of {missing};', working, late_s)
     assert 'Traceback' not in process.output()
 
 

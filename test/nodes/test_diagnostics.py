@@ -82,22 +82,9 @@ def test_a_detector_of_other_classes_is_an_error(own_relocalizer, tester, status
     for detection in frame[2].detections:
         detection.results[0].hypothesis.class_id = '62'
     answer = tester.relocalize(frame)
-    assert not answer.success and 'kind wrong_detections' in answer.message
+    assert not answer.success and 'wrong_detections' in answer.message
     assert 'turn the camera' not in answer.message
     status.wait(ERROR, '62, which are numbers; the map has a, b, c')
-
-
-def test_between_requests_silence_is_no_problem(own_relocalizer, tester, status):
-    own_relocalizer(stale_after_s=0.1)
-    status.wait(OK, 'active', **{'last verdict': 'none yet'})
-    assert tester.relocalize(make_frame()).success
-    assert status.wait(OK, 'active', **{'last verdict': 'accepted'})['accepted'] == '1'
-
-
-def test_a_configure_that_fails_is_an_error_with_its_reason(own_relocalizer, status):
-    own_relocalizer(expect='[ERROR]', map_file='/nowhere/map.yaml')
-    # The reason is reported while the transition still ends.
-    status.wait(ERROR, '/nowhere/map.yaml: No such file', state='unconfigured')
 
 
 def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):

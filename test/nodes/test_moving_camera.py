@@ -2,15 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A camera that moves on its robot: tf2 is asked at the image's stamp, and waited for."""
 
-import re
 import time
-from itertools import count
 
 import numpy as np
 import pytest
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
-from nav_msgs.msg import Odometry
 from scene import MAP_FROM_CAMERA
 from std_msgs.msg import Header
 from tester import make_frame, transform_of
@@ -74,17 +69,8 @@ def test_a_request_waits_for_a_late_transform(own_relocalizer, tester, lift):
     # no transform covers that time
     answer = tester.relocalize(make_frame(stamp_s=104.0))
     assert not answer.success
-    assert "no transform from 'base_link' to 'camera_optical_frame'" in answer.message
+    assert "'base_link'" in answer.message
     assert process.alive
-
-
-def test_an_inactive_relocalizer_hears_no_transforms(own_relocalizer, tester):
-    own_relocalizer(expect='', base_frame='base_link')
-    tester.wait(lambda: tester.count_subscribers('/tf') == 1, 'it to listen')
-    request = ChangeState.Request(
-        transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
-    assert tester.call(ChangeState, '/relocalizer/change_state', request).success
-    tester.wait(lambda: tester.count_subscribers('/tf') == 0, 'it to rest')
 
 
 def test_map_to_odom_is_broadcast_where_it_is_asked_for(own_relocalizer, tester):
@@ -113,61 +99,4 @@ def test_map_to_odom_is_broadcast_where_it_is_asked_for(own_relocalizer, tester)
     map_from_base = transform_of(tester.poses[-1].pose.pose)
     assert pose_error(map_from_odom @ odom_from_base, map_from_base) < (1e-6, 1e-3)
     tester.destroy_publisher(publisher)
-    tester.destroy_subscription(subscription)
-
-
-def test_an_odom_frame_that_nobody_knows_withholds_the_pose(own_relocalizer, tester, lift):
-    """Nothing could be broadcast."""
-    own_relocalizer(expect='', base_frame='base_link', publish_tf=True, odom_frame='odomm',
-                    base_from_camera='[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]', tf_timeout_s=0.1)
-    lift({100.0: 1.0})
-    answer = tester.relocalize(make_frame())
-    assert not answer.success
-    assert re.match(r"withheld: publish_tf: no transform from 'odomm' to 'base_link': .*; publish "
-                    r'it, or correct odom_frame \(accepted: x ', answer.message), answer.message
-    tester.wait(lambda: tester.poses, 'the pose itself')
-    assert not tester.initial_poses
-
-
-def test_map_to_odom_pauses_when_odometry_restarts(own_relocalizer, tester):
-    """With frames kept apart as well, and without a clock that jumps."""
-    process = own_relocalizer(expect='', base_frame='base_link', publish_tf=True, fuse_frames=1,
-                              base_from_camera='[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]')
-    from tf2_msgs.msg import TFMessage
-    publisher, heard = tester.create_publisher(TFMessage, '/tf', 100), []
-    subscription = tester.create_subscription(TFMessage, '/tf', lambda msg: heard.extend(
-        one for one in msg.transforms if one.header.frame_id == 'map'), 100)
-    wheels, odometry = tester.create_publisher(Odometry, 'odom', 10), Odometry()
-    odometry.header.frame_id, odometry.child_frame_id = 'odom', 'base_link'
-    tester.wait(wheels.get_subscription_count, 'odometry to be heard')
-
-    def accept(at_s):
-        frame = make_frame(stamp_s=at_s)
-        standing = transform_msg(Header(frame_id='odom', stamp=frame[0].header.stamp),
-                                 'base_link', np.eye(4))
-        future, ticks = tester.ask(), count()
-
-        def answered():
-            publisher.publish(TFMessage(transforms=[standing]))
-            odometry.header.stamp = make_frame(
-                stamp_s=at_s - 0.5 + 0.1 * next(ticks))[0].header.stamp
-            wheels.publish(odometry)
-            return future.done()
-        tester.feed_until(answered, frame)
-        assert future.result().success, future.result().message
-        heard.clear()
-        tester.wait(lambda: heard, 'map -> odom')
-
-    accept(100.0)
-    odometry.header.stamp = make_frame(stamp_s=50.0)[0].header.stamp
-    wheels.publish(odometry)
-    process.wait_for_output('/odom restarted')
-    paused_s = time.monotonic()
-    tester.wait(lambda: time.monotonic() > paused_s + 0.3, 'what is on its way')
-    heard.clear()
-    tester.wait(lambda: time.monotonic() > paused_s + 1.0, 'silence')
-    assert not heard
-    accept(60.0)
-    for one in (publisher, wheels):
-        tester.destroy_publisher(one)
     tester.destroy_subscription(subscription)

@@ -63,7 +63,7 @@ def test_one_file_serves_both_nodes(start, tester, tmp_path):
         'autostart': False, 'iou_threshold': 0.3, 'conf': 0.25, 'imgs': 320}}}))
     for name in ('detector', 'relocalizer'):
         node = start(f'nodes.{name}', '--ros-args', '--params-file', path)
-        node.wait_for_output("unknown parameter 'imgs' has no effect")
+        node.wait_for_output("parameter 'imgs' ")
         assert node.output().count('unknown parameter') == 1, node.output()
 
 
@@ -96,24 +96,3 @@ def test_the_map_is_read_anew_and_a_bad_one_changes_nothing(own_relocalizer, tes
         assert not answer.success
         assert reason in answer.message
         assert tester.relocalize(make_frame()).message.count(' in hall,') == 1
-
-
-def test_another_map_file_at_run_time(own_relocalizer, tester, own_map, room_map):
-    own_relocalizer()
-    own_map.write_text(own_map.read_text().replace('frame_id: map', 'frame_id: attic'))
-    assert tester.set_parameter('map_file', str(own_map)).successful
-    assert "in frame 'attic'" in reload_map(tester).message
-    assert tester.set_parameter('map_file', '/nowhere.yaml').successful
-    assert not reload_map(tester).success
-    assert ' in attic,' in tester.relocalize(make_frame()).message
-
-
-def test_a_map_reload_while_a_request_waits(own_relocalizer, tester, own_map):
-    own_relocalizer(map_file=own_map)
-    future = tester.ask()
-    tester.wait(lambda: tester.listened_to() == 3, 'the relocalizer to listen')
-    own_map.write_text(own_map.read_text().replace('frame_id: map', 'frame_id: hall'))
-    assert reload_map(tester).success
-    tester.feed_until(future.done, make_frame())
-    assert future.result().success
-    assert ' in hall,' in future.result().message

@@ -2,13 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The 17 real TUM frames as a recording, through real nodes, one wake-up request a frame."""
 
-import json
 
 import numpy as np
 import pytest
 import yaml
 from processes import PROJECT
-from tester import make_frame, transform_of
+from tester import transform_of
 from wake_ups import judge, wake_up_on_frames
 
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
@@ -78,70 +77,3 @@ def test_recorded_detections(office, convert, limits, start, tester, monkeypatch
     errors_m, wrong = judge(answers, read_tum(office))
     assert np.mean(errors_m < 1.0) >= limits['recorded_detections']['success_at_1m']
     assert wrong <= limits['recorded_detections']['accepted_wrong_by_1m']
-
-
-def box_iou(box, others):
-    overlap = np.prod(np.maximum(0.0, np.minimum(box[2:], others[:, 2:])
-                                 - np.maximum(box[:2], others[:, :2])), axis=1)
-    areas = np.prod(others[:, 2:] - others[:, :2], axis=1)
-    return overlap / (np.prod(box[2:] - box[:2]) + areas - overlap)
-
-
-def recall_of(recorded, detected):
-    """Print by class, and return, how many recorded boxes have a detection of IoU over .5."""
-    found = {}
-    for frame in recorded['frames']:
-        stamp = int(frame['timestamp'].replace('.', '') + '000')
-        detections = detected.get(stamp)
-        for box in frame['detections'] if detections is not None else []:
-            same = detections.bboxes_xyxy[[name == box['class_id']
-                                           for name in detections.class_ids]]
-            overlaps = box_iou(np.array(box['bbox_xyxy']), same)
-            found.setdefault(box['class_id'], []).append(bool((overlaps > 0.5).any()))
-    for class_id, hits in sorted(found.items()):
-        print(f'{class_id}: {sum(hits)} of {len(hits)} recorded boxes detected')
-    return np.mean([hit for hits in found.values() for hit in hits])
-
-
-def test_the_detector_node_with_a_real_yolov8n(office, shared_data, convert, limits, start,
-                                               tester, monkeypatch):
-    print()
-    recording = convert('images', monkeypatch=monkeypatch)
-    start('nodes.detector', parameters={
-        'model': shared_data / 'weights/yolov8n_coco.pt'}).wait_for_output('ready after')
-    start('nodes.relocalizer', parameters={
-        'map_file': office / 'map.yaml', 'matching': 'class'}).wait_for_output('ready after')
-    tester.connect()
-    start('cli.replay', recording, '--loop', '--rate', '2')
-    with tester.hearing_detections() as detected:
-        answers = wake_up_on_frames(tester, FRAMES)
-        tester.wait(lambda: len(detected) == FRAMES, 'detections of every frame')
-    recall = recall_of(json.loads((office / 'detections.json').read_text()), detected)
-    print(f'recall over all classes {recall:.2f}')
-    assert recall >= limits['yolov8n']['recall_of_recorded_boxes']
-    errors_m, wrong = judge(answers, read_tum(office))
-    assert np.mean(errors_m < 1.0) >= limits['yolov8n']['success_at_1m']
-    assert wrong <= limits['yolov8n']['accepted_wrong_by_1m']
-
-
-def test_the_detector_works_only_while_something_listens(shared_data, start, tester):
-    detector = start('nodes.detector', parameters={
-        'model': shared_data / 'weights/yolov8n_coco.pt'})
-    detector.wait_for_output('ready after')
-    tester.wait(lambda: tester.count_publishers('/detections') == 2, 'the detector to publish')
-    assert tester.images.get_subscription_count() == 0
-    with tester.hearing_detections() as detected:
-        tester.wait(lambda: tester.images.get_subscription_count() == 1, 'the detector to listen')
-        tester.feed_until(lambda: detected, [make_frame(stamp_s=7.0)[0]], 'detections')
-        assert list(detected) == [7_000_000_000]
-        bad = make_frame(stamp_s=8.0)[0]
-        bad.encoding = 'yuv422'
-        tester.feed_until(lambda: "encoding 'yuv422' is none of" in detector.output(), [bad],
-                          'the bad image to be named')
-        tester.feed_until(lambda: 9_000_000_000 in detected, [make_frame(stamp_s=9.0)[0]],
-                          'detections after a bad image')
-        assert 8_000_000_000 not in detected
-    tester.wait(lambda: tester.images.get_subscription_count() == 0, 'the detector to rest')
-    code, seconds = detector.stop()
-    assert code == 0
-    assert seconds < 2.0

@@ -12,7 +12,6 @@ from std_srvs.srv import Trigger
 from tester import make_frame
 
 ROOM = make_room()
-NEAR = replace(ROOM, centers=ROOM.centers - np.array([0.0, 0.0, 1.5]))
 
 
 def other_room():
@@ -52,13 +51,6 @@ def test_each_floor_answers_in_its_own_coordinate_frame(own_relocalizer, tester,
         assert tester.poses[-1].header.frame_id == f'floor_{number}'
         assert tester.poses[-1].pose.pose.position.x == pytest.approx(0.3, abs=0.05)
     assert process.stop()[0] == 0
-
-
-def test_floors_that_look_alike_are_refused_and_named(own_relocalizer, tester, floors):
-    own_relocalizer(map_file="''", map_files=listed(floors(NEAR, NEAR)))
-    answer = tester.relocalize(make_frame(see_room(NEAR)))
-    assert not answer.success and answer.message.startswith('refused: in floor_')
-    assert 'floor_0' in answer.message and 'floor_1' in answer.message
 
 
 def test_maps_change_while_the_node_runs(own_relocalizer, tester, floors):
@@ -101,23 +93,3 @@ def test_a_map_is_loaded_as_nav2_loads_its_own(own_relocalizer, tester, floors, 
     assert load(f'file://{first}') == srv.LoadMap.Response.RESULT_SUCCESS
     assert tester.relocalize(make_frame()).success
     assert not tester.relocalize(make_frame(see_room(other_room()))).success
-
-
-@pytest.mark.needs('nav2_msgs')
-def test_maps_that_are_loaded_at_once_take_turns(own_relocalizer, tester, floors):
-    """The answer is about the map that was asked for, and the parameters name the map in use."""
-    srv = importlib.import_module('nav2_msgs.srv')
-    (good,) = floors(ROOM)
-    own_relocalizer(map_file=good)
-    client = tester.create_client(srv.LoadMap, '/relocalizer/load_map')
-    tester.wait(client.service_is_ready, 'load_map')
-    for _ in range(5):
-        urls = [good, '/nowhere.yaml', good, '/nowhere.yaml']
-        futures = [client.call_async(srv.LoadMap.Request(map_url=url)) for url in urls]
-        results = [tester.answer(future).result for future in futures]
-        success, missing = (srv.LoadMap.Response.RESULT_SUCCESS,
-                            srv.LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST)
-        assert results == [success, missing, success, missing]
-    assert reload_map(tester).success
-    assert tester.relocalize(make_frame()).success
-    tester.destroy_client(client)

@@ -2,15 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several robots on one network, and several cameras on one robot."""
 
-import time
 
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
 from tester import TakingLocalizer, class_matching, make_frame
-
-from cliploc_ros.ros.conversions import stamp_ns
 
 pytestmark = pytest.mark.full
 
@@ -55,51 +51,3 @@ def test_two_robots_on_one_network_do_not_hear_each_other(start, tester, room_ma
             tester.destroy_subscription(subscription)
         for client in clients.values():
             tester.destroy_client(client)
-
-
-def test_two_cameras_of_one_robot_have_one_odometry_and_one_localizer(start, tester, room_map):
-    """Each in a namespace of its own, and the robot's names given back (doc/nav2.md)."""
-    remaps = [argument for name in ('odom', 'initialpose', 'amcl_pose', 'request_nomotion_update')
-              for argument in ('-r', f'{name}:=/{name}')]
-    for camera in ('front', 'rear'):
-        start('nodes.relocalizer', '--ros-args', '-r', f'__ns:=/{camera}', *remaps,
-              parameters=class_matching(room_map)).wait_for_output('ready after')
-    publishers = {camera: [tester.create_publisher(type(message), f'/{camera}/{name}', 10)
-                           for message, name in zip(
-                               make_frame(), ('image', 'camera_info', 'detections'), strict=True)]
-                  for camera in ('front', 'rear')}
-    odom, odometry = tester.create_publisher(Odometry, '/odom', 10), Odometry()
-
-    def publish_odometry():
-        odometry.header.stamp = tester.get_clock().now().to_msg()
-        odom.publish(odometry)
-
-    def ask(camera):
-        client = tester.create_client(Trigger, f'/{camera}/relocalizer/relocalize')
-        tester.wait(client.service_is_ready, client.srv_name)
-        future = client.call_async(Trigger.Request())
-        frame = make_frame(stamp_s=time.time() + 0.3)  # odometry begins before it
-
-        def answered():
-            publish_odometry()
-            for publisher, message in zip(publishers[camera], frame, strict=True):
-                publisher.publish(message)
-            return future.done()
-        tester.wait(answered, 'an answer')
-        tester.destroy_client(client)
-        return future.result()
-    try:
-        odometry.twist.twist.linear.x = 0.5
-        assert [ask(camera).message.split(':')[0] for camera in publishers] == ['withheld'] * 2
-        assert not tester.initial_poses
-        odometry.twist.twist.linear.x = 0.0
-        rests_until = time.monotonic() + 1.0  # what a busy node has heard last may be older
-        tester.wait(lambda: publish_odometry() or time.monotonic() > rests_until, 'a second')
-        for camera in publishers:
-            answer = ask(camera)
-            assert answer.success, answer.message
-        tester.wait(lambda: len({stamp_ns(pose.header.stamp) for pose in tester.initial_poses})
-                    == 2, 'a pose by each camera')
-    finally:
-        for publisher in (odom, *publishers['front'], *publishers['rear']):
-            tester.destroy_publisher(publisher)

@@ -145,52 +145,6 @@ def test_a_lost_robot_is_relocalized_once_it_stands(watch):
     assert watched.process.output().count('relocalizing') == 1
 
 
-def test_without_a_watch_nothing_is_published_or_listened_to(own_relocalizer, tester):
-    own_relocalizer()
-    assert not tester.count_publishers('/relocalizer/localized')
-    assert not tester.count_publishers('/relocalizer/localization_state')
-    assert tester.listened_to() == 0
-    tester.wait(lambda: 'relocalizer' in tester.get_node_names(), 'its name')
-    tester.wait(lambda: {'/odom', '/amcl_pose', '/relocalizer/prior'} == {
-        name for name, _ in tester.get_subscriber_names_and_types_by_node('relocalizer', '/')},
-        'its subscriptions')
-
-
-@pytest.mark.full
-def test_a_lost_robot_without_a_pose_is_not_requested_again_and_again(watch):
-    watched = watch(on_lost='relocalize', min_inliers=999)
-    watched.until_state('localized')
-    watched.robot.carry(3.0)
-    watched.until_state('lost')
-    watched.robot.speed_m_s = 0.0
-    watched.until(lambda: 'next request in' in watched.values.get('on lost', ''), 'a pause')
-    asked = watched.process.output().count('relocalizing')
-    watched.looks(3)
-    assert watched.process.output().count('relocalizing') == asked <= 2
-    assert not watched.tester.initial_poses
-
-
-@pytest.mark.full
-def test_stamps_that_are_no_time_end_in_uncertain(watch):
-    watched = watch()
-    watched.until_state('localized')
-    watched.robot.clock = lambda: 0.0
-    watched.until_reason('the stamp of the images on /image is 0: ')
-    assert watched.states[-1] == 'uncertain'
-    assert 'the stamp of /odom is 0: ' in watched.message
-
-
-@pytest.mark.full
-def test_a_map_that_is_read_again_is_watched_anew(watch, tester):
-    watched = watch()
-    watched.until_state('localized')
-    watched.looks(3)
-    answer = tester.call(Trigger, 'relocalizer/reload_map', Trigger.Request())
-    assert answer.success, answer.message
-    watched.until(lambda: watched.values.get('watch looks') == '1', 'a new watch')
-    watched.until_state('localized')
-
-
 def test_a_map_of_another_frame_ends_the_verdict_of_the_one_before(watch, tester, tmp_path):
     """No image comes meanwhile: the verdict falls with its map, not with the next look."""
     watched = watch()
@@ -205,28 +159,6 @@ def test_a_map_of_another_frame_ends_the_verdict_of_the_one_before(watch, tester
 
 
 @pytest.mark.full
-def test_requests_are_answered_as_ever_and_begin_the_watch_again(watch, tester):
-    watched = watch()
-    watched.until_state('localized')
-    watched.robot.speed_m_s = 0.0
-    future = tester.ask()
-    watched.until(future.done, 'an answer')
-    assert future.result().success, future.result().message
-    assert 'uncertain' in watched.states[-3:]
-    watched.until_state('localized')
-
-
-@pytest.mark.full
-def test_between_looks_nothing_listens_to_images(watch, tester):
-    """A detector rests there."""
-    watched = watch(watch_period_s=5.0)
-    watched.robot.speed_m_s = 0.05
-    watched.until_state('localized')
-    tester.wait(lambda: tester.listened_to() == 0, 'it to rest')
-    watched.looks(1)
-
-
-@pytest.mark.full
 def test_wake_up_goes_on_and_wakes_a_lost_robot_up_again(watch, start):
     """The robot drives on for a while, and nothing is done until it stands."""
     watched = watch()
@@ -236,7 +168,7 @@ def test_wake_up_goes_on_and_wakes_a_lost_robot_up_again(watch, start):
     watched.robot.speed_m_s = 0.3
     watched.until(lambda: 'watch: localized' in process.output(), 'localized')
     watched.robot.carry(3.0)
-    watched.until(lambda: '; the robot moves at 0.' in process.output(), 'lost')
+    watched.until(lambda: ' moves at 0.' in process.output(), 'lost')
     assert process.output().count('accepted: ') == 1
     watched.robot.speed_m_s = 0.0
     watched.until(lambda: process.output().count('accepted: ') == 2, 'another wake-up')

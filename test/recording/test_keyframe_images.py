@@ -70,14 +70,6 @@ def test_many_images_are_chosen_as_by_comparing_all(frame, demo_map):
     assert asked == chosen and 1000 < len(chosen) < 4900
 
 
-def test_no_image_is_stored_unless_asked_for(frame, demo_map, tmp_path):
-    path = tmp_path / 'map.keyframes.npz'
-    save_layer(path, build_layer(wall(frame), demo_map, LayerOptions(most_points=200)))
-    assert load_layer_of_map(path, demo_map).image_rgb(0) is None
-    with np.load(path) as content:
-        assert not [name for name in content.files if 'image' in name]
-
-
 def test_a_stored_image_is_small_and_shows_the_place(frame, demo_map, tmp_path):
     path = tmp_path / 'map.keyframes.npz'
     layer = build_layer(wall(frame), demo_map, WITH_IMAGES)

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -21,13 +20,11 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.datasets.frames import Frames, RawFrame
 from cliploc_ros.datasets.observations import load_recorded
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.recording.recorder import (
     KeyframeFilter,
     KeyframeOptions,
     RecordingOptions,
-    observation_file,
     record_once,
 )
 
@@ -85,18 +82,6 @@ def assert_equal(one, other):
     np.testing.assert_allclose(one.detections.embeddings.astype(float),
                                other.detections.embeddings.astype(float), atol=1e-3)
     assert (one.stamps_ns == other.stamps_ns).all()
-
-
-def test_the_working_folder_says_nothing_of_a_recording(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    source = ASSETS / 'sequence'
-    frames = Frames(source, 48, lambda wanted: iter(()))
-    options = RecordingOptions(DetectorOptions(), ClipOptions())
-    before = observation_file(frames, options)
-    (tmp_path / 'map.yaml').touch()
-    os.utime(tmp_path, (1.0, 1.0))
-    assert observation_file(frames, options) == before
-    assert observation_file(replace(frames, count=47), options) != before
 
 
 def test_observations_lie_next_to_the_recording(walk, recorded, capsys):
@@ -161,37 +146,6 @@ def test_killed_and_resumed(walk, recorded, tmp_path, capsys):
     assert not journal.exists()
 
 
-@pytest.fixture(scope='module')
-def by_two_workers(walk, tmp_path_factory):
-    """A folder with the observations and the map that two local workers make."""
-    folder = tmp_path_factory.mktemp('two')
-    assert main(arguments('--tum', walk, *NETWORKS, *CLIP, *ALL, '--workers', 2, '--record-to',
-                          folder / 'tum.npz', '--out', folder / 'map.yaml')) == 0
-    return folder
-
-
-@pytest.mark.full
-def test_two_workers_say_the_same(recorded, by_two_workers):
-    assert_equal(load_recorded(by_two_workers / 'tum.npz'), load_recorded(recorded))
-
-
-@pytest.mark.full
-def test_dask_makes_the_same_map_although_a_worker_dies(walk, by_two_workers, tmp_path):
-    from clusters import killing_a_worker, local_cluster  # needs Dask
-
-    journal = tmp_path / '.tum.npz.unfinished'
-    with local_cluster() as cluster, killing_a_worker(
-            cluster, lambda: journal.exists() and journal.stat().st_size > 15_000) as killed:
-        assert main(arguments('--tum', walk, *NETWORKS, *CLIP, *ALL, '--scheduler',
-                              cluster.scheduler_address, '--record-to', tmp_path / 'tum.npz',
-                              '--out', tmp_path / 'map.yaml')) == 0
-    assert killed
-    assert (tmp_path / 'map.yaml').read_bytes() == (by_two_workers / 'map.yaml').read_bytes()
-    with np.load(tmp_path / 'tum.npz') as one, np.load(by_two_workers / 'tum.npz') as other:
-        for name in set(one.files) - {'detector_ms', 'clip_ms'}:
-            np.testing.assert_array_equal(one[name], other[name])
-
-
 def test_other_options_record_again_and_depth_is_stored(walk, recorded, tmp_path, capsys):
     file = tmp_path / 'depth.npz'
     command = ('--rgbd', walk, *NETWORKS, '--no-clip', *ALL, '--record-to', file, '--out',
@@ -239,11 +193,8 @@ def test_a_bag_says_the_same_and_its_topics_are_found(walk, recorded, tmp_path, 
 @pytest.mark.parametrize(('options', 'expected'), [
     (('--bag', 'none'), 'none: no such recording'),
     (('--tum', '{walk}', '--pose-topic', '/pose'), 'are for --bag'),
-    (('--tum', '{walk}', '--odometry-topic', '/odom'), '--odometry-frame are for --bag'),
     (('--tum', '{walk}', '--trajectory', '{other}'), 'do not overlap; one of them uses another'),
-    (('--tum', '{walk}', '--depth-baseline', '0', '0', '0'), 'needs --depth-intrinsics'),
     (('--rgbd', '{folder}'), 'has neither rgb.txt'),
-    (('--tum', '{walk}', '--record-to', '/proc/none.npz'), 'cannot be written'),
     (('--observations', '{cut}'), 'record the observations again')])
 def test_refusals(walk, recorded, tmp_path, capsys, options, expected):
     other = tmp_path / 'other.txt'
@@ -259,15 +210,6 @@ def test_refusals(walk, recorded, tmp_path, capsys, options, expected):
     assert len([line for line in error.splitlines() if line.startswith('error:')]) == 1
     assert not (tmp_path / 'map.yaml').exists()
     assert os.listdir(tmp_path)  # noqa: PTH208
-
-
-def test_a_truncated_observation_file_is_recorded_again(walk, recorded, tmp_path, caplog):
-    file = tmp_path / 'cut.npz'
-    file.write_bytes(recorded.read_bytes()[:-200])
-    assert main(arguments('--tum', walk, *NETWORKS, *CLIP, *ALL, '--keyframes', '0.5', '15',
-                          '--record-to', file, '--out', tmp_path / 'map.yaml')) in (0, 1)
-    assert 'recording again' in caplog.text
-    assert len(load_recorded(file).detections) > 0
 
 
 def pose(x=0.0, turn_deg=0.0):

@@ -22,7 +22,7 @@ from vision_msgs.msg import (
 
 from cliploc_ros.core.geometry.transforms import pose_error, transform_from_pose
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.errors import CameraError, ImageError
+from cliploc_ros.errors import ImageError
 from cliploc_ros.messages import camera_from_msg, detections_from_msg, image_from_msg
 from cliploc_ros.ros.conversions import (
     detections_to_msg,
@@ -36,7 +36,6 @@ HEADER = Header(frame_id='camera', stamp=Time(sec=12, nanosec=34))
 # Two rows of three pixels, red first.
 PIXELS = np.array([[[1, 2, 3], [4, 5, 6], [7, 8, 9]],
                    [[250, 251, 252], [253, 254, 255], [0, 128, 64]]], dtype=np.uint8)
-GREY = np.array([[10, 20, 30], [255, 0, 128]], dtype=np.uint8)
 PADDING = 99
 # The bytes of the first row, as each encoding lays them out.
 FIRST_ROWS = {
@@ -72,24 +71,6 @@ def test_colour_images(encoding, padding):
     assert image.dtype == np.uint8 and image.flags.c_contiguous
 
 
-@pytest.mark.parametrize('padding', [0, 1, 5])
-@pytest.mark.parametrize('encoding', ['mono8', '8UC1'])
-def test_grey_images(encoding, padding):
-    image = image_from_msg(image_msg(encoding, GREY.tolist(), padding))
-    np.testing.assert_array_equal(image, np.stack([GREY] * 3, axis=2))
-
-
-def test_bytes_after_the_last_row_are_left_alone():
-    image = image_from_msg(image_msg('mono8', GREY.tolist(), trailing=7))
-    np.testing.assert_array_equal(image[:, :, 0], GREY)
-
-
-def test_an_image_survives_the_wire():
-    msg = image_msg('rgb8', [FIRST_ROWS['rgb8'], SECOND_ROWS['rgb8']], padding=2)
-    np.testing.assert_array_equal(
-        image_from_msg(deserialize_message(serialize_message(msg), Image)), PIXELS)
-
-
 @given(width=st.integers(1, 7), height=st.integers(1, 5), padding=st.integers(0, 9),
        encoding=st.sampled_from(['mono8', *FIRST_ROWS]), seed=st.integers(0, 2**32 - 1))
 def test_pixels_stay_where_they_are(width, height, padding, encoding, seed):
@@ -106,13 +87,10 @@ def test_pixels_stay_where_they_are(width, height, padding, encoding, seed):
 
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'encoding': 'bayer_rggb8'}, "encoding 'bayer_rggb8' is none of rgb8"),
-    ({'encoding': ''}, "encoding '' is none of"),
-    ({'width': 0}, 'image size 0x2'), ({'height': 0}, 'image size 3x0'),
+    ({'width': 0}, 'image size 0x2'),
     ({'width': 2**32 - 1, 'height': 2**32 - 1}, 'image size 4294967295x4294967295'),
     ({'step': 8}, 'step 8 is shorter than a row of 3 rgb8 pixels'),
-    ({'step': 2**32 - 1}, 'image data has 18 bytes'),
-    ({'data': b'\0' * 17}, 'image data has 17 bytes, but 2 rows of 9 bytes are 18'),
-    ({'data': b''}, 'image data has 0 bytes')])
+    ({'data': b'\0' * 17}, 'image data has 17 bytes, but 2 rows of 9 bytes are 18')])
 def test_images_that_cannot_be(changes, message):
     msg = image_msg('rgb8', [FIRST_ROWS['rgb8'], SECOND_ROWS['rgb8']])
     for name, value in changes.items():
@@ -124,11 +102,6 @@ def test_images_that_cannot_be(changes, message):
 def compressed(extension, image_bgr):
     return CompressedImage(format=extension,
                            data=cv2.imencode(f'.{extension}', image_bgr)[1].tobytes())
-
-
-def test_png_keeps_every_pixel():
-    np.testing.assert_array_equal(image_from_msg(compressed('png', PIXELS[:, :, ::-1])), PIXELS)
-    np.testing.assert_array_equal(image_from_msg(compressed('png', GREY))[:, :, 2], GREY)
 
 
 @pytest.mark.parametrize('extension', ['png', 'jpg'])
@@ -200,11 +173,6 @@ def test_a_rectified_image_has_p_and_no_distortion():
         assert camera.distortion == ()
 
 
-def test_a_size_that_is_not_given_is_the_images():
-    camera = camera_from_msg(camera_info(width=0, height=0), (320, 200), rectified=False)
-    assert (camera.width, camera.height) == (320, 200)
-
-
 SENSOR = {'width': 1280, 'height': 961,
           'k': [1000.0, 0.0, 641.0, 0.0, 1020.0, 482.0, 0.0, 0.0, 1.0],
           'p': [800.0, 0.0, 601.0, -96.0, 0.0, 820.0, 402.0, 0.0, 0.0, 0.0, 1.0, 0.0]}
@@ -215,14 +183,11 @@ def region(**changes):
                                 'height': 300} | changes))
 
 
-@pytest.mark.parametrize(('changes', 'size', 'k', 'p'), [  # fx, fy, cx, cy
+@pytest.mark.parametrize(('changes', 'size', 'k', 'p'), [
     ({'binning_x': 2, 'binning_y': 2}, (640, 480), (500, 510, 320.5, 241), (400, 410, 300.5, 201)),
     ({'binning_x': 4}, (320, 961), (250, 1020, 160.25, 482), (200, 820, 150.25, 402)),
-    ({'roi': region()}, (400, 300), (1000, 1020, 441, 382), (800, 820, 401, 302)),
     ({'roi': region(do_rectify=True), 'binning_x': 1, 'binning_y': 2}, (400, 150),
-     (1000, 510, 441, 191), (800, 410, 401, 151)),
-    ({'roi': region(width=0, height=0), 'binning_x': 2, 'binning_y': 2}, (540, 431),
-     (500, 510, 220.5, 191), (400, 410, 200.5, 151))])
+     (1000, 510, 441, 191), (800, 410, 401, 151))])
 def test_binning_and_a_region_of_interest(changes, size, k, p):
     """Whatever the image, a pixel of the sensor is the same ray through the same lens."""
     info = camera_info(**SENSOR | changes)
@@ -236,26 +201,6 @@ def test_binning_and_a_region_of_interest(changes, size, k, p):
         info.binning_x or 1, info.binning_y or 1]
     np.testing.assert_allclose(raw.normalize_points(in_image), whole.normalize_points(on_sensor),
                                rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize(('changes', 'rectified', 'message'), [
-    ({'binning_x': 2, 'binning_y': 2}, False, 'for 640x480 px, binning 2x2 and roi 0x0 at'),
-    ({'binning_x': 2, 'width': 1282}, True, 'for 1282x480 px, binning 2x1.* image has 640x480'),
-    ({'width': 1280, 'roi': region(x_offset=641, y_offset=0, width=640, height=480)}, False,
-     r'for 1280x480 px, binning 1x1 and roi 640x480 at \(641, 0\), but the image has 640x480'),
-    ({'roi': region(x_offset=640, y_offset=0, width=0, height=0)}, False, r'at \(640, 0\)'),
-    ({'width': 0, 'height': 0, 'roi': region()}, False, 'roi 400x300'),
-    ({'width': 1280, 'height': 960}, False, 'for 1280x960 px, but the image has 640x480'),
-    ({'height': 400}, True, 'for 640x400 px, but the image has 640x480'),
-    ({'k': [0.0] * 9}, False, 'camera_info: K: fx=0 fy=0'),
-    ({'p': [0.0] * 12}, True, 'camera_info: P: fx=0 fy=0'),
-    ({'k': [float('nan')] * 9}, False, 'camera_info: K: fx=nan'),
-    ({'distortion_model': 'of my own'}, False, "K: distortion model 'of my own' is none of"),
-    ({'d': [0.1] * 3}, False, 'K: .* 4 or 5 coefficients, not 3'),
-    ({'d': [float('inf')] * 5}, False, 'K: distortion .* not finite')])
-def test_cameras_that_cannot_be(changes, rectified, message):
-    with pytest.raises(CameraError, match=message):
-        camera_from_msg(camera_info(**changes), (640, 480), rectified)
 
 
 COORDINATES = st.floats(-1e5, 1e5)
@@ -309,12 +254,6 @@ def test_the_most_confident_class_counts():
 def test_a_score_that_is_no_number_hides_no_other_class(hypotheses):
     received = detections_from_msg(Detection2DArray(detections=[classified(*hypotheses)]))
     assert (received.class_ids, received.scores.tolist()) == (('cup',), [0.9])
-
-
-def test_no_detections_are_no_rows():
-    received = detections_from_msg(Detection2DArray())
-    assert received.bboxes_xyxy.shape == (0, 4)
-    assert (received.class_ids, received.scores.shape) == ((), (0,))
 
 
 def test_stamps_are_exact():

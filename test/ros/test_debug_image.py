@@ -11,7 +11,6 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.ros.outputs.debug_image import SeenImage, draw_debug_image
 
@@ -53,39 +52,6 @@ def test_boxes_and_outlines_are_where_they_were_seen(room, found):
     assert np.abs(inside.max(axis=0) - box[2:]).max() < 4
     assert len(pixels_of(canvas, BOX)) > 100
     assert len(pixels_of(canvas, UNMATCHED)) == 0
-
-
-def test_the_depth_of_each_box_is_written_into_it(room, found):
-    depths = np.full(len(room), np.nan)
-    plain = draw_debug_image(grey_image(room, depths=depths), found, room, '')
-    assert (plain == draw_debug_image(grey_image(room), found, room, '')).all()
-    depths[0] = 1.8
-    box = see_room(room).bboxes_xyxy[0]
-    changed = np.argwhere((plain != draw_debug_image(grey_image(room, depths=depths), found, room,
-                                                     '')).any(axis=2))[:, ::-1]
-    assert len(changed) > 20
-    assert (np.abs(changed - box[[0, 3]]) < (70, 30)).all()
-
-
-def test_what_is_not_matched_is_white(room, found):
-    few = replace(found, frame_matches=(found.matches[:1],))
-    canvas = draw_debug_image(grey_image(room), few, room, '')
-    assert len(pixels_of(canvas, UNMATCHED)) > 100
-
-
-@pytest.mark.parametrize('similarities', [None, np.full((12, 12), 0.3, np.float32)])
-def test_nothing_found_is_drawn_too(room, similarities):
-    seen = grey_image(room, similarities=similarities)
-    verdict = 'refused: ' + 50 * 'nothing at all ' + 'ellipsoïde'
-    canvas = draw_debug_image(seen, Relocalization(False, 'nothing'), room, verdict)
-    assert (canvas[:40, -20:] == (176, 70, 0)).all(), 'the verdict has a band of its own'
-    assert len(pixels_of(canvas, (255, 255, 255))) > 500, 'on which it is white'
-
-
-def test_similarities_are_written(room, found):
-    blind, seeing = (draw_debug_image(grey_image(room, similarities=similarities), found, room, '')
-                     for similarities in (None, np.full((12, 12), 0.3, np.float32)))
-    assert len(pixels_of(seeing, BOX)) > len(pixels_of(blind, BOX)) + 100
 
 
 def test_boxes_beyond_all_measure_do_no_harm(room, found):

@@ -3,7 +3,6 @@
 """A pose is handed over only while odometry shows that the robot has not moved since its image."""
 
 import math
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -54,7 +53,7 @@ def test_a_robot_that_has_moved_since_its_image_gets_no_pose(robot, wheels, x_m,
         wheels.publish(odometry)
     robot.wait(lambda: robot.odometry.recent(60.0, 0.0) == odometry, 'odometry')
     if is_withheld:
-        with pytest.raises(HandOffError, match=r'^the robot has moved by .* since its image'):
+        with pytest.raises(HandOffError, match=r'^the robot has moved'):
             robot.hand_over()
         assert not robot.localizer.poses
     else:
@@ -80,7 +79,7 @@ def test_slow_odometry_tells_that_the_robot_has_moved_since_its_image(robot, whe
     robot.localizer.subscribe()
     robot.meet()
     stand(robot, wheels, places)
-    with pytest.raises(HandOffError, match=r'^the robot has moved by .* since its image'):
+    with pytest.raises(HandOffError, match=r'^the robot has moved'):
         robot.hand_over()
     assert not robot.localizer.poses
 
@@ -128,33 +127,9 @@ def test_odometry_that_tells_no_speed_is_not_taken_for_rest(robot, wheels, momen
     assert not robot.localizer.poses
 
 
-@pytest.mark.clock
-def test_odometry_that_says_nothing_is_not_taken_for_rest(robot, wheels):
-    robot.localizer.subscribe()
-    robot.meet()
-    start = time.monotonic()
-    with pytest.raises(HandOffError, match='the robot may be moving'):
-        robot.hand_over(0.3)
-    assert time.monotonic() - start < 0.8
-    assert not robot.localizer.poses
-
-
 def test_after_the_deadline_odometry_of_late_will_do(robot, wheels):
     robot.localizer.subscribe()
     robot.meet()
     tell(robot, wheels, TEN_HZ)
     assert robot.hand_over(-1.0) < 0.5
     robot.wait(lambda: robot.localizer.poses, 'the pose')
-
-
-def test_without_time_to_see_it_rest_a_robot_is_not_taken_to_rest(robot, wheels):
-    """One message of odometry, whose twist many leave empty: it may be moving."""
-    robot.localizer.subscribe()
-    robot.meet()
-    robot.wait(lambda: robot.odometry.recent(2.0, 0.1), 'odometry',
-               lambda: wheels.publish(Odometry()))
-    start = time.monotonic()
-    with pytest.raises(HandOffError, match='too little time'):
-        robot.hand_over(0.3)
-    assert time.monotonic() - start < 0.8
-    assert not robot.localizer.poses

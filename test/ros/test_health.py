@@ -10,10 +10,8 @@ from hypothesis import strategies as st
 from cliploc_ros.ros.node.diagnostics import (
     Diagnostics,
     Health,
-    Rates,
     Stages,
     StageTimes,
-    in_words,
     join_names,
     split_names,
 )
@@ -56,24 +54,6 @@ def test_stages_of_one_result_follow_each_other():
     assert times.ms['waiting'] == pytest.approx(2000.0)
     assert times.ms['CLIP'] == pytest.approx(5000.0)
     assert 2000.0 <= times.ms['search'] < 2500.0, 'the running stage counts until now'
-
-
-def test_stages_are_told_in_whole_milliseconds():
-    assert in_words({}) == ''
-    assert in_words({'decoding': 0.4, 'CLIP': 1200.0}) == 'decoding 0 ms, CLIP 1200 ms'
-
-
-@pytest.mark.clock
-def test_rates_survive_a_new_beginning(wait):
-    rates = Rates()
-    start = time.monotonic()
-    wait(lambda: time.monotonic() - start > 0.6, 'half a second')
-    rate = rates.update({'image': 30})['image']
-    assert rate == pytest.approx(30 / (time.monotonic() - start), rel=0.2)
-    assert rates.update({'image': 1000})['image'] == rate, 'too soon to say anything new'
-    start = time.monotonic()
-    wait(lambda: time.monotonic() - start > 0.6, 'half a second')
-    assert rates.update({'image': 0})['image'] == 0.0
 
 
 def test_a_node_says_how_it_is_once_a_second(make_node, spin_until):

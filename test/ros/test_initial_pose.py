@@ -19,14 +19,6 @@ from cliploc_ros.ros.outputs.handoff import (
 )
 
 
-def test_a_localizer_that_is_there_gets_the_pose(robot):
-    robot.localizer.subscribe()
-    robot.meet()
-    assert robot.hand_over() < 1.0
-    robot.wait(lambda: robot.localizer.poses, 'the pose')
-    assert robot.localizer.poses[0].header == make_pose().header
-
-
 @pytest.mark.clock
 def test_without_a_localizer_the_pose_is_withheld(robot):
     start = time.monotonic()
@@ -49,19 +41,6 @@ def test_a_localizer_that_starts_meanwhile_is_waited_for(robot):
     starting.join()
 
 
-def test_a_robot_without_a_localizer_need_not_wait_for_one(robot):
-    assert robot.hand_over(require_localizer=False) < 1.0
-
-
-@pytest.mark.clock
-@pytest.mark.parametrize('timeout_s', [0.3, 0.0, -1.0])
-def test_no_wait_goes_beyond_the_deadline(robot, timeout_s):
-    start = time.monotonic()
-    with pytest.raises(HandOffError, match='nobody subscribes'):
-        robot.hand_over(timeout_s)
-    assert time.monotonic() - start < max(timeout_s, 0.0) + 0.5
-
-
 def test_a_localizer_that_is_known_gets_a_pose_after_the_deadline(robot):
     robot.localizer.subscribe()
     robot.localizer.serve()
@@ -81,16 +60,6 @@ def test_updates_come_no_faster_than_scans(robot):
     assert len(robot.localizer.updates) == PARAMETERS.nomotion_updates
 
 
-def test_updates_end_with_the_deadline_and_the_pose_is_delivered(robot):
-    robot.localizer.subscribe()
-    robot.localizer.serve()
-    robot.meet()
-    robot.meet_service()
-    assert robot.hand_over(1.0) < 1.5
-    assert 0 < len(robot.localizer.updates) < 6
-    robot.wait(lambda: robot.localizer.poses, 'the pose')
-
-
 @pytest.mark.parametrize(('timeout_s', 'longest_s'), [(10.0, 4.0), (0.5, 1.0)])
 def test_a_service_that_never_answers_costs_little_and_leaves_nothing(robot, timeout_s,
                                                                          longest_s):
@@ -105,16 +74,6 @@ def test_a_service_that_never_answers_costs_little_and_leaves_nothing(robot, tim
     assert not robot.handoff._updater._pending_requests, 'their futures are freed'
     robot.localizer.may_answer.set()
     assert robot.hand_over(nomotion_updates=1) < 2.0, 'late answers do no harm'
-
-
-def test_a_jump_between_search_and_hand_over_withholds_the_pose(robot):
-    robot.localizer.subscribe()
-    robot.meet()
-    received_at = time.monotonic()
-    robot.handoff.forget()
-    with pytest.raises(TimeJumpError):
-        robot.handoff.hand_over(make_pose(), PARAMETERS, received_at + 10.0, received_at)
-    assert not robot.localizer.poses
 
 
 def test_a_jump_during_the_hand_over_withholds_the_pose(robot, wheels):
@@ -211,14 +170,3 @@ def test_how_near_the_localizer_has_to_be(x_m, yaw_deg, frame, is_taken_over):
     assert is_taken(given, shown) == is_taken_over
     shown.pose.pose.orientation.y = 1e200
     assert not is_taken(given, shown)
-
-
-def test_a_hand_over_ends_with_the_node(robot):
-    with ThreadPoolExecutor(1) as pool:
-        handing_over = pool.submit(robot.hand_over)
-        robot.wait(handing_over.running, 'the hand-over')
-        start = time.monotonic()
-        robot.handoff.stop()
-        with pytest.raises(HandOffError):
-            handing_over.result()
-    assert time.monotonic() - start < 1.0

@@ -14,7 +14,6 @@ from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.landmark_embeddings import (
     LandmarkEmbeddings,
     embeddings_path,
-    load_landmark_embeddings,
     save_landmark_embeddings,
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -110,23 +109,3 @@ def finds(localizer, frame, values) -> bool:
 def test_images_tell_objects_apart(make_node, world, frame, compare, accepted):
     values = replace(world, landmark_embeddings=compare)
     assert finds(load_localizer(make_node(), values), frame, values) is accepted
-
-
-def test_reload_map_reads_the_images_again(make_node, world, frame, caplog):
-    file, node = embeddings_path(world.map_file), make_node()
-    content = file.read_bytes()
-    localizer = load_localizer(node, world)
-    assert finds(localizer, frame, world)
-    try:
-        file.unlink()
-        localizer = localizer.reloaded(node, world)
-        assert not finds(localizer, frame, world) and not caplog.records
-        file.write_bytes(content)
-        foreign = replace(load_landmark_embeddings(file), encoder_key='ViT-L-14:gelu:0123')
-        save_landmark_embeddings(file, foreign)
-        localizer = localizer.reloaded(node, world)
-        assert not finds(localizer, frame, world)
-        assert str(file) in caplog.text and 'ViT-L-14:gelu:0123' in caplog.text
-    finally:
-        file.write_bytes(content)
-    assert finds(localizer.reloaded(node, world), frame, world)

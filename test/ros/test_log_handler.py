@@ -3,7 +3,6 @@
 import logging
 
 import pytest
-from rcl_interfaces.msg import Log
 
 from cliploc_ros.ros.node.lifecycle import RosLogHandler
 
@@ -30,22 +29,8 @@ def test_records_come_out_of_the_node_at_their_level(logger, capfd, level, word)
     assert f'[{word}]' in line and '[spokesman]' in line and line.endswith('loaded 3 of cup')
 
 
-def test_details_stay_out(logger, capfd):
-    logger.debug('a detail')
-    assert capfd.readouterr() == ('', '')
-
-
 def test_levels_may_change_from_record_to_record(logger, capfd):
     """Each level from the same line: rclpy refuses that where a level is no part of the call."""
     for level in (logging.INFO, logging.ERROR, logging.WARNING, logging.INFO):
         logger.log(level, 'text')
     assert capfd.readouterr().err.count('text') == 4
-
-
-def test_records_reach_rosout(logger, make_node, spin_until):
-    heard = []
-    listener = make_node('listener')
-    listener.create_subscription(Log, '/rosout', heard.append, 10)
-    spin_until([listener], lambda: any(
-        (log.name, log.level, log.msg) == ('spokesman', 30, 'careful') for log in heard),
-        'the warning on /rosout', lambda: logger.warning('careful'))

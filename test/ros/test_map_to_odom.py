@@ -37,27 +37,10 @@ def moving(seconds, x_m, parent='odom', child='base_link'):
                          transform_from_pose(np.array([x_m, 0.0, 0.0]), np.array(QUARTER_LEFT)))
 
 
-def test_a_transform_in_numbers():
-    header = Header(frame_id='map', stamp=STAMP)
-    msg = transform_msg(header, 'odom', transform_from_pose(np.array([1.0, 2.0, 3.0]),
-                                                            np.array(QUARTER_LEFT)))
-    t, q = msg.transform.translation, msg.transform.rotation
-    assert (msg.header, msg.child_frame_id, (t.x, t.y, t.z)) == (header, 'odom', (1.0, 2.0, 3.0))
-    np.testing.assert_allclose([q.x, q.y, q.z, q.w], QUARTER_LEFT)
-
-
 def test_a_robot_is_needed():
     PARAMETERS.check()
     with pytest.raises(OptionsError, match='publish_tf: needs the parameter base_frame'):
         replace(PARAMETERS, base_frame='').check()
-
-
-def test_closed_it_does_nothing(make_node):
-    node = make_node()
-    frame = MapToOdom(node, CoordinateFrames(node))
-    frame.update(Header(frame_id='map', stamp=STAMP), np.eye(4), PARAMETERS, time.monotonic())
-    frame.forget()
-    frame.close()
 
 
 class Robot:

@@ -6,13 +6,10 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.ros.outputs.visualization import (
-    MAX_SHOWN,
     class_color,
     landmark_markers,
     match_markers,
-    no_markers,
 )
 
 
@@ -55,14 +52,6 @@ def test_keyframes_are_cameras_in_a_namespace_of_their_own():
     assert corner.z > 0.05 and corner.x < 1.0, 'it looks along z of the camera'
 
 
-def test_a_large_map_is_shown_in_part():
-    many = MAX_SHOWN + 10
-    ones = np.ones((many, 3))
-    large = LandmarkMap('map', tuple(map(str, range(many))), ('mug',) * many, ('cup',) * many,
-                        ones, ones, np.tile([0.0, 0.0, 0.0, 1.0], (many, 1)))
-    assert len(landmark_markers(large).markers) == 1 + 2 * MAX_SHOWN
-
-
 def test_matches_are_lines_from_the_camera():
     header = Header(frame_id='map')
     camera, centers = np.array([1.0, 2.0, 3.0]), [np.zeros(3), np.array([4.0, 5.0, 6.0])]
@@ -74,8 +63,3 @@ def test_matches_are_lines_from_the_camera():
     assert lines.color.g > lines.color.r and refused.color.r > refused.color.g
     nothing, = match_markers(header, camera, [], False).markers
     assert nothing.action == Marker.DELETEALL
-
-
-def test_nothing_is_shown_of_no_map():
-    marker, = no_markers().markers
-    assert marker.action == Marker.DELETEALL

@@ -5,7 +5,6 @@
 from dataclasses import dataclass
 
 import pytest
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
 from cliploc_ros.errors import OptionsError
@@ -55,16 +54,6 @@ def test_a_node_takes_the_generated_file(declare, kind, capfd):
     assert 'unknown parameter' not in capfd.readouterr().err
 
 
-def test_without_a_file_all_is_at_its_default(declare):
-    node, parameters = declare()
-    assert parameters.snapshot() == Probe()
-    assert parameters.values.ratio == 0.5
-    descriptor = node.describe_parameter('span')
-    assert (descriptor.description, descriptor.read_only) == ('From, to. [m]', False)
-    assert node.describe_parameter('mode').read_only
-    assert node.describe_parameter('mode').additional_constraints == 'calm, wild'
-
-
 def test_given_values_are_taken_whole_numbers_too(declare):
     _, parameters = declare(given(low=2, ratio=1, mode='wild', span='[1, 2]'))
     assert parameters.snapshot() == Probe(low=2, ratio=1.0, mode='wild', span=[1.0, 2.0])
@@ -74,30 +63,14 @@ def test_given_values_are_taken_whole_numbers_too(declare):
 @pytest.mark.parametrize(('values', 'reason'), [
     ({'low': 101}, 'must be 0 to 100; correct it with: ros2 param set node_under_test low'),
     ({'ratio': '.nan'}, 'ratio: nan must be 0 to 1'),
-    ({'ratio': 'half'}, 'ratio: must be of type float, not str'),
     ({'mode': 'willd'}, "did you mean 'wild'?); correct it and restart"),
-    ({'span': '[1.0]'}, 'span: must be 2 finite numbers'),
-    ({'span': '[1.0, .nan]'}, 'span: must be 2 finite numbers'),
-    ({'span': "['0', '1']"}, 'span: must be 2 finite numbers'),
-    ({'low': 6}, 'low: above high')])
+    ({'span': '[1.0]'}, 'span: must be 2 finite numbers'), ({'low': 6}, 'low: above high')])
 def test_an_invalid_start_is_reported_until_it_is_corrected(declare, values, reason):
     _, parameters = declare(given(**values))
     for _ in range(2):
         with pytest.raises(OptionsError) as raised:
             parameters.snapshot()
         assert reason in str(raised.value)
-
-
-def test_problems_are_reported_together_and_corrected_one_by_one(declare):
-    node, parameters = declare(given(low=101, ratio=2.0))
-    with pytest.raises(OptionsError, match=r'^parameter low: 101.*ratio: 2\.0'):
-        parameters.snapshot()
-    assert set_values(node, low=3).successful
-    with pytest.raises(OptionsError, match=r'^parameter ratio'):
-        parameters.snapshot()
-    assert not set_values(node, ratio=3.0).successful
-    assert set_values(node, ratio=0.25).successful
-    assert parameters.snapshot() == Probe(low=3, ratio=0.25)
 
 
 def test_mistyped_names_are_warned_of_with_the_nearest(declare, capfd):
@@ -116,10 +89,8 @@ def test_changes_at_run_time(declare):
 
 
 @pytest.mark.parametrize(('values', 'reason'), [
-    ({'low': -1}, 'low out of range'), ({'low': 6}, 'low: above high'),
-    ({'low': 2, 'high': 1}, 'low: above high'), ({'ratio': float('nan')}, 'ratio out of range'),
+    ({'low': -1}, 'low out of range'), ({'low': 2, 'high': 1}, 'low: above high'),
     ({'span': [1.0]}, 'span: must be 2 finite numbers'),
-    ({'span': [1.0, float('inf')]}, 'span: must'),
     ({'ratio': 'half'}, 'Wrong parameter type'), ({'mode': 'wild'}, 'read-only'),
     ({'use_sim_time': False, 'high': 0}, 'low: above high')])
 def test_a_refused_change_changes_nothing(declare, values, reason):
@@ -127,17 +98,6 @@ def test_a_refused_change_changes_nothing(declare, values, reason):
     answer = set_values(node, **values)
     assert not answer.successful and reason in answer.reason
     assert parameters.snapshot() == Probe()
-
-
-def test_what_another_callback_refuses_has_no_effect(declare):
-    node, parameters = declare(given(low=101))
-    # rclpy asks the callback that was added last first
-    refusing = SetParametersResult(successful=False, reason='not today')
-    node.add_on_set_parameters_callback(lambda _: refusing)
-    node._on_set_parameters_callbacks.reverse()
-    assert set_values(node, low=3).reason == 'not today'
-    with pytest.raises(OptionsError, match='low: 101'):
-        parameters.snapshot()
 
 
 def test_the_map_does_not_change_at_run_time(declare):

@@ -3,7 +3,6 @@
 """Odometry on the wire: the camera's place at an image, and the robot's speed."""
 
 import threading
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +14,6 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import make_transform, transform_from_pose
 from cliploc_ros.ros.conversions import pose_to_msg
-from cliploc_ros.ros.inputs.odometry import NoOdometryError
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -76,28 +74,10 @@ def test_it_knows_the_way_driven_until_the_image(robot, source):
     assert place(robot, 12.1).way_m == 0.0, 'another run'
 
 
-def test_odometry_of_the_camera_needs_no_mount(robot, source):
-    talk(source, 10.0, child_frame='camera')
-    np.testing.assert_allclose(place(robot, 10.0).odom_from_camera, odom_from_base(10.0),
-                               atol=1e-9)
-
-
-def test_frames_kept_apart_need_no_odometry(robot, source):
-    talk(source, 10.0)
-    assert place(robot, 10.0, fuse_frames=1) is None
-
-
 def test_a_body_that_nobody_places_links_nothing(robot, source, capfd):
     talk(source, 10.0, child_frame='wheels')
     assert place(robot, 10.0) is None
     assert 'one frame alone: ' in capfd.readouterr().err
-
-
-def test_odometry_without_a_child_frame_links_nothing(robot, source):
-    talk(source, 10.0, child_frame='')
-    assert place(robot, 10.0) is None
-    with pytest.raises(NoOdometryError, match='no child_frame_id'):
-        source.pose_at(stamp(10.0))
 
 
 def test_an_image_waits_for_the_message_after_it(robot, source):
@@ -107,18 +87,6 @@ def test_an_image_waits_for_the_message_after_it(robot, source):
     np.testing.assert_allclose(place(robot, 10.05).odom_from_camera,
                                odom_from_base(10.05) @ BASE_FROM_CAMERA, atol=1e-9)
     late.join()
-
-
-@pytest.mark.clock
-@pytest.mark.parametrize('moments', [[], [10.0], [12.0], [1.0]])
-def test_an_image_outside_of_odometry_costs_no_time(robot, source, moments):
-    talk(source, *moments)
-    start = time.monotonic()
-    assert place(robot, 10.3) is None
-    assert time.monotonic() - start < 0.5
-    assert source.covers_soon(stamp(10.3), 0.1) == (moments in ([10.0], [12.0]))
-    newest = source.recent(5.0, 5.0)
-    assert (newest.header.stamp == stamp(moments[-1])) if moments else newest is None
 
 
 @pytest.mark.parametrize('frames', [{'frame': 'other'}, {'child_frame': 'camera'}])
@@ -137,19 +105,6 @@ def restarts(source):
     stamps_ns = []
     source.on_restart(stamps_ns.append)
     return stamps_ns
-
-
-@pytest.mark.parametrize('frames', [{'frame': 'other'}, {'child_frame': 'camera'}])
-def test_other_frames_are_a_restart(source, restarts, frames):
-    talk(source, 9.9, 10.0)
-    talk(source, 10.1, 10.2, **frames)
-    assert restarts == [10_100_000_000]
-
-
-@pytest.mark.parametrize('back_s', [8.5, 2.0])
-def test_a_bag_that_loops_is_a_restart(source, restarts, back_s):
-    talk(source, 9.9, 10.0, back_s, back_s + 0.1)
-    assert restarts == [back_s * 1e9]
 
 
 def test_an_origin_that_is_reset_is_a_restart(source, restarts, capfd):
@@ -241,13 +196,3 @@ def test_no_speed_is_taken_across_a_restart(source):
     restarted.pose.pose.position.x = -100.0
     source.take(restarted)
     assert source.speeds_by_poses(0.0) is None
-
-
-@pytest.mark.clock
-@pytest.mark.parametrize('moments', [
-    [], [10.0], [10.0, 10.0], [9.9, 10.0], [9.0, 9.9, 10.0], [6.9, 10.0]])
-def test_too_few_poses_give_no_speed(source, moments):
-    talk(source, *moments)
-    start = time.monotonic()
-    assert source.speeds_by_poses(0.2) is None
-    assert time.monotonic() - start < 1.0

@@ -22,78 +22,6 @@ def add_all(pairing, *additions):
     return answer
 
 
-def test_the_last_of_three_completes_the_set():
-    pairing = ExactPairing(LIMITS, MAX_COUNT)
-    assert add_all(pairing, ('image', 5)) is None
-    assert add_all(pairing, ('detections', 5)) is None
-    assert add_all(pairing, ('camera_info', 5)) == {
-        'image': 'image 5', 'camera_info': 'camera_info 5', 'detections': 'detections 5'}
-    assert pairing.waiting_bytes() == 0
-
-
-def test_a_nanosecond_apart_is_apart():
-    pairing = ExactPairing(LIMITS, MAX_COUNT)
-    assert add_all(pairing, ('image', 10**18), ('camera_info', 10**18),
-                   ('detections', 10**18 + 1)) is None
-    assert add_all(pairing, ('detections', 10**18)) is not None
-
-
-def test_a_set_is_given_once():
-    pairing = ExactPairing(LIMITS, MAX_COUNT)
-    add_all(pairing, ('image', 1), ('camera_info', 1), ('detections', 1))
-    assert add_all(pairing, ('detections', 1)) is None
-    assert add_all(pairing, ('image', 1), ('camera_info', 1)) is not None
-
-
-def test_of_equal_stamps_the_later_message_counts():
-    pairing = ExactPairing({'image': 100, 'detections': 100}, MAX_COUNT)
-    pairing.add('image', 1, 'first', 60)
-    pairing.add('image', 1, 'second', 70)
-    assert pairing.waiting_bytes() == 70
-    assert pairing.add('detections', 1, 'boxes', 1) == {'image': 'second', 'detections': 'boxes'}
-
-
-def test_stamps_that_jump_back_pair_at_once():
-    pairing = ExactPairing(LIMITS, MAX_COUNT)
-    for stamp in (900, 901, 3, -4):
-        answer = add_all(pairing, ('camera_info', stamp), ('image', stamp), ('detections', stamp))
-        assert answer is not None and answer['image'] == f'image {stamp}', stamp
-
-
-def test_detections_of_a_late_frame_are_late_for_good():
-    pairing = ExactPairing({'image': 100, 'detections': 100}, MAX_COUNT)
-    add_all(pairing, ('image', 1), ('image', 2))
-    assert add_all(pairing, ('detections', 2)) is not None
-    assert add_all(pairing, ('detections', 1)) is None
-    # what arrived after the completed one still waits for its own
-    add_all(pairing, ('image', 3), ('image', 4), ('detections', 3))
-    assert add_all(pairing, ('detections', 4)) is not None
-
-
-def test_the_oldest_gives_way_by_count():
-    pairing = ExactPairing({'image': 100, 'detections': 100}, max_count=2)
-    add_all(pairing, ('image', 1), ('image', 2), ('image', 3))
-    assert add_all(pairing, ('detections', 1)) is None
-    assert add_all(pairing, ('detections', 2)) is not None
-
-
-def test_the_oldest_gives_way_by_size():
-    pairing = ExactPairing({'image': 100, 'detections': 100}, max_count=10)
-    for stamp in (1, 2, 3):
-        pairing.add('image', stamp, stamp, 40)
-    assert pairing.waiting_bytes() == 80
-    assert add_all(pairing, ('detections', 1)) is None
-    assert add_all(pairing, ('detections', 2)) is not None
-
-
-def test_one_item_beyond_the_limit_still_pairs():
-    pairing = ExactPairing({'image': 100, 'detections': 100}, MAX_COUNT)
-    pairing.add('image', 1, 'small', 10)
-    pairing.add('image', 2, 'huge', 1000)
-    assert pairing.waiting_bytes() == 1000
-    assert pairing.add('detections', 2, 'boxes', 1) == {'image': 'huge', 'detections': 'boxes'}
-
-
 def test_what_came_is_known_for_the_reason_that_nothing_paired():
     pairing = ExactPairing(LIMITS, MAX_COUNT)
     add_all(pairing, ('image', 7), ('image', 6), ('detections', 9))
@@ -104,11 +32,6 @@ def test_what_came_is_known_for_the_reason_that_nothing_paired():
     assert pairing.last_stamp_ns == {}
     assert pairing.waiting_bytes() == 0
     assert add_all(pairing, ('camera_info', 9), ('image', 9)) is None
-
-
-def test_a_topic_that_is_not_paired_is_a_mistake():
-    with pytest.raises(KeyError):
-        ExactPairing(LIMITS, MAX_COUNT).add('depth', 1, None, 1)
 
 
 class Expected:
@@ -183,22 +106,3 @@ def test_images_pair_however_slow_the_detector_is(behind, room):
         paired = paired_by_a_slow_detector(behind, room, 10 * behind, begin=begin)
         assert len(paired) >= 8, paired
     assert len(paired_by_a_slow_detector(behind, room, 10 * behind, queue=True)) >= 6
-
-
-@given(st.lists(st.tuples(st.sampled_from(TOPICS), st.integers()), max_size=80))
-def test_count_is_bounded_whatever_comes(additions):
-    pairing = ExactPairing(dict.fromkeys(TOPICS, 10**9), MAX_COUNT, 'image', 'detections')
-    for topic, stamp in additions:
-        pairing.add(topic, stamp, None, 1)
-        assert pairing.waiting_bytes() <= MAX_COUNT * len(TOPICS)
-
-
-@given(st.permutations([(topic, stamp) for topic in TOPICS for stamp in (1, 2)]))
-def test_in_any_order_of_arrival_at_least_one_of_two_frames_pairs(additions):
-    pairing = ExactPairing(LIMITS, MAX_COUNT)
-    answers = [pairing.add(topic, stamp, (topic, stamp), 1) for topic, stamp in additions]
-    complete = [answer for answer in answers if answer is not None]
-    assert complete
-    for answer in complete:
-        assert len({stamp for _, stamp in answer.values()}) == 1
-        assert all(topic == name for name, (topic, _) in answer.items())

@@ -11,10 +11,9 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.observation import OPTICAL_FROM_BODY
-from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
-from cliploc_ros.ros.inputs.prior import PriorSource, planar_of
+from cliploc_ros.ros.inputs.prior import PriorSource
 from cliploc_ros.ros.node.worker import Worker
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -76,14 +75,6 @@ def test_a_message_withdraws_the_one_before(source):
         assert region_of(source) is not None
         source.hear(other)
         assert region_of(source) is None
-
-
-def test_planar_of_an_invalid_pose_is_refused():
-    invalid = pose()
-    invalid.pose.pose.position.x = np.nan
-    for wrong in (invalid, pose(covariance=np.zeros((6, 6)))):
-        with pytest.raises(CliplocError):
-            planar_of(wrong)
 
 
 def test_the_last_accepted_pose_holds_at_the_next_start_until_another_is_accepted(

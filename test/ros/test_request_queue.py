@@ -3,7 +3,6 @@
 """Requests in a real node with a real frame source; the localizer is the test's own function."""
 
 import array
-import logging
 import re
 import threading
 import time
@@ -192,8 +191,7 @@ def test_4k_images_wait_for_a_slow_detector(node, camera, clients, wait):
         take(number)
     boxes.publish(Detection2DArray(header=Header(stamp=Time(sec=15))))
     wait(request.done, 'the answer')
-    assert re.search('no fresh frame within 3 s: detections come 12 images late, and memory '
-                     'holds 256 MiB of images: use smaller images', request.result().message)
+    assert re.search('12 images late.* 256 MiB', request.result().message)
 
 
 @pytest.mark.parametrize(('kind', 'advice'), [
@@ -272,31 +270,15 @@ def test_an_answer_keeps_to_the_time_out_while_the_map_loads(node, clients, wait
 
 def test_a_failing_start_is_logged_once_and_retried_by_requests(node, capfd, wait):
     def fail():
-        raise MapError('office.yaml: No such file')
+        raise MapError('office.yaml: gone')
     wait(lambda: node.active, 'the node to be active')
     node.loads = fail
     node.trigger_deactivate()
     node.trigger_cleanup()
     for _ in range(3):
-        assert 'office.yaml: No such file' in node.requests.answer().message
+        assert 'office.yaml: gone' in node.requests.answer().message
     assert sum('[ERROR]' in line and 'office.yaml' in line
                for line in capfd.readouterr().err.splitlines()) == 1
     node.loads = lambda: 'a map'
     set_values(node, timeout_s=0.2)
     assert 'no fresh frame' in node.requests.answer().message
-
-
-def test_a_finalized_node_asks_to_be_restarted(node, wait):
-    wait(lambda: node.active, 'the node to be active')
-    node.trigger_shutdown()
-    assert node.requests.answer().message == 'the node is finalized: restart it'
-
-
-def test_a_destroyed_node_leaves_no_log_handler(node):
-    handlers = logging.getLogger('cliploc_ros').handlers
-    before = len(handlers)
-    other = Answering()
-    assert len(handlers) == before + 1
-    other.worker.stop()
-    other.destroy_node()
-    assert len(handlers) == before

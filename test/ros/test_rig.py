@@ -16,7 +16,6 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.errors import StoppedError
 from cliploc_ros.ros.inputs.frame_source import FrameSource, NoFrameError
 from cliploc_ros.ros.inputs.rig import frames_of
-from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 NAMES = ('front', 'left', 'back')
@@ -110,14 +109,6 @@ def test_silent_inputs_are_named_by_camera(rig, cameras, wait):
     assert rig.main.image_topic == rig.image_topic == '/front/image'
     assert [one for one in rig.topics if one.startswith('left')] == [
         'left/image', 'left/camera_info', 'left/detections']
-
-
-def test_the_health_of_each_camera_is_reported(rig, cameras, wait):
-    ask(rig, cameras, {'front': 0.0}, wait)
-    health = Health()
-    rig.examine(health, 1e-9)
-    text = str(vars(health))
-    assert all(name in text for name in NAMES)
 
 
 def test_nothing_in_time_and_a_rig_that_is_closed(rig, cameras, wait):

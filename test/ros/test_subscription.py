@@ -78,27 +78,11 @@ def ear(nodes, spin_until):
     ear.subscription.destroy()
 
 
-def test_before_anybody_publishes_it_would_hear_everybody(ear):
-    ear.wait_for_policies(BEST_EFFORT)
-
-
 @pytest.mark.parametrize('policy', [RELIABLE, BEST_EFFORT])
 def test_it_is_as_reliable_as_the_publisher_that_comes(ear, policy):
     publisher = ear.offer(policy)
     ear.wait_for_policies(policy)
     ear.wait_for_hearing(publisher, 'camera')
-
-
-def test_it_is_as_reliable_as_the_publisher_that_was_there(nodes, spin_until):
-    listener, speaker = nodes
-    publisher = speaker.create_publisher(
-        Header, 'topic', QoSProfile(depth=10, reliability=RELIABLE))
-    spin_until([listener, speaker],
-               lambda: listener.get_publishers_info_by_topic('/topic'), 'the publisher')
-    ear = Ear(listener, speaker, spin_until, 'topic')
-    ear.wait_for_policies(RELIABLE)
-    ear.wait_for_hearing(publisher, 'camera')
-    ear.subscription.destroy()
 
 
 def test_a_best_effort_publisher_beside_a_reliable_one_is_heard(ear):
@@ -108,23 +92,6 @@ def test_a_best_effort_publisher_beside_a_reliable_one_is_heard(ear):
     ear.wait_for_policies(BEST_EFFORT)
     ear.wait_for_hearing(best_effort, 'best effort')
     ear.wait_for_hearing(reliable, 'reliable')
-
-
-def test_when_the_last_best_effort_publisher_leaves_it_is_reliable_again(ear):
-    reliable, best_effort = ear.offer(RELIABLE), ear.offer(BEST_EFFORT)
-    ear.wait_for_hearing(best_effort, 'best effort')
-    ear.withdraw(best_effort)
-    ear.wait_for_policies(RELIABLE)
-    ear.wait_for_hearing(reliable, 'reliable')
-
-
-def test_publishers_come_and_go_many_times(ear):
-    for turn in range(5):
-        for policy in (RELIABLE, BEST_EFFORT):
-            publisher = ear.offer(policy)
-            ear.wait_for_policies(policy)
-            ear.wait_for_hearing(publisher, f'{policy.name} {turn}')
-            ear.withdraw(publisher)
 
 
 @pytest.mark.filterwarnings('ignore:MultiThreadedExecutor is used with a single thread')
@@ -180,16 +147,6 @@ def test_a_publisher_of_empty_messages_does_not_keep_it_busy(ear):
     ear.wait(lambda: time.monotonic() > end, 'two seconds', publish)
     assert 2 <= len(seen) <= 4  # once a second
     ear.wait_for_hearing(publisher, 'after')
-
-
-def test_a_message_that_cannot_be_read_is_dropped(ear):
-    publisher = ear.offer(RELIABLE)
-    ear.wait_for_hearing(publisher, 'before')
-    former = ear.endpoints()
-    publisher.publish(b'\x00\x01\x00\x00nonsense')
-    ear.wait_for_hearing(publisher, 'after')
-    assert {msg.frame_id for msg in ear.heard} == {'before', 'after'}
-    assert ear.endpoints() == former
 
 
 def test_destroyed_it_hears_nobody_and_stays_away(ear):

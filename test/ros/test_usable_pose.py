@@ -6,10 +6,9 @@ from builtin_interfaces.msg import Time as TimeMsg
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from hypothesis import given
 from hypothesis import strategies as st
-from nav_msgs.msg import Odometry
 from rclpy.time import Time
 
-from cliploc_ros.ros.outputs.handoff import speeds, usable_pose
+from cliploc_ros.ros.outputs.handoff import usable_pose
 
 # x, xy, yx, y and yaw: all that AMCL reads
 AMCL_READS = [0, 1, 6, 7, 35]
@@ -52,10 +51,3 @@ def test_the_stamp_is_the_images_but_not_later_than_now(image_s, now_s, publishe
     assert usable.header.stamp.sec == published_s
     assert usable.header.frame_id == 'map'
     assert pose.header.stamp.sec == image_s, 'what is published elsewhere is not touched'
-
-
-def test_speeds():
-    odometry = Odometry()
-    linear, angular = odometry.twist.twist.linear, odometry.twist.twist.angular
-    linear.x, linear.y, angular.z = 0.3, -0.4, -2.0
-    assert speeds(odometry) == (pytest.approx(0.5), 2.0)

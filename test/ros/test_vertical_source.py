@@ -11,9 +11,8 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
-from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
-from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource, sample_from_msg
+from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 OPTICAL = [0.3, 0.0, 1.0, -0.5, 0.5, -0.5, 0.5]  # looks along the base's x axis
@@ -46,10 +45,6 @@ def up(source, **changes):
     return source.up_in_camera(parameters(**changes), CAMERA_FROM_BASE, 'camera', AT)
 
 
-def test_nobody_asks_for_it(source):
-    assert up(source, gravity='none') is None
-
-
 def test_a_base_stands_upright(source):
     np.testing.assert_allclose(up(source, gravity='base_frame'), [0, -1, 0], atol=1e-12)
 
@@ -77,23 +72,10 @@ def test_an_orientation_counts_more_than_an_acceleration(source, acceleration):
     np.testing.assert_allclose(up(source), TILTED_UP, atol=1e-12)
 
 
-def test_an_orientation_without_an_acceleration_counts(source):
-    msg = imu(quat_xyzw=TILT.as_quat())
-    msg.linear_acceleration_covariance = NOT_MEASURED
-    source.take(msg)
-    np.testing.assert_allclose(up(source), TILTED_UP, atol=1e-12)
-
-
 def test_a_default_orientation_is_none(source):
     """rclcpp, rclpy and every driver that fills the acceleration alone send w = 1."""
     source.take(imu(GRAVITY, (0, 0, 0, 1)))
     np.testing.assert_allclose(up(source), TILTED_UP, atol=1e-12)
-
-
-def test_a_default_message_says_nothing(source):
-    source.take(imu((0.0, 0.0, 0.0), (0, 0, 0, 1)))
-    with pytest.raises(NoVerticalError, match='/imu has neither an orientation nor an acc'):
-        up(source)
 
 
 def test_an_upright_robot_has_its_vertical_by_either(source):
@@ -131,15 +113,6 @@ def test_a_wrong_orientation_stays_refused_when_the_robot_starts(source):
         up(source)
 
 
-def test_a_right_orientation_is_kept_when_the_robot_starts(source):
-    """2 m/s^2 for a moment: 11 degrees off, but no farther from gravity than noise."""
-    for number in range(20):
-        start = 2.0 if number > 15 else 0.0
-        source.take(imu((GRAVITY[0] + start, *GRAVITY[1:]), TILT.as_quat(),
-                        seconds=48.1 + 0.1 * number))
-    np.testing.assert_allclose(up(source), TILTED_UP, atol=1e-12)
-
-
 def test_a_message_out_of_order_costs_nothing(source):
     """Drivers stamp in several threads; one that is more than a second late is a jump."""
     for seconds in (49.92, 49.93, 49.929, 49.94, 50.05, 50.02):
@@ -149,43 +122,19 @@ def test_a_message_out_of_order_costs_nothing(source):
     assert len(source._samples) == 1
 
 
-def test_an_imu_in_the_camera_needs_no_transform(source):
-    source.take(imu((0.0, -9.81, 0.0), frame_id='camera'))
-    np.testing.assert_allclose(up(source), [0, -1, 0], atol=1e-12)
-
-
-def test_an_imu_that_nobody_places_is_an_error(source):
-    source.take(imu(frame_id='mast'))
-    with pytest.raises(CliplocError, match=r'mast|tf2_ros'):
-        up(source)
-
-
 @pytest.mark.parametrize(('messages', 'named'), [
-    ([], 'no message of /imu is within 100 ms'),
-    ([imu(seconds=51.0)], 'within 100 ms'),
-    ([imu(frame_id='')], 'no frame_id'),
+    ([], 'no message of /imu is within 100 ms'), ([imu(frame_id='')], 'no frame_id'),
     ([imu((0.0, 0.0, 11.0))], r'the IMU is moving: it measures 11\.00 m/s\^2'),
-    ([imu((0.0, 0.0, 1.0))], r'measures 1\.00'),  # in units of gravity
     ([imu((0.0, 0.0, 0.0))], 'neither an orientation nor an acceleration'),
-    ([imu((float('nan'), 0.0, 9.81))], 'neither an orientation nor an acceleration'),
     ([imu(quat_xyzw=Rotation.from_euler('y', angle, degrees=True).as_quat(), seconds=seconds,
           acceleration=(0.0, 0.0, 0.0)) for angle, seconds in ((-40, 49.95), (40, 50.05))],
      'turns too fast'),
-    ([imu(seconds=50.0), imu(seconds=10.0)], 'no message of /imu is within'),  # a jump
-])
+    ([imu(seconds=50.0), imu(seconds=10.0)], 'no message of /imu is within')])
 def test_what_is_not_known_is_said(source, messages, named):
     for msg in messages:
         source.take(msg)
     with pytest.raises(NoVerticalError, match=named):
         up(source)
-
-
-def test_fields_that_are_not_measured_say_nothing():
-    msg = imu()
-    msg.linear_acceleration_covariance = NOT_MEASURED
-    assert sample_from_msg(msg) is None
-    for quat_xyzw in ((0, 0, 0, 0), (0, 0, 0, 2), (float('nan'), 0, 0, 1)):
-        assert sample_from_msg(imu(quat_xyzw=quat_xyzw)).up is None
 
 
 def test_it_listens_from_open_to_close(source, make_node, spin_until):

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cliploc_ros.errors import CliplocError, InternalError, ModelError, StoppedError, TimeUpError
+from cliploc_ros.errors import CliplocError, InternalError, StoppedError, TimeUpError
 from cliploc_ros.ros.node.worker import LatestOnly, Worker
 
 PATIENCE_S = 60.0
@@ -60,32 +60,6 @@ def fail_with(error):
     return task
 
 
-def test_results_come_back(worker):
-    assert worker.run(lambda: 6 * 7) == 42
-    assert worker.submit(lambda: None).result(PATIENCE_S) is None
-
-
-def test_tasks_run_in_their_order_in_one_other_thread(worker):
-    threads, order = [], []
-
-    def task(number):
-        threads.append(threading.get_ident())
-        order.append(number)
-    futures = [worker.submit(lambda number=number: task(number)) for number in range(50)]
-    for future in futures:
-        future.result(PATIENCE_S)
-    assert order == list(range(50))
-    assert len(set(threads)) == 1 and threads[0] != threading.get_ident()
-
-
-def test_bad_input_passes_as_it_is(worker, reports):
-    error = ModelError('weights.pt: truncated')
-    with pytest.raises(ModelError) as raised:
-        worker.run(fail_with(error))
-    assert raised.value is error
-    assert reports == []
-
-
 @pytest.mark.parametrize('error', [
     ValueError('shapes differ'), KeyError('boxes'), MemoryError('2 GiB'), RuntimeError('CUDA'),
     AssertionError('')], ids=repr)
@@ -109,15 +83,6 @@ def test_a_task_whose_time_is_up_before_its_turn_never_runs(worker, gate):
     running.result(PATIENCE_S)
     assert worker.run(lambda: 'next') == 'next'
     assert ran == []
-
-
-def test_stop_of_an_idle_worker_is_immediate_and_final(worker):
-    worker.run(lambda: None)
-    worker.stop()
-    for use in (worker.submit, worker.run):
-        with pytest.raises(StoppedError, match='shutting down'):
-            use(lambda: None)
-    worker.stop()
 
 
 @pytest.mark.clock
@@ -172,19 +137,6 @@ def test_whoever_waits_in_run_learns_that_the_node_stops(gate, is_running):
     gate.open()
 
 
-def test_a_task_that_ends_in_time_is_waited_for(worker):
-    entered = threading.Event()
-
-    def task():
-        entered.set()
-        threading.Event().wait(0.02)
-        return 'done'
-    future = worker.submit(task)
-    assert entered.wait(PATIENCE_S)
-    worker.stop()
-    assert future.result(0) == 'done'
-
-
 def test_only_the_newest_waits_while_the_worker_is_busy(worker, gate):
     done = []
     latest = LatestOnly(worker, done.append)
@@ -195,24 +147,6 @@ def test_only_the_newest_waits_while_the_worker_is_busy(worker, gate):
     gate.open()
     worker.run(lambda: None)
     assert done == [99]
-
-
-def test_an_item_that_comes_during_the_work_is_worked_on_next(worker, gate):
-    done = []
-
-    def work(item):
-        if item == 'first':
-            gate()
-        done.append(item)
-    latest = LatestOnly(worker, work)
-    latest.offer('first')
-    assert gate.entered.wait(PATIENCE_S)
-    latest.offer('second')
-    latest.offer('third')
-    gate.open()
-    worker.run(lambda: None)
-    assert done == ['first', 'third']
-    assert latest.dropped == 1
 
 
 def test_work_that_fails_does_not_end_the_flow(worker, reports):
@@ -244,22 +178,3 @@ def test_the_last_item_is_never_lost(pauses):
     assert done == sorted(set(done))
     assert done[-1:] == list(range(len(pauses)))[-1:]
     assert len(done) + latest.dropped == len(pauses)
-
-
-def test_offers_of_many_threads_are_all_accounted_for(worker):
-    done, start = [], threading.Barrier(4)
-    latest = LatestOnly(worker, done.append)
-
-    def offer(first):
-        start.wait(PATIENCE_S)
-        for item in range(first, first + 250):
-            latest.offer(item)
-    threads = [threading.Thread(target=offer, args=(250 * number,)) for number in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(PATIENCE_S)
-    worker.run(lambda: None)
-    assert len(done) + latest.dropped == 1000
-    assert len(set(done)) == len(done)
-    assert done[-1] % 250 == 249, 'the last item of some thread comes last'

@@ -5,22 +5,9 @@
 import numpy as np
 import pytest
 
-from cliploc_ros.core.localizer import succeed
-from studies.covariance.continuous import COVARIANCES, Filter, walk_squares
+from studies.covariance.continuous import COVARIANCES, walk_squares
 
 pytestmark = pytest.mark.full
-
-OWN = np.diag([0.04, 0.01, 0.02, 0.001, 0.002, 0.003])
-HERE = np.eye(4)
-
-
-def test_a_filter_of_a_standing_robot_stays_as_certain_as_one_answer():
-    known, fused = None, None
-    for _ in range(300):
-        given, known = succeed(known, HERE, HERE, OWN)
-        fused = Filter(HERE, given, HERE) if fused is None else fused.updated(HERE, given)
-    assert np.linalg.eigvalsh(fused.covariance - 0.95 * OWN).min() > 0.0
-    np.testing.assert_allclose(known.covariance, fused.covariance, rtol=1e-6, atol=1e-12)
 
 
 def test_a_filter_of_a_walk_is_consistent():

@@ -25,10 +25,3 @@ def test_the_kernel_is_two_orders_faster_than_a_plain_loop_and_as_good():
     assert 'times the tenth' in done.stdout
     assert ratio > 120
     assert float(ours) == pytest.approx(float(plain), abs=5e-3)
-
-
-def test_queries_need_their_map():
-    done = subprocess.run([sys.executable, '-m', 'studies.speed', 'search', '--queries', 'x'],
-                          capture_output=True, text=True, cwd=PROJECT, check=False)
-    assert done.returncode == 2
-    assert '--queries and --map belong together' in done.stderr

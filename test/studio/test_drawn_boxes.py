@@ -13,8 +13,7 @@ from cliploc_ros.mapping.landmarks import group_boxes, landmarks_of_map, project
 from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.mapping.views import camera_centers, make_views
 from cliploc_ros.studio.edits import EditError
-from cliploc_ros.studio.landmark import Landmark, shape_fields
-from cliploc_ros.studio.recording import Recording, fit_boxes
+from cliploc_ros.studio.recording import fit_boxes
 
 TRIALS_PER_LANDMARK = 6
 
@@ -101,34 +100,6 @@ def test_three_boxes_make_a_landmark_that_fits_other_views(office, name, least):
           f'{np.median(medians):.3f}, quartiles {np.quantile(medians, [.25, .75]).round(3)}')
     assert len(medians) > 60
     assert np.median(medians) >= least
-
-
-@pytest.mark.parametrize('used', [0, 1])
-def test_refitting_takes_the_boxes_of_the_recording(office, used):
-    """All objects are drawn in three boxes of the detector, then refitted to every second frame.
-
-    They are judged on the frames between, which neither drawing nor refitting used.
-    """
-    detections, views, landmarks, shown = office
-    half = np.arange(used, len(detections), 2)
-
-    drawn, unseen = {}, {}
-    for boxes, others in draw_boxes(office, {'min_iou': 0.2, 'frames': half},
-                                    np.random.default_rng(0)):
-        (fit, _), number = fit_boxes(3 * detections.cameras, *boxes), shown[others[0]]
-        drawn[str(number)] = Landmark({
-            'label': 'x', 'class_id': detections.class_names[landmarks.classes[number]],
-            **shape_fields(fit.center, fit.basis)})
-        unseen[str(number)] = others[~np.isin(views.frames[others], half)]
-    recording = Recording(detections.select_frames(half))
-    refitted = recording.refitted(drawn, list(drawn))[0]
-    before, after = ([np.median(ious_with(views, unseen[key], one.center, one.basis))
-                      for key, one in landmarks.items()]
-                     for landmarks in (drawn, refitted.apply(drawn)))
-    print(f'{len(drawn)} objects from three boxes of the detector: median IoU in unseen views '
-          f'{np.median(before):.3f}, after refitting {np.median(after):.3f}')
-    assert len(drawn) > 20
-    assert np.median(after) >= 0.75
 
 
 def test_views_that_look_alike_are_warned_of(office):

@@ -9,13 +9,12 @@ import urllib.request
 import cv2
 import numpy as np
 import pytest
-from studio_map import ASSETS, demo_studio, open_page
+from studio_map import demo_studio, open_page
 
 from cliploc_ros.datasets.observations import load_observations
 from cliploc_ros.studio import edits
 from cliploc_ros.studio.document import Document
-from cliploc_ros.studio.edits import EditError
-from cliploc_ros.studio.images import landmark_at, outlines_of, views_of_folder
+from cliploc_ros.studio.images import landmark_at
 from cliploc_ros.studio.recording import Recording
 from cliploc_ros.studio.sightings import find_sightings
 from cliploc_ros.studio.studio import Studio
@@ -90,19 +89,6 @@ def test_moved_landmarks_come_back_by_refitting(office):
     assert document.landmarks[moved[0]].center.tolist() != fitted[moved[0]].center.tolist()
 
 
-def test_merging_with_boxes_fits_the_boxes_of_both(office):
-    document = office.document
-    office.refit_all()
-    whole = document.landmarks['tv_1']
-    document.select(['tv_1'])
-    office.split()
-    assert len(document.selection) == 2
-    assert office.merge().endswith('by boxes')
-    merged = document.landmarks['tv_1']
-    assert document.selection == ('tv_1',)
-    assert np.linalg.norm(merged.center - whole.center) < 0.25 * whole.semi_axes.max()
-
-
 def test_the_review_goes_from_the_worst_to_the_end(office):
     """A moved landmark is fixed, a duplicate merged; each decision leads to the next one."""
     document, review = office.document, office.review
@@ -126,42 +112,6 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
         assert len(document.selection) == 1
     counts = review.counts()
     assert counts['accepted'] + counts['fixed'] + counts['deleted'] == counts['total'] == total
-
-
-def test_a_box_of_the_detector_is_taken(office):
-    view = int(np.argmax(np.diff(office.recording.detections.frame_offsets)))
-    boxes = office.recording.boxes_in_view(view)
-    box = boxes[0]
-    office.new.take(view, (box[:2] + box[2:]) / 2)
-    assert office.new.boxes[view] in [tuple(one) for one in boxes]
-    assert office.new.class_id in office.recording.detections.class_names
-    assert 'changed' in office.new.draw(view, box[:2], box[2:] + 3.0), 'one box a view'
-    with pytest.raises(EditError, match='no box'):
-        office.new.take(view, (-1.0, -1.0))
-
-
-def test_the_next_view_for_a_box_shows_the_object(tmp_path):
-    """It does for each landmark of the demo's first walk; asked once more, it is another one."""
-    shutil.copy(ASSETS / 'map.yaml', tmp_path / 'map.yaml')
-    detections = views_of_folder(ASSETS / 'mapping')
-    studio = Studio(Document(tmp_path / 'map.yaml'), Recording(detections))
-    new, shown = studio.new, []
-    for key, one in studio.document.landmarks.items():
-        boxes = {}
-        for view, pose in enumerate(detections.map_from_camera):
-            if outline := outlines_of({key: one}, detections.camera_of(view), pose):
-                half = np.sqrt(outline[0].ellipse[[2, 4]])
-                box = np.array([outline[0].ellipse[:2] - half, outline[0].ellipse[:2] + half])
-                if box.min() > 0.0 and (box[1] < (640.0, 480.0)).all():
-                    boxes[view] = box
-        if len(boxes) > 2:
-            new.forget(None)
-            new.draw(next(iter(boxes)), *next(iter(boxes.values())))
-            views = [new.next_view(), new.next_view()]
-            assert len({*views, *new.boxes}) == 3
-            shown.append(views[0] in boxes)
-    studio.document.close()
-    assert len(shown) > 50 and np.mean(shown) > 0.95
 
 
 def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):

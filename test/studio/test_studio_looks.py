@@ -94,17 +94,6 @@ def test_rows_follow_their_landmarks(path, rows):
     document.close()
 
 
-def test_saving_without_new_landmarks_leaves_the_file(path):
-    document = Document(path)
-    document.apply(edits.delete(document.landmarks, ['cup_1']))
-    document.save()
-    written = embeddings_path(path).stat().st_mtime_ns
-    document.apply(edits.relabel(document.landmarks, ['book_1'], 'a novel'))
-    document.save()
-    document.close()
-    assert embeddings_path(path).stat().st_mtime_ns == written
-
-
 def test_a_killed_studio_restores_them(path, rows):
     killed = Document(path)
     change_all(killed)

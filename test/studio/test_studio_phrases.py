@@ -7,8 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from browser import wait_for
-from studio_map import ASSETS, person_at
+from studio_map import ASSETS
 
 from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_landmark_embeddings
@@ -64,23 +63,6 @@ def test_clip_offers_phrases_for_what_the_images_show(path):
     assert studio.phrases() == found, 'a drag asks nothing'
     studio.finder.close()
     studio.document.close()
-
-
-@pytest.mark.clock
-@pytest.mark.needs('viser', 'playwright', 'chromium')
-def test_a_person_chooses_a_phrase(chromium, path):
-    """The page goes on while CLIP loads."""
-    studio = opened(path, '--images', WALK, *CLIP)
-    document, truth = studio.document, studio.document.landmarks['bowl_1'].label
-    document.apply(edits.relabel(document.landmarks, ['bowl_1'], 'something'))
-    with person_at(chromium, studio) as (person, _):
-        person.mode('Edit')
-        person.select(document, 'bowl_1')
-        wait_for(lambda: truth in studio.phrases(), 'the phrases of CLIP')
-        person.picture('phrases')
-        person.click(truth)
-        wait_for(lambda: document.landmarks['bowl_1'].label == truth, 'the label')
-    studio.finder.close()
 
 
 def observed(tmp_path, object_id):

@@ -2,17 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Phrases: what the grammar makes, what is shipped for COCO, and what a user's file adds."""
 
-import importlib.util
 import re
 import time
-from pathlib import Path
 
 import pytest
-import yaml
 
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.vocabulary.vocabulary import (
-    MOST_PHRASES,
     expand_phrases,
     load_vocabulary,
     misspelt_classes,
@@ -37,31 +33,17 @@ def test_a_symbol_has_one_value_in_a_phrase_and_phrases_are_told_once():
 
 @pytest.mark.parametrize(('rules', 'message'), [
     ({'phrases': ['a {brand}']}, r'\{brand\} has no words; add the rule brand'),
-    ({'phrases': ['a {phrases}']}, r'\{phrases\} has no words'),
     ({'phrases': ['{a}'], 'a': ['{b}'], 'b': ['{a}']}, 'does not end'),
-    ({'phrases': ['{a}'], 'a': ['x {a}']}, 'does not end'),
     ({'phrases': ['{second}'], 'colour': ['red']}, None),
     ({'phrases': ['{colour} {second}'], 'colour': ['red']}, 'needs two colours'),
-    ({'phrases': ['x' * 201]}, 'more than 200 characters'),
     ({'phrases': ['{a} {b} {c} {d}'], **{name: [f'{name}{i}' for i in range(1000)]
-                                         for name in 'abcd'}}, 'more than 2000 phrases'),
-    ({'phrases': ['{a} {b} {c} {d}'], **{name: ['same'] * 1000 for name in 'abcd'}},
-     'more than 2000 phrases'),
-])
+                                         for name in 'abcd'}}, 'more than 2000 phrases')])
 def test_rules_that_cannot_be_used(rules, message):
     if message is None:
         assert expand_phrases(rules) == ('red',)
         return
     with pytest.raises(OptionsError, match=message):
         expand_phrases(rules)
-
-
-@pytest.mark.full
-def test_all_coco_classes_are_shipped():
-    file = Path(importlib.util.find_spec('ultralytics').origin).parent / 'cfg/datasets/coco.yaml'
-    names = yaml.safe_load(file.read_text(encoding='utf-8'))['names'].values()
-    assert len(names) == 80
-    assert set(shipped_classes()) == set(names)
 
 
 @pytest.mark.parametrize('name', [*shipped_classes(), 'unheard-of thing'])
@@ -95,16 +77,6 @@ def test_a_users_file_adds_phrases(tmp_path):
     assert set(load_vocabulary().phrases('cup')) < set(ours.phrases('cup'))
     assert 'a silver Alpha cleaning robot' in ours.phrases('robot')
     assert ours.phrases('dog') == load_vocabulary().phrases('dog')
-
-
-def test_each_shipped_class_has_phrases_and_a_users_come_first(tmp_path):
-    file = tmp_path / 'our.yaml'
-    file.write_text('gadget: [our gadget]')
-    vocabulary = load_vocabulary(file)
-    assert vocabulary.phrases('gadget')[:2] == ('our gadget', 'a gadget')
-    counts = [len(vocabulary.phrases(name)) for name in shipped_classes()]
-    assert len(counts) == 80
-    assert all(0 < count < MOST_PHRASES for count in counts)
 
 
 def test_classes_that_look_misspelt_have_a_hint():

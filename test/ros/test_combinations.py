@@ -1,0 +1,144 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where features meet: cameras, what is known besides, and what asks, in one process."""
+
+import math
+import time
+from dataclasses import asdict, replace
+from itertools import product
+
+import cv2
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from cameras import MAP, MOUNTS, NAMES, look
+from scene import CAMERA, depth_image, make_layer
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.observation import Region
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.watch.watch import WatchState
+from cliploc_ros.datasets.cases import read_case
+from cliploc_ros.evaluation.cases import replay_case
+from cliploc_ros.ros.answer import Answer, Verdict
+from cliploc_ros.ros.case_recorder import CaseRecorder
+from cliploc_ros.ros.conversions import detections_to_msg
+from cliploc_ros.ros.frame_localizer import FrameLocalizer, Keyframes
+from cliploc_ros.ros.inputs.frame_source import Frame
+from cliploc_ros.ros.inputs.prior import Known
+from cliploc_ros.ros.inputs.robot_state import CameraPlace, RobotState
+from cliploc_ros.ros.node.diagnostics import StageTimes
+from cliploc_ros.ros.parameters import RelocalizerParameters
+
+ANY_YAW = 1e3
+KNOWN = ('nothing', 'depth', 'prior', 'keyframes', 'all')
+COMBINATIONS = [*product((1, 4), KNOWN)]
+LAYER = make_layer(MAP)
+
+
+class Drive:
+    """A robot that drives ahead, what its cameras see, and the localizer that answers."""
+
+    def __init__(self, cameras, known, folder, mode='on_request'):
+        self.parameters = RelocalizerParameters(
+            matching='class', mode=mode, cameras=list(NAMES) if cameras > 1 else [],
+            time_budget_ms=5000.0, record_folder=str(folder / 'cases'))
+        options = self.parameters.options()
+        keyframes = Keyframes(KeyframeLocalizer(LAYER)) if known in ('keyframes', 'all') else None
+        self.localizer = FrameLocalizer(MAP, None, Relocalizer(MAP, options), options, 'cpu', '',
+                                        keyframes)
+        self.has_depth = known in ('depth', 'all')
+        self.known = Known() if known not in ('prior', 'all') else Known(Region(
+            'map', np.zeros(3), np.diag([0.5, 0.5, ANY_YAW]) ** 2, 0.95))
+        self.recorder = CaseRecorder(True)
+        self.cameras, self.rng = cameras, np.random.default_rng(3)
+
+    def pixels(self):
+        """Return an image (h, w) of some blobs, another one each time."""
+        return cv2.resize(self.rng.integers(0, 255, (6, 8), np.uint8), (CAMERA.width,
+                                                                        CAMERA.height))
+
+    def see(self, number):
+        """Return the frames of an instant with their states, and the true pose of the first."""
+        robot = make_transform(np.eye(3), np.array([0.0, 0.0, 0.05 * number]))
+        frames = []
+        for name, mount, seen in zip(NAMES, MOUNTS, look(self.rng, robot, 8, noise_px=0.3),
+                                     strict=True):
+            header = Header(frame_id=name, stamp=Time(sec=100 + number))
+            frames.append((Frame(
+                Image(header=header, width=CAMERA.width, height=CAMERA.height, encoding='mono8',
+                      step=CAMERA.width, data=self.pixels().tobytes()),
+                CameraInfo(header=header, width=CAMERA.width, height=CAMERA.height,
+                           k=CAMERA.matrix.ravel(), p=np.c_[CAMERA.matrix, np.zeros(3)].ravel()),
+                detections_to_msg(seen.detections, header), float(number), float(number),
+                depth=Image(
+                    header=header, width=CAMERA.width, height=CAMERA.height, encoding='32FC1',
+                    step=4 * CAMERA.width, data=depth_image(
+                        MAP, robot @ mount, seen.detections.bboxes_xyxy).tobytes())
+                if self.has_depth else None,
+                camera=name if self.cameras > 1 else ''),
+                RobotState(invert_transform(mount), place=CameraPlace(
+                    robot @ mount, 0, 0.05 * number))))
+        return frames[:self.cameras], robot @ MOUNTS[0]
+
+    def localize(self, number=0):
+        """Answer for an instant as the node does; return the result and the pose's error [m]."""
+        ((frame, state), *beside), truth = self.see(number)
+        found = self.localizer.localize(frame, self.parameters, state, StageTimes(
+            'waiting', time.monotonic()), math.inf, beside, self.known)
+        assert found.found.accepted, found.found.reason
+        answer = Answer(Verdict.ACCEPTED, '', received_at=frame.received_at, state=state,
+                        beside=tuple(beside))
+        self.recorder.add(replace(frame, beside=tuple(one for one, _ in beside)), answer)
+        self.recorder.end(answer)
+        return found, pose_error(found.found.map_from_camera, truth)[0]
+
+
+@pytest.mark.parametrize(('cameras', 'known'), COMBINATIONS)
+def test_a_request_is_answered_and_its_record_is_answered_alike(cameras, known, tmp_path):
+    drive = Drive(cameras, known, tmp_path)
+    found, error_m = drive.localize()
+    assert error_m < 0.05
+    assert found.cameras == cameras
+    assert found.found.source == 'objects'
+    depths = found.seen.observation.depths
+    assert (depths is not None and np.isfinite(depths).sum() >= 6) == drive.has_depth
+    drive.recorder.store(drive.parameters)
+    case = read_case(next((tmp_path / 'cases').iterdir()))
+    assert asdict(drive.parameters).items() >= case.report['parameters'].items()
+    again = replay_case(case, MAP, None, LAYER if drive.localizer.keyframes else None)
+    assert again.accepted
+    np.testing.assert_allclose(again.map_from_camera, found.found.map_from_camera, atol=1e-6)
+    if drive.known.region is None:  # what was known of the place before is not recorded
+        assert again.confidence == pytest.approx(found.found.confidence, abs=1e-9)
+    else:
+        assert again.confidence <= found.found.confidence + 1e-9
+
+
+@pytest.mark.parametrize(('cameras', 'known'), COMBINATIONS)
+def test_continuous_answers_tell_a_filter_only_what_is_new(cameras, known, tmp_path):
+    drive = Drive(cameras, known, tmp_path, 'continuous')
+    shares = []
+    for number in range(4):
+        found, error_m = drive.localize(number)
+        assert error_m < 0.05
+        shares.append(np.trace(found.found.covariance[:3, :3])
+                      / np.trace(found.for_filter[:3, :3]))
+    assert shares[0] == pytest.approx(1.0)
+    assert max(shares[1:]) < 0.9
+
+
+@pytest.mark.parametrize(('cameras', 'known'), COMBINATIONS)
+@pytest.mark.parametrize(('displaced_m', 'state'), [
+    (0.0, WatchState.LOCALIZED), (2.0, WatchState.LOST)])
+def test_the_watch_tells_a_right_pose_from_a_wrong_one(cameras, known, displaced_m, state,
+                                                       tmp_path):
+    drive = Drive(cameras, known, tmp_path)
+    for number in range(8):
+        ((frame, robot_state), *_), pose = drive.see(10 * number)
+        pose[0, 3] += displaced_m
+        report = drive.localizer.look(frame, drive.parameters, robot_state, 'map', pose)
+    assert report.state is state
