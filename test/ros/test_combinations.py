@@ -28,7 +28,6 @@ from cliploc_ros.ros.case_recorder import CaseRecorder
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Keyframes
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.prior import Known
 from cliploc_ros.ros.inputs.robot_state import CameraPlace, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -51,8 +50,8 @@ class Drive:
         self.localizer = FrameLocalizer(MAP, None, Relocalizer(MAP, options), options, 'cpu', '',
                                         keyframes)
         self.has_depth = known in ('depth', 'all')
-        self.known = Known() if known not in ('prior', 'all') else Known(Region(
-            'map', np.zeros(3), np.diag([0.5, 0.5, ANY_YAW]) ** 2, 0.95))
+        self.region = None if known not in ('prior', 'all') else Region(
+            'map', np.zeros(3), np.diag([0.5, 0.5, ANY_YAW]) ** 2, 0.95)
         self.recorder = CaseRecorder(True)
         self.cameras, self.rng = cameras, np.random.default_rng(3)
 
@@ -88,7 +87,7 @@ class Drive:
         """Answer for an instant as the node does; return the result and the pose's error [m]."""
         ((frame, state), *beside), truth = self.see(number)
         found = self.localizer.localize(frame, self.parameters, state, StageTimes(
-            'waiting', time.monotonic()), math.inf, beside, self.known)
+            'waiting', time.monotonic()), math.inf, beside, self.region)
         assert found.found.accepted, found.found.reason
         answer = Answer(Verdict.ACCEPTED, '', received_at=frame.received_at, state=state,
                         beside=tuple(beside))
@@ -112,7 +111,7 @@ def test_a_request_is_answered_and_its_record_is_answered_alike(cameras, known, 
     again = replay_case(case, MAP, None, LAYER if drive.localizer.keyframes else None)
     assert again.accepted
     np.testing.assert_allclose(again.map_from_camera, found.found.map_from_camera, atol=1e-6)
-    if drive.known.region is None:  # what was known of the place before is not recorded
+    if drive.region is None:  # what was known of the place before is not recorded
         assert again.confidence == pytest.approx(found.found.confidence, abs=1e-9)
     else:
         assert again.confidence <= found.found.confidence + 1e-9
