@@ -62,15 +62,11 @@ def test_arguments_are_parameters(constants, node):
 
 
 def test_every_topic_and_service_can_be_remapped(constants):
-    """The policy names them all; a test holds it equal to the graph.
-
-    The topic map is no argument: Nav2's argument of that name is a file.
-    """
+    """The policy names them all; a test holds it equal to the graph."""
     names = {entry.text for entry in ElementTree.parse(POLICY).iter()
              if entry.tag in ('topic', 'service')}
     relative = {name[1:] for name in names if not OWN.match(name)}
-    assert set(constants['NAMES']) | {'image/compressed', 'depth/compressedDepth',
-                                      'map'} == relative
+    assert set(constants['NAMES']) | {'image/compressed', 'depth/compressedDepth'} == relative
 
 
 def test_a_wake_up_is_launched_with_its_own_options(of_wake_up):

@@ -117,6 +117,8 @@ class Reviewer:
                         for name, mount in mounts.items()}
         self._options = values.options()
         self._relocalizer = Relocalizer(landmark_map, self._options)
+        # what it learns of the camera decides how many crops a request compares
+        self._localizer = Localizer(self._relocalizer)
         self._observer = None
         if self._options.needs_similarities:
             from cliploc_ros.models.map_rows import load_encoder_for_map
@@ -135,7 +137,7 @@ class Reviewer:
         """Repeat the search of a wake-up."""
         seen = {name: self._observed(name, judged.wake_up) for name in self._sequences}
         (_, first), *others = seen.values()
-        found = self._search(first, [observation for _, observation in others])
+        found = self._search(self._localizer, first, [observation for _, observation in others])
         if found.map_from_camera is None or judged.pose is None:
             repeated = found.map_from_camera is judged.pose
         else:
@@ -148,7 +150,7 @@ class Reviewer:
                    for (name, one), its in zip(seen.items(), matches, strict=True)}
         first_review, *_ = reviews.values()
         return replace(first_review, beside=dict(list(reviews.items())[1:]), accepted_alone=(
-            self._search(first, []) if others else found).accepted)
+            self._search(Localizer(self._relocalizer), first, []) if others else found).accepted)
 
     def _observed(self, name: str, wake_up: WakeUp) -> tuple[NDArray[np.uint8], Observation]:
         """Return the image (h, w, 3) of a camera, and what was detected in it."""
@@ -166,11 +168,12 @@ class Reviewer:
         return image_rgb, replace(observation, camera_name=name,
                                   odom_from_camera=self._mounts[name])
 
-    def _search(self, first: Observation, others: Sequence[Observation]) -> Relocalization:
+    def _search(self, localizer: Localizer, first: Observation, others: Sequence[Observation]
+                ) -> Relocalization:
         """Return the pose of the first camera, as the relocalizer finds it."""
         if can_do_without_crops(self._options):
             others = [by_classes(one, len(self._relocalizer.landmark_map)) for one in others]
-        return Localizer(self._relocalizer).localize(
+        return localizer.localize(
             first, run=None, crops=recorded_crops(first, self._options), others=others)
 
     def _review(self, name: str, judged: Judged, image_rgb: NDArray[np.uint8],

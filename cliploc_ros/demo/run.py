@@ -105,7 +105,8 @@ class DemoOptions:
             parameters |= {'clip_model': self.assets / 'clip.json',
                            'clip_pretrained': self.assets / 'clip.safetensors'}
         if self.has_rig:
-            parameters |= {**self.of_detector, 'base_frame': next(iter(self.mounts)),
+            # the pose of the first camera
+            parameters |= {**self.of_detector, 'base_frame': 'camera_optical_frame',
                            'base_from_camera': list(chain(*self.mounts.values()))}
         return parameters
 

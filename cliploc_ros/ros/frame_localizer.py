@@ -279,9 +279,11 @@ class FrameLocalizer:
         seen = localizer.observation
         assert seen is not None
         compared = int((seen.similarity_rows >= 0).sum())
-        if found.accepted and parameters.base_frame and found.map_from_camera is not None:
+        frame_id = frame.image.header.frame_id
+        if (found.accepted and found.map_from_camera is not None
+                and parameters.base_frame not in ('', frame_id)):
             with self._keeping(frame.camera):
-                check_faults(faults_of_axes(frame.image.header.frame_id, state.camera_from_base,
+                check_faults(faults_of_axes(frame_id, state.camera_from_base,
                                             found.map_from_camera))
         is_cut = not found.accepted and self._observer is not None and compared < len(detections)
         for_filter = localizer.covariance_for_filter(found) \

@@ -117,11 +117,12 @@ def test_a_damaged_cache_is_made_anew(small_clip, small_cache, tmp_path, image_r
     damage(folder)
     caplog.clear()
     assert np.array_equal(load(small_clip, tmp_path).encode_crops(image_rgb, BBOXES), before)
-    warning, = caplog.records
+    warning, = (one for one in caplog.records if one.levelno >= logging.WARNING)
     assert 'cannot be used' in warning.getMessage() and str(folder) in warning.getMessage()
     caplog.clear()
     assert np.array_equal(load(small_clip, tmp_path).encode_crops(image_rgb, BBOXES), before)
-    assert caplog.records == [] and [*(tmp_path / 'openvino').iterdir()] == [folder]
+    assert not any(one.levelno >= logging.WARNING for one in caplog.records)
+    assert [*(tmp_path / 'openvino').iterdir()] == [folder]
 
 
 MISSING = """
