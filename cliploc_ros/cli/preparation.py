@@ -66,7 +66,7 @@ def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bo
     picture : Path or None
         Picture for the request; None: one of the demo.
     cache_dir : Path or None
-        The folder to carry; None: the one that the parameters name.
+        The folder to carry; None: that of the parameters.
     has_detector : bool
         Whether the robot runs this package's detector.
     """

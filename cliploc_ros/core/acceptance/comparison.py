@@ -255,7 +255,7 @@ def evidence_of(joined: JoinedFrames, compared: Comparison, covariance: NDArray[
 def _signs(joined: JoinedFrames, compared: Comparison) -> Signs | None:
     """Return the signs that the leading place is no picture; None if keyframes do not propose it.
 
-    In the last frame: it is the one that keyframes are recognized in.
+    In the last frame, since keyframes are recognized there.
     """
     place, last = compared.by_keyframes, joined.frames[-1].observation
     if place is None or place.recognized is None or compared.recognition is None:

@@ -74,7 +74,7 @@ def compare_motion(deviation_per_metre: float, first: RecognizedPlace, second: R
 
 def _covariance(deviation_per_metre: float, first: RecognizedPlace, second: RecognizedPlace,
                 first_from_second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the covariance (6, 6) of the second pose about the one that odometry expects.
+    """Return the covariance (6, 6) of the second pose about the pose expected by odometry.
 
     A wrong pose of a keyframe moves both looks at it alike, so it does not count where the same
     keyframes are seen. What their points add with the distance counts for the way between.

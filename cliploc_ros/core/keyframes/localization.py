@@ -44,8 +44,8 @@ _ITERATIONS, _RIVAL_ITERATIONS = 3000, 1000
 _RIVAL_TOLERANCE = 3.0
 #: Nothing is known of the camera.
 NOTHING_KNOWN = Prior()
-# Cells of the image (columns, rows), and how many points of keyframes and features of the image,
-# which has half as many as a keyframe, make one comparable.
+# Cells of the image (columns, rows). A cell is comparable from so many points of keyframes and
+# features of the image on; an image has half as many features as a keyframe.
 _CELLS = (8, 6)
 _LEAST_EXPECTED, _LEAST_SEEN = 4, 2
 # Points near each other share errors, and several keyframes have the same point: the errors of
@@ -224,7 +224,7 @@ class KeyframeLocalizer:
         """Return which cells have inliers, of those where keyframes expect some.
 
         A cell without features, such as one that something covers, says nothing. The values are
-        the share, the one that is expected of this number of inliers, whose density varies from
+        the share of cells, the share expected of this number of inliers, whose density varies from
         cell to cell (a geometric distribution), and the numbers of cells.
         """
         seen = _count(look.features.pixels, look.camera)

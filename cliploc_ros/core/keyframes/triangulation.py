@@ -33,8 +33,8 @@ class PosedFeatures(NamedTuple):
 def triangulate(images: Sequence[PosedFeatures], row: int) -> NDArray[np.float64]:
     """Return the points (n, 3) of an image's features in its own coordinate frame [m].
 
-    Each feature is matched in the neighbouring images. Each match gives a point; the one that
-    the most matches agree with is kept, or the one with the widest angle. NaN: no point.
+    Each feature is matched in the neighbouring images. Each match gives a point. The point
+    with which most matches agree is kept, or that with the widest angle. NaN: no point.
     """
     ours = images[row]
     poses = np.array([one.map_from_camera for one in images])

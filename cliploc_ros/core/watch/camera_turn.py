@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a camera is turned against its stated mount: a constant angle over looks at right poses.
 
-Each look gives the turn from the given pose to the one that fits, with its information. The given
+Each look gives the turn from the given pose to the fitted pose, with its information. The given
 pose is off by decimetres and its yaw by degrees, which changes along the way, while the turn of
 the camera stays. So looks are averaged by their information and by how much they scatter, far ones
 with less weight (Cauchy). A yaw error of the localizer that never changes is the same as a camera
@@ -100,7 +100,7 @@ class TurnEstimate:
 
 def _turn_of(pose: NDArray[np.float64], information: NDArray[np.float64],
              given: NDArray[np.float64]) -> _Turn:
-    """Return the turn from a given pose (4, 4) to the one that fits, at the likeliest position.
+    """Return the turn from a given pose (4, 4) to the fitted pose, at the likeliest position.
 
     The given position is right to within _DRIFT_M, so what moves the fit away from it is in part
     a turn: the least squares of the fit and of the given position together.
