@@ -180,15 +180,12 @@ class Rig:
 
     def _pass_on(self) -> None:
         """Pass on the instants, in their order, that no other frame can complete."""
-        ready = []
-        with self._changed:
+        with self._changed:  # while passing on, too: the timer must not overtake a frame
             while self._pending and (len(self._pending) > _MOST_PENDING
                                      or not self._may_grow(self._pending[0])):
                 instant = self._pending.popleft()
                 self._passed_ns = max(instant.stamps_ns)
-                ready.append(self._joined(instant.frames))
-        for frame in ready:
-            self._on_frame(frame)
+                self._on_frame(self._joined(instant.frames))
 
     def _may_grow(self, instant: _Instant) -> bool:
         """Return whether a frame of another camera may still come; holds the condition."""
