@@ -246,6 +246,8 @@ class Localizer:
         #: Depth is not used any more once it is wrong.
         self.depth_scale = DepthScale()
         self.cameras = CameraCheck()
+        #: Before the newest frame: with it the same answer comes again.
+        self.cameras_before = CameraCheck()
 
     def localize(self, observation: Observation, run: int | None = 0, limit: int = 1,
                  length_s: float = 0.0, crops: Crops | None = None,
@@ -284,6 +286,7 @@ class Localizer:
         if self.depth_scale.is_wrong:
             observation = replace(observation, depths=None)
             others = [replace(one, depths=None) for one in others]
+        self.cameras_before = self.cameras.copied()
         for one in (*others, observation):
             self.cameras.see(one)
         found = self._localize(observation, run, limit, length_s, crops, recognizer, others)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.geometry.camera_faults import check_faults
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import (
@@ -31,7 +32,7 @@ from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.datasets.cases import Case, CaseFrame
 from cliploc_ros.datasets.depth import depths_from_msg
-from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
+from cliploc_ros.errors import CameraError, CliplocError, DatasetError, OptionsError
 from cliploc_ros.messages import (
     camera_from_msg,
     detections_from_msg,
@@ -56,6 +57,18 @@ def options_of(case: Case) -> RelocalizerOptions:
         return replace(RelocalizerOptions(**options), time_budget_s=math.inf)
     except (AttributeError, KeyError, TypeError, OptionsError) as error:
         raise DatasetError(f'the options of this case are broken: {error}') from error
+
+
+def cameras_of(case: Case) -> CameraCheck:
+    """Return what looks before the last frame said of its cameras; DatasetError: it is broken.
+
+    Nothing is known of them in cases from before this was recorded.
+    """
+    try:
+        return CameraCheck.of_fields(case.report.get('cameras_before', {}))
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError,
+            CameraError) as error:
+        raise DatasetError(f'the cameras of this case are broken: {error}') from error
 
 
 def parameters_of(case: Case) -> Mapping[str, Any]:
@@ -84,8 +97,8 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observer: Observer | None
     session = Localizer(Relocalizer(landmark_map, options))
     keyframes = None if layer is None else KeyframeLocalizer(layer)
     class_map = parse_class_map(parameters['class_map'])
-    found = None
-    for *beside, frame in case.instants():
+    found, instants = None, case.instants()
+    for number, (*beside, frame) in enumerate(instants, start=1):
         image, observation = _observed(frame, parameters, class_map)
         others = [_observed(one, parameters, class_map)[1] for one in beside]
         if can_do_without_crops(options):
@@ -97,6 +110,8 @@ def replay_case(case: Case, landmark_map: LandmarkMap, observer: Observer | None
                 image, observation.camera, observation.detections, frame.stamp_ns).similarities)
         # of several cameras without odometry, the robot itself is what links them
         run = 0 if case.report.get('linked', frame.odom_from_camera is not None) else None
+        if number == len(instants):
+            session.cameras = cameras_of(case)
         found = session.localize(
             observation, run, parameters['fuse_frames'], parameters['fuse_window_s'],
             recorded_crops(observation, options), recognizer,

@@ -15,6 +15,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from numpy.typing import NDArray
 from std_msgs.msg import Header
 
+from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
@@ -58,6 +59,7 @@ class Answer:
     #: Where the robot's x axis points, or the camera looks, from the map's x axis to its y axis
     heading_deg: float = 0.0
     number: int = 0  #: From 1, in the order of the answers to requests; 0: to no request
+    cameras_before: CameraCheck | None = None  #: See Localized; None without an image
 
     @property
     def is_linked(self) -> bool:

@@ -93,6 +93,7 @@ class CaseRecorder:
         case = Case(tuple(frame for one in seen for frame in _case_frames(one)), {
             'verdict': str(last.verdict), 'message': last.message, 'found': str(found.verdict),
             'reason': found.detail, 'map_hash': found.map_hash, 'linked': found.is_linked,
+            'cameras_before': found.cameras_before.fields() if found.cameras_before else {},
             'parameters': asdict(parameters), 'options': asdict(parameters.options())})
         _check_room(folder, case, parameters.record_limit_mb)
         now = datetime.now(UTC).strftime('%Y%m%dT%H%M%S.%f')[:-3]

@@ -145,6 +145,7 @@ class Localized(NamedTuple):
     for_filter: NDArray[np.float64] | None
     cameras: int  #: Number of cameras whose frames of this instant were used
     left_out: tuple[str, ...]  #: Names of those that had none, or of another run of odometry
+    cameras_before: CameraCheck  #: What looks before this frame said of the cameras
 
 
 class FrameLocalizer:
@@ -291,7 +292,7 @@ class FrameLocalizer:
         found, landmark_map, seen = _in_its_map(self._explained(found), self._map, seen)
         layer = None if self._keyframes is None else self._keyframes.layer
         return Localized(found, landmark_map, SeenImage(image, seen, layer), compared, is_cut,
-                         for_filter, 1 + len(others), left_out)
+                         for_filter, 1 + len(others), left_out, localizer.cameras_before)
 
     def look(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
              frame_id: str, map_from_camera: NDArray[np.float64]) -> WatchReport:

@@ -145,7 +145,8 @@ class Pipeline:
         answer = Answer(Verdict.REFUSED, f'{found.reason} {_summary(localized, stages_ms)}',
                         None, frame.received_at, state, localized.is_cut, tuple(beside),
                         stages_ms, localizer.map_hash, found.refusal_kind,
-                        header, _figures(localized, parameters))
+                        header, _figures(localized, parameters),
+                        cameras_before=localized.cameras_before)
         if found.accepted:
             answer = self._publish(header, localized, state, replace(
                 answer, verdict=Verdict.ACCEPTED, detail=_summary(localized, stages_ms)))

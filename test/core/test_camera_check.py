@@ -5,6 +5,7 @@
 A simulated room, seen from many places.
 """
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -236,3 +237,20 @@ def test_odds_are_those_of_gaussians():
 
 def test_nothing_is_known_of_a_new_camera():
     assert CameraCheck().judge([], np.eye(6)) == (1.0, '')
+
+
+@pytest.mark.parametrize('focal', [1.0, 1.3])
+def test_with_what_was_known_before_the_same_answer_comes_again(focal, rng):
+    """As a recorded request is answered again, from a file."""
+    localizer = Localizer(RELOCALIZER)
+    queries = wrong_sensors.scaled_focal([query(rng) for _ in range(LOOKS)], focal)
+    for one in queries:
+        found = localizer.localize(one.observation, None)
+        again = Localizer(RELOCALIZER)
+        again.cameras = CameraCheck.of_fields(json.loads(json.dumps(
+            localizer.cameras_before.fields())))
+        repeated = again.localize(one.observation, None)
+        assert repeated.evidence == found.evidence
+        assert repeated.refusal_kind == found.refusal_kind
+    assert again.cameras.faults == localizer.cameras.faults
+    assert bool(again.cameras.faults) == (focal != 1.0)

@@ -27,10 +27,11 @@ alike, and the looks then say so.
 
 import math
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import asdict, replace
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -235,36 +236,36 @@ class Extent:
     """Where the boxes of a camera end, over some frames, accepted or not."""
 
     def __init__(self) -> None:
-        self._boxes = np.empty((0, 4))
+        self.boxes = np.empty((0, 4))  #: (n, 4) [px]
 
     def add(self, boxes: NDArray[np.float64]) -> None:
         """Take in the boxes (n, 4) of a frame; those that were seen before count once."""
-        low = np.maximum(boxes[:, None, :2], self._boxes[:, :2])
-        high = np.minimum(boxes[:, None, 2:], self._boxes[:, 2:])
+        low = np.maximum(boxes[:, None, :2], self.boxes[:, :2])
+        high = np.minimum(boxes[:, None, 2:], self.boxes[:, 2:])
         shared = np.maximum(high - low, 0.0).prod(axis=2)
-        areas, known = ((one[:, 2:] - one[:, :2]).prod(axis=1) for one in (boxes, self._boxes))
+        areas, known = ((one[:, 2:] - one[:, :2]).prod(axis=1) for one in (boxes, self.boxes))
         is_known = (shared > _SAME_BOX_IOU * (areas[:, None] + known - shared)).any(axis=1)
-        self._boxes = np.concatenate([self._boxes, boxes[~is_known]])[-_MOST_BOXES:]
+        self.boxes = np.concatenate([self.boxes, boxes[~is_known]])[-_MOST_BOXES:]
 
     @property
     def reach(self) -> NDArray[np.float64]:
         """Return the left, top, right and bottom end (4,) of all boxes [px]."""
-        return np.append(self._boxes[:, :2].min(axis=0), self._boxes[:, 2:].max(axis=0))
+        return np.append(self.boxes[:, :2].min(axis=0), self.boxes[:, 2:].max(axis=0))
 
     def log_odds(self, camera: Camera) -> float:
         """Return the log odds that the boxes are in the pixels of another image, 0 or more."""
-        count, size = len(self._boxes), np.array([camera.width, camera.height])
+        count, size = len(self.boxes), np.array([camera.width, camera.height])
         if not count:
             return 0.0
         # by how much each box reaches to the right, down, left and up
-        reaches = np.hstack([self._boxes[:, 2:], size - self._boxes[:, :2]])
+        reaches = np.hstack([self.boxes[:, 2:], size - self.boxes[:, :2]])
         lines, lengths = reaches.max(axis=0), np.tile(size, 2)
         # others that end at the same line, and the density of those that end near it
         ends = (reaches > lines - _BORDER_PX).sum(axis=0) - 1
         near = (reaches > lines - _NEAR_SHARE * lengths).sum(axis=0) - ends
         density = np.maximum(_LEAST_DENSITY * count, near / _NEAR_SHARE) / lengths
         is_line = (lines < (1.0 - _INSIDE) * lengths) & (ends > 0)
-        middles = (self._boxes[:, :2] + self._boxes[:, 2:]) / 2
+        middles = (self.boxes[:, :2] + self.boxes[:, 2:]) / 2
         beyond = int(((middles < 0.0) | (middles > size)).any(axis=1).sum())
         chances = [*np.where(is_line, pdtrc(ends - 1, _BORDER_PX * density), 1.0),
                    float(bdtrc(beyond - 1, count, _BEYOND)) if beyond else 1.0]
@@ -304,6 +305,33 @@ class _Record:
                 self.views, self.since = self.since, Views()
         self.odds, self.by_looks = self.views.odds(self.by_extent), self.views.odds().log_odds
 
+    def copied(self) -> '_Record':
+        """Return what is known now. Views and boxes are replaced, and never change."""
+        same = copy(self)
+        same.extent = copy(self.extent)
+        return same
+
+    def fields(self) -> dict[str, Any]:
+        """Return what is known, as lists and numbers."""
+        return {'camera': asdict(self.camera), 'boxes': self.extent.boxes.tolist(),
+                **{name: [part.tolist() for part in getattr(self, name)]
+                   for name in ('views', 'since')}}
+
+    @classmethod
+    def of_fields(cls, name: str, fields: Mapping[str, Any]) -> '_Record':
+        """Return what `fields` returned; KeyError, TypeError or ValueError: it is broken."""
+        camera = dict(fields['camera'])
+        record = cls(name, Camera(**camera | {'distortion': tuple(camera['distortion'])}))
+        record.extent.boxes = np.array(fields['boxes'], dtype=np.float64).reshape(-1, 4)
+        record.views, record.since = (Views._make(
+            np.array(part, dtype=empty.dtype).reshape(-1, *empty.shape[1:])
+            for part, empty in zip(fields[some], Views(), strict=True))
+            for some in ('views', 'since'))
+        record.by_extent = record.extent.log_odds(record.camera)
+        record.odds = record.views.odds(record.by_extent)
+        record.by_looks = record.views.odds().log_odds
+        return record
+
     @property
     def fault(self) -> str:
         """Return what is certainly wrong with the camera; empty if nothing is."""
@@ -335,6 +363,23 @@ class CameraCheck:
     def __init__(self) -> None:
         self._records: dict[str, _Record] = {}
         self._instants: deque[dict[str, tuple[int, int]]] = deque(maxlen=_MOST_INSTANTS)
+
+    def copied(self) -> 'CameraCheck':
+        """Return what the looks so far say; it stays as it is."""
+        same = CameraCheck()
+        same._records = {name: record.copied() for name, record in self._records.copy().items()}
+        return same
+
+    def fields(self) -> dict[str, Any]:
+        """Return what decides about poses, as lists and numbers, for a file."""
+        return {name: record.fields() for name, record in self._records.items()}
+
+    @classmethod
+    def of_fields(cls, fields: Mapping[str, Any]) -> 'CameraCheck':
+        """Return what `fields` returned; KeyError, TypeError or ValueError: it is broken."""
+        check = cls()
+        check._records = {name: _Record.of_fields(name, one) for name, one in fields.items()}
+        return check
 
     def see(self, observation: Observation) -> None:
         """Take in the boxes of a frame, accepted or not; another camera_info forgets all looks."""
