@@ -192,6 +192,8 @@ def looks_of(joined: JoinedFrames, pose: Finalist) -> list[CameraLook]:
                      / (max(0, int(is_edge.sum()) - 6 - ERRORS) + _PRIOR_RESIDUALS))
         information = fit.information / square
         vector = information @ fit.errors + fit.errors / _WRONG ** 2 / square
+        if not np.isfinite([*information.ravel(), *vector]).all():
+            continue  # it would stay in the sum
         weight = _TERMS.view / max(_TERMS.view, odds_of(information, vector).log_odds)
         looks.append(CameraLook(
             seen.camera_name, seen.stamp_ns == last.stamp_ns,
@@ -327,6 +329,9 @@ class _Record:
             np.array(part, dtype=empty.dtype).reshape(-1, *empty.shape[1:])
             for part, empty in zip(fields[some], Views(), strict=True))
             for some in ('views', 'since'))
+        if not all(np.isfinite(part).all() for part in (
+                record.extent.boxes, *record.views, *record.since)):
+            raise ValueError('values that are not finite')
         record.by_extent = record.extent.log_odds(record.camera)
         record.odds = record.views.odds(record.by_extent)
         record.by_looks = record.views.odds().log_odds
