@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a camera was: poses over time, with interpolation between them."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -55,8 +56,8 @@ class TimedPoses:
         """
         stamps, order = np.unique(np.array(stamps_ns, dtype=np.int64), return_index=True)
         samples = np.array(rows, dtype=np.float64).reshape(-1, 7)[order]
-        norms = np.linalg.norm(samples[:, 3:], axis=1)
-        with np.errstate(invalid='ignore'):
+        with np.errstate(over='ignore', invalid='ignore'):
+            norms = np.linalg.norm(samples[:, 3:], axis=1)
             sound = np.isfinite(samples).all(axis=1) & (np.abs(norms - 1.0) < _MAX_NORM_ERROR)
         if not sound.all():
             raise DatasetError(f'{where}: {int((~sound).sum())} of {len(sound)} poses are not '
@@ -117,7 +118,7 @@ def mount_from_numbers(numbers: Sequence[float]) -> NDArray[np.float64]:
 
     DatasetError: the quaternion is far from unit.
     """
-    norm = float(np.linalg.norm(numbers[3:]))
+    norm = math.hypot(*numbers[3:])
     if not (np.isfinite(numbers).all() and abs(norm - 1.0) < _MAX_NORM_ERROR):
         raise DatasetError(f'mount {list(numbers)}: needs x y z and a unit quaternion '
                            'qx qy qz qw')

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read TUM RGB-D folders (Sturm et al. 2012): rgb.txt, rgb/, groundtruth.txt."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
@@ -74,7 +75,7 @@ def read_tum_trajectory(path: str | Path) -> TimedPoses:
     """
     samples: dict[int, list[float]] = {}
     for where, stamp_ns, values in _stamped_numbers(Path(path), 'tx ty tz qx qy qz qw'):
-        norm = float(np.linalg.norm(values[3:]))
+        norm = math.hypot(*values[3:])
         if abs(norm - 1) > _MAX_NORM_ERROR:
             raise DatasetError(f'{where}: quaternion qx qy qz qw has norm {norm:.3f}, not 1')
         samples.setdefault(stamp_ns, values)

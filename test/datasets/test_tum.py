@@ -10,9 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.datasets.captures.capture import pose_of
 from cliploc_ros.datasets.intrinsics import PRESETS, find_camera, read_camera
+from cliploc_ros.datasets.poses import TimedPoses, mount_from_numbers
 from cliploc_ros.datasets.recorded_detections import read_recorded_detections
-from cliploc_ros.datasets.tum import parse_stamp_ns, read_tum
+from cliploc_ros.datasets.tum import parse_stamp_ns, read_tum, read_tum_trajectory
 from cliploc_ros.errors import DatasetError
 
 MS = 1_000_000
@@ -132,3 +134,17 @@ def test_recorded_detections(tmp_path):
     assert first.class_ids == ('book', 'tv')
     assert list(first.scores) == [0.5789, 0.5789]
     assert second.bboxes_xyxy.shape == (0, 4)
+
+
+@pytest.mark.parametrize('number', [1e200, 1e308, 1e-320, 2.0])
+def test_quaternions_of_any_numbers_are_refused(number, tmp_path):
+    """Squares of the largest overflow: no warning says so, and no pose is made of them."""
+    sample = [0.0, 0.0, 0.0, number, number, number, number]
+    file = tmp_path / 'trajectory.txt'
+    file.write_text('1.0 ' + ' '.join(map(str, sample)))
+    for read in (lambda: pose_of(sample[:3], sample[3:], 'here'),
+                 lambda: mount_from_numbers(sample),
+                 lambda: read_tum_trajectory(file),
+                 lambda: TimedPoses.from_samples([1], [sample], 'here')):
+        with pytest.raises(DatasetError):
+            read()

@@ -3,6 +3,7 @@
 """What the reader of each layout returns: images in the order of time, with cameras and poses."""
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -140,7 +141,7 @@ def pose_of(position: Sequence[float], quat_xyzw: Sequence[float], where: str
     """
     if not np.isfinite([*position, *quat_xyzw]).all():
         return None
-    if abs(float(np.linalg.norm(quat_xyzw)) - 1.0) > _ROTATION_TOLERANCE:
+    if abs(math.hypot(*quat_xyzw) - 1.0) > _ROTATION_TOLERANCE:
         raise DatasetError(f'{where}: the quaternion {list(quat_xyzw)} has no unit length')
     return transform_from_pose(np.array(position), np.array(quat_xyzw))
 

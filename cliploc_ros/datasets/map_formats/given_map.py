@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a reader of a map format returns, and how it becomes a map of ours."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -172,7 +173,7 @@ def _reason_against(landmark: GivenLandmark, scale: float) -> str | None:
         return f'its semi-axes are {shown} m, not {least:g} to {most:g}'
     if np.abs(numbers[:3]).max() * scale > _MAX_COORDINATE_M:
         return f'its centre is beyond {_MAX_COORDINATE_M:g} m'
-    norm = float(np.linalg.norm(numbers[6:]))
+    norm = math.hypot(*numbers[6:])
     if abs(norm - 1.0) > _MAX_NORM_ERROR:
         return f'its quaternion has the norm {norm:.3g}, not 1'
     return None
