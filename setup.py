@@ -63,7 +63,7 @@ setup(
     version='0.2.0',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
-        f'{PACKAGE}.datasets': ['vision_msgs/msg/*.msg'],
+        f'{PACKAGE}.offline.datasets': ['vision_msgs/msg/*.msg'],
         # By name: evaluate and build_map put files of their own beside a recording. A wheel has no
         # command that shows the demo.
         f'{PACKAGE}.demo': [] if BUILDS_WHEEL else [
@@ -72,8 +72,8 @@ setup(
             'assets/openvino/*/*.*',
         ],
         f'{PACKAGE}.core.acceptance': ['calibration.yaml'],
-        f'{PACKAGE}.studio': ['web/studio.*'],
-        f'{PACKAGE}.vocabulary': ['*.yaml'],
+        f'{PACKAGE}.offline.studio': ['web/studio.*'],
+        f'{PACKAGE}.offline.vocabulary': ['*.yaml'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),

@@ -3,10 +3,15 @@
 """Errors that the user can fix."""
 
 import difflib
+from collections import Counter
 from collections.abc import Iterable
 
 # A longer message loses its middle: it begins with what is wrong and ends with what to do.
 _HEAD, _TAIL = 700, 250
+# Share of the letters that a misspelt class has in common with the right one. A guess: bokk, book.
+_ALIKE = 0.75
+# More pairs of classes take seconds to compare.
+_MOST_PAIRS = 100_000
 
 
 class CliplocError(Exception):
@@ -33,6 +38,29 @@ def did_you_mean(name: str, known: Iterable[str], most: int = 1, alike: float = 
     near = difflib.get_close_matches(name.lower(), by_lower_case, most, alike)
     names = ' or '.join(f"'{by_lower_case[one]}'" for one in near)
     return f' (did you mean {names}?)' if near else ''
+
+
+def misspelt_classes(class_ids: Iterable[str], known: Iterable[str], all_known: bool = False
+                     ) -> dict[str, str]:
+    """Return the classes of a map that look misspelt, each with a hint of the right one.
+
+    They are unknown, and nearly a known one. With too many classes, none is returned.
+
+    Parameters
+    ----------
+    class_ids : iterable of str
+        Of the landmarks.
+    known : iterable of str
+        Classes that are right: of the detector, of a vocabulary.
+    all_known : bool
+        Whether these are all. Otherwise the classes of several landmarks are right, too.
+    """
+    counts = Counter(class_ids)
+    right = {*known, *(name for name, count in counts.items() if count > 1 and not all_known)}
+    unknown = [name for name in counts if name not in right]
+    if len(unknown) * len(right) > _MOST_PAIRS:
+        return {}
+    return {name: hint for name in unknown if (hint := did_you_mean(name, right, alike=_ALIKE))}
 
 
 class MapError(CliplocError):

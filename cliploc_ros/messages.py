@@ -16,8 +16,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.depth_image import (
+    PLAUSIBLE_DEPTH_M,
+    DepthCamera,
+    DepthImage,
+    depth_from_counts,
+    depths_of_boxes,
+)
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.camera_faults import Fault, calibration_faults
+from cliploc_ros.core.geometry.camera_faults import Fault, calibration_faults, check_faults
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import CameraError, ImageError, OptionsError
 
@@ -29,6 +36,8 @@ _CHANNELS = {'rgb8': ((0, 1, 2), 3), 'bgr8': ((2, 1, 0), 3), '8UC3': ((2, 1, 0),
 _MAX_PIXELS = 2**26
 _DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
 _DEPTH_HEADER = struct.Struct('<iff')  # of compressedDepth: format, and two parameters of floats
+# Rounding of a depth image that is a whole fraction of the colour image.
+_SAME_ASPECT = 0.02
 _PNG, _JPEG = b'\x89PNG\r\n\x1a\n', b'\xff\xd8'
 # The markers of JPEG that are followed by the size of the image.
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -336,3 +345,50 @@ def parse_class_map(text: str) -> dict[str, str]:
             raise OptionsError(f"class_map: '{theirs}' occurs twice")
         found[theirs] = ours
     return found
+
+
+def depths_from_msg(msg: Any, image_frame: str, camera: Camera, bboxes_xyxy: NDArray[np.float64],
+                    camera_info: Any = None,
+                    color_from_depth: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """Return the depths (n,) of boxes (n, 4) by a message of depth, NaN where there is none [m].
+
+    Parameters
+    ----------
+    msg : sensor_msgs/Image or CompressedImage
+    image_frame : str
+        The coordinate frame of the colour image. Depth in another one is not registered.
+    camera : Camera
+        Of the colour image.
+    camera_info : sensor_msgs/CameraInfo, optional
+        Of a depth camera that is not registered.
+    color_from_depth : ndarray (4, 4), optional
+        Its pose, seen from the colour camera.
+
+    Raises
+    ------
+    CliplocError
+        The message is invalid, or does not belong to the image; says what to do.
+    """
+    depths_m = depth_from_counts(depth_counts_from_msg(msg), None, 'depth')
+    height, width = depths_m.shape
+    own = None
+    if msg.header.frame_id != image_frame:
+        if camera_info is None or color_from_depth is None:
+            raise ImageError(
+                f"depth is in the coordinate frame '{msg.header.frame_id}', the image in "
+                f"'{image_frame}', without {'tf' if camera_info else 'depth_camera_info'} between "
+                'them: publish that, or depth registered to the image')
+        seen_by = camera_from_msg(camera_info, (width, height), False)
+        check_faults(faults_of_camera_info(camera_info, seen_by, False))
+        if not seen_by.is_pinhole:
+            raise ImageError('depth is distorted, by its camera_info: publish it rectified')
+        own = DepthCamera(seen_by.fx, seen_by.fy, seen_by.cx, seen_by.cy, color_from_depth)
+    elif abs(width * camera.height / (height * camera.width) - 1.0) > _SAME_ASPECT:
+        raise ImageError(f'depth has {width}x{height} px, the image {camera.width}x'
+                         f'{camera.height}: publish depth registered to the image')
+    depths = depths_of_boxes(DepthImage(depths_m, own), camera, bboxes_xyxy)[0].astype(np.float64)
+    known, (least, greatest) = depths[np.isfinite(depths)], PLAUSIBLE_DEPTH_M
+    if len(known) and not least < np.median(known) < greatest:
+        raise ImageError(f'depth of the boxes is {np.median(known):.3g} m: 16UC1 is in '
+                         'millimetres, 32FC1 in metres')
+    return depths

@@ -21,11 +21,11 @@ from tqdm import tqdm
 from cliploc_ros.command import run_command
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.evaluation.methods import parse_methods
-from cliploc_ros.evaluation.run import run_methods
-from cliploc_ros.evaluation.summary import Summary, as_text, summarize, table_rows
-from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.files.storage import make_folder
+from cliploc_ros.offline.evaluation.methods import parse_methods
+from cliploc_ros.offline.evaluation.run import run_methods
+from cliploc_ros.offline.evaluation.summary import Summary, as_text, summarize, table_rows
+from cliploc_ros.offline.evaluation.trials import make_queries
 from demo_world.compare import record
 
 #: Objects of each class in the four rooms.

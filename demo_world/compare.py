@@ -19,24 +19,24 @@ from numpy.typing import NDArray
 from cliploc_ros.command import run_command
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.datasets.folders import tum_frames
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.queries import Queries, QueryFrame, save_queries
-from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.demo.truth import TrueFrame, read_frames
-from cliploc_ros.evaluation.methods import parse_methods
-from cliploc_ros.evaluation.recording import make_queries_of
-from cliploc_ros.evaluation.run import compare_methods
-from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.files.storage import make_folder
 from cliploc_ros.models.clip_encoder import load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_weights import import_ultralytics
-from cliploc_ros.recording.networks import RunNetworks
-from cliploc_ros.recording.recorder import record_every_frame
+from cliploc_ros.offline.datasets.folders import tum_frames
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.queries import Queries, QueryFrame, save_queries
+from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.offline.evaluation.methods import parse_methods
+from cliploc_ros.offline.evaluation.recording import make_queries_of
+from cliploc_ros.offline.evaluation.run import compare_methods
+from cliploc_ros.offline.evaluation.trials import make_queries
+from cliploc_ros.offline.recording.networks import RunNetworks
+from cliploc_ros.offline.recording.recorder import record_every_frame
 from demo_world import train_detector
 
 

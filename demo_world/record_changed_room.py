@@ -17,20 +17,20 @@ import numpy as np
 
 from cliploc_ros.core.map.landmark_embeddings import embeddings_path, save_landmark_embeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.datasets.folders import tum_frames
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.observations import save_observations
-from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo import ASSETS
-from cliploc_ros.mapping.association import associate
-from cliploc_ros.mapping.labelling import embed_landmarks
-from cliploc_ros.mapping.landmarks import landmarks_of_map
-from cliploc_ros.mapping.options import MappingOptions
-from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.views import make_views
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.recording.recorder import KeyframeOptions, RecordingOptions, record_once
+from cliploc_ros.offline.datasets.folders import tum_frames
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.observations import save_observations
+from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.offline.mapping.association import associate
+from cliploc_ros.offline.mapping.labelling import embed_landmarks
+from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
+from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.views import make_views
+from cliploc_ros.offline.recording.recorder import KeyframeOptions, RecordingOptions, record_once
 
 _ROUNDING = 128
 _SHOWN_IOU = 0.3

@@ -37,9 +37,9 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
-from cliploc_ros.datasets.queries import Queries, load_queries
-from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
-from cliploc_ros.evaluation.trials import Query, make_queries
+from cliploc_ros.offline.datasets.queries import Queries, load_queries
+from cliploc_ros.offline.evaluation.sensors import with_neighbours, with_vertical
+from cliploc_ros.offline.evaluation.trials import Query, make_queries
 
 CAUSES = ('objects', 'map', 'candidates', 'search', 'choice')
 _MATCHINGS = {'hybrid': 'labels', 'class': 'classes'}

@@ -26,10 +26,10 @@ from cliploc_ros.core.localizer import Localizer, recorded_crops
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation.sensors import with_vertical
-from cliploc_ros.evaluation.trials import Query, make_queries
+from cliploc_ros.offline.datasets.queries import load_queries
+from cliploc_ros.offline.evaluation.sensors import with_vertical
+from cliploc_ros.offline.evaluation.trials import Query, make_queries
 from studies import wrong_sensors
 from studies.reports import interval, table
 from studies.worlds.places import KINDS

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.transforms import RIGHT_M
-from cliploc_ros.evaluation.summary import wilson_interval
+from cliploc_ros.offline.evaluation.summary import wilson_interval
 
 #: Bounds of the confidences that are counted together.
 BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 1.0)
@@ -40,8 +40,13 @@ def mean(values: NDArray[Any], digits: int = 3) -> str:
 def draw_judged(folder: Path, title: str, judged: Mapping[str, Judged]) -> None:
     """Draw a reliability diagram: reliability.png in a folder."""
     # late, since tables need no matplotlib
-    from cliploc_ros.evaluation.figures import add_legend, draw_reliability, new_axes, save_figure
     from cliploc_ros.files.storage import make_folder
+    from cliploc_ros.offline.evaluation.figures import (
+        add_legend,
+        draw_reliability,
+        new_axes,
+        save_figure,
+    )
 
     make_folder(folder)
     figure, axes = new_axes('confidence', f'share of poses within {RIGHT_M:g} m')

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.evaluation.sensors import turned
-from cliploc_ros.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.sensors import turned
+from cliploc_ros.offline.evaluation.trials import Query
 
 
 def with_mount_error(queries: Sequence[Query], groups: Sequence[int], noise_deg: float,

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.datasets.folders import FolderOptions, read_folder
+from cliploc_ros.offline.datasets.folders import FolderOptions, read_folder
 
 ASSETS = Path(__file__).resolve().parents[1] / 'cliploc_ros/demo/assets'
 WALK = ASSETS / 'mapping'

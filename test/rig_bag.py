@@ -9,11 +9,11 @@ from pathlib import Path
 import cv2
 
 from cliploc_ros.core.geometry.transforms import quaternion_from_transform
-from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bags import BagWriter, typestore
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.poses import mount_from_numbers
-from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.offline.datasets import bag_messages
+from cliploc_ros.offline.datasets.bags import BagWriter, typestore
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.poses import mount_from_numbers
+from cliploc_ros.offline.datasets.tum import read_tum
 
 RIG = Path(__file__).resolve().parents[1] / 'cliploc_ros/demo/assets/rig'
 #: By camera: x y z qx qy qz qw on the robot, which is where the front camera is.

@@ -21,7 +21,7 @@ SOURCES = [*MODULES, PROJECT / 'setup.py', *(
     path for folder in ('demo_world', 'studies', 'test')
     for path in sorted((PROJECT / folder).rglob('*.py')))]
 SCRIPTS = [path for path in sorted((PROJECT / 'script').iterdir()) if path.is_file()]
-INTERFACES = sorted((PROJECT / 'cliploc_ros/datasets/vision_msgs/msg').glob('*.msg'))
+INTERFACES = sorted((PROJECT / 'cliploc_ros/offline/datasets/vision_msgs/msg').glob('*.msg'))
 EXECUTABLES = ['build_map', 'check_map', 'demo', 'detector', 'import_map', 'prepare',
                'relocalizer', 'replay', 'studio', 'tum_to_bag', 'wake_up']
 

@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from cliploc_ros.mapping.options import MappingOptions, PoseErrors
-    from cliploc_ros.mapping.posed_detections import PosedDetections
+    from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
+    from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
 # A check at the end of a build: it takes seconds, not the minute of all views.
 _QUICK = ('--positions', '25', '--headings', '6', '--frames', '30')
@@ -126,10 +126,10 @@ def build(options: argparse.Namespace) -> int:
     from cliploc_ros.core.keyframes.layer import remove_layer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.core.map.map_file import write_map
-    from cliploc_ros.datasets.frames import move_frames
-    from cliploc_ros.datasets.map_recording import save_recording
-    from cliploc_ros.make_map import find_labeller, make_map, update_map
-    from cliploc_ros.mapping.options import MappingOptions, OdometryErrors
+    from cliploc_ros.offline.datasets.frames import move_frames
+    from cliploc_ros.offline.datasets.map_recording import save_recording
+    from cliploc_ros.offline.make_map import find_labeller, make_map, update_map
+    from cliploc_ros.offline.mapping.options import MappingOptions, OdometryErrors
 
     begin = time.monotonic()
     path, update, name = options.out, options.update, source_of(options).name
@@ -185,7 +185,7 @@ def build(options: argparse.Namespace) -> int:
 @contextmanager
 def _reporting_failure(path: Path | None) -> Iterator[None]:
     """Make a report of a MappingError: why there is no map, and what was left out of it."""
-    from cliploc_ros.mapping.building import NothingFoundError
+    from cliploc_ros.offline.mapping.building import NothingFoundError
 
     try:
         yield
@@ -242,7 +242,7 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
     import numpy as np
 
     from cliploc_ros.core.geometry.tilt import NO_VERTICAL, find_tilt, tilt_note
-    from cliploc_ros.make_map import scale_of_objects
+    from cliploc_ros.offline.make_map import scale_of_objects
 
     scale, rotation = 1.0, np.eye(3)
     if folder_of(options) is None:  # whoever reads a folder levels it
@@ -265,7 +265,7 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
 
 def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':
     """Return how the poses may be off; None where that is unknown, or not to be refined."""
-    from cliploc_ros.mapping.options import PoseErrors
+    from cliploc_ros.offline.mapping.options import PoseErrors
 
     if options.joint is False:
         if options.pose_noise is not None:

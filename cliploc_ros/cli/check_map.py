@@ -26,7 +26,7 @@ from cliploc_ros.command import (
 )
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.mapping.options import CheckOptions, Thresholds
+from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.mapping.check.relocalization import PosedObservation
-    from cliploc_ros.mapping.posed_detections import PosedDetections
-    from cliploc_ros.studio.images import Images
+    from cliploc_ros.offline.mapping.check.relocalization import PosedObservation
+    from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+    from cliploc_ros.offline.studio.images import Images
 
 _ADVICE_SHOWN = 8
 EPILOG = """\
@@ -123,11 +123,11 @@ def check(options: argparse.Namespace) -> int:
     # Late, so that --help is fast.
     from cliploc_ros.core.geometry.tilt import tilt_note
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.evaluation.map_check.page import PAGE, summary_lines, write_report
-    from cliploc_ros.evaluation.map_check.pictures import draw_pictures
-    from cliploc_ros.evaluation.map_check.views import ViewPainter
     from cliploc_ros.files.storage import make_folder
-    from cliploc_ros.mapping.check.checking import check_map
+    from cliploc_ros.offline.evaluation.map_check.page import PAGE, summary_lines, write_report
+    from cliploc_ros.offline.evaluation.map_check.pictures import draw_pictures
+    from cliploc_ros.offline.evaluation.map_check.views import ViewPainter
+    from cliploc_ros.offline.mapping.check.checking import check_map
 
     begin = time.monotonic()
     landmark_map = LandmarkMap.from_file(options.map)
@@ -167,11 +167,11 @@ def check(options: argparse.Namespace) -> int:
 
 def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Images | None] | None':
     """Return the recording of the command line or of the map, and its images where they are."""
-    from cliploc_ros.datasets.bag_frames import BagTopics
-    from cliploc_ros.datasets.map_recording import load_recording
-    from cliploc_ros.datasets.observations import load_observations
-    from cliploc_ros.recording.recorder import source_of
-    from cliploc_ros.studio.images import images_of_recording, open_images
+    from cliploc_ros.offline.datasets.bag_frames import BagTopics
+    from cliploc_ros.offline.datasets.map_recording import load_recording
+    from cliploc_ros.offline.datasets.observations import load_observations
+    from cliploc_ros.offline.recording.recorder import source_of
+    from cliploc_ros.offline.studio.images import images_of_recording, open_images
 
     recording = load_recording(options.map) if options.observations is None else None
     if options.observations is not None:
@@ -208,9 +208,9 @@ def _image_of(detections: 'PosedDetections', images: 'Images', frame: int
 
 
 def _read_queries(path: Path, landmark_map: 'LandmarkMap') -> list['PosedObservation']:
-    from cliploc_ros.datasets.queries import load_queries
-    from cliploc_ros.evaluation.trials import make_queries
-    from cliploc_ros.mapping.check.relocalization import PosedObservation
+    from cliploc_ros.offline.datasets.queries import load_queries
+    from cliploc_ros.offline.evaluation.trials import make_queries
+    from cliploc_ros.offline.mapping.check.relocalization import PosedObservation
 
     found = make_queries(load_queries(path, landmark_map.landmark_ids), landmark_map)
     return [PosedObservation(one.observation, one.map_from_camera,

@@ -30,17 +30,17 @@ from cliploc_ros.cli.sources import (
 from cliploc_ros.command import SEEDS, finite, limit, not_negative, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation.methods import ALL, AUTO, PAPER_METHODS
+from cliploc_ros.offline.evaluation.methods import ALL, AUTO, PAPER_METHODS
 from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
 
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.datasets.frames import Frames
-    from cliploc_ros.datasets.queries import Queries
-    from cliploc_ros.evaluation.methods import Method
-    from cliploc_ros.evaluation.trials import Query
+    from cliploc_ros.offline.datasets.frames import Frames
+    from cliploc_ros.offline.datasets.queries import Queries
+    from cliploc_ros.offline.evaluation.methods import Method
+    from cliploc_ros.offline.evaluation.trials import Query
 
 EPILOG = f"""\
 methods: {', '.join(PAPER_METHODS)};
@@ -173,14 +173,14 @@ def evaluate(options: argparse.Namespace) -> int:
     # imported late, so that --help is fast
     from cliploc_ros.core.map.joined_map import join_maps
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.datasets.bags import BagReader
-    from cliploc_ros.datasets.cases import is_case
-    from cliploc_ros.evaluation.methods import parse_methods
-    from cliploc_ros.evaluation.recording import with_features
-    from cliploc_ros.evaluation.run import compare_methods
-    from cliploc_ros.evaluation.sensors import with_neighbours, with_vertical
-    from cliploc_ros.evaluation.trials import join_cameras, make_queries
     from cliploc_ros.files.storage import make_folder
+    from cliploc_ros.offline.datasets.bags import BagReader
+    from cliploc_ros.offline.datasets.cases import is_case
+    from cliploc_ros.offline.evaluation.methods import parse_methods
+    from cliploc_ros.offline.evaluation.recording import with_features
+    from cliploc_ros.offline.evaluation.run import compare_methods
+    from cliploc_ros.offline.evaluation.sensors import with_neighbours, with_vertical
+    from cliploc_ros.offline.evaluation.trials import join_cameras, make_queries
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):
@@ -255,7 +255,7 @@ def _notes_on_detector(queries: 'Sequence[Query]', landmark_map: 'LandmarkMap') 
 
 def _notes_on_maps(options: argparse.Namespace) -> list[str]:
     """Return a note on each map that was built from the images it is evaluated on."""
-    from cliploc_ros.datasets.map_recording import load_recording
+    from cliploc_ros.offline.datasets.map_recording import load_recording
 
     if options.queries is not None:
         return []
@@ -306,17 +306,17 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
 
 
 def _truth(options: argparse.Namespace) -> str:
-    from cliploc_ros.datasets.bag_poses import GROUND_TRUTH
+    from cliploc_ros.offline.datasets.bag_poses import GROUND_TRUTH
 
     return str(options.ground_truth or GROUND_TRUTH)
 
 
 def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
     """Answer a recorded request again; return 0 if the verdict is the same, else 1."""
-    from cliploc_ros.datasets.cases import read_case
-    from cliploc_ros.evaluation.cases import options_of, parameters_of, replay_case
     from cliploc_ros.models.map_rows import load_encoder_for_map
     from cliploc_ros.models.observer import Observer
+    from cliploc_ros.offline.datasets.cases import read_case
+    from cliploc_ros.offline.evaluation.cases import options_of, parameters_of, replay_case
 
     case, observer = read_case(options.bag), None
     if options_of(case).needs_similarities:
@@ -339,9 +339,9 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
 def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', camera: str
                   ) -> 'Queries':
     """Return the queries of a file, or record them, of one of several cameras."""
-    from cliploc_ros.datasets.queries import load_queries, save_queries
-    from cliploc_ros.evaluation.recording import recorded_queries
-    from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions
+    from cliploc_ros.offline.datasets.queries import load_queries, save_queries
+    from cliploc_ros.offline.evaluation.recording import recorded_queries
+    from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions
 
     if options.queries is not None:
         if options.save_queries is not None:
@@ -367,15 +367,15 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
 
 
 def _frames(options: argparse.Namespace, camera: str) -> 'Frames':
-    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames, topic_of
-    from cliploc_ros.datasets.bag_poses import (
+    from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames, topic_of
+    from cliploc_ros.offline.datasets.bag_poses import (
         GROUND_TRUTH,
         find_poses,
         poses_of_tf,
         poses_of_topic,
     )
-    from cliploc_ros.datasets.folders import FolderOptions
-    from cliploc_ros.datasets.map_recording import load_recording
+    from cliploc_ros.offline.datasets.folders import FolderOptions
+    from cliploc_ros.offline.datasets.map_recording import load_recording
 
     if options.bag is None:
         frames = read_named_folder(options, FolderOptions(options.intrinsics))

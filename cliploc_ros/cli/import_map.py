@@ -14,7 +14,7 @@ from cliploc_ros.command import finite, positive, printable, run_main
 from cliploc_ros.errors import DatasetError, MapError, OptionsError
 
 if TYPE_CHECKING:
-    from cliploc_ros.datasets.map_formats.given_map import GivenMap
+    from cliploc_ros.offline.datasets.map_formats.given_map import GivenMap
 
 _FORMATS = ('msgloc', 'goreloc', 'oaslam', 'csv')
 _LEFT_OUT_SHOWN = 10
@@ -80,10 +80,10 @@ def import_map(options: argparse.Namespace) -> int:
     # Late, so that --help is fast.
     from cliploc_ros.core.keyframes.layer import remove_layer
     from cliploc_ros.core.map.map_file import write_map
-    from cliploc_ros.datasets.map_formats.given_map import place, refit
-    from cliploc_ros.datasets.map_recording import recording_path
-    from cliploc_ros.datasets.poses import mount_from_numbers
     from cliploc_ros.files.storage import write_text
+    from cliploc_ros.offline.datasets.map_formats.given_map import place, refit
+    from cliploc_ros.offline.datasets.map_recording import recording_path
+    from cliploc_ros.offline.datasets.poses import mount_from_numbers
 
     begin = time.monotonic()
     _check_paths(options)
@@ -145,10 +145,10 @@ def _check_paths(options: argparse.Namespace) -> None:
 
 def _read(options: argparse.Namespace) -> 'GivenMap':
     """Return the content of the input."""
-    from cliploc_ros.datasets.map_formats.given_map import COCO, read_class_names
-    from cliploc_ros.datasets.map_formats.msgloc import read_msgloc
-    from cliploc_ros.datasets.map_formats.quadric_maps import read_goreloc, read_oaslam
-    from cliploc_ros.datasets.map_formats.table import read_table
+    from cliploc_ros.offline.datasets.map_formats.given_map import COCO, read_class_names
+    from cliploc_ros.offline.datasets.map_formats.msgloc import read_msgloc
+    from cliploc_ros.offline.datasets.map_formats.quadric_maps import read_goreloc, read_oaslam
+    from cliploc_ros.offline.datasets.map_formats.table import read_table
 
     if options.format == 'csv':
         if options.class_names is not None:

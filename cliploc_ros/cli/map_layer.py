@@ -12,7 +12,7 @@ from cliploc_ros.errors import MapError, MappingError, OptionsError
 if TYPE_CHECKING:
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.datasets.frames import Frames
+    from cliploc_ros.offline.datasets.frames import Frames
 
 _DEFAULT_POINTS = 600
 
@@ -62,7 +62,7 @@ def make_layer(options: argparse.Namespace, frames: 'Frames | None', landmark_ma
 
     MappingError: a layer is asked for, and the images give none.
     """
-    from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
+    from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 
     if options.keyframe_layer is False:
         return None, ''

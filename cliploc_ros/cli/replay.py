@@ -21,12 +21,12 @@ from cliploc_ros.command import (
     running_ros,
     split_ros_args,
 )
-from cliploc_ros.datasets.bags import BagReader
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.offline.datasets.bags import BagReader
 from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from cliploc_ros.ros.replay import Player
+    from cliploc_ros.offline.replay import Player
 
 NODE_NAME = 'replay'
 
@@ -97,7 +97,7 @@ def replay(args: list[str], stop: Interruption) -> int:
         from rclpy.exceptions import InvalidTopicNameException
         from rclpy.node import Node
     with running_ros(ros_args), BagReader(options.bag) as reader:
-        from cliploc_ros.ros.replay import Player, PlayOptions
+        from cliploc_ros.offline.replay import Player, PlayOptions
 
         # Nothing spins this node, so it could not serve its parameters.
         node = Node(NODE_NAME, start_parameter_services=False)

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from cliploc_ros.datasets.bag_poses import ReadPoses
-    from cliploc_ros.datasets.folders import FolderOptions
-    from cliploc_ros.datasets.frames import DepthFormat, Frames
-    from cliploc_ros.datasets.map_recording import MapRecording
-    from cliploc_ros.datasets.observations import Recorded
-    from cliploc_ros.datasets.poses import Poses
     from cliploc_ros.models.clip_weights import ClipOptions
     from cliploc_ros.models.protocols import DetectorOptions, Prompts
+    from cliploc_ros.offline.datasets.bag_poses import ReadPoses
+    from cliploc_ros.offline.datasets.folders import FolderOptions
+    from cliploc_ros.offline.datasets.frames import DepthFormat, Frames
+    from cliploc_ros.offline.datasets.map_recording import MapRecording
+    from cliploc_ros.offline.datasets.observations import Recorded
+    from cliploc_ros.offline.datasets.poses import Poses
 
 # Of a recording, these change how its frames are read.
 _READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'max_gap', 'image',
@@ -137,7 +137,7 @@ def folder_of(options: argparse.Namespace) -> 'tuple[Path, str] | None':
 
 def read_named_folder(options: argparse.Namespace, folder: 'FolderOptions') -> 'Frames':
     """Return the images of the folder that the command line names, and print what is to know."""
-    from cliploc_ros.datasets.folders import read_folder, rgbd_frames
+    from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
 
     found = folder_of(options)
     assert found is not None
@@ -235,7 +235,7 @@ def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
 
     DatasetError: the bag has none, or several.
     """
-    from cliploc_ros.datasets import bag_frames
+    from cliploc_ros.offline.datasets import bag_frames
 
     open_topics = [name for name in ('image', 'camera_info') if getattr(options, name) is None]
     if bag is None or options.cameras != ['']:
@@ -260,8 +260,8 @@ def read_source(options: argparse.Namespace) -> Source:
 
     CliplocError: the source, the networks or the options cannot be used.
     """
-    from cliploc_ros.datasets.observations import load_recorded
-    from cliploc_ros.recording.recorder import (
+    from cliploc_ros.offline.datasets.observations import load_recorded
+    from cliploc_ros.offline.recording.recorder import (
         KeyframeOptions,
         RecordingOptions,
         observation_file,
@@ -290,7 +290,7 @@ def read_source(options: argparse.Namespace) -> Source:
 def recording_of(options: argparse.Namespace, file: Path, scale: float,
                  rotation: 'NDArray[np.float64]') -> 'MapRecording':
     """Return what a map is built from; its poses are those of a file, scaled and turned."""
-    from cliploc_ros.datasets.map_recording import MapRecording
+    from cliploc_ros.offline.datasets.map_recording import MapRecording
 
     folder = folder_of(options)
     source, layout = folder or (options.bag, '')
@@ -322,9 +322,9 @@ def read_frames(options: argparse.Namespace) -> 'Frames':
 
     CliplocError: the source or the options cannot be used.
     """
-    from cliploc_ros.datasets.folders import FolderOptions
-    from cliploc_ros.datasets.frames import join_frames
-    from cliploc_ros.datasets.tum import read_tum_trajectory
+    from cliploc_ros.offline.datasets.folders import FolderOptions
+    from cliploc_ros.offline.datasets.frames import join_frames
+    from cliploc_ros.offline.datasets.tum import read_tum_trajectory
 
     names, mounts = camera_names(options), _mounts(options)
     if options.bag is not None:
@@ -366,7 +366,7 @@ def _mounts(options: argparse.Namespace) -> 'dict[str, NDArray[np.float64] | Non
 def _frames_of(options: argparse.Namespace, name: str, mount: 'NDArray[np.float64] | None'
                ) -> 'Frames':
     """Return the images of one camera of a bag; its name is '' where it is the only one."""
-    from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames
+    from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
 
     topics = BagTopics(options.image, options.camera_info, options.rectified, options.depth or '')
     read = _read_poses(options, name, mount)
@@ -380,7 +380,7 @@ def _frames_of(options: argparse.Namespace, name: str, mount: 'NDArray[np.float6
 
 def mount_of(numbers: Sequence[float] | None) -> 'NDArray[np.float64] | None':
     """Return the mount (4, 4) that an option gives; None where it is not given."""
-    from cliploc_ros.datasets.poses import mount_from_numbers
+    from cliploc_ros.offline.datasets.poses import mount_from_numbers
 
     return None if numbers is None else mount_from_numbers(numbers)
 
@@ -391,14 +391,14 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: 'NDArray[np.flo
 
     A topic without a mount is the camera's own, in its namespace.
     """
-    from cliploc_ros.datasets.bag_frames import topic_of
-    from cliploc_ros.datasets.bag_poses import (
+    from cliploc_ros.offline.datasets.bag_frames import topic_of
+    from cliploc_ros.offline.datasets.bag_poses import (
         GROUND_TRUTH,
         find_poses,
         poses_of_tf,
         poses_of_topic,
     )
-    from cliploc_ros.datasets.tum import read_tum_trajectory
+    from cliploc_ros.offline.datasets.tum import read_tum_trajectory
 
     given = [name for name in ('pose_topic', 'map_frame', 'trajectory')
              if getattr(options, name) is not None]
@@ -429,8 +429,8 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: 'NDArray[np.flo
 
 def _odometry(options: argparse.Namespace) -> 'dict[str, Poses] | None':
     """Return the cameras of a bag by odometry, by name; None where none is asked for."""
-    from cliploc_ros.datasets.bag_frames import bag_odometry, topic_of
-    from cliploc_ros.datasets.bag_poses import poses_of_tf, poses_of_topic
+    from cliploc_ros.offline.datasets.bag_frames import bag_odometry, topic_of
+    from cliploc_ros.offline.datasets.bag_poses import poses_of_tf, poses_of_topic
 
     max_gap_ns = round(options.max_gap * NS_PER_S)
     if options.odometry_frame is None and options.odometry_topic is None:
@@ -453,9 +453,9 @@ def _odometry(options: argparse.Namespace) -> 'dict[str, Poses] | None':
 def _depth_format(options: argparse.Namespace) -> 'DepthFormat':
     import numpy as np
 
+    from cliploc_ros.core.depth_image import DepthCamera
     from cliploc_ros.core.geometry.transforms import make_transform
-    from cliploc_ros.datasets.depth import DepthCamera
-    from cliploc_ros.datasets.frames import DepthFormat
+    from cliploc_ros.offline.datasets.frames import DepthFormat
 
     camera = None
     if options.depth_intrinsics is not None:

@@ -18,12 +18,12 @@ from cliploc_ros.command import run_main, within
 from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:
-    from cliploc_ros.mapping.posed_detections import PosedDetections
-    from cliploc_ros.studio.images import Images
-    from cliploc_ros.studio.live import LiveRelocalizer
-    from cliploc_ros.studio.phrases import PhraseFinder
-    from cliploc_ros.studio.recording import Recording
-    from cliploc_ros.studio.studio import Studio
+    from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+    from cliploc_ros.offline.studio.images import Images
+    from cliploc_ros.offline.studio.live import LiveRelocalizer
+    from cliploc_ros.offline.studio.phrases import PhraseFinder
+    from cliploc_ros.offline.studio.recording import Recording
+    from cliploc_ros.offline.studio.studio import Studio
 
 _LOOPBACK = '127.0.0.1'
 EPILOG = """\
@@ -84,7 +84,7 @@ def serve(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C; return the exit code."""
     # Late, so that --help is fast.
     from cliploc_ros.core.geometry.tilt import tilt_note
-    from cliploc_ros.studio.page import serve_studio
+    from cliploc_ros.offline.studio.page import serve_studio
 
     studio = open_studio(options)
     try:
@@ -110,7 +110,7 @@ def follow(options: argparse.Namespace) -> 'AbstractContextManager[LiveRelocaliz
     if not options.ros:
         return nullcontext()
     try:
-        from cliploc_ros.studio.live import follow_relocalizer
+        from cliploc_ros.offline.studio.live import follow_relocalizer
     except ImportError as error:
         raise OptionsError(f'--ros needs ROS ({error}): source it first, as with source '
                            '/opt/ros/jazzy/setup.bash') from error
@@ -119,15 +119,15 @@ def follow(options: argparse.Namespace) -> 'AbstractContextManager[LiveRelocaliz
 
 def open_studio(options: argparse.Namespace) -> 'Studio':
     """Return the studio that the command line asks for."""
-    from cliploc_ros.datasets.bag_frames import BagTopics
-    from cliploc_ros.datasets.folders import find_layout
-    from cliploc_ros.datasets.map_recording import load_recording
-    from cliploc_ros.datasets.observations import load_observations
-    from cliploc_ros.studio.document import Document
-    from cliploc_ros.studio.floor import read_occupancy_grid
-    from cliploc_ros.studio.images import images_of_recording, open_images, views_of_folder
-    from cliploc_ros.studio.recording import Recording
-    from cliploc_ros.studio.studio import Studio
+    from cliploc_ros.offline.datasets.bag_frames import BagTopics
+    from cliploc_ros.offline.datasets.folders import find_layout
+    from cliploc_ros.offline.datasets.map_recording import load_recording
+    from cliploc_ros.offline.datasets.observations import load_observations
+    from cliploc_ros.offline.studio.document import Document
+    from cliploc_ros.offline.studio.floor import read_occupancy_grid
+    from cliploc_ros.offline.studio.images import images_of_recording, open_images, views_of_folder
+    from cliploc_ros.offline.studio.recording import Recording
+    from cliploc_ros.offline.studio.studio import Studio
 
     images = detections = None
     is_folder = options.images is not None and find_layout(options.images) is not None
@@ -173,8 +173,8 @@ def _cameras(options: argparse.Namespace, detections: 'PosedDetections | None') 
 def _phrase_finder(options: argparse.Namespace, recording: 'Recording | None',
                    images: 'Images | None') -> 'PhraseFinder | None':
     from cliploc_ros.models.clip_weights import ClipOptions
-    from cliploc_ros.studio.phrases import PhraseFinder
-    from cliploc_ros.vocabulary.vocabulary import load_vocabulary
+    from cliploc_ros.offline.studio.phrases import PhraseFinder
+    from cliploc_ros.offline.vocabulary.vocabulary import load_vocabulary
 
     if (options.clip_model is None) != (options.clip_pretrained is None):
         raise OptionsError('give both --clip-model and --clip-pretrained, or neither')

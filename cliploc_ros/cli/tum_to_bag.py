@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cliploc_ros.command import positive_int, run_main
-from cliploc_ros.datasets.bags import STORAGES
+from cliploc_ros.offline.datasets.bags import STORAGES
 
 EPILOG = """\
 topics (with --prefix camera: /camera/image and so on):
@@ -66,9 +66,9 @@ def convert(options: argparse.Namespace) -> int:
     # Late, so that --help is fast.
     from tqdm import tqdm
 
-    from cliploc_ros.datasets.folders import read_sequence
-    from cliploc_ros.datasets.recorded_detections import read_recorded_detections
-    from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum
+    from cliploc_ros.offline.datasets.folders import read_sequence
+    from cliploc_ros.offline.datasets.recorded_detections import read_recorded_detections
+    from cliploc_ros.offline.datasets.tum_conversion import ConversionOptions, convert_tum
 
     begin = time.monotonic()
     sequence, camera, origin = read_sequence(options.folder, options.intrinsics)

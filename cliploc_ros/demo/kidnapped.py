@@ -31,13 +31,13 @@ from cliploc_ros.core.geometry.transforms import (
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.watch.watch import WatchState
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.poses import slerp
-from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo.pictures import Moment, Step, draw_kidnapped
 from cliploc_ros.demo.processes import DemoError, own_ros_domain
 from cliploc_ros.demo.run import DemoOptions, nodes, prepare
 from cliploc_ros.messages import detections_from_msg
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.poses import slerp
+from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_to_msg, pose_with_covariance_msg, stamp_ns
 from cliploc_ros.ros.outputs.visualization import image_to_msg

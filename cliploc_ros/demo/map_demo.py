@@ -9,10 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.datasets.folders import tum_frames
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.observations import load_recorded
-from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo.map_review import (
     PICTURE,
     console_lines,
@@ -25,16 +21,20 @@ from cliploc_ros.demo.map_review import (
 from cliploc_ros.demo.processes import DemoError, find_executable
 from cliploc_ros.demo.run import DemoOptions, WakeUpMap, prepare, run_demo
 from cliploc_ros.demo.truth import read_frames, read_objects
-from cliploc_ros.evaluation.methods import Method
-from cliploc_ros.evaluation.recording import make_queries_of
-from cliploc_ros.evaluation.run import run_methods
-from cliploc_ros.evaluation.summary import Summary, summarize
-from cliploc_ros.evaluation.trials import make_queries
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.map_rows import embed_map
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.recording.networks import LoadNetworks
-from cliploc_ros.recording.recorder import record_every_frame
+from cliploc_ros.offline.datasets.folders import tum_frames
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.observations import load_recorded
+from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.offline.evaluation.methods import Method
+from cliploc_ros.offline.evaluation.recording import make_queries_of
+from cliploc_ros.offline.evaluation.run import run_methods
+from cliploc_ros.offline.evaluation.summary import Summary, summarize
+from cliploc_ros.offline.evaluation.trials import make_queries
+from cliploc_ros.offline.recording.networks import LoadNetworks
+from cliploc_ros.offline.recording.recorder import record_every_frame
 
 
 def run_map_demo(options: DemoOptions) -> None:

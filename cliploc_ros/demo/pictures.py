@@ -23,8 +23,8 @@ from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.demo.review import Judged, Review
-from cliploc_ros.evaluation.drawing import draw_map, spread_names, write_name
 from cliploc_ros.files.page import ACCEPTED, BAD
+from cliploc_ros.offline.evaluation.drawing import draw_map, spread_names, write_name
 
 _DPI = 110
 _BOX, _UNMATCHED, _ELLIPSE, _EXPECTED = '#56B4E9', '#FFFFFF', '#E69F00', '#F0E442'

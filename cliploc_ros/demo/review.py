@@ -22,11 +22,11 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.tum import TumSequence, parse_stamp_ns
 from cliploc_ros.demo.robot import WakeUp
 from cliploc_ros.demo.truth import read_frames, true_ids
 from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.tum import TumSequence, parse_stamp_ns
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
 

@@ -20,13 +20,13 @@ from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.datasets.bags import BagMessage, BagReader
 from cliploc_ros.demo.processes import DemoError
 from cliploc_ros.messages import detections_from_msg
+from cliploc_ros.offline.datasets.bags import BagMessage, BagReader
+from cliploc_ros.offline.replay import create_publisher
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.frame_source import of_camera
-from cliploc_ros.ros.replay import create_publisher
 from cliploc_ros.units import NS_PER_S
 
 _PATIENCE_S = 60.0

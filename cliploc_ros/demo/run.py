@@ -18,10 +18,6 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.datasets.bags import BagReader
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.tum import TumSequence, read_tum
-from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum
 from cliploc_ros.demo import page
 from cliploc_ros.demo.pictures import draw_top_view, draw_wake_up
 from cliploc_ros.demo.processes import (
@@ -34,6 +30,10 @@ from cliploc_ros.demo.processes import (
 from cliploc_ros.demo.review import Judged, Reviewer, judge
 from cliploc_ros.demo.robot import Robot
 from cliploc_ros.files.storage import make_folder
+from cliploc_ros.offline.datasets.bags import BagReader
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.tum import TumSequence, read_tum
+from cliploc_ros.offline.datasets.tum_conversion import ConversionOptions, convert_tum
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # The first start compiles the kernels of the search.

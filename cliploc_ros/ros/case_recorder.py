@@ -23,7 +23,7 @@ from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 if TYPE_CHECKING:
-    from cliploc_ros.datasets.cases import Case, CaseFrame
+    from cliploc_ros.offline.datasets.cases import Case, CaseFrame
 
 # As many frames as acceptance looks back to, see cliploc_ros.core.acceptance.looks.
 _MAX_FRAMES = 20
@@ -83,7 +83,7 @@ class CaseRecorder:
             raise OptionsError('record_folder is empty: set it at the start, to a folder with '
                                'room for record_limit_mb')
         try:
-            from cliploc_ros.datasets.cases import Case, write_case
+            from cliploc_ros.offline.datasets.cases import Case, write_case
         except ImportError as error:
             raise OptionsError(f'recording needs rosbags ({error}): pip install rosbags'
                                ) from error
@@ -138,7 +138,7 @@ def _case_frames(seen: _Seen) -> list['CaseFrame']:
 
 
 def _case_frame(frame: Frame, state: RobotState | None) -> 'CaseFrame':
-    from cliploc_ros.datasets.cases import CaseFrame
+    from cliploc_ros.offline.datasets.cases import CaseFrame
 
     detections, odom_from_camera = frame.detections, None
     if any(one.bbox.center.theta != 0.0 for one in detections.detections):

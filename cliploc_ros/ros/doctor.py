@@ -23,10 +23,10 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from cliploc_ros.core.detector_check import DetectorCheck
 from cliploc_ros.core.geometry.camera_faults import fields_of_view
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.datasets.depth import depths_from_msg
-from cliploc_ros.errors import CliplocError
+from cliploc_ros.errors import CliplocError, misspelt_classes
 from cliploc_ros.messages import (
     camera_from_msg,
+    depths_from_msg,
     detections_from_msg,
     faults_of_camera_info,
     faults_of_headers,
@@ -64,7 +64,6 @@ from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 from cliploc_ros.ros.request import time_is_up
 from cliploc_ros.ros.running import NotRunningError, ask, parameters_of_files, whole_name
 from cliploc_ros.units import NS_PER_S
-from cliploc_ros.vocabulary.vocabulary import misspelt_classes
 
 # Images that come later after their stamps show clocks that differ (a guess).
 _MOST_LAG_S = 1.0
@@ -347,9 +346,8 @@ def _check_detections(parameters: RelocalizerParameters, localizer: FrameLocaliz
                                                     frame.detections.header.frame_id)]
         if faults:
             return report.add('detector', State.FAIL, '; '.join(fault.text for fault in faults))
-        misspelt = misspelt_classes(localizer.landmark_map.class_ids)
-        if names := ', '.join(f"'{name}'{hint}" for name, hint in misspelt.items()
-                              if name not in found.class_ids):
+        misspelt = misspelt_classes(localizer.landmark_map.class_ids, found.class_ids)
+        if names := ', '.join(f"'{name}'{hint}" for name, hint in misspelt.items()):
             text += f'; the map has the class {names}'
     report.add('detector', State.PASS, text)
 

@@ -50,11 +50,11 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization, in_its_map
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.watch import Watch, WatchReport
-from cliploc_ros.datasets.depth import depths_from_msg
 from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.messages import (
     camera_from_msg,
+    depths_from_msg,
     detections_from_msg,
     image_from_msg,
     parse_class_map,

@@ -24,9 +24,9 @@ from tqdm import tqdm
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation.run import RunError
 from cliploc_ros.files.parallel import MakeWork, run_tasks
 from cliploc_ros.files.storage import make_folder
+from cliploc_ros.offline.evaluation.run import RunError
 from studies.acceptance import fit
 from studies.acceptance.looks import (
     LOOKS,

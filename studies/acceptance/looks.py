@@ -17,8 +17,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.evaluation.sensors import with_neighbours
-from cliploc_ros.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.sensors import with_neighbours
+from cliploc_ros.offline.evaluation.trials import Query
 from studies.acceptance.places import (
     STEP_DEG,
     STEP_M,

@@ -13,7 +13,7 @@ from cliploc_ros.core.acceptance.look_alikes import find_alike
 from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Region
-from cliploc_ros.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.trials import Query
 from studies.acceptance.places import ALL, LEVEL, ONE
 from studies.acceptance.troubles import Trouble, World, unchanged
 

@@ -20,9 +20,9 @@ from cliploc_ros.core.localizer import Localizer, recorded_crops
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.evaluation.figures import within_ellipsoid
-from cliploc_ros.evaluation.methods import AUTO, Method
-from cliploc_ros.evaluation.trials import Query, run_trial
+from cliploc_ros.offline.evaluation.figures import within_ellipsoid
+from cliploc_ros.offline.evaluation.methods import AUTO, Method
+from cliploc_ros.offline.evaluation.trials import Query, run_trial
 from studies.acceptance.fit import best_recall
 from studies.acceptance.places import SEED, AnyPlace, Place
 from studies.acceptance.priors import PRIORS
@@ -202,9 +202,9 @@ def draw_curves(folder: Path, outcomes: Sequence[Outcome]) -> Path:
     # late, since tables need no matplotlib
     from matplotlib.figure import Figure
 
-    from cliploc_ros.evaluation.figures import save_figure
-    from cliploc_ros.evaluation.summary import wilson_interval
     from cliploc_ros.files.storage import make_folder
+    from cliploc_ros.offline.evaluation.figures import save_figure
+    from cliploc_ros.offline.evaluation.summary import wilson_interval
 
     make_folder(folder)
     curves = {name: list(some) for name, some in groupby(outcomes, lambda one: one.trouble)}

@@ -23,11 +23,11 @@ from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_difference
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation.sensors import with_neighbours
-from cliploc_ros.evaluation.summary import wilson_interval
-from cliploc_ros.evaluation.trials import Query, make_queries
+from cliploc_ros.offline.datasets.queries import load_queries
+from cliploc_ros.offline.evaluation.sensors import with_neighbours
+from cliploc_ros.offline.evaluation.summary import wilson_interval
+from cliploc_ros.offline.evaluation.trials import Query, make_queries
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_world
@@ -157,8 +157,8 @@ def run(arguments: list[str]) -> int:
 
 def _draw(folder: Path, squares: Mapping[str, Squares]) -> None:
     # late, since the table needs no matplotlib
-    from cliploc_ros.evaluation.figures import add_legend, new_axes, save_figure
     from cliploc_ros.files.storage import make_folder
+    from cliploc_ros.offline.evaluation.figures import add_legend, new_axes, save_figure
 
     make_folder(folder)
     figure, axes = new_axes('share that the ellipsoids should hold', 'share that they hold')

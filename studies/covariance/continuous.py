@@ -31,7 +31,7 @@ from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.trials import Query
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_walk
 

@@ -19,7 +19,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.datasets.frames import RawFrame
+from cliploc_ros.offline.datasets.frames import RawFrame
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]

@@ -18,14 +18,14 @@ from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.evaluation.figures import (
+from cliploc_ros.offline.evaluation.figures import (
     add_legend,
     draw_reliability,
     new_axes,
     save_figure,
     within_ellipsoid,
 )
-from cliploc_ros.evaluation.summary import wilson_interval
+from cliploc_ros.offline.evaluation.summary import wilson_interval
 from studies.keyframes.records import Record, StoredCase, StoredRecognizer, localize
 
 WAYS = ('objects', 'keyframes', 'both')

@@ -32,18 +32,18 @@ from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.core.search.scene import Prior
-from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
-from cliploc_ros.datasets.frames import DepthFormat, Frames, RawFrame
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.files.storage import make_folder, write_file
-from cliploc_ros.mapping.building import build_map
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
-from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
-from cliploc_ros.recording.networks import MAX_DETECTIONS, RunNetworks
-from cliploc_ros.recording.recorder import record_every_frame
+from cliploc_ros.offline.datasets.folders import FolderOptions, rgbd_frames, tum_frames
+from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, RawFrame
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
+from cliploc_ros.offline.recording.networks import MAX_DETECTIONS, RunNetworks
+from cliploc_ros.offline.recording.recorder import record_every_frame
 from studies.keyframes.cases import (
     Case,
     Floats,

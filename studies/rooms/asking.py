@@ -21,9 +21,9 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import MappingError
-from cliploc_ros.evaluation.trials import Query
-from cliploc_ros.mapping.building import build_map
-from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
+from cliploc_ros.offline.evaluation.trials import Query
+from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from studies.blame import blame
 from studies.rooms.baseline import SiftMap
 from studies.rooms.rooms import ROBOT, Room, RoomOptions, known_of, read_room

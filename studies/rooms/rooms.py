@@ -20,15 +20,21 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.features import Features
 from cliploc_ros.core.keyframes.localization import query_features
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.datasets.folders import FolderOptions, find_layout, read_folder
-from cliploc_ros.datasets.frames import DepthFormat, Frames, ImageFile, RawFrame, folder_frames
 from cliploc_ros.errors import DatasetError, OptionsError
-from cliploc_ros.evaluation.sensors import with_vertical
-from cliploc_ros.evaluation.trials import ImageFeatures, Query
 from cliploc_ros.files.storage import make_folder, write_file
-from cliploc_ros.mapping.posed_detections import PosedDetections
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
+from cliploc_ros.offline.datasets.folders import FolderOptions, find_layout, read_folder
+from cliploc_ros.offline.datasets.frames import (
+    DepthFormat,
+    Frames,
+    ImageFile,
+    RawFrame,
+    folder_frames,
+)
+from cliploc_ros.offline.evaluation.sensors import with_vertical
+from cliploc_ros.offline.evaluation.trials import ImageFeatures, Query
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
 from cliploc_ros.units import NS_PER_S
 from studies.acceptance.places import observation_of
 

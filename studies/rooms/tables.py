@@ -10,7 +10,7 @@ from math import inf
 import numpy as np
 
 from cliploc_ros.core.geometry.transforms import RIGHT_M
-from cliploc_ros.evaluation.figures import within_ellipsoid
+from cliploc_ros.offline.evaluation.figures import within_ellipsoid
 from studies.reports import BINS, FAR_DEG, FAR_M, interval, table
 from studies.rooms.asking import (
     BOTH,

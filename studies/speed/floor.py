@@ -27,11 +27,11 @@ from scipy.spatial import cKDTree
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.datasets.observations import load_observations, save_observations
-from cliploc_ros.datasets.queries import Queries, QueryFrame, save_queries
-from cliploc_ros.mapping.building import build_map
-from cliploc_ros.mapping.labelling import embed_landmarks
-from cliploc_ros.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.offline.datasets.observations import load_observations, save_observations
+from cliploc_ros.offline.datasets.queries import Queries, QueryFrame, save_queries
+from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.mapping.labelling import embed_landmarks
+from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from studies.speed.floors import (
     CAMERA,
     Floor,

@@ -18,7 +18,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from studies.worlds.detector import hidden
 from studies.worlds.things import CLASS_NAMES, TYPICAL
 

@@ -34,7 +34,6 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.datasets.intrinsics import find_camera
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.clip_encoder import ClipEncoder, load_encoder
@@ -44,6 +43,7 @@ from cliploc_ros.models.observer import Observer
 from cliploc_ros.models.profiles import PROFILES, load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_weights import import_ultralytics
+from cliploc_ros.offline.datasets.intrinsics import find_camera
 from studies.speed.startup import write_random_checkpoint
 
 ENGINES = ('pytorch', 'openvino')

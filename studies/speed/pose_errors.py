@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.datasets.observations import load_observations
-from cliploc_ros.mapping.building import BuiltMap, build_map
-from cliploc_ros.mapping.options import MappingOptions, OdometryErrors, PoseErrors
-from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.datasets.observations import load_observations
+from cliploc_ros.offline.mapping.building import BuiltMap, build_map
+from cliploc_ros.offline.mapping.options import MappingOptions, OdometryErrors, PoseErrors
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
 LEVELS = ((0.02, 0.5), (0.05, 1.0), (0.1, 2.0))
 KINDS = ('independent', 'correlated', 'drifting')

@@ -92,7 +92,9 @@ def query_scenes(queries: Path, map_file: Path, matching: str) -> list[Scene]:
     matching : str
         'hybrid' or 'class'.
     """
-    from cliploc_ros.datasets.queries import load_queries  # core needs no data sets otherwise
+    from cliploc_ros.offline.datasets.queries import (
+        load_queries,  # core needs no data sets otherwise
+    )
 
     landmark_map = LandmarkMap.from_file(map_file)
     recorded = load_queries(queries, landmark_map.landmark_ids)

@@ -21,9 +21,9 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.watch import Watch
-from cliploc_ros.datasets.observations import load_observations, load_recorded
-from cliploc_ros.datasets.tum import read_tum_trajectory
-from cliploc_ros.mapping.building import build_map
+from cliploc_ros.offline.datasets.observations import load_observations, load_recorded
+from cliploc_ros.offline.datasets.tum import read_tum_trajectory
+from cliploc_ros.offline.mapping.building import build_map
 from studies.acceptance.fit import FITTED_KINDS
 from studies.watch import fit
 from studies.watch.judge import Alarm, Right, alarm_table, judge, right_table

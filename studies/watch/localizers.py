@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.units import NS_PER_S
 from studies.acceptance.places import observation_of
 from studies.worlds.world import make_drive

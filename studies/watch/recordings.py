@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, pose_error
 from cliploc_ros.core.watch.watch import Watch, WatchState
-from cliploc_ros.datasets.observations import Recorded
-from cliploc_ros.datasets.poses import Poses
-from cliploc_ros.evaluation.figures import add_legend, new_axes, save_figure
 from cliploc_ros.files.storage import make_folder, write_text
+from cliploc_ros.offline.datasets.observations import Recorded
+from cliploc_ros.offline.datasets.poses import Poses
+from cliploc_ros.offline.evaluation.figures import add_legend, new_axes, save_figure
 from cliploc_ros.units import NS_PER_S
 from studies.acceptance.places import observation_of
 
-# Okabe and Ito, see cliploc_ros.evaluation.figures.
+# Okabe and Ito, see cliploc_ros.offline.evaluation.figures.
 _COLORS = {'localized': '#009E73', 'uncertain': '#E69F00', 'lost': '#D55E00'}
 _ERROR, _PROBABILITY = '#555555', '#0072B2'
 

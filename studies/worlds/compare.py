@@ -23,9 +23,9 @@ from cliploc_ros.core.geometry.ellipsoid import (
 )
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.datasets.queries import load_queries
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.evaluation.trials import Query, make_queries
+from cliploc_ros.offline.datasets.queries import load_queries
+from cliploc_ros.offline.evaluation.trials import Query, make_queries
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_world
 

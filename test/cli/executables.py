@@ -23,8 +23,8 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rosbags.interfaces import QosHistory
 
-from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bags import RELIABLE_QOS, BagWriter
+from cliploc_ros.offline.datasets import bag_messages
+from cliploc_ros.offline.datasets.bags import RELIABLE_QOS, BagWriter
 
 PROJECT = Path(__file__).resolve().parents[2]
 TIMEOUT_S = 120.0  # a limit for hangs alone, on a machine under load

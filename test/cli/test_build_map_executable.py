@@ -9,7 +9,7 @@ import pytest
 
 from cliploc_ros.cli.build_map import main
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.datasets.observations import load_observations, save_observations
+from cliploc_ros.offline.datasets.observations import load_observations, save_observations
 
 
 @pytest.fixture(scope='module')

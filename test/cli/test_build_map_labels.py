@@ -13,7 +13,7 @@ import pytest
 from cliploc_ros.cli.build_map import main
 from cliploc_ros.core.map.landmark_embeddings import load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.datasets.observations import load_observations
+from cliploc_ros.offline.datasets.observations import load_observations
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 CLIP = ('--clip-model', ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'clip.safetensors',

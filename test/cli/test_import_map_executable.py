@@ -11,7 +11,7 @@ from foreign_maps import table_text
 
 from cliploc_ros.cli.import_map import main
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.datasets.observations import load_observations, save_observations
+from cliploc_ros.offline.datasets.observations import load_observations, save_observations
 
 
 @pytest.fixture

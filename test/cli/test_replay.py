@@ -17,12 +17,12 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from vision_msgs.msg import Detection2DArray
 
-from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bags import LATCHED_QOS, BagReader, BagWriter
-from cliploc_ros.datasets.intrinsics import PRESETS
-from cliploc_ros.datasets.recorded_detections import read_recorded_detections
-from cliploc_ros.datasets.tum import read_tum
-from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum
+from cliploc_ros.offline.datasets import bag_messages
+from cliploc_ros.offline.datasets.bags import LATCHED_QOS, BagReader, BagWriter
+from cliploc_ros.offline.datasets.intrinsics import PRESETS
+from cliploc_ros.offline.datasets.recorded_detections import read_recorded_detections
+from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.offline.datasets.tum_conversion import ConversionOptions, convert_tum
 
 CLASSES = {
     '/image': Image,

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from executables import run, wait_until
 
-from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bags import BagReader
+from cliploc_ros.offline.datasets import bag_messages
+from cliploc_ros.offline.datasets.bags import BagReader
 
 FORMS = [(storage, form) for storage in ('sqlite3', 'mcap') for form in ('raw', 'compressed')]
 

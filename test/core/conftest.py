@@ -11,7 +11,7 @@ import yaml
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.datasets.queries import Queries, load_queries
+from cliploc_ros.offline.datasets.queries import Queries, load_queries
 
 
 @pytest.fixture(scope='session')

@@ -29,7 +29,7 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN
-from cliploc_ros.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.trials import Query
 from studies import wrong_sensors
 
 ROOM = make_room()

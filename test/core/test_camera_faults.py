@@ -7,7 +7,7 @@ import pytest
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.camera_faults import camera_faults, fields_of_view
-from cliploc_ros.datasets.intrinsics import PRESETS, read_camera
+from cliploc_ros.offline.datasets.intrinsics import PRESETS, read_camera
 
 SOUND = {'width': 640, 'height': 480, 'fx': 525.0, 'fy': 525.0, 'cx': 320.0, 'cy': 240.0}
 FISHEYE = {'distortion_model': 'equidistant', 'distortion': (-0.02, 0.01, -0.005, 0.001)}

@@ -21,7 +21,7 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.scene import make_scene
-from cliploc_ros.evaluation.trials import make_queries
+from cliploc_ros.offline.evaluation.trials import make_queries
 from studies.acceptance.troubles import exchange_landmarks
 
 # 95 % of a chi-squared variable of six degrees of freedom lies below this.

@@ -7,7 +7,8 @@ import yaml
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
 
-from cliploc_ros.datasets.bags import (
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.bags import (
     LATCHED_QOS,
     RELIABLE_QOS,
     STORAGES,
@@ -15,7 +16,6 @@ from cliploc_ros.datasets.bags import (
     BagReader,
     typestore,
 )
-from cliploc_ros.errors import DatasetError
 
 STRING = 'std_msgs/msg/String'
 # From ROS's own generator, not computed here.

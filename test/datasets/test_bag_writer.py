@@ -10,10 +10,10 @@ import yaml
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bags import LATCHED_QOS, RELIABLE_QOS, BagReader, BagWriter
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.messages import detections_from_msg
+from cliploc_ros.offline.datasets import bag_messages
+from cliploc_ros.offline.datasets.bags import LATCHED_QOS, RELIABLE_QOS, BagReader, BagWriter
 
 STAMP_NS = 1341847980722988001
 CAMERA = Camera(64, 48, 53.5, 53.9, 32.0, 24.7, 'plumb_bob', (0.1, -0.2, 0.001, 0.002, 0.3))

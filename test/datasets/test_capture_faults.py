@@ -20,8 +20,8 @@ from capture_folders import (
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from cliploc_ros.datasets.folders import FolderOptions, read_folder
 from cliploc_ros.errors import CliplocError, DatasetError
+from cliploc_ros.offline.datasets.folders import FolderOptions, read_folder
 
 pytestmark = pytest.mark.needs('pycolmap')
 METRES = FolderOptions(scale=1.0)

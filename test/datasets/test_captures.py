@@ -21,16 +21,16 @@ from capture_folders import (
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.datasets.folders import FolderOptions, find_layout, read_folder
-from cliploc_ros.datasets.observations import load_observations, save_observations
 from cliploc_ros.errors import MappingError
-from cliploc_ros.make_map import scale_of_objects
-from cliploc_ros.mapping.building import build_map
-from cliploc_ros.mapping.options import MappingOptions
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.recording.networks import RunNetworks
-from cliploc_ros.recording.recorder import (
+from cliploc_ros.offline.datasets.folders import FolderOptions, find_layout, read_folder
+from cliploc_ros.offline.datasets.observations import load_observations, save_observations
+from cliploc_ros.offline.make_map import scale_of_objects
+from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.recording.networks import RunNetworks
+from cliploc_ros.offline.recording.recorder import (
     record_every_frame,
 )
 

@@ -6,7 +6,8 @@ import numpy as np
 from scene import CAMERA, make_room, see_room
 
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.datasets.bag_messages import (
+from cliploc_ros.messages import depths_from_msg
+from cliploc_ros.offline.datasets.bag_messages import (
     CAMERA_INFO,
     DETECTIONS,
     IMAGE,
@@ -14,9 +15,8 @@ from cliploc_ros.datasets.bag_messages import (
     detections_message,
     image_message,
 )
-from cliploc_ros.datasets.bags import typestore
-from cliploc_ros.datasets.cases import Case, CaseFrame, read_case, write_case
-from cliploc_ros.datasets.depth import depths_from_msg
+from cliploc_ros.offline.datasets.bags import typestore
+from cliploc_ros.offline.datasets.cases import Case, CaseFrame, read_case, write_case
 
 POSE = make_transform(np.eye(3), np.array([0.05, 0.0, 0.0]))
 

@@ -6,18 +6,18 @@ import cv2
 import numpy as np
 import pytest
 
-from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.datasets.depth import (
+from cliploc_ros.core.depth_image import (
     DepthCamera,
     DepthImage,
     check_depth_unit,
     depth_from_counts,
     depths_of_boxes,
 )
-from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames
-from cliploc_ros.datasets.frames import DepthFormat
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.folders import FolderOptions, rgbd_frames
+from cliploc_ros.offline.datasets.frames import DepthFormat
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
 NO_OPTIONS = FolderOptions()

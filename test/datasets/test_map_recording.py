@@ -7,15 +7,15 @@ import pytest
 from scene import CAMERA
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.datasets.map_recording import (
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.map_recording import (
     MapRecording,
     load_recording,
     recording_path,
     save_recording,
 )
-from cliploc_ros.datasets.observations import save_observations
-from cliploc_ros.errors import DatasetError
-from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.datasets.observations import save_observations
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
 
 @pytest.fixture

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.tilt import find_vertical
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
-from cliploc_ros.datasets.captures import placing
-from cliploc_ros.datasets.captures.capture import StampedPoses
-from cliploc_ros.datasets.captures.placing import AXES, check_axes
-from cliploc_ros.datasets.folders import FolderOptions, find_layout, read_folder
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.captures import placing
+from cliploc_ros.offline.datasets.captures.capture import StampedPoses
+from cliploc_ros.offline.datasets.captures.placing import AXES, check_axes
+from cliploc_ros.offline.datasets.folders import FolderOptions, find_layout, read_folder
 
 pytestmark = pytest.mark.needs('pycolmap')
 STORED = {'opencv': lambda pose: pose, 'opengl': lambda pose: pose @ FLIP,

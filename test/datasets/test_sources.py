@@ -13,17 +13,22 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames, bag_odometry, find_topics
-from cliploc_ros.datasets.bag_poses import (
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets import bag_messages
+from cliploc_ros.offline.datasets.bag_frames import (
+    BagTopics,
+    bag_frames,
+    bag_odometry,
+    find_topics,
+)
+from cliploc_ros.offline.datasets.bag_poses import (
     find_poses,
     pose_sources,
     poses_of_tf,
     poses_of_topic,
 )
-from cliploc_ros.datasets.bags import BagWriter, typestore
-from cliploc_ros.datasets.poses import mount_from_numbers
-from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.bags import BagWriter, typestore
+from cliploc_ros.offline.datasets.poses import mount_from_numbers
 
 MS = 1_000_000
 START = 1_700_000_000_000 * MS

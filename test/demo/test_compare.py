@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cliploc_ros.evaluation.methods import PAPER_METHODS
+from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
 
 pytestmark = pytest.mark.full
 

@@ -15,7 +15,7 @@ from cliploc_ros.demo.map_review import (
     section,
 )
 from cliploc_ros.demo.truth import TrueObject
-from cliploc_ros.evaluation.summary import Summary
+from cliploc_ros.offline.evaluation.summary import Summary
 
 HOSTILE = '<script>alert("&")</script>'
 

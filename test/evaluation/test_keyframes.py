@@ -19,10 +19,10 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import prior_of
 from cliploc_ros.core.watch.watch import Watch
-from cliploc_ros.datasets.folders import FolderOptions, rgbd_frames, tum_frames
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.tum import read_tum
-from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
+from cliploc_ros.offline.datasets.folders import FolderOptions, rgbd_frames, tum_frames
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from studies.keyframes.cases import IMAGE_CHANGES, World, hang, make_picture, twin
 
 EVERY = LayerOptions(0.0, 0.0)

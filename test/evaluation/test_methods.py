@@ -6,7 +6,7 @@ import pytest
 
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.evaluation.methods import PAPER_METHODS, parse_methods
+from cliploc_ros.offline.evaluation.methods import PAPER_METHODS, parse_methods
 
 PAPER = RelocalizerOptions(iterations=500, k=5, random_seed=4)
 

@@ -6,10 +6,10 @@
 import numpy as np
 import pytest
 
-from cliploc_ros.evaluation.figures import (
+from cliploc_ros.offline.evaluation.figures import (
     precision_recall,
 )
-from cliploc_ros.evaluation.summary import (
+from cliploc_ros.offline.evaluation.summary import (
     Summary,
     as_markdown,
     as_text,
@@ -20,7 +20,7 @@ from cliploc_ros.evaluation.summary import (
     table_rows,
     wilson_interval,
 )
-from cliploc_ros.evaluation.trials import Result
+from cliploc_ros.offline.evaluation.trials import Result
 
 
 def make_summary(errors, method='auto', accepted=None, confidence=None):

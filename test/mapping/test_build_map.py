@@ -12,10 +12,10 @@ from walk import CAMERA, CLASSES, look_at, make_table, nearest_errors, see, walk
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import MappingError, ModelError
-from cliploc_ros.make_map import find_labeller, make_map, update_map
-from cliploc_ros.mapping.building import _windows, build_map
-from cliploc_ros.mapping.options import MappingOptions, PoseErrors
-from cliploc_ros.mapping.views import make_views, number_viewpoints, thin_out
+from cliploc_ros.offline.make_map import find_labeller, make_map, update_map
+from cliploc_ros.offline.mapping.building import _windows, build_map
+from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.offline.mapping.views import make_views, number_viewpoints, thin_out
 from studies.speed.pose_errors import disturb, draw_errors
 
 

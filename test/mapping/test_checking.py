@@ -17,27 +17,27 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError, OptionsError
-from cliploc_ros.evaluation.map_check.page import DATA, PAGE, write_report
-from cliploc_ros.evaluation.map_check.pictures import draw_pictures
-from cliploc_ros.evaluation.map_check.views import ViewPainter
-from cliploc_ros.mapping.check.advice import give_advice
-from cliploc_ros.mapping.check.checking import check_map
-from cliploc_ros.mapping.check.landmark_faults import (
+from cliploc_ros.offline.evaluation.map_check.page import DATA, PAGE, write_report
+from cliploc_ros.offline.evaluation.map_check.pictures import draw_pictures
+from cliploc_ros.offline.evaluation.map_check.views import ViewPainter
+from cliploc_ros.offline.mapping.check.advice import give_advice
+from cliploc_ros.offline.mapping.check.checking import check_map
+from cliploc_ros.offline.mapping.check.landmark_faults import (
     check_landmarks,
     find_map_overlaps,
     hear_witness,
 )
-from cliploc_ros.mapping.check.places import LookAlike, find_look_alikes, make_grid
-from cliploc_ros.mapping.check.relocalization import (
+from cliploc_ros.offline.mapping.check.places import LookAlike, find_look_alikes, make_grid
+from cliploc_ros.offline.mapping.check.relocalization import (
     make_folds,
     measure_detector,
     try_recording,
 )
-from cliploc_ros.mapping.check.report import Measure
-from cliploc_ros.mapping.options import CheckOptions, MappingOptions, Thresholds
-from cliploc_ros.mapping.systematic import find_corrections
-from cliploc_ros.mapping.views import make_views
-from cliploc_ros.simulation.labels import LabelModel
+from cliploc_ros.offline.mapping.check.report import Measure
+from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions, Thresholds
+from cliploc_ros.offline.mapping.systematic import find_corrections
+from cliploc_ros.offline.mapping.views import make_views
+from cliploc_ros.offline.simulation.labels import LabelModel
 
 NOUNS = ('apple', 'brick', 'candle', 'drum', 'engine', 'flag', 'globe', 'hammer', 'iron')
 TABLE = replace(make_table(), labels=NOUNS)

@@ -10,7 +10,7 @@ from walk import make_table, nearest_errors, see, walk_around
 
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.building import build_map
+from cliploc_ros.offline.mapping.building import build_map
 
 
 def measure_depth(detections, table, scale=1.0, holes=0.0, seed=0):

@@ -11,13 +11,13 @@ from walk import CLASSES, join_maps, make_table, see, see_rows, walk_around
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.mapping.building import build_map
-from cliploc_ros.mapping.check.checking import check_map
-from cliploc_ros.mapping.check.landmark_faults import find_map_overlaps, hear_witness
-from cliploc_ros.mapping.options import CheckOptions, MappingOptions
-from cliploc_ros.mapping.refit import refit_map
-from cliploc_ros.mapping.update.updating import update_map
-from cliploc_ros.mapping.views import make_views
+from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.mapping.check.checking import check_map
+from cliploc_ros.offline.mapping.check.landmark_faults import find_map_overlaps, hear_witness
+from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions
+from cliploc_ros.offline.mapping.refit import refit_map
+from cliploc_ros.offline.mapping.update.updating import update_map
+from cliploc_ros.offline.mapping.views import make_views
 
 POSES = walk_around()
 FRAMES = np.arange(len(POSES))

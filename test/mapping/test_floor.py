@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cliploc_ros.mapping.association import find_overlaps, ious_with
-from cliploc_ros.mapping.building import build_map
-from cliploc_ros.mapping.landmarks import landmarks_of_map
-from cliploc_ros.mapping.options import MappingOptions
-from cliploc_ros.mapping.pose_noise import _sample
-from cliploc_ros.mapping.views import make_views
+from cliploc_ros.offline.mapping.association import find_overlaps, ious_with
+from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
+from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.pose_noise import _sample
+from cliploc_ros.offline.mapping.views import make_views
 from studies.speed import floor as benchmark
 from studies.speed.floors import CLASS_NAMES, compare_maps, make_floor, see_floor
 

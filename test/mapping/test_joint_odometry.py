@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from walk import look_at, make_table, see, walk_around
 
-from cliploc_ros.mapping.building import build_map
-from cliploc_ros.mapping.joint import Prior, State, pose_bands
-from cliploc_ros.mapping.landmarks import landmarks_of_map
-from cliploc_ros.mapping.odometry import link_frames
-from cliploc_ros.mapping.options import MappingOptions, OdometryErrors, PoseErrors
-from cliploc_ros.mapping.views import make_views
+from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.mapping.joint import Prior, State, pose_bands
+from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
+from cliploc_ros.offline.mapping.odometry import link_frames
+from cliploc_ros.offline.mapping.options import MappingOptions, OdometryErrors, PoseErrors
+from cliploc_ros.offline.mapping.views import make_views
 from studies.speed.pose_errors import (
     aligned_offsets_m,
     disturb,

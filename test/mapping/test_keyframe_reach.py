@@ -15,10 +15,10 @@ from cliploc_ros.cli.check_map import main
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, save_layer
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.mapping.check.advice import give_advice
-from cliploc_ros.mapping.check.checking import check_map
-from cliploc_ros.mapping.check.report import check_keyframes, in_reach
-from cliploc_ros.mapping.options import CheckOptions
+from cliploc_ros.offline.mapping.check.advice import give_advice
+from cliploc_ros.offline.mapping.check.checking import check_map
+from cliploc_ros.offline.mapping.check.report import check_keyframes, in_reach
+from cliploc_ros.offline.mapping.options import CheckOptions
 
 ROOM = make_room()
 #: The camera looks along x, z is up.

@@ -9,10 +9,10 @@ import pytest
 from walk import make_table, see, walk_around
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.mapping.building import build_map
-from cliploc_ros.mapping.labelling import embed_landmarks, label_landmarks
-from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.vocabulary.vocabulary import Phrases
+from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.mapping.labelling import embed_landmarks, label_landmarks
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.vocabulary.vocabulary import Phrases
 
 SIZE = 32
 

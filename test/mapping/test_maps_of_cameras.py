@@ -16,16 +16,16 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.datasets.observations import load_observations, save_observations
 from cliploc_ros.errors import DatasetError, MappingError
-from cliploc_ros.mapping.building import build_map
-from cliploc_ros.mapping.check.checking import check_map
-from cliploc_ros.mapping.check.relocalization import sample_frames
-from cliploc_ros.mapping.joint import pose_errors
-from cliploc_ros.mapping.options import CheckOptions, MappingOptions, PoseErrors
-from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.mapping.update.updating import update_map
-from cliploc_ros.mapping.views import make_views, thin_out
+from cliploc_ros.offline.datasets.observations import load_observations, save_observations
+from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.mapping.check.checking import check_map
+from cliploc_ros.offline.mapping.check.relocalization import sample_frames
+from cliploc_ros.offline.mapping.joint import pose_errors
+from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions, PoseErrors
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.update.updating import update_map
+from cliploc_ros.offline.mapping.views import make_views, thin_out
 
 #: By name: the camera, and where it looks [deg].
 RIG = {'front': (CAMERA, 0.0), 'left': (Camera(320, 240, 200.0, 200.0, 160.0, 120.0), 90.0),

@@ -13,12 +13,12 @@ import pytest
 import yaml
 
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.datasets.observations import load_observations
-from cliploc_ros.mapping.building import build_map
-from cliploc_ros.mapping.evidence import explained_boxes
-from cliploc_ros.mapping.landmarks import landmarks_of_map
-from cliploc_ros.mapping.options import MappingOptions, PoseErrors
-from cliploc_ros.mapping.views import make_views
+from cliploc_ros.offline.datasets.observations import load_observations
+from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.mapping.evidence import explained_boxes
+from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
+from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.offline.mapping.views import make_views
 from studies.speed.pose_errors import disturb, draw_errors, offsets_m
 
 

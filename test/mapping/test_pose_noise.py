@@ -8,17 +8,17 @@ from scipy.spatial.transform import Rotation
 from walk import look_at, make_table, nearest_errors, see, walk_around
 
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.mapping.building import build_map
-from cliploc_ros.mapping.joint import Prior
-from cliploc_ros.mapping.landmarks import landmarks_of_map
-from cliploc_ros.mapping.options import MappingOptions, PoseErrors
-from cliploc_ros.mapping.pose_noise import (
+from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.mapping.joint import Prior
+from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
+from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.offline.mapping.pose_noise import (
     _BENDING,
     estimate_pose_errors,
     shared_by_neighbours,
     significant_pose_errors,
 )
-from cliploc_ros.mapping.views import Views, make_views
+from cliploc_ros.offline.mapping.views import Views, make_views
 from studies.speed.pose_errors import aligned_offsets_m, disturb, draw_errors, offsets_m
 
 ESTIMATING = MappingOptions(estimate_pose_errors=True)

@@ -8,7 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.mapping.landmarks import box_iou, linearize_box, move_ellipsoid, project_box
+from cliploc_ros.offline.mapping.landmarks import (
+    box_iou,
+    linearize_box,
+    move_ellipsoid,
+    project_box,
+)
 
 SEMI_AXES = np.array([0.3, 0.1, 0.2])
 ROTATION = Rotation.from_rotvec([0.3, -0.5, 0.8])

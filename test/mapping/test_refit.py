@@ -11,7 +11,7 @@ from walk import join_maps, make_table, see, walk_around
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.refit import refit_map
+from cliploc_ros.offline.mapping.refit import refit_map
 
 
 @pytest.fixture(scope='module')

@@ -14,8 +14,8 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.mapping.options import MappingOptions, PoseErrors
-from cliploc_ros.mapping.update.updating import update_map
+from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.offline.mapping.update.updating import update_map
 
 ENCODER = 'test:0'
 POSES = walk_around(frames=60, turn_deg=320.0, radius=2.6)

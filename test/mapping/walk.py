@@ -15,7 +15,7 @@ from cliploc_ros.core.geometry.ellipsoid import (
 )
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 CLASSES = ('book', 'bottle', 'cup')

@@ -12,7 +12,7 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.models.clip_encoder import encode_labels
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.label_embeddings import LabelCache, mixed_rows
-from cliploc_ros.models.phrase_embeddings import embed_phrases
+from cliploc_ros.offline.vocabulary.phrase_embeddings import embed_phrases
 
 KEY = 'ViT-B-32:gelu:0123'
 LABELS = ['a red mug', 'tasse bleue é', "it's \0 odd"]

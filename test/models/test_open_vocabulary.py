@@ -13,7 +13,6 @@ from open_weights import TextTower, write_open_yolo, write_tower
 from scene import make_room
 from torchvision.ops import box_iou
 
-from cliploc_ros.datasets.frames import Frames
 from cliploc_ros.models.open_vocabulary import (
     prompts_of_map,
     prompts_of_names,
@@ -21,7 +20,8 @@ from cliploc_ros.models.open_vocabulary import (
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_detector import YoloDetector
 from cliploc_ros.models.yolo_weights import load_yolo
-from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions, describe
+from cliploc_ros.offline.datasets.frames import Frames
+from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions, describe
 
 pytestmark = pytest.mark.full
 

@@ -28,8 +28,8 @@ import cv2, numpy as np
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.map_rows import load_encoder_for_map

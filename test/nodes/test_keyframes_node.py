@@ -15,10 +15,10 @@ from cliploc_ros.cli.evaluate import main as evaluate
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, save_layer
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.datasets.folders import tum_frames
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.tum import read_tum
-from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
+from cliploc_ros.offline.datasets.folders import tum_frames
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 ROOM = make_room()  # its objects are nowhere in the images

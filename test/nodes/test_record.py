@@ -12,7 +12,7 @@ from std_srvs.srv import Trigger
 from tester import make_frame
 
 from cliploc_ros.cli.evaluate import main as evaluate
-from cliploc_ros.datasets.bags import BagReader
+from cliploc_ros.offline.datasets.bags import BagReader
 
 
 def four_of(rows=(0, 3, 6, 9)):

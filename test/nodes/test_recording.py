@@ -16,8 +16,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.datasets.intrinsics import PRESETS
-from cliploc_ros.datasets.tum import read_tum
+from cliploc_ros.offline.datasets.intrinsics import PRESETS
+from cliploc_ros.offline.datasets.tum import read_tum
 
 pytestmark = pytest.mark.full
 

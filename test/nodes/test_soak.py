@@ -12,8 +12,8 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from tester import transform_of
 
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bags import BagWriter
+from cliploc_ros.offline.datasets import bag_messages
+from cliploc_ros.offline.datasets.bags import BagWriter
 from cliploc_ros.ros.conversions import stamp_ns
 
 pytestmark = pytest.mark.full

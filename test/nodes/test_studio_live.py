@@ -12,7 +12,7 @@ from processes import wait_for
 from tester import RELIABLE, make_frame
 
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.studio.live import LiveError, follow_relocalizer
+from cliploc_ros.offline.studio.live import LiveError, follow_relocalizer
 
 
 @pytest.fixture

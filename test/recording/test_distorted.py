@@ -16,12 +16,12 @@ from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.datasets.frames import RawFrame
-from cliploc_ros.datasets.observations import load_recorded
 from cliploc_ros.demo.truth import read_objects
-from cliploc_ros.mapping.options import MappingOptions
-from cliploc_ros.mapping.views import make_views
-from cliploc_ros.recording.networks import RunNetworks
+from cliploc_ros.offline.datasets.frames import RawFrame
+from cliploc_ros.offline.datasets.observations import load_recorded
+from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.views import make_views
+from cliploc_ros.offline.recording.networks import RunNetworks
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--device', 'cpu')

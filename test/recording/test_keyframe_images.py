@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.depth_image import DepthImage
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, load_layer_of_map, save_layer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.datasets.depth import DepthImage
-from cliploc_ros.datasets.folders import tum_frames
-from cliploc_ros.datasets.frames import Frames, PosedImage, RawFrame
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.errors import MappingError
-from cliploc_ros.recording.keyframe_layer import LayerOptions, build_layer
+from cliploc_ros.offline.datasets.folders import tum_frames
+from cliploc_ros.offline.datasets.frames import Frames, PosedImage, RawFrame
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 
 ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
 WITH_IMAGES = LayerOptions(most_points=200, images=True)

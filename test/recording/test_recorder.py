@@ -17,11 +17,11 @@ import pytest
 from cliploc_ros.cli.build_map import main
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.datasets.frames import Frames, RawFrame
-from cliploc_ros.datasets.observations import load_recorded
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.recording.recorder import (
+from cliploc_ros.offline.datasets.frames import Frames, RawFrame
+from cliploc_ros.offline.datasets.observations import load_recorded
+from cliploc_ros.offline.recording.recorder import (
     KeyframeFilter,
     KeyframeOptions,
     RecordingOptions,

@@ -21,8 +21,8 @@ from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.observation import Region
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.watch import WatchState
-from cliploc_ros.datasets.cases import read_case
-from cliploc_ros.evaluation.cases import replay_case
+from cliploc_ros.offline.datasets.cases import read_case
+from cliploc_ros.offline.evaluation.cases import replay_case
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.case_recorder import CaseRecorder
 from cliploc_ros.ros.conversions import detections_to_msg

@@ -19,12 +19,12 @@ from cliploc_ros.core.map.landmark_embeddings import (
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.tum import read_tum
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.demo.truth import read_frames
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import load_localizer
 from cliploc_ros.ros.inputs.frame_source import Frame

@@ -12,11 +12,11 @@ from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.datasets.queries import load_queries
-from cliploc_ros.evaluation.figures import within_ellipsoid
-from cliploc_ros.evaluation.methods import Method
-from cliploc_ros.evaluation.run import run_methods
-from cliploc_ros.evaluation.trials import make_queries
+from cliploc_ros.offline.datasets.queries import load_queries
+from cliploc_ros.offline.evaluation.figures import within_ellipsoid
+from cliploc_ros.offline.evaluation.methods import Method
+from cliploc_ros.offline.evaluation.run import run_methods
+from cliploc_ros.offline.evaluation.trials import make_queries
 from studies.acceptance.fit import Case, fit, judge, outcomes
 
 pytestmark = pytest.mark.full

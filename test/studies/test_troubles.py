@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.evaluation import sensors
+from cliploc_ros.offline.evaluation import sensors
 from studies import wrong_sensors
 from studies.acceptance.__main__ import run
 from studies.acceptance.places import Simulated

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.datasets.bag_frames import BagTopics, bag_frames, bag_odometry
-from cliploc_ros.datasets.bag_messages import map_from_camera_of, pose_message, stamp_ns
-from cliploc_ros.datasets.bag_poses import poses_of_topic
-from cliploc_ros.datasets.bags import BagReader, BagWriter
-from cliploc_ros.datasets.intrinsics import find_camera
-from cliploc_ros.datasets.tum import read_tum
-from cliploc_ros.datasets.tum_conversion import ConversionOptions, convert_tum
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
+from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames, bag_odometry
+from cliploc_ros.offline.datasets.bag_messages import map_from_camera_of, pose_message, stamp_ns
+from cliploc_ros.offline.datasets.bag_poses import poses_of_topic
+from cliploc_ros.offline.datasets.bags import BagReader, BagWriter
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.offline.datasets.tum_conversion import ConversionOptions, convert_tum
+from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
 from studies.watch.__main__ import run
 from studies.watch.recordings import (
     WatchedLook,

@@ -11,10 +11,10 @@ from browser import Person
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.studio.document import Document
-from cliploc_ros.studio.images import open_images, views_of_folder
-from cliploc_ros.studio.recording import Recording
-from cliploc_ros.studio.studio import Studio
+from cliploc_ros.offline.studio.document import Document
+from cliploc_ros.offline.studio.images import open_images, views_of_folder
+from cliploc_ros.offline.studio.recording import Recording
+from cliploc_ros.offline.studio.studio import Studio
 
 ASSETS = Path(__file__).parents[2] / 'cliploc_ros/demo/assets'
 _ROOM = np.array([[0.0, 0.0, 0.4], [0.9, 0.2, 0.6], [0.3, 1.1, 0.5], [1.2, 1.3, 0.8],
@@ -76,7 +76,7 @@ def demo_studio(path):
 @contextmanager
 def open_page(studio, host='127.0.0.1'):
     """Serve the page of a studio; yield its URL and the server, and close the document."""
-    from cliploc_ros.studio.page import serve_studio
+    from cliploc_ros.offline.studio.page import serve_studio
 
     try:
         with serve_studio(studio, host, 0) as (url, server):

@@ -8,8 +8,8 @@ import yaml
 from browser import wait_for
 from studio_map import ASSETS, person_at
 
-from cliploc_ros.studio.document import Document
-from cliploc_ros.studio.studio import Studio
+from cliploc_ros.offline.studio.document import Document
+from cliploc_ros.offline.studio.studio import Studio
 
 pytestmark = [pytest.mark.full, pytest.mark.clock,
               pytest.mark.needs('viser', 'playwright', 'chromium')]

@@ -7,9 +7,9 @@ import pytest
 from browser import wait_for
 from studio_map import person_at, write_two_rooms
 
-from cliploc_ros.studio import edits
-from cliploc_ros.studio.document import Document
-from cliploc_ros.studio.studio import Studio
+from cliploc_ros.offline.studio import edits
+from cliploc_ros.offline.studio.document import Document
+from cliploc_ros.offline.studio.studio import Studio
 
 pytestmark = [pytest.mark.full, pytest.mark.clock,
               pytest.mark.needs('viser', 'playwright', 'chromium')]

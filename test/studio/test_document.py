@@ -13,10 +13,10 @@ from studio_map import TEXT
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import CliplocError, DatasetError, MapError
-from cliploc_ros.studio import edits
-from cliploc_ros.studio.document import Document
-from cliploc_ros.studio.edits import EditError
-from cliploc_ros.studio.map_file import ChangedOnDiskError
+from cliploc_ros.offline.studio import edits
+from cliploc_ros.offline.studio.document import Document
+from cliploc_ros.offline.studio.edits import EditError
+from cliploc_ros.offline.studio.map_file import ChangedOnDiskError
 
 
 @pytest.fixture

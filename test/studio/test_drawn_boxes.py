@@ -7,13 +7,13 @@ import pytest
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.datasets.observations import load_observations
-from cliploc_ros.mapping.association import associate, ious_with
-from cliploc_ros.mapping.landmarks import group_boxes, landmarks_of_map, project_box
-from cliploc_ros.mapping.options import MappingOptions
-from cliploc_ros.mapping.views import camera_centers, make_views
-from cliploc_ros.studio.edits import EditError
-from cliploc_ros.studio.recording import fit_boxes
+from cliploc_ros.offline.datasets.observations import load_observations
+from cliploc_ros.offline.mapping.association import associate, ious_with
+from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map, project_box
+from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.views import camera_centers, make_views
+from cliploc_ros.offline.studio.edits import EditError
+from cliploc_ros.offline.studio.recording import fit_boxes
 
 TRIALS_PER_LANDMARK = 6
 

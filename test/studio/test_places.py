@@ -10,11 +10,11 @@ import pytest
 from studio_map import write_two_rooms
 
 from cliploc_ros.errors import MapError
-from cliploc_ros.studio import edits
-from cliploc_ros.studio.document import Document
-from cliploc_ros.studio.edits import EditError
-from cliploc_ros.studio.places import PlacesSearch, find_places
-from cliploc_ros.studio.studio import Studio
+from cliploc_ros.offline.studio import edits
+from cliploc_ros.offline.studio.document import Document
+from cliploc_ros.offline.studio.edits import EditError
+from cliploc_ros.offline.studio.places import PlacesSearch, find_places
+from cliploc_ros.offline.studio.studio import Studio
 
 
 @pytest.fixture

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from studio_map import demo_studio, open_page
 
-from cliploc_ros.datasets.observations import load_observations
-from cliploc_ros.studio import edits
-from cliploc_ros.studio.document import Document
-from cliploc_ros.studio.images import landmark_at
-from cliploc_ros.studio.recording import Recording
-from cliploc_ros.studio.sightings import find_sightings
-from cliploc_ros.studio.studio import Studio
+from cliploc_ros.offline.datasets.observations import load_observations
+from cliploc_ros.offline.studio import edits
+from cliploc_ros.offline.studio.document import Document
+from cliploc_ros.offline.studio.images import landmark_at
+from cliploc_ros.offline.studio.recording import Recording
+from cliploc_ros.offline.studio.sightings import find_sightings
+from cliploc_ros.offline.studio.studio import Studio
 
 
 @pytest.fixture

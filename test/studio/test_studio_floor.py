@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cliploc_ros.errors import MapError
-from cliploc_ros.studio.floor import FREE, OCCUPIED, UNKNOWN, read_occupancy_grid
+from cliploc_ros.offline.studio.floor import FREE, OCCUPIED, UNKNOWN, read_occupancy_grid
 
 # row 0 is at the origin: y up
 CELLS = np.array([[FREE, OCCUPIED, FREE], [UNKNOWN, FREE, FREE]], dtype=np.int8)

@@ -10,10 +10,10 @@ from scene import CAMERA, make_room, write_map
 from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, save_layer
-from cliploc_ros.datasets import bag_messages
-from cliploc_ros.datasets.bag_frames import BagTopics
-from cliploc_ros.datasets.bags import BagWriter
-from cliploc_ros.studio.images import open_images
+from cliploc_ros.offline.datasets import bag_messages
+from cliploc_ros.offline.datasets.bag_frames import BagTopics
+from cliploc_ros.offline.datasets.bags import BagWriter
+from cliploc_ros.offline.studio.images import open_images
 
 BAG_CAMERA = Camera(64, 48, 53.0, 53.0, 32.0, 24.0)
 START_NS = 1_700_000_000_000_000_000

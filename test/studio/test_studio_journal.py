@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from studio_map import TEXT
 
-from cliploc_ros.studio import edits
-from cliploc_ros.studio.document import Document
+from cliploc_ros.offline.studio import edits
+from cliploc_ros.offline.studio.document import Document
 
 
 @pytest.fixture
@@ -25,8 +25,8 @@ def path(tmp_path):
 EDITOR = """
 import sys, numpy as np
 from pathlib import Path
-from cliploc_ros.studio import edits
-from cliploc_ros.studio.document import Document
+from cliploc_ros.offline.studio import edits
+from cliploc_ros.offline.studio.document import Document
 document = Document(Path(sys.argv[1]))
 document.apply(edits.mark(document.landmarks, ['book_1'], 'lock', is_locked=True))
 document.apply(edits.delete(document.landmarks, ['plant_1']))

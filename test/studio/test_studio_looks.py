@@ -15,8 +15,8 @@ from cliploc_ros.core.map.landmark_embeddings import (
     load_landmark_embeddings,
     save_landmark_embeddings,
 )
-from cliploc_ros.studio import edits
-from cliploc_ros.studio.document import Document
+from cliploc_ros.offline.studio import edits
+from cliploc_ros.offline.studio.document import Document
 
 IDS = ('plant_1', 'gone_1', 'cup_1', 'book_1')  # not in the map's order, and one too many
 SIZE = 16

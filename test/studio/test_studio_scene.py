@@ -11,14 +11,14 @@ import viser
 from scipy.spatial.transform import Rotation
 from studio_map import demo_studio
 
+from cliploc_ros.core.depth_image import DepthImage
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.datasets.depth import DepthImage
-from cliploc_ros.mapping.posed_detections import PosedDetections
-from cliploc_ros.studio import viewpoint
-from cliploc_ros.studio.context import draw_walls, find_cloud
-from cliploc_ros.studio.floor import OCCUPIED, UNKNOWN, OccupancyGrid
-from cliploc_ros.studio.images import Images
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.studio import viewpoint
+from cliploc_ros.offline.studio.context import draw_walls, find_cloud
+from cliploc_ros.offline.studio.floor import OCCUPIED, UNKNOWN, OccupancyGrid
+from cliploc_ros.offline.studio.images import Images
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
 UPRIGHT = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # looks along x

@@ -1,0 +1,185 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Depth images, and how far the objects in boxes are.
+
+Depth is never exact: it has holes, its scale errs, and it does not lie quite on the colour image.
+So a box gets one robust value, from its inner half, and the spread of the values there.
+"""
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.errors import DatasetError
+
+#: Of a 16-bit depth image, by ROS's convention and by that of the TUM RGB-D dataset [m].
+MILLIMETRE, TUM_UNIT = 1e-3, 1 / 5000
+# The inner part of a box that counts, in each direction, and how many values it needs.
+_INNER_SHARE = 0.5
+_LEAST_VALUES = 12
+_LEAST_SHARE = 0.1
+# A neighbouring pixel that is further away by this share belongs to another surface.
+_EDGE = 0.1
+_NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
+# Every second pixel in each direction is enough for a median.
+_STEP = 2
+#: Rooms and halls: the typical depth of a recording lies between these [m].
+PLAUSIBLE_DEPTH_M = (0.15, 40.0)
+
+
+@dataclass(frozen=True)
+class DepthCamera:
+    """A depth camera whose images are not registered to the colour images."""
+
+    #: Of the depth image [px]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    #: (4, 4): its pose, seen from the colour camera
+    color_from_depth: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+
+
+@dataclass(frozen=True)
+class DepthImage:
+    """Depths along z [m], float32 (h, w); NaN where there is none.
+
+    ``camera`` is None for depth that is registered to the colour image.
+    """
+
+    depths_m: NDArray[np.float32]
+    camera: DepthCamera | None = None
+
+
+def depth_from_counts(counts: NDArray[np.generic], unit_m: float | None, where: str
+                      ) -> NDArray[np.float32]:
+    """Return the depths (h, w) [m] of a decoded depth image, NaN where there is none.
+
+    DatasetError: the image is of another type.
+
+    Parameters
+    ----------
+    counts : ndarray (h, w)
+        uint16, with 0 and 65535 for none, or float.
+    unit_m : float or None
+        Metres of one count. None: 1 mm for uint16, 1 m for float.
+    where : str
+        File or message, for the error.
+    """
+    if counts.ndim != 2 or counts.dtype not in (np.uint16, np.float32, np.float64):
+        raise DatasetError(f'{where}: is no depth image of 16-bit integers or floats, but '
+                           f'{counts.dtype} with shape {counts.shape}')
+    is_integer = counts.dtype == np.uint16
+    depths = counts.astype(np.float32) * np.float32(
+        unit_m or (MILLIMETRE if is_integer else 1.0))
+    with np.errstate(invalid='ignore'):
+        valid = np.isfinite(depths) & (depths > 0.0)
+    if is_integer:
+        valid &= counts != np.uint16(65535)
+    depths[~valid] = np.nan
+    return depths
+
+
+def depths_of_boxes(depth: DepthImage, camera: Camera, bboxes_xyxy: NDArray[np.float64]
+                    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the depth of what boxes show, and its spread.
+
+    Parameters
+    ----------
+    camera : Camera
+        Of the colour image.
+    bboxes_xyxy : ndarray (n, 4)
+        Boxes in the colour image, as detected.
+
+    Returns
+    -------
+    depths_m : ndarray (n,) float32
+        Median over the inner half of each box, along z of the colour camera [m]; NaN where too
+        few pixels have depth.
+    spreads_m : ndarray (n,) float32
+        Half the distance between the 16th and 84th percentile there [m].
+    """
+    pixels, values = points_in_color(depth, camera, _STEP)
+    depths = np.full(len(bboxes_xyxy), np.nan, dtype=np.float32)
+    spreads = depths.copy()
+    density = depth.depths_m.size / (camera.width * camera.height) / _STEP**2
+    centres = np.tile(0.5 * (bboxes_xyxy[:, :2] + bboxes_xyxy[:, 2:]), 2)
+    inner = centres + _INNER_SHARE * (bboxes_xyxy - centres)
+    for row, (left, top, right, bottom) in enumerate(inner):
+        inside = values[(pixels[0] >= left) & (pixels[0] <= right)
+                        & (pixels[1] >= top) & (pixels[1] <= bottom)]
+        expected = density * (right - left) * (bottom - top)
+        if len(inside) >= max(_LEAST_VALUES, _LEAST_SHARE * expected):
+            low, depths[row], high = np.percentile(inside, [16, 50, 84])
+            spreads[row] = 0.5 * (high - low)
+    return depths, spreads
+
+
+def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float64]
+                     ) -> NDArray[np.float32]:
+    """Return the depth of what single pixels show.
+
+    Parameters
+    ----------
+    camera : Camera
+        Of the colour image.
+    pixels : ndarray (n, 2)
+        In the colour image, distorted [px].
+
+    Returns
+    -------
+    ndarray (n,) float32
+        Along z of the colour camera [m]: the nearest surface within a pixel of each; NaN where
+        nothing was measured, and at edges, where a neighbour is much further away.
+    """
+    height, width = depth.depths_m.shape
+    seen, values = points_in_color(depth, camera, 1)
+    places = np.round(seen * [[width / camera.width], [height / camera.height]]).astype(np.int64)
+    inside = ((places >= 0) & (places < [[width], [height]])).all(axis=0)
+    near = np.full((height, width), np.inf, dtype=np.float32)
+    np.minimum.at(near, (places[1, inside], places[0, inside]), values[inside])
+    nearest = cv2.erode(near, _NEIGHBOURS)
+    furthest = cv2.dilate(np.where(np.isfinite(near), near, 0.0), _NEIGHBOURS)
+    rows = np.round(pixels * (width / camera.width, height / camera.height)).astype(np.int64)
+    rows = np.clip(rows, 0, (width - 1, height - 1))
+    found, other = nearest[rows[:, 1], rows[:, 0]], furthest[rows[:, 1], rows[:, 0]]
+    with np.errstate(invalid='ignore'):
+        return np.where(np.isfinite(found) & (other - found <= _EDGE * found), found,
+                        np.float32(np.nan))
+
+
+def check_depth_unit(depths_m: NDArray[np.float32], where: str) -> None:
+    """Refuse depths of boxes that no camera in a room or hall measures.
+
+    DatasetError: the median is implausible; says how to give the unit.
+    """
+    known = depths_m[np.isfinite(depths_m)]
+    if len(known) == 0:
+        return
+    median, (least, greatest) = float(np.median(known)), PLAUSIBLE_DEPTH_M
+    if not least < median < greatest:
+        raise DatasetError(
+            f'{where}: the median depth of the boxes is {median:.4g} m, expected {least} to '
+            f'{greatest:.0f} m: wrong unit? give --depth-unit (0.001 for mm, 0.0002 for TUM)')
+
+
+def points_in_color(depth: DepthImage, camera: Camera, step: int
+                    ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Return the colour pixels (2, p) of the depth pixels that have a value, and the values."""
+    height, width = depth.depths_m.shape
+    v, u = np.mgrid[0:height:step, 0:width:step]
+    values = depth.depths_m[::step, ::step]
+    valid = np.isfinite(values)
+    u, v, values = u[valid].astype(np.float64), v[valid].astype(np.float64), values[valid]
+    own = depth.camera
+    if own is None:  # scaled, where the depth image is smaller than the colour image
+        return np.stack([u * camera.width / width, v * camera.height / height]), values
+    points = np.stack([(u - own.cx) / own.fx * values, (v - own.cy) / own.fy * values, values],
+                      axis=1) @ own.color_from_depth[:3, :3].T + own.color_from_depth[:3, 3]
+    points = points[points[:, 2] > 0.0]
+    pixels = camera.project_normalized(points[:, :2] / points[:, 2:])
+    inside = np.isfinite(pixels).all(axis=1)
+    return pixels[inside].T, points[inside, 2].astype(np.float32)

@@ -1,0 +1,355 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Read and write rosbag2 recordings (sqlite3 and mcap) with the rosbags library.
+
+Not with rosbag2_py, which PyPI lacks: recordings are also read and written where no ROS is
+installed. The module imports little, for replay.
+"""
+
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer, WriterError
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from cliploc_ros.errors import DatasetError
+
+_VISION_MSGS = ('Point2D', 'Pose2D', 'BoundingBox2D', 'ObjectHypothesis',
+                'ObjectHypothesisWithPose', 'Detection2D', 'Detection2DArray')
+STORAGES: Mapping[str, StoragePlugin] = {'sqlite3': StoragePlugin.SQLITE3,
+                                         'mcap': StoragePlugin.MCAP}
+
+_INFINITE = QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
+
+#: The default of rclcpp, as camera drivers and detectors offer it; matches best-effort and
+#: reliable subscribers.
+RELIABLE_QOS = Qos(QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE,
+                   _INFINITE, _INFINITE, QosLiveliness.AUTOMATIC, _INFINITE, False)
+#: For maps and static transforms: a late subscriber receives the last message.
+LATCHED_QOS = RELIABLE_QOS._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
+
+
+@cache
+def typestore() -> Typestore:
+    """Return the types of ROS 2 Jazzy's common interfaces and the seven of vision_msgs.
+
+    All callers share it: do not register types in it.
+    """
+    store = get_typestore(Stores.ROS2_JAZZY)
+    folder = files('cliploc_ros.offline.datasets') / 'vision_msgs' / 'msg'
+    for name in _VISION_MSGS:
+        definition = (folder / f'{name}.msg').read_text(encoding='utf-8')
+        store.register(get_types_from_msg(definition, f'vision_msgs/msg/{name}'))
+    return store
+
+
+def deserialize(data: bytes, msgtype: str, where: str) -> Any:
+    """Return a message of its bytes; DatasetError: they are no such message."""
+    try:
+        return typestore().deserialize_cdr(data, msgtype)
+    except Exception as error:  # the library raises what the bytes happen to cause
+        raise DatasetError(f'{where}: a message is no {msgtype}: {error}') from error
+
+
+@dataclass(frozen=True)
+class BagTopic:
+    """One topic of a recording."""
+
+    #: As ``/image`` and ``sensor_msgs/msg/Image``
+    name: str
+    msgtype: str
+    message_count: int  #: Number of messages that the recording lists
+    #: What its publishers offered during the recording; empty if unknown
+    offered_qos: tuple[Qos, ...] = ()
+    type_hash: str = ''  #: RIHS01 hash of the type; empty if not recorded
+
+
+@dataclass(frozen=True)
+class BagMessage:
+    """One recorded message, still serialized."""
+
+    topic: str  #: Name of its topic
+    stamp_ns: int  #: When it was recorded [ns]
+    data: bytes  #: CDR, with its four-byte header
+
+
+class BagReader:
+    """Reads a rosbag2 folder, or a single .mcap or .db3 file, in order of recording.
+
+    A context manager. It streams messages: memory does not grow with the recording. It unpacks
+    compressed files (zstd) into the temporary folder while it is open. DatasetError: on entry, if
+    the recording cannot be read; the message names path and reason.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._reader: Reader | None = None
+        self._topics: dict[str, BagTopic] = {}
+
+    def __enter__(self) -> Self:
+        """Open the recording."""
+        if not self.path.exists():
+            raise DatasetError(f'{self.path}: no such recording')
+        if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
+            raise DatasetError(
+                f'{self.path}: has no metadata.yaml; it is no rosbag2 recording, or an incomplete '
+                f'one that `ros2 bag reindex {self.path}` rebuilds'
+            )
+        try:
+            reader = Reader(self.path)
+            reader.open()
+        except Exception as error:  # the library's own, sqlite's, the operating system's
+            raise self._unreadable(error) from error
+        self._reader = reader
+        try:
+            self._topics = self._collect_topics(reader.connections)
+        except BaseException:
+            reader.close()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        """Close the recording."""
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    @property
+    def topics(self) -> Mapping[str, BagTopic]:
+        """Topics by name."""
+        return self._topics
+
+    @property
+    def message_count(self) -> int:
+        """Number of messages on all topics."""
+        return sum(topic.message_count for topic in self._topics.values())
+
+    @property
+    def start_ns(self) -> int:
+        """Stamp of the first message [ns]; 0 for an empty recording."""
+        return self._open_reader.start_time if self.message_count else 0
+
+    @property
+    def end_ns(self) -> int:
+        """Stamp of the last message [ns]; 0 for an empty recording."""
+        # The library's end lies one nanosecond after the last message.
+        return self._open_reader.end_time - 1 if self.message_count else 0
+
+    def topic(self, name: str) -> BagTopic:
+        """Return a topic.
+
+        DatasetError: the recording has no topic of that name; the message lists its topics.
+        """
+        if name not in self._topics:
+            recorded = ', '.join(f'{one.name} ({one.msgtype})' for one in self._topics.values())
+            raise DatasetError(f'{self.path}: has no topic {name}; it has {recorded or "none"}')
+        return self._topics[name]
+
+    def messages(self, topics: Collection[str] | None = None, start_ns: int | None = None,
+                 stop_ns: int | None = None) -> Iterator[BagMessage]:
+        """Yield messages in the order of their stamps.
+
+        DatasetError: for an unknown topic, or at a damaged part of the recording.
+
+        Parameters
+        ----------
+        topics : collection of str, optional
+            Names of topics; all of them by default.
+        start_ns, stop_ns : int, optional
+            Yield only messages at or after start_ns and before stop_ns [ns].
+        """
+        names = self._topics if topics is None else topics
+        connections = self._connections({self.topic(name).name for name in names})
+        if not connections:
+            return
+        stream = self._open_reader.messages(connections, start_ns, stop_ns)
+        while True:
+            try:
+                connection, stamp_ns, data = next(stream)
+            except StopIteration:
+                return
+            except Exception as error:  # the library's own, sqlite's, the operating system's
+                raise self._unreadable(error) from error
+            yield BagMessage(connection.topic, stamp_ns, bytes(data))
+
+    def deserialize(self, message: BagMessage) -> Any:
+        """Turn a message's bytes into an object with the fields of its type.
+
+        DatasetError: the type is unknown here or was recorded with another definition, or if the
+        bytes do not fit it.
+        """
+        topic = self.topic(message.topic)
+        store = typestore()
+        if topic.msgtype not in store.types:
+            raise DatasetError(f'{self.path}: {topic.name} has an unknown type, {topic.msgtype}')
+        if topic.type_hash and topic.type_hash != store.hash_rihs01(topic.msgtype):
+            raise DatasetError(
+                f'{self.path}: {topic.name} was recorded with another definition of '
+                f'{topic.msgtype} than the one of Jazzy')
+        return deserialize(message.data, topic.msgtype,
+                           f'{self.path}: {topic.name} at {message.stamp_ns}')
+
+    @property
+    def _open_reader(self) -> Reader:
+        if self._reader is None:
+            raise RuntimeError('the recording is not open: use it in a with statement')
+        return self._reader
+
+    def _collect_topics(self, connections: Collection[Connection]) -> dict[str, BagTopic]:
+        topics: dict[str, BagTopic] = {}
+        for one in connections:
+            assert isinstance(one.ext, ConnectionExtRosbag2)
+            known = topics.get(one.topic, BagTopic(one.topic, one.msgtype, 0))
+            if known.msgtype != one.msgtype:
+                raise DatasetError(
+                    f'{self.path}: {one.topic} has two types, {known.msgtype} and {one.msgtype}')
+            topics[one.topic] = BagTopic(
+                one.topic, one.msgtype, known.message_count + one.msgcount,
+                known.offered_qos + tuple(one.ext.offered_qos_profiles),
+                known.type_hash or one.digest)
+        return topics
+
+    def _connections(self, names: Collection[str]) -> list[Connection]:
+        """Return the library's handles of topics, of the recording and of each of its files.
+
+        The library silently drops the messages of a file whose QoS differs from that in
+        metadata.yaml, which people edit to repair QoS. The files' own handles always match.
+        """
+        reader = self._open_reader
+        files = getattr(reader.storage, 'storages', [])
+        handles = [*reader.connections, *(one for file in files for one in file.connections)]
+        return [handle for handle in handles if handle.topic in names]
+
+    def _unreadable(self, error: Exception) -> DatasetError:
+        name = '' if isinstance(error, ReaderError) else f'{type(error).__name__}: '
+        return DatasetError(f'{self.path}: cannot be read as a rosbag2 recording: {name}{error}')
+
+
+class BagWriter:
+    """Writes a rosbag2 folder as Jazzy does (metadata version 9).
+
+    A context manager. It builds the recording beside its final path and moves it there when it is
+    complete. If the block raises, nothing remains. DatasetError: the path exists or cannot be
+    written, for example because the disk is full.
+
+    Parameters
+    ----------
+    path : str or Path
+        The folder to make. Its parent must exist.
+    storage : str
+        ``sqlite3`` or ``mcap``.
+    """
+
+    def __init__(self, path: str | Path, storage: str = 'sqlite3') -> None:
+        self.path = Path(path)
+        if storage not in STORAGES:
+            raise DatasetError(f'storage {storage!r} is none of {", ".join(STORAGES)}')
+        self._storage = STORAGES[storage]
+        self._staging: Path | None = None
+        self._writer: Writer | None = None
+        self._connections: dict[str, Connection] = {}
+
+    def __enter__(self) -> Self:
+        """Begin the recording beside its final path."""
+        self._check_free()
+        try:
+            self._staging = Path(tempfile.mkdtemp(
+                prefix=f'.{self.path.name}.', suffix='.partial', dir=self.path.parent))
+            writer = Writer(self._staging / self.path.name, version=9,
+                            storage_plugin=self._storage)
+            writer.open()
+        except BaseException as error:  # Ctrl-C, too
+            self._discard()
+            if isinstance(error, OSError | sqlite3.Error | WriterError):
+                raise self._unwritable(error) from error
+            raise
+        self._writer = writer
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        """Complete the recording and move it to its final path, or remove it."""
+        writer, self._writer = self._writer, None
+        assert writer is not None and self._staging is not None
+        try:
+            if kind is None:
+                writer.close()
+                self._check_free()  # another process may have written it meanwhile
+                (self._staging / self.path.name).rename(self.path)
+            else:
+                with suppress(Exception):  # the block's own exception is the one to report
+                    writer.abort()
+        except (OSError, sqlite3.Error) as problem:
+            with suppress(Exception):
+                writer.abort()
+            raise self._unwritable(problem) from problem
+        finally:
+            self._discard()
+
+    def add_topic(self, name: str, msgtype: str, qos: Qos = RELIABLE_QOS) -> None:
+        """Declare a topic before its first message.
+
+        Parameters
+        ----------
+        name, msgtype : str
+            As ``/image`` and ``sensor_msgs/msg/Image``.
+        qos : Qos
+            What its publisher would offer.
+        """
+        try:
+            self._connections[name] = self._open_writer.add_connection(
+                name, msgtype, typestore=typestore(), offered_qos_profiles=[qos])
+        except (OSError, sqlite3.Error) as error:
+            raise self._unwritable(error) from error
+
+    def write(self, topic: str, stamp_ns: int, message: Any) -> None:
+        """Append a message of a declared topic, or its bytes, as recorded at a stamp [ns]."""
+        connection = self._connections[topic]
+        data = (message if isinstance(message, bytes)
+                else typestore().serialize_cdr(message, connection.msgtype))
+        try:
+            self._open_writer.write(connection, stamp_ns, data)
+        except (OSError, sqlite3.Error) as error:
+            raise self._unwritable(error) from error
+
+    @property
+    def _open_writer(self) -> Writer:
+        if self._writer is None:
+            raise RuntimeError('the recording is not open: use it in a with statement')
+        return self._writer
+
+    def _check_free(self) -> None:
+        if self.path.exists() or self.path.is_symlink():
+            raise DatasetError(f'{self.path}: exists already and is not overwritten')
+        if not self.path.parent.is_dir():
+            raise DatasetError(f'{self.path}: the folder {self.path.parent} does not exist')
+
+    def _discard(self) -> None:
+        if self._staging is not None:
+            shutil.rmtree(self._staging, ignore_errors=True)
+            self._staging = None
+
+    def _unwritable(self, error: Exception) -> DatasetError:
+        reason = getattr(error, 'strerror', None) or str(error)
+        return DatasetError(f'{self.path}: cannot be written: {reason}; no partial file remains')

@@ -1,0 +1,273 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Models of COLMAP: cameras and images, as text or binary (colmap.github.io/format.html)."""
+
+import mmap
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.captures.capture import (
+    IMAGES,
+    Capture,
+    Shot,
+    arrange,
+    camera_of,
+    pose_of,
+    read_text,
+)
+
+_PLACES = ('.', 'sparse', 'sparse/0', 'sparse/1', 'colmap/sparse/0', 'model', 'colmap')
+_MOST_NAME = 4096
+_REMEDY = 'undistort the images with colmap image_undistorter, and give its output folder'
+
+
+class _Model(NamedTuple):
+    """A camera model: name, number of focal lengths, distortion model, places of its values."""
+
+    name: str
+    focals: int
+    distortion: str = ''
+    #: Of each value of the file, the coefficient in OpenCV's order
+    places: tuple[int, ...] = ()
+
+    @property
+    def length(self) -> int:
+        return self.focals + 2 + len(self.places)
+
+
+# By COLMAP's number. It counts pixels from the corner of the first one, OpenCV from its centre.
+_MODELS = {
+    0: _Model('SIMPLE_PINHOLE', 1), 1: _Model('PINHOLE', 2),
+    2: _Model('SIMPLE_RADIAL', 1, 'plumb_bob', (0,)), 3: _Model('RADIAL', 1, 'plumb_bob', (0, 1)),
+    4: _Model('OPENCV', 2, 'plumb_bob', (0, 1, 2, 3)),
+    5: _Model('OPENCV_FISHEYE', 2, 'equidistant', (0, 1, 2, 3)),
+    6: _Model('FULL_OPENCV', 2, 'rational_polynomial', (0, 1, 2, 3, 4, 5, 6, 7)),
+    8: _Model('SIMPLE_RADIAL_FISHEYE', 1, 'equidistant', (0,)),
+    9: _Model('RADIAL_FISHEYE', 1, 'equidistant', (0, 1)),
+    14: _Model('SIMPLE_FISHEYE', 1, 'equidistant'), 15: _Model('FISHEYE', 2, 'equidistant')}
+_LENGTHS = {'': 0, 'plumb_bob': 4, 'equidistant': 4, 'rational_polynomial': 8}
+_OTHERS = {7: 'FOV', 10: 'THIN_PRISM_FISHEYE', 11: 'RAD_TAN_THIN_PRISM_FISHEYE',
+           12: 'SIMPLE_DIVISION', 13: 'DIVISION', 16: 'EUCM', 17: 'EQUIRECTANGULAR'}
+_BY_NAME = {model.name: number for number, model in _MODELS.items()}
+
+
+class _Posed(NamedTuple):
+    """An image of a model."""
+
+    name: str
+    camera_id: int
+    pose: NDArray[np.float64] | None  #: (4, 4): map_from_camera
+
+
+def is_colmap(folder: Path) -> bool:
+    """Return whether a folder holds a model, or is a project with one."""
+    return bool(_models(folder))
+
+
+def read_colmap(folder: Path, images: Path | None) -> Capture:
+    """Return the images of a model, or of the largest one of a project.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the model (cameras and images, .bin or .txt), or of the project around it.
+    images : Path, optional
+        Folder of the images; None: ``images/`` beside the model or above it.
+
+    Raises
+    ------
+    DatasetError
+        The model cannot be used; names what to mend.
+    """
+    models = _models(folder)
+    if not models:
+        raise DatasetError(f'{folder}: no COLMAP model here: it has cameras.bin and images.bin, '
+                           'or .txt; run the mapper of COLMAP first')
+    found = {model: list(_images(model)) for model in models}
+    model = max(models, key=lambda one: len(found[one]))
+    cameras = dict(_cameras(model))
+    notes = []
+    if len(models) > 1:
+        rest = sum(map(len, found.values())) - len(found[model])
+        notes.append(f'the model is in {len(models)} pieces: {model.name} with '
+                     f'{len(found[model])} images is used, {rest} images of the others are not')
+    root = images or next((one / 'images' for one in (folder, *model.resolve().parents[:3])
+                           if (one / 'images').is_dir()), folder)
+    shots = []
+    for one in found[model]:
+        if one.camera_id not in cameras:
+            raise DatasetError(f'{model}: image {one.name} is of camera {one.camera_id}, which '
+                               'the model does not have')
+        shots.append(Shot(root / one.name, cameras[one.camera_id], one.pose))
+    if len({one.color for one in shots}) < len(shots):
+        raise DatasetError(f'{model}: has two images of one name; give each its own')
+    files, poses = arrange(shots, str(model))
+    if len(files) < len(shots):
+        notes.append(f'{len(shots) - len(files)} of {len(shots)} images of the model are not in '
+                     f'{root}')
+    there = sum(one.suffix.lower() in IMAGES for one in root.rglob('*'))
+    return Capture(files, poses, is_metric=False, notes=tuple(notes), images=there)
+
+
+def _models(folder: Path) -> list[Path]:
+    """Return the folders of models in a folder."""
+    places = [folder / place for place in _PLACES]
+    sparse = folder / 'sparse'
+    places += sorted(sparse.iterdir()) if sparse.is_dir() else []
+    return [place for place in dict.fromkeys(places)
+            if _has(place, 'bin') or _has(place, 'txt')]
+
+
+def _has(model: Path, end: str) -> bool:
+    return (model / f'cameras.{end}').is_file() and (model / f'images.{end}').is_file()
+
+
+def _cameras(model: Path) -> Iterator[tuple[int, Camera]]:
+    """Yield the cameras of a model by their ids."""
+    binary = model / 'cameras.bin'
+    if not _has(model, 'bin'):
+        for where, cells in _lines(model / 'cameras.txt', 4):
+            number = _BY_NAME.get(cells[1], -1)
+            values = _numbers(cells[4:], where)
+            yield _integer(cells[0], where), _camera(
+                where, number, cells[1], (_integer(cells[2], where), _integer(cells[3], where)),
+                values)
+        return
+    with _Bytes(binary) as data:
+        for place in range(data.count(24)):
+            camera_id, number, width, height = data.take('<IiQQ')
+            name = _OTHERS.get(number, f'number {number}')
+            values = data.take(f'<{_MODELS[number].length}d') if number in _MODELS else ()
+            yield camera_id, _camera(f'{binary}: camera {place}', number, name, (width, height),
+                                     values)
+
+
+def _camera(where: str, number: int, name: str, size: tuple[int, int], values: tuple[float, ...]
+            ) -> Camera:
+    model = _MODELS.get(number)
+    if model is None:
+        raise DatasetError(f'{where} has the camera model {name}, which is not known here; '
+                           f'{_REMEDY}')
+    if len(values) != model.length:
+        raise DatasetError(f'{where}: {model.name} has {model.length} values, not {len(values)}')
+    fx, fy, (cx, cy) = values[0], values[model.focals - 1], values[model.focals:model.focals + 2]
+    distortion = np.zeros(_LENGTHS[model.distortion])
+    distortion[list(model.places)] = values[model.focals + 2:]
+    return camera_of(where, *size, fx, fy, cx - 0.5, cy - 0.5, model.distortion,
+                     tuple(distortion.tolist()))
+
+
+def _images(model: Path) -> Iterator[_Posed]:
+    """Yield the images of a model."""
+    binary = model / 'images.bin'
+    if not _has(model, 'bin'):
+        yield from _text_images(model / 'images.txt')
+        return
+    with _Bytes(binary) as data:
+        for _ in range(data.count(73)):
+            _, *numbers, camera_id = data.take('<I7dI')
+            name = data.name()
+            data.skip(24 * data.take('<Q')[0])
+            yield _posed(name, camera_id, numbers, f'{binary}: image {name}')
+
+
+def _text_images(path: Path) -> Iterator[_Posed]:
+    """Yield the images of a text file: two lines each, the second one may be empty."""
+    lines = [line for line in read_text(path).split('\n') if not line.startswith('#')]
+    for number, line in enumerate(lines[::2]):
+        cells = line.strip().split(maxsplit=9)
+        where = f'{path}: image {number}'
+        if not cells and 2 * number + 2 >= len(lines):
+            continue
+        if len(cells) != 10:
+            raise DatasetError(f'{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, '
+                               f'got {line[:60]!r}')
+        yield _posed(cells[9], _integer(cells[8], where), _numbers(cells[1:8], where), where)
+
+
+def _posed(name: str, camera_id: int, numbers: Sequence[float], where: str) -> _Posed:
+    w, x, y, z, *position = numbers
+    camera_from_map = pose_of(position, (x, y, z, w), where)
+    return _Posed(name, camera_id,
+                  None if camera_from_map is None else invert_transform(camera_from_map))
+
+
+def _lines(path: Path, least: int) -> Iterator[tuple[str, list[str]]]:
+    """Yield the cells of each line that is no comment."""
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        cells = line.split()
+        if cells and not cells[0].startswith('#'):
+            if len(cells) < least:
+                raise DatasetError(f'{path}:{number}: expected {least} values, got {line[:60]!r}')
+            yield f'{path}:{number}', cells
+
+
+def _numbers(cells: list[str], where: str) -> tuple[float, ...]:
+    return tuple(_parsed(cell, float, where) for cell in cells)
+
+
+def _integer(cell: str, where: str) -> int:
+    return _parsed(cell, int, where)
+
+
+def _parsed[T](cell: str, kind: Callable[[str], T], where: str) -> T:
+    try:
+        return kind(cell)
+    except ValueError:
+        raise DatasetError(f'{where}: {cell[:40]!r} is no number') from None
+
+
+class _Bytes:
+    """A binary file that is read from its start; no count in it is trusted."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._place = path, 0
+        try:
+            with path.open('rb') as file:
+                self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        except (OSError, ValueError) as error:  # ValueError: it is empty
+            raise DatasetError(f'{path}: cannot be read: {error}') from error
+
+    def __enter__(self) -> '_Bytes':
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._data.close()
+
+    def count(self, least_bytes: int) -> int:
+        """Return the number of entries that follow, each of this size at least."""
+        count = int(self.take('<Q')[0])
+        if count * least_bytes > len(self._data):
+            raise self._short(f'{count} entries do not fit')
+        return count
+
+    def take(self, form: str) -> tuple[Any, ...]:
+        begin = self._place
+        self.skip(struct.calcsize(form))
+        return struct.unpack_from(form, self._data, begin)
+
+    def skip(self, size: int) -> None:
+        self._place += size
+        if self._place > len(self._data):
+            raise self._short(f'byte {self._place} is missing')
+
+    def name(self) -> str:
+        """Return a text that ends with a zero byte."""
+        end = self._data.find(b'\0', self._place, self._place + _MOST_NAME)
+        if end < 0:
+            raise self._short('the name of an image does not end')
+        text = self._data[self._place:end].decode('utf-8', 'replace')
+        self._place = end + 1
+        return text
+
+    def _short(self, what: str) -> DatasetError:
+        return DatasetError(f'{self._path}: is cut short or damaged: {what} in '
+                            f'{len(self._data)} bytes; export the model again')

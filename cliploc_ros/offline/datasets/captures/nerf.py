@@ -1,0 +1,118 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The transforms.json of nerfstudio, Instant-NGP and the original NeRF.
+
+Camera axes are OpenGL's: x right, y up, z back. Fields that are not used here are ignored.
+"""
+
+import math
+from pathlib import Path, PurePosixPath
+
+import cv2
+import numpy as np
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.captures.capture import (
+    Capture,
+    Fields,
+    Shot,
+    arrange,
+    beside,
+    camera_of,
+)
+
+FILE = 'transforms.json'
+_PERSPECTIVE = ('PINHOLE', 'SIMPLE_PINHOLE', 'SIMPLE_RADIAL', 'RADIAL', 'OPENCV', 'PERSPECTIVE')
+_FISHEYE = ('OPENCV_FISHEYE', 'FISHEYE')
+_INTRINSICS = ('w', 'h', 'fl_x', 'fl_y', 'cx', 'cy', 'camera_angle_x', 'k1', 'k2', 'k3', 'k4',
+               'p1', 'p2', 'camera_model', 'is_fisheye')
+_ENDINGS = ('.png', '.jpg', '.jpeg', '.JPG', '.PNG')
+
+
+def is_nerf(folder: Path) -> bool:
+    """Return whether a folder has a transforms.json, or is one."""
+    return folder.name.endswith('.json') or (folder / FILE).is_file()
+
+
+def read_nerf(folder: Path, images: Path | None) -> Capture:
+    """Return the images that a transforms.json lists.
+
+    Parameters
+    ----------
+    folder : Path
+        The file, or its folder.
+    images : Path, optional
+        Folder that holds the images by their names alone; None: where the file says.
+
+    Raises
+    ------
+    DatasetError
+        A field cannot be used; names it.
+    """
+    path = folder if folder.name.endswith('.json') else folder / FILE
+    meta = Fields.of_file(path)
+    frames = meta.values.get('frames')
+    if not isinstance(frames, list) or not frames:
+        raise DatasetError(f'{path}: lists no frames')
+    scale = meta.number('applied_scale', 1.0)
+    if scale <= 0.0:
+        raise DatasetError(f'{path}: applied_scale is {scale:g}, not above 0')
+    shots, cameras = [], dict[str, Camera]()
+    for place, values in enumerate(frames):
+        # a frame's own values come before those of all
+        frame = Fields(values, f'{path}: frame {place}')
+        both = Fields({**{name: value for name, value in meta.values.items() if name != 'frames'},
+                       **frame.values}, frame.where)
+        color = _image(path.parent, frame.text('file_path'), images)
+        shown = repr([both.values.get(name) for name in _INTRINSICS])
+        if shown not in cameras:
+            cameras[shown] = _camera(both, color)
+        pose = both.numbers('transform_matrix', (-1, 4))
+        if pose.shape[0] not in (3, 4):
+            raise DatasetError(f'{frame.where}: transform_matrix has {pose.shape[0]} rows')
+        full = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])[:4]
+        full[:3, 3] /= scale
+        depth = frame.text('depth_file_path', '')
+        shots.append(Shot(color, cameras[shown], full,
+                          depth=beside(path.parent / depth) if depth else None))
+    files, poses = arrange(shots, str(path))
+    # depth is in metres, and so are the poses that it goes with
+    return Capture(files, poses, 'opengl', is_metric=all(one.depth for one in files))
+
+
+def _image(folder: Path, name: str, images: Path | None) -> Path:
+    """Return the file of an image; the original NeRF leaves its ending away."""
+    path = folder / name if images is None else images / PurePosixPath(name).name
+    return next((found for end in ('', *_ENDINGS)
+                 if (found := beside(path.with_name(path.name + end))) is not None), path)
+
+
+def _camera(values: Fields, image: Path) -> Camera:
+    """Return the camera of a frame. Pixels are counted from the corner of the first one."""
+    where = values.where
+    model = values.text('camera_model', 'OPENCV')
+    if 'w' in values and 'h' in values:
+        width, height = values.size('w', 'h')
+    else:
+        pixels = cv2.imread(str(image), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        if pixels is None:
+            raise DatasetError(f'{where}: fields w and h are missing, and {image} cannot be read')
+        height, width = pixels.shape[:2]
+    if 'fl_x' in values:
+        fx = values.number('fl_x')
+    elif 'camera_angle_x' in values:
+        fx = 0.5 * width / math.tan(0.5 * values.number('camera_angle_x') or math.nan)
+    else:
+        raise DatasetError(f'{where}: has no intrinsics: neither fl_x nor camera_angle_x')
+    fy = values.number('fl_y', fx)
+    cx, cy = values.number('cx', 0.5 * width) - 0.5, values.number('cy', 0.5 * height) - 0.5
+    k1, k2, k3, k4, p1, p2 = (values.number(name, 0.0)
+                              for name in ('k1', 'k2', 'k3', 'k4', 'p1', 'p2'))
+    if model in _FISHEYE or values.values.get('is_fisheye') is True:
+        return camera_of(where, width, height, fx, fy, cx, cy, 'equidistant',
+                         (k1, k2, k3, k4))
+    if model not in _PERSPECTIVE or k4:
+        raise DatasetError(f'{where}: camera_model {model} ' + ('with k4 ' if k4 else '')
+                           + 'is not known here; undistort the images to PINHOLE')
+    return camera_of(where, width, height, fx, fy, cx, cy, 'plumb_bob', (k1, k2, p1, p2, k3))

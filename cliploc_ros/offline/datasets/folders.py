@@ -1,0 +1,318 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Folders of images with poses: the table of their layouts, and the one reader of all of them.
+
+TUM RGB-D, with or without depth, and 7-Scenes are read here, the others in ``captures``.
+"""
+
+import hashlib
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.depth_image import MILLIMETRE, TUM_UNIT, DepthCamera
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.tilt import NO_VERTICAL, find_tilt, tilt_note
+from cliploc_ros.core.geometry.transforms import (
+    invert_transform,
+    is_rigid,
+    make_transform,
+    quaternion_from_transform,
+)
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.captures.capture import Capture, StampedPoses
+from cliploc_ros.offline.datasets.captures.colmap import is_colmap, read_colmap
+from cliploc_ros.offline.datasets.captures.devices import (
+    is_arkitscenes,
+    is_hololens,
+    is_polycam,
+    is_record3d,
+    is_stray,
+    read_arkitscenes,
+    read_hololens,
+    read_polycam,
+    read_record3d,
+    read_stray,
+)
+from cliploc_ros.offline.datasets.captures.nerf import is_nerf, read_nerf
+from cliploc_ros.offline.datasets.captures.placing import (
+    UP,
+    PlacedPoses,
+    check_axes,
+    find_scale,
+)
+from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, ImageFile, folder_frames
+from cliploc_ros.offline.datasets.intrinsics import find_camera, read_camera
+from cliploc_ros.offline.datasets.poses import Poses, TimedPoses
+from cliploc_ros.offline.datasets.tum import TumSequence, read_image_list, read_tum
+from cliploc_ros.units import NS_PER_S
+
+# Colour images of 7-Scenes are not registered, and its authors give no intrinsics for them. These
+# values make the edges of colour and depth agree best (measured for this project on RedKitchen).
+_SEVEN_SCENES_COLOR = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
+_SEVEN_SCENES_DEPTH = DepthCamera(585.0, 585.0, 320.0, 240.0,
+                                  make_transform(np.eye(3), np.array([-0.025, 0.0, 0.0])))
+_SEVEN_SCENES_NAME = re.compile(r'frame-(\d+)\.color\.(?:jpe?g|png)')
+_SEVEN_SCENES_HZ = 30
+_MAX_DEPTH_DELAY_NS = 20_000_000
+_NO_CHANGE = DepthFormat()
+
+
+@dataclass(frozen=True)
+class FolderOptions:
+    """What a folder does not say itself."""
+
+    intrinsics: str | None = None  #: Name of a preset, or a camera.json; None: the folder's own
+    trajectory: TimedPoses | None = None  #: Poses instead of the folder's own
+    max_gap_ns: int = 0  #: Greatest gap between two poses to interpolate over [ns]
+    #: (4, 4): how the camera is mounted on what the poses are of
+    body_from_camera: NDArray[np.float64] | None = None
+    depth: DepthFormat = _NO_CHANGE  #: What differs from the folder's usual format
+    layout: str = ''  #: Key of one of LAYOUTS; '': the one whose files are there
+    images: Path | None = None  #: Folder of the images of colmap and nerf
+    axes: str | None = None  #: What the stored poses are, one of AXES; None: by the layout
+    scale: float | None = None  #: Metres of a stored unit
+    #: Two images, and the distance between their cameras [m]: another way to say the scale
+    known_distance: tuple[str, str, float] | None = None
+    any_unit: bool = False  #: Take an unknown unit for the metre
+    level: bool = False  #: Turn the map so that z is up, by the tilt of the cameras
+
+
+_NO_OPTIONS = FolderOptions()
+
+
+class Layout(NamedTuple):
+    """A layout of folders."""
+
+    key: str
+    name: str  #: For people
+    #: Returns whether a folder has it, and its images
+    is_layout: Callable[[Path], bool]
+    read: Callable[[Path, FolderOptions], Capture]
+
+
+def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
+    """Return the images of a folder of any layout, with poses in metres and OpenCV's camera axes.
+
+    Images and poses are compared, so that a wrong choice of axes is refused.
+
+    Raises
+    ------
+    DatasetError
+        The folder has no known layout, or cannot be used; says what to do.
+    """
+    layout = find_layout(folder, options.layout)
+    if layout is None:
+        remedy = ('it is a recording: give --bag' if (folder / 'metadata.yaml').is_file()
+                  else 'unpack it' if folder.suffix in ('.r3d', '.zip')
+                  else 'images alone need poses, as COLMAP makes them')
+        raise DatasetError(f'{folder}: has the files of no known layout: '
+                           f'{", ".join(sorted({one.name for one in LAYOUTS}))}; {remedy}')
+    if layout.key not in _OPEN and (options.intrinsics or options.trajectory is not None
+                                    or options.body_from_camera is not None):
+        raise DatasetError(f'{folder}: {layout.name} has its own cameras and poses: '
+                           '--intrinsics, --trajectory and --mount are for TUM RGB-D')
+    if options.images is not None and layout.key not in ('colmap', 'nerf'):
+        raise DatasetError(f'{folder}: --images is for COLMAP and transforms.json')
+    try:
+        return _placed(folder, layout, layout.read(folder, options), options)
+    except OSError as error:
+        raise DatasetError(f'{folder}: cannot be read: {error}') from error
+
+
+def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Camera, str]:
+    """Return images and poses of a folder of one camera, the camera, and what says it.
+
+    DatasetError: it has several cameras, a video, or no unit.
+    """
+    layout = find_layout(folder)
+    if layout is None or layout.key == 'rgbd':
+        return read_tum(folder), *find_camera(intrinsics, folder)
+    capture = layout.read(folder, FolderOptions(intrinsics))
+    cameras = {one.camera for one in capture.files}
+    if len(cameras) > 1 or not capture.is_metric or any(
+            one.number is not None for one in capture.files):
+        raise DatasetError(f'{folder}: {layout.name} with {len(cameras)} cameras: a recording '
+                           'needs image files of one camera, and poses in metres')
+    posed = PlacedPoses(capture.poses, capture.axes, map_from_stored=UP[capture.up or 'z']
+                        ).all_of(capture.files)
+    trajectory = TimedPoses.from_samples(
+        [one.stamp_ns for one, _ in posed],
+        [[*pose[:3, 3], *quaternion_from_transform(pose)] for _, pose in posed], str(folder))
+    return (TumSequence(folder, tuple(one.stamp_ns for one in capture.files),
+                        tuple(one.color for one in capture.files), trajectory), cameras.pop(),
+            intrinsics or f'those of {layout.name}')
+
+
+def find_layout(folder: Path, key: str = '') -> Layout | None:
+    """Return the layout of a key, or the one whose files are there; None for none.
+
+    DatasetError: there is no such folder.
+    """
+    if not folder.exists():
+        raise DatasetError(f'{folder}: no such folder')
+    return next((one for one in LAYOUTS
+                 if one.key == key or (not key and one.is_layout(folder))), None)
+
+
+def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptions) -> Frames:
+    """Return the frames of a capture, in the map's coordinate frame."""
+    _check_poses(folder, capture.poses)
+    axes = options.axes or capture.axes
+    files, poses = list(capture.files), PlacedPoses(capture.poses, axes)
+    posed = poses.all_of(files)
+    count = max(len(files), capture.images)
+    notes = [f'read as {layout.name}: {len(posed)} of {count} images have poses', *capture.notes,
+             check_axes(files, capture.poses, axes, folder)]
+    scale = options.scale
+    if options.known_distance is not None:
+        scale = find_scale(posed, *options.known_distance, str(folder))
+        notes.append(f'a unit is {scale:.5g} m, by the known distance')
+    if scale is None and not capture.is_metric and not options.any_unit:
+        raise DatasetError(f'{folder}: {layout.name} does not know its unit: give --scale METRES '
+                           'of a unit (1 where they are metres), --known-distance or '
+                           '--object-size')
+    poses = replace(poses, scale=scale or 1.0, map_from_stored=UP[capture.up or 'z'])
+    poses, note = _levelled(folder, poses, files, options.level, bool(capture.up))
+    notes.append(note)
+    frames = folder_frames(folder, files, poses, replace(
+        capture.depth, unit_m=options.depth.unit_m or capture.depth.unit_m,
+        camera=options.depth.camera or capture.depth.camera))
+    known = [(file.color.name, file.camera, np.round(pose, 6).tolist())
+             for file, pose in poses.all_of(files)]
+    return replace(frames, digest=hashlib.sha256(repr(known).encode()).hexdigest()[:12],
+                   notes=(*filter(None, notes), *frames.notes))
+
+
+def _levelled(folder: Path, poses: PlacedPoses, files: Sequence[ImageFile], level: bool,
+              is_known: bool) -> tuple[PlacedPoses, str]:
+    """Return poses with z up where that is asked for, and a note on the vertical, or ''."""
+    placed = np.array([pose for _, pose in poses.all_of(files)]).reshape(-1, 4, 4)
+    if level:
+        found = find_tilt(placed)
+        if found is None:
+            raise DatasetError(f'{folder}: {NO_VERTICAL}')
+        rotation, tilt_deg = found
+        return (replace(poses, map_from_stored=rotation @ poses.map_from_stored),
+                f'levelled: the vertical of the cameras was {tilt_deg:.1f} degrees off z')
+    return poses, '' if is_known else tilt_note(placed)
+
+
+def tum_frames(sequence: TumSequence, camera: Camera, options: FolderOptions = _NO_OPTIONS
+               ) -> Frames:
+    """Return the frames of a TUM folder, taken by one camera; without depth.
+
+    DatasetError: there are no poses, or they are of another time.
+    """
+    files = [ImageFile(stamp, path, camera) for stamp, path in
+             zip(sequence.stamps_ns, sequence.image_paths, strict=True)]
+    poses = _poses(sequence, options)
+    _check_poses(sequence.folder, poses)
+    return folder_frames(sequence.folder, files, poses)
+
+
+def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
+    """Return the frames of a folder with depth: of 7-Scenes, or TUM RGB-D.
+
+    DatasetError: the folder has neither layout, or poses and intrinsics are missing.
+    """
+    is_tum = (folder / 'rgb.txt').exists()
+    if is_tum and not (folder / 'depth.txt').exists():
+        raise DatasetError(f'{folder}: has no depth.txt; map from it with --tum, without depth')
+    return read_folder(folder, replace(options, layout='rgbd' if is_tum else '7scenes'))
+
+
+def _tum(folder: Path, options: FolderOptions, with_depth: bool = True) -> Capture:
+    """Return a TUM folder; each image has the nearest depth image."""
+    sequence, camera = read_tum(folder), find_camera(options.intrinsics, folder)[0]
+    depths: dict[int, Path] = {}
+    if with_depth and (folder / 'depth.txt').exists():
+        stamps, paths = read_image_list(folder / 'depth.txt')
+        times = np.array(stamps, dtype=np.int64)
+        for stamp in sequence.stamps_ns:
+            nearest = int(np.argmin(np.abs(times - stamp)))
+            if abs(stamps[nearest] - stamp) <= _MAX_DEPTH_DELAY_NS:
+                depths[stamp] = paths[nearest]
+    return Capture(tuple(
+        ImageFile(stamp, path, camera, depths.get(stamp)) for stamp, path in
+        zip(sequence.stamps_ns, sequence.image_paths, strict=True)),
+        _poses(sequence, options), depth=DepthFormat(TUM_UNIT))
+
+
+def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
+    """Return the images of 7-Scenes, whose poses are the depth camera's."""
+    camera = (_SEVEN_SCENES_COLOR if options.intrinsics is None
+              else read_camera(options.intrinsics))
+    images = {int(match[1]): path for path in folder.iterdir()
+              if (match := _SEVEN_SCENES_NAME.fullmatch(path.name))}
+    if not images:
+        raise DatasetError(f'{folder}: has neither rgb.txt (TUM RGB-D) nor frame-000000.color.jpg '
+                           '(7-Scenes); give a folder of one of these layouts')
+    files, poses = [], {}
+    form = DepthFormat(options.depth.unit_m or MILLIMETRE,
+                       options.depth.camera or _SEVEN_SCENES_DEPTH)
+    assert form.camera is not None
+    depth_from_color = invert_transform(form.camera.color_from_depth)
+    for number, path in sorted(images.items()):
+        stem = path.name.partition('.')[0]
+        depth, pose = folder / f'{stem}.depth.png', folder / f'{stem}.pose.txt'
+        stamp = number * NS_PER_S // _SEVEN_SCENES_HZ
+        files.append(ImageFile(stamp, path, camera, depth if depth.exists() else None))
+        map_from_depth = _read_pose(pose) if pose.exists() else None
+        if map_from_depth is not None:
+            poses[stamp] = map_from_depth @ depth_from_color
+    if not poses:
+        raise DatasetError(f'{folder}: no image has a valid .pose.txt beside it')
+    return Capture(tuple(files), StampedPoses(poses), depth=form)
+
+
+def _read_pose(path: Path) -> NDArray[np.float64] | None:
+    """Return a pose (4, 4); None where tracking was lost, which is written as NaN or infinite."""
+    try:
+        pose = np.loadtxt(path, dtype=np.float64)
+    except (OSError, ValueError) as error:
+        raise DatasetError(f'{path}: is no 4x4 matrix: {error}') from error
+    if pose.shape != (4, 4):
+        raise DatasetError(f'{path}: is no 4x4 matrix, its shape is {pose.shape}')
+    if not np.isfinite(pose).all():
+        return None
+    if not is_rigid(pose, tolerance=1e-3):
+        raise DatasetError(f'{path}: is no rigid transform (rotation and translation [m])')
+    return pose
+
+
+def _poses(sequence: TumSequence, options: FolderOptions) -> Poses:
+    trajectory = sequence.trajectory if options.trajectory is None else options.trajectory
+    return replace(trajectory, max_gap_ns=options.max_gap_ns,
+                   body_from_camera=options.body_from_camera)
+
+
+def _check_poses(folder: Path, poses: Poses) -> None:
+    if poses.span_ns is None:
+        raise DatasetError(f'{folder}: there are no poses: no groundtruth.txt here; give '
+                           '--trajectory FILE')
+
+
+#: The first one whose files are there is read. TUM RGB-D without depth only where asked for.
+LAYOUTS = (
+    Layout('rgbd', 'TUM RGB-D', lambda folder: (folder / 'rgb.txt').is_file(), _tum),
+    Layout('7scenes', '7-Scenes', lambda folder: any(folder.glob('frame-*.color.*')),
+           _seven_scenes),
+    Layout('polycam', 'Polycam', is_polycam, lambda folder, _: read_polycam(folder)),
+    Layout('stray', 'Stray Scanner', is_stray, lambda folder, _: read_stray(folder)),
+    Layout('record3d', 'Record3D', is_record3d, lambda folder, _: read_record3d(folder)),
+    Layout('arkitscenes', 'ARKitScenes', is_arkitscenes,
+           lambda folder, _: read_arkitscenes(folder)),
+    Layout('hololens', 'HoloLens 2', is_hololens, lambda folder, _: read_hololens(folder)),
+    Layout('nerf', 'transforms.json', is_nerf,
+           lambda folder, options: read_nerf(folder, options.images)),
+    Layout('colmap', 'COLMAP model', is_colmap,
+           lambda folder, options: read_colmap(folder, options.images)),
+    Layout('tum', 'TUM RGB-D', lambda folder: False,
+           lambda folder, options: _tum(folder, options, with_depth=False)))
+_OPEN = ('rgbd', '7scenes', 'tum')  # layouts that may lack cameras and poses

@@ -1,0 +1,266 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Images with their cameras, poses and depth, out of folders and recordings alike.
+
+The one reader of evaluation, mapping and map editor. A source is read as a stream of raw frames:
+what is not wanted is never decoded, and a raw frame can be decoded in another process.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from itertools import chain
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.depth_image import DepthCamera, DepthImage, depth_from_counts
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.camera_faults import camera_faults
+from cliploc_ros.core.geometry.transforms import move_poses
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.poses import Poses, check_clock
+from cliploc_ros.units import NS_PER_S
+
+_MOST_NOTES = 5  # on cameras, of which each image may have its own
+# An undistorted image has so many places computed, which take 0.6 kB each.
+_MOST_PLACES = 1_000_000
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """An image (h, w, 3) uint8, red first, with its camera, pose and depth.
+
+    ``map_from_camera`` is None where no pose is known at ``stamp_ns``.
+    """
+
+    stamp_ns: int
+    image_rgb: NDArray[np.uint8]
+    camera: Camera
+    map_from_camera: NDArray[np.float64] | None
+    depth: DepthImage | None = None
+
+
+@dataclass(frozen=True)
+class RawFrame:
+    """A frame that is not decoded yet; small, and fit for another process."""
+
+    place: int  #: Number of the image in its source
+    stamp_ns: int  #: [ns]
+    map_from_camera: NDArray[np.float64] | None  #: (4, 4)
+    color: Callable[[], tuple[NDArray[np.uint8], Camera]]  #: Returns the image and its camera
+    depth: Callable[[], DepthImage] | None = None  #: Returns the depth image
+    camera: str = ''  #: Its name, of several cameras
+
+    def __str__(self) -> str:
+        """Name the frame in messages."""
+        of = f' of {self.camera}' if self.camera else ''
+        return f'image {self.place}{of} at {self.stamp_ns / NS_PER_S:.6f} s'
+
+    def decode(self) -> PosedImage:
+        """Return the frame.
+
+        DatasetError: the image cannot be decoded, or its camera is invalid.
+        """
+        image_rgb, camera = self.color()
+        return PosedImage(self.stamp_ns, image_rgb, camera, self.map_from_camera,
+                          None if self.depth is None else self.depth())
+
+
+#: Tells whether the frame of a place, stamp [ns] and pose is to be read.
+Wanted = Callable[[int, int, 'NDArray[np.float64] | None'], bool]
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Frames of a source that is read again each time, one image in memory at a time."""
+
+    source: Path  #: Folder or file
+    count: int  #: How many images there are
+    #: Returns an iterator over the wanted frames, asked once for each image in order
+    read_raw: Callable[[Wanted], Iterator[RawFrame]]
+    camera: str = ''  #: Its name, of several cameras
+    #: The frames of each of several cameras; empty for one
+    of_cameras: tuple['Frames', ...] = ()
+    varies: bool = False  #: Whether each image has a camera of its own
+    digest: str = ''  #: Of poses and cameras, which may change while the folder does not
+    notes: tuple[str, ...] = ()  #: What the user should know about how they were read
+
+    @property
+    def each(self) -> tuple['Frames', ...]:
+        """Return the frames of each camera, one at least."""
+        return self.of_cameras or (self,)
+
+    def read(self) -> Iterator[PosedImage]:
+        """Yield all frames, decoded."""
+        for raw in self.read_raw(lambda place, stamp_ns, pose: True):
+            yield raw.decode()
+
+    def select(self, places: Iterable[int]) -> 'Frames':
+        """Return some of the frames, by their places: 0 is the first."""
+        chosen = frozenset(places)
+
+        def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
+            return self.read_raw(lambda place, stamp_ns, pose: place in chosen
+                                 and is_wanted(place, stamp_ns, pose))
+        return Frames(self.source, len(chosen), read_raw, varies=self.varies, digest=self.digest,
+                      notes=self.notes)
+
+
+def move_frames(frames: Frames, scale: float, rotation: NDArray[np.float64]) -> Frames:
+    """Return frames with other poses, see move_poses."""
+    def moved(pose: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+        return None if pose is None else move_poses(pose[None], scale, rotation)[0]
+
+    def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
+        for raw in frames.read_raw(lambda place, stamp_ns, pose: is_wanted(place, stamp_ns,
+                                                                           moved(pose))):
+            yield replace(raw, map_from_camera=moved(raw.map_from_camera))
+    return replace(frames, read_raw=read_raw, of_cameras=tuple(
+        move_frames(one, scale, rotation) for one in frames.of_cameras))
+
+
+def join_frames(of_cameras: Mapping[str, Frames]) -> Frames:
+    """Return the frames of several cameras of one recording, by name: camera after camera."""
+    first, parts = 0, []
+    for name, frames in of_cameras.items():
+        def read_raw(is_wanted: Wanted, name: str = name, frames: Frames = frames,
+                     first: int = first) -> Iterator[RawFrame]:
+            for raw in frames.read_raw(is_wanted):
+                yield replace(raw, place=first + raw.place, camera=name)
+        parts.append(replace(frames, read_raw=read_raw, camera=name))
+        first += frames.count
+    return Frames(parts[0].source, first, lambda is_wanted: chain.from_iterable(
+        part.read_raw(is_wanted) for part in parts), of_cameras=tuple(parts),
+        notes=tuple(note for part in parts for note in part.notes))
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """An image of a folder, and its depth image if there is one."""
+
+    stamp_ns: int
+    color: Path  #: An image, or a video
+    camera: Camera
+    depth: Path | None = None
+    confidence: Path | None = None  #: Of the depth: an image of its size, 0 where it is a guess
+    number: int | None = None  #: Of the image in a video
+
+
+@dataclass(frozen=True)
+class DepthFormat:
+    """How depth images are to be read."""
+
+    #: Metres of one count. None: 1 mm for 16-bit integers, 1 m for floats.
+    unit_m: float | None = None
+    camera: DepthCamera | None = None  #: None: registered to the colour image
+
+
+def folder_frames(folder: Path, files: Sequence[ImageFile], poses: Poses,
+                  depth: DepthFormat | None = None) -> Frames:
+    """Return the frames of image files.
+
+    DatasetError: the poses are of another time than the images.
+    """
+    check_clock(poses, files[0].stamp_ns, files[-1].stamp_ns, str(folder))
+    form = depth or DepthFormat()
+
+    def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
+        for place, file in enumerate(files):
+            pose = poses.pose_at(file.stamp_ns)
+            if is_wanted(place, file.stamp_ns, pose):
+                yield RawFrame(place, file.stamp_ns, pose, partial(read_color, file),
+                               None if file.depth is None else partial(read_depth, file, form))
+    cameras = dict.fromkeys(file.camera for file in files)
+    # pictures may be cut out of larger ones, which no file tells: no fault is certain
+    notes = dict.fromkeys(f'note: {fault.text}' for one in cameras for fault in camera_faults(one))
+    return Frames(folder, len(files), read_raw, varies=len(cameras) > 1,
+                  notes=tuple(notes)[:_MOST_NOTES])
+
+
+def read_color(file: ImageFile) -> tuple[NDArray[np.uint8], Camera]:
+    """Return the image (h, w, 3) of a file, red first, and its camera.
+
+    DatasetError: the image cannot be decoded, or is not of the camera's size.
+    """
+    path, camera = file.color, file.camera
+    image = (cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+             if file.number is None else _open_video(path).image(file.number))
+    if image is None:
+        of = '' if file.number is None else f': image {file.number} of the video'
+        raise DatasetError(f'{path}{of} cannot be read as an image')
+    if image.shape[:2] != (camera.height, camera.width):
+        turned = image.shape[:2] == (camera.width, camera.height)
+        raise DatasetError(
+            f'{path} has {image.shape[1]}x{image.shape[0]} px, but the camera has '
+            f'{camera.width}x{camera.height} px' + (
+                '; is it turned by its EXIF orientation? turn the pixels, as with mogrify '
+                '-auto-orient' if turned else ''))
+    return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8), camera
+
+
+class _Video:
+    """A video that is read forward; a jump back opens it again."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._open()
+
+    def _open(self) -> None:
+        self._next = 0
+        self._capture = cv2.VideoCapture(str(self._path))
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+
+    def image(self, number: int) -> NDArray[np.uint8] | None:
+        """Return an image (h, w, 3), blue first; None where there is none."""
+        if number < self._next:
+            self._open()
+        while self._next < number:
+            self._next += 1
+            if not self._capture.grab():
+                return None
+        self._next += 1
+        found, image = self._capture.read()
+        return image if found else None
+
+
+_open_video = lru_cache(1)(_Video)
+
+
+def read_depth(file: ImageFile, form: DepthFormat) -> DepthImage:
+    """Return the depth image of a file that has one; DatasetError: it cannot be read."""
+    counts = cv2.imread(str(file.depth), cv2.IMREAD_UNCHANGED)
+    if counts is None:
+        raise DatasetError(f'{file.depth} cannot be read as a depth image')
+    depths_m = depth_from_counts(counts, form.unit_m, str(file.depth))
+    if file.confidence is not None:
+        certain = cv2.imread(str(file.confidence), cv2.IMREAD_UNCHANGED)
+        if certain is None or certain.shape != depths_m.shape:
+            raise DatasetError(f'{file.confidence} is no image of the size of {file.depth}')
+        depths_m[certain == 0] = np.nan
+    return DepthImage(depths_m, form.camera)
+
+
+def undistorted(image_rgb: NDArray[np.uint8], camera: Camera, pinhole: Camera | None = None
+                ) -> NDArray[np.uint8]:
+    """Return an image (h, w, 3) as a pinhole would show it, its camera's own by default.
+
+    It is black where the camera saw nothing.
+    """
+    pinhole = pinhole or camera.pinhole
+    if pinhole == camera.pinhole and camera.is_pinhole:
+        return image_rgb
+    # a large image has a coarser grid of places, and those between: a lens is smooth
+    step = max(1, math.isqrt(pinhole.width * pinhole.height // _MOST_PLACES))
+    columns, rows = np.meshgrid(*(step * np.arange(-1, side // step + 2) + 0.5 * (step - 1)
+                                  for side in (pinhole.width, pinhole.height)))
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    places = camera.project_normalized(pinhole.normalize_points(pixels))
+    places = np.nan_to_num(places, nan=-1.0).reshape(*columns.shape, 2).astype(np.float32)
+    places = cv2.resize(places, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)[
+        step:step + pinhole.height, step:step + pinhole.width]
+    return np.asarray(cv2.remap(image_rgb, places[..., 0], places[..., 1], cv2.INTER_LINEAR),
+                      dtype=np.uint8)

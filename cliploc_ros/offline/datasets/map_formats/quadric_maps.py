@@ -1,0 +1,282 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Maps of dual quadrics: of GOReloc, and of OA-SLAM in both forms in which it saves them.
+
+| file | content |
+|---|---|
+| NAME.objects (GOReloc) | protocol buffers: repeated object = 1 |
+| object | ellipsoid = 1, object_id = 2, cat_ids = 3, cat_counts = 4, mappoint_id = 5 |
+| ellipsoid | 16 floats = 1: a dual quadric, row by row |
+| map_objects_NAME.txt (both) | a line for each object: track id, category, dual quadric |
+| map_NAME.mapobjects (OA-SLAM) | repeated mapobject = 1 {ellipsoid = 1, track id = 2} |
+| map_NAME.objecttracks | next to it: repeated track = 1 {id = 1, category = 2, boxes = 8} |
+
+The facts on OA-SLAM are from its sources; no map that it saved was at hand. A monocular map has no
+metric scale, and its coordinate frame is the first camera's: z forward, y down.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.map_formats.given_map import (
+    GivenLandmark,
+    GivenMap,
+    Skipped,
+    class_name,
+    make_id,
+    read_bytes,
+    shares,
+)
+
+_MAX_ASYMMETRY = 1e-3
+_LEAST_SCALE = 1e-9
+_NOTE = ('a monocular map of OA-SLAM has no metric scale, and its axes are those of the first '
+         'camera: give --scale and --transform')
+_NUMBERS_IN_A_LINE = 18
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
+_MAX_VARINT_BYTES = 10
+
+
+class QuadricError(Exception):
+    """Why a dual quadric is no ellipsoid."""
+
+
+class WireError(Exception):
+    """What is wrong with a protocol buffer; the caller adds the file's name."""
+
+
+def read_goreloc(path: Path, class_names: Sequence[str]) -> GivenMap:
+    """Read the objects of a GOReloc map, NAME.objects.
+
+    Class weights are the counts of its categories. An object without a category, or that is no
+    ellipsoid, is left out. `class_names` are those of the category indices. DatasetError: the
+    message names the file and what is wrong with it.
+    """
+    given = GivenMap([], [], [])
+    try:
+        for item in _messages(path):
+            number = _integer(item, 2)
+            categories = [one for value in item.get(3, ()) for one in _integers(value)]
+            counts = [one for value in item.get(4, ()) for one in _integers(value)]
+            quadric = _quadric(item)
+            if len(categories) != len(counts) or not sum(counts):
+                given.left_out.append(Skipped(
+                    f'object {number}',
+                    f'it has {len(categories)} categories with the counts {counts[:5]}'))
+                continue
+            votes: Counter[str] = Counter()
+            for category, count in zip(categories, counts, strict=True):
+                votes[class_name(class_names, category)] += count
+            weights = shares(votes)
+            _add(given, f'object {number}', make_id(weights[0][0], number), weights[0][0], quadric,
+                 LandmarkDetails(class_weights=weights if len(weights) > 1 else None))
+    except WireError as error:
+        raise DatasetError(f'{path}: is no complete NAME.objects of GOReloc: {error}') from error
+    return given
+
+
+def read_oaslam(path: Path, class_names: Sequence[str]) -> GivenMap:
+    """Read the objects of an OA-SLAM map.
+
+    DatasetError: the message names the file and what is wrong with it.
+
+    Parameters
+    ----------
+    path : Path
+        map_objects_NAME.txt, or map_NAME.mapobjects next to map_NAME.objecttracks.
+    class_names : sequence of str
+        Of the category indices.
+    """
+    if path.suffix == '.mapobjects':
+        return _read_saved_map(path, class_names)
+    given = GivenMap([], [], [_NOTE])
+    try:
+        lines = read_bytes(path).decode('ascii').splitlines()
+    except UnicodeDecodeError as error:
+        raise DatasetError(f'{path}: is no map_objects_NAME.txt of OA-SLAM: not a text; a '
+                           'saved map must end in .mapobjects') from error
+    for line_number, line in enumerate(lines, 1):
+        words = line.split()
+        if not words:
+            continue
+        try:
+            if len(words) != _NUMBERS_IN_A_LINE:
+                raise ValueError
+            track, category = int(words[0]), int(words[1])
+            quadric = [float(word) for word in words[2:]]
+        except ValueError as error:
+            raise DatasetError(f'{path}: line {line_number}: expected track id, category and the '
+                               f'16 numbers of a dual quadric, not {line[:40]!r}') from error
+        name = class_name(class_names, category)
+        _add(given, make_id(name, track), make_id(name, track), name, quadric, LandmarkDetails())
+    return given
+
+
+def _read_saved_map(path: Path, class_names: Sequence[str]) -> GivenMap:
+    tracks_path = path.with_suffix('.objecttracks')
+    if not tracks_path.is_file():
+        raise DatasetError(f'{tracks_path} is missing: it holds the classes of {path.name}')
+    given = GivenMap([], [], [_NOTE])
+    reading = tracks_path
+    try:
+        # category and number of keyframes of each track
+        tracks = {_integer(item, 1): (_integer(item, 2), len(item.get(8, ())))
+                  for item in _messages(tracks_path, is_strict=False)}
+        reading = path
+        for item in _messages(path):
+            track, quadric = _integer(item, 2), _quadric(item)
+            if track not in tracks:
+                given.left_out.append(Skipped(
+                    f'track {track}', f'{tracks_path.name} has no such track, and so no class'))
+                continue
+            category, support = tracks[track]
+            name = class_name(class_names, category)
+            _add(given, make_id(name, track), make_id(name, track), name, quadric,
+                 LandmarkDetails(support=support))
+    except WireError as error:
+        raise DatasetError(f'{reading}: is no complete map of OA-SLAM: {error}') from error
+    return given
+
+
+def _add(given: GivenMap, shown: str, landmark_id: str, name: str, quadric: list[float],
+         details: LandmarkDetails) -> None:
+    """Append an object to the content of a file; one that is no ellipsoid is left out."""
+    try:
+        ellipsoid = decompose(quadric)
+    except QuadricError as error:
+        given.left_out.append(Skipped(shown, str(error)))
+    else:
+        given.landmarks.append(GivenLandmark(landmark_id, name, name, *ellipsoid, details))
+
+
+def decompose(numbers: list[float]) -> tuple[list[float], list[float], list[float]]:
+    """Return centre, semi-axes and quaternion x, y, z, w of a dual quadric, 16 numbers by rows.
+
+    QuadricError: it is no ellipsoid.
+    """
+    if len(numbers) != 16:
+        raise QuadricError(f'its dual quadric has {len(numbers)} numbers, not 16')
+    quadric = np.array(numbers, dtype=np.float64).reshape(4, 4)
+    size = np.abs(quadric).max()
+    if not np.isfinite(size):
+        raise QuadricError('it has numbers that are not finite')
+    if np.abs(quadric - quadric.T).max() > _MAX_ASYMMETRY * size:
+        raise QuadricError('its dual quadric is not symmetric')
+    if abs(quadric[3, 3]) <= _LEAST_SCALE * size:
+        raise QuadricError('its dual quadric has no finite centre')
+    quadric = 0.5 * (quadric + quadric.T) / -quadric[3, 3]
+    center = -quadric[:3, 3]
+    squares, axes = np.linalg.eigh(quadric[:3, :3] + np.outer(center, center))
+    if squares[0] <= 0.0:
+        shown = ' '.join(f'{square:.3g}' for square in squares)
+        raise QuadricError(f'its dual quadric is no ellipsoid: squared semi-axes {shown}')
+    if np.linalg.det(axes) < 0.0:
+        axes[:, 2] *= -1.0
+    return (center.tolist(), np.sqrt(squares).tolist(),
+            Rotation.from_matrix(axes).as_quat().tolist())
+
+
+# ---- protocol buffers ---------------------------------------------------------------------------
+#
+# A message is a sequence of fields. Each begins with a varint, 8 * number + wire type; what
+# follows depends on the wire type: protobuf.dev/programming-guides/encoding. The package protobuf
+# is no dependency of others here, and would need compiled schemas.
+
+_Fields = Mapping[int, list[int | memoryview]]
+
+
+def _messages(path: Path, is_strict: bool = True) -> Iterator[_Fields]:
+    """Yield the messages of a file; WireError: a strict one has other fields."""
+    fields = _fields(memoryview(read_bytes(path)))
+    for number in fields:
+        if is_strict and number != 1:
+            raise WireError(f'field {number} is unknown')
+    for values in fields.values():
+        for value in values:
+            yield _fields(_message(value))
+
+
+def _quadric(item: _Fields) -> list[float]:
+    """Return the numbers of the ellipsoid that is field 1 of an object."""
+    numbers: list[float] = []
+    for ellipsoid in item.get(1, ()):
+        for value in _fields(_message(ellipsoid)).get(1, ()):
+            if isinstance(value, int) or len(value) % 4:
+                raise WireError('field 1 holds no 32-bit floats')
+            numbers += np.frombuffer(value, dtype='<f4').tolist()
+    return numbers
+
+
+def _message(value: int | memoryview) -> memoryview:
+    if isinstance(value, int):
+        raise WireError('a field is a number where a message was expected')
+    return value
+
+
+def _integer(item: _Fields, number: int) -> int:
+    """Return a number of a message; a zero is not stored."""
+    value = item.get(number, [0])[-1]
+    if not isinstance(value, int):
+        raise WireError(f'field {number} is a message where a number was expected')
+    return value
+
+
+def _integers(value: int | memoryview) -> list[int]:
+    """Return the numbers of a repeated field, packed or not."""
+    if isinstance(value, int):
+        return [value]
+    numbers, place = [], 0
+    while place < len(value):
+        number, place = _read_varint(value, place)
+        numbers.append(number)
+    return numbers
+
+
+def _fields(data: memoryview) -> _Fields:
+    """Return the values of a message by the number of their field; nothing is copied.
+
+    WireError: the bytes are no message, or end too early.
+    """
+    fields: dict[int, list[int | memoryview]] = defaultdict(list)
+    place = 0
+    while place < len(data):
+        tag, place = _read_varint(data, place)
+        number, wire_type = tag >> 3, tag & 7
+        if number == 0:
+            raise WireError(f'byte {place}: field 0 does not exist')
+        if wire_type == _VARINT:
+            value, place = _read_varint(data, place)
+            fields[number].append(value)
+            continue
+        if wire_type == _BYTES:
+            size, place = _read_varint(data, place)
+        elif wire_type in (_FIXED32, _FIXED64):
+            size = 4 if wire_type == _FIXED32 else 8
+        else:
+            raise WireError(f'byte {place}: wire type {wire_type} does not exist')
+        if size > len(data) - place:
+            raise WireError(f'byte {place}: field {number} has {size} bytes, and only '
+                            f'{len(data) - place} are left')
+        fields[number].append(data[place:place + size])
+        place += size
+    return fields
+
+
+def _read_varint(data: memoryview, place: int) -> tuple[int, int]:
+    """Return the number that begins at a place, and the place after it."""
+    value = 0
+    for count in range(_MAX_VARINT_BYTES):
+        if place >= len(data):
+            raise WireError(f'byte {place}: the data ends within a number')
+        byte = data[place]
+        place += 1
+        value |= (byte & 0x7F) << (7 * count)
+        if byte < 0x80:
+            return value, place
+    raise WireError(f'byte {place}: a number has more than {_MAX_VARINT_BYTES} bytes')

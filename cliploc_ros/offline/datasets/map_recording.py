@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a map was built from: NAME.recording.json next to NAME.yaml.
+
+``check_map`` and the studio find observations and images by it. Paths in it are relative to the
+map, so that folders can be moved together.
+"""
+
+import json
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.files.storage import write_text
+from cliploc_ros.offline.datasets.observations import load_observations
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+
+_PATHS = ('observations', 'source', 'images')
+
+
+@dataclass(frozen=True)
+class MapRecording:
+    """A recording of the place of a map."""
+
+    observations: Path
+    source: Path | None = None  #: The bag or folder with the images; None: none is known
+    #: Of a bag: topics of image and camera_info, and whether images are rectified
+    image: str = ''
+    camera_info: str = ''
+    rectified: bool = False
+    #: Of a folder: the key of its layout, its camera, and where its images are
+    layout: str = ''
+    intrinsics: str | None = None
+    images: Path | None = None
+    #: From the poses of the observations to those of the map: positions times a scale, then turned
+    #: by a rotation (3, 3)
+    scale: float = 1.0
+    rotation: list[list[float]] = field(default_factory=lambda: np.eye(3).tolist())
+
+    @property
+    def is_moved(self) -> bool:
+        """Return whether the poses of the map are others than those of the recording."""
+        return self.scale != 1.0 or not np.array_equal(self.rotation, np.eye(3))
+
+    def load(self) -> PosedDetections:
+        """Return the observations in the map; DatasetError: they cannot be read."""
+        return load_observations(self.observations).moved(self.scale, np.array(self.rotation))
+
+
+def recording_path(map_file: Path) -> Path:
+    """Return the file that says what a map was built from."""
+    return map_file.with_suffix('.recording.json')
+
+
+def save_recording(map_file: Path, recording: MapRecording) -> None:
+    """Write what a map was built from, next to it; CliplocError: the file cannot be written."""
+    folder = map_file.resolve().parent
+    values: dict[str, Any] = asdict(recording)
+    for name in _PATHS:
+        if values[name] is not None:
+            values[name] = os.path.relpath(values[name].resolve(), folder)
+    write_text(recording_path(map_file), json.dumps(values, indent=1))
+
+
+def load_recording(map_file: Path) -> MapRecording | None:
+    """Return what a map was built from; None where nothing says it, or its observations are gone.
+
+    A source that is gone is None. DatasetError: the file is damaged.
+    """
+    path = recording_path(map_file)
+    if not path.is_file():
+        return None
+    try:
+        values = json.loads(path.read_text(encoding='utf-8'))
+        paths = {name: map_file.resolve().parent / values[name] for name in _PATHS
+                 if values.get(name) is not None}
+        found = MapRecording(**(values | {
+            name: one if one.exists() else None for name, one in paths.items()}))
+        turn = np.array(found.rotation, dtype=float)
+        is_valid = turn.shape == (3, 3) and 0.0 < found.scale < np.inf and np.allclose(
+            turn @ turn.T, np.eye(3), atol=1e-6)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise DatasetError(f'{path}: cannot be read: {error}; remove it') from error
+    if not is_valid:
+        raise DatasetError(f'{path}: has no valid scale and rotation; remove it')
+    return None if found.observations is None else found

@@ -1,0 +1,151 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Convert a TUM RGB-D sequence into a recording with the nodes' topics."""
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets import bag_messages
+from cliploc_ros.offline.datasets.bags import BagWriter
+from cliploc_ros.offline.datasets.tum import TumSequence, read_tum_accelerometer
+
+#: Passes on an iterable of stamp [ns] and file of each image, and shows progress.
+Progress = Callable[[Iterable[tuple[int, Path]]], Iterable[tuple[int, Path]]]
+
+_NAMESPACE = re.compile(r'/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*/?|/?')
+_CODECS = {b'\x89PNG': 'png', b'\xff\xd8\xff': 'jpeg'}
+
+
+@dataclass(frozen=True)
+class ConversionOptions:
+    """Format, topics and coordinate frames of the recording."""
+
+    storage: str = 'sqlite3'  #: ``sqlite3`` or ``mcap``
+    #: ``raw`` for sensor_msgs/Image; ``compressed`` for sensor_msgs/CompressedImage with the
+    #: files' own bytes
+    image_format: str = 'raw'
+    prefix: str = ''  #: Namespace of all topics: ``camera`` gives ``/camera/image``
+    #: Coordinate frame of images, camera_info and detections (optical axes)
+    camera_frame: str = 'camera_optical_frame'
+    world_frame: str = 'world'  #: Coordinate frame of the ground-truth poses: the map's
+    imu_frame: str = 'imu'  #: Coordinate frame of the accelerometer, whose mount TUM does not give
+
+    def topic(self, name: str) -> str:
+        """Return the absolute name of a topic.
+
+        DatasetError: the prefix is no valid ROS namespace.
+        """
+        if _NAMESPACE.fullmatch(self.prefix) is None:
+            raise DatasetError(f'prefix {self.prefix!r} is no ROS namespace, such as /camera')
+        return '/'.join(['', *filter(None, self.prefix.split('/')), name])
+
+
+@dataclass(frozen=True)
+class ConversionResult:
+    """Counts of what was written."""
+
+    images: int  #: Images, each with a camera_info
+    poses: int  #: Images with ground truth
+    detections: int  #: Images with an entry of recorded detections, which may be empty
+    accelerations: int = 0  #: Samples of the accelerometer
+
+
+def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
+                options: ConversionOptions, detections: Mapping[int, Detections] | None = None,
+                progress: Progress = iter) -> ConversionResult:
+    """Write a sequence as a rosbag2 recording.
+
+    Topics: ``image`` or ``image/compressed``, ``camera_info``, ``ground_truth``, ``detections`` if
+    given, and ``imu`` where the folder has an accelerometer.txt. All headers of a frame have
+    exactly the image's stamp, which is also the time of recording. DatasetError: an image is
+    invalid, no image has detections, or the output cannot be written. No partial recording
+    remains.
+
+    Parameters
+    ----------
+    camera : Camera
+        Intrinsics; the images must have its size.
+    output : str or Path
+        The folder to make.
+    detections : mapping of int to Detections, optional
+        Recorded detections by stamp [ns].
+    progress : callable
+        Wraps the iterable of images, to show progress.
+    """
+    recorded = detections or {}
+    if detections is not None and not any(stamp in detections for stamp in sequence.stamps_ns):
+        raise DatasetError(
+            f'{sequence.folder}: the recorded detections have the stamps of none of its images; '
+            'are they of another sequence?')
+    is_compressed = options.image_format == 'compressed'
+    image_topic = options.topic('image/compressed' if is_compressed else 'image')
+    info_topic, pose_topic = options.topic('camera_info'), options.topic('ground_truth')
+    boxes_topic = options.topic('detections')
+    frame, poses, boxes = options.camera_frame, 0, 0
+    accelerometer = sequence.folder / 'accelerometer.txt'
+    stamps_ns, accelerations = (read_tum_accelerometer(accelerometer) if accelerometer.exists()
+                                else ([], np.empty((0, 3))))
+    with BagWriter(output, options.storage) as bag:
+        bag.add_topic(image_topic, bag_messages.COMPRESSED_IMAGE if is_compressed
+                      else bag_messages.IMAGE)
+        bag.add_topic(info_topic, bag_messages.CAMERA_INFO)
+        bag.add_topic(pose_topic, bag_messages.POSE)
+        if detections is not None:
+            bag.add_topic(boxes_topic, bag_messages.DETECTIONS)
+        for stamp_ns, path in progress(
+                list(zip(sequence.stamps_ns, sequence.image_paths, strict=True))):
+            bag.write(image_topic, stamp_ns,
+                      _image_message(stamp_ns, frame, path, camera, is_compressed))
+            bag.write(info_topic, stamp_ns,
+                      bag_messages.camera_info_message(stamp_ns, frame, camera))
+            if stamp_ns in recorded:
+                bag.write(boxes_topic, stamp_ns, bag_messages.detections_message(
+                    stamp_ns, frame, recorded[stamp_ns]))
+                boxes += 1
+            if (map_from_camera := sequence.pose_at(stamp_ns)) is not None:
+                bag.write(pose_topic, stamp_ns, bag_messages.pose_message(
+                    stamp_ns, options.world_frame, map_from_camera))
+                poses += 1
+        if stamps_ns:
+            imu_topic = options.topic('imu')
+            bag.add_topic(imu_topic, bag_messages.IMU)
+            for stamp_ns, acceleration in zip(stamps_ns, accelerations, strict=True):
+                bag.write(imu_topic, stamp_ns, bag_messages.imu_message(
+                    stamp_ns, options.imu_frame, acceleration))
+    return ConversionResult(len(sequence), poses, boxes, len(stamps_ns))
+
+
+def _image_message(stamp_ns: int, frame_id: str, path: Path, camera: Camera, is_compressed: bool
+                   ) -> Any:
+    """Return an image file as message; DatasetError: it is damaged, or of another size."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DatasetError(f'{path}: cannot be read: {error.strerror}') from error
+    # Compressed images are decoded too: this refuses a damaged file before a node receives it.
+    try:
+        pixels_bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error:
+        pixels_bgr = None  # OpenCV raises for an empty buffer and returns None for a damaged one
+    if pixels_bgr is None:
+        raise DatasetError(f'{path}: cannot be decoded as an image')
+    height, width = pixels_bgr.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise DatasetError(f'{path}: has {width}x{height} px, but the intrinsics are for '
+                           f'{camera.width}x{camera.height} px')
+    if not is_compressed:
+        return bag_messages.image_message(stamp_ns, frame_id, np.asarray(
+            cv2.cvtColor(pixels_bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8))
+    for magic, codec in _CODECS.items():
+        if data.startswith(magic):
+            return bag_messages.compressed_image_message(stamp_ns, frame_id, data, codec)
+    raise DatasetError(f'{path}: is neither PNG nor JPEG; write raw images instead (--raw)')

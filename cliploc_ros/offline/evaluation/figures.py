@@ -1,0 +1,340 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's figures and others, as PNG and SVG."""
+
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.files.storage import write_file
+from cliploc_ros.offline.evaluation.drawing import draw_map, spread_names
+from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
+from cliploc_ros.offline.evaluation.summary import Summary, find_best, wilson_interval
+from cliploc_ros.offline.evaluation.trials import Query, Result
+
+# The colours of Okabe and Ito, which the colour-blind can distinguish: one for each matching, the
+# others for other methods. Line style and marker show the algorithm.
+_COLORS = {'class': '#D55E00', 'clip': '#009E73', 'hybrid': '#0072B2'}
+_OTHER_COLORS = ('#CC79A7', '#E69F00', '#56B4E9', '#000000', '#F0E442')
+_STYLES = {'bf': ('-', 'o'), 'ransac': ((0, (1, 1.2)), '^'), 'prosac': ((0, (5, 1.5)), 's'),
+           'b-prosac': ((0, (5, 1, 1, 1)), 'D')}
+_SIZE = (6.4, 4.0)
+_MAX_ERROR_M = 2.0
+_SUCCESS_M = 1.0
+_BOX_BINS = ((0, 2), (3, 4), (5, 6), (7, 9), (10, 14), (15, 10_000))
+_MARGIN_M = 0.5
+# Of reliability, finer where poses are accepted
+_BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.0)
+_FREEDOM = 6  # of a pose
+_JUDGED_COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
+_MARKERS = 'osD^vP'
+
+
+def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
+             results: Sequence[Result], summaries: Sequence[Summary],
+             sweep: Mapping[str, Mapping[int, Summary]], observing_ms: Mapping[str, float]
+             ) -> list[Path]:
+    """Draw every figure that has data.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the figures.
+    summaries : sequence of Summary
+        Of the results.
+    sweep : mapping of str to mapping of int to Summary
+        Of each sampling method, by its number of iterations.
+    observing_ms : mapping of str to float
+        Mean times of the stages before the search, where recorded.
+
+    Returns
+    -------
+    list of Path
+        The PNG files; each has an SVG beside it.
+    """
+    sampled = [one for one in summaries if _style(one.method)[2] is not None
+               and not one.method.endswith('_bf')]
+    best = find_best(summaries)
+    figures = {
+        'success_over_threshold': _success_over_threshold(summaries),
+        'success_by_boxes': _success_by_boxes(summaries),
+        'precision_over_recall': _precision_over_recall(summaries),
+        'reliability': _reliability(best),
+        'consistency': _consistency(summaries),
+        'time_by_stage': _time_by_stage(summaries, observing_ms),
+        'top_view': _top_view(landmark_map, queries,
+                              [one for one in results if one.method == best.method], best.method),
+    }
+    if sampled:
+        figures['best_iteration'] = _best_iteration(sampled)
+    if sweep:
+        figures['success_over_iterations'] = _success_over_iterations(sweep)
+    return [save_figure(figure, folder / f'{name}.png') for name, figure in figures.items()]
+
+
+def save_figure(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG and as SVG beside it; return the path."""
+    spread_names(figure)
+    write_file(path, lambda partial: figure.savefig(partial, dpi=150))
+    # without its date and with fixed ids, an SVG of the same results is the same file
+    with matplotlib.rc_context({'svg.hashsalt': path.stem}):
+        write_file(path.with_suffix('.svg'),
+                   lambda partial: figure.savefig(partial, metadata={'Date': None}))
+    return path
+
+
+def new_axes(xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
+    """Return a figure and its axes in the common style."""
+    figure = Figure(figsize=_SIZE, layout='constrained')
+    axes = figure.add_subplot()
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.grid(alpha=0.3)
+    axes.set_axisbelow(True)
+    return figure, axes
+
+
+def _style(method: str) -> tuple[str, object, str | None]:
+    """Return the colour, line style and marker of a method."""
+    if method in PAPER_METHODS:
+        matching, algorithm = method.split('_')
+        return _COLORS[matching], *_STYLES[algorithm]
+    return _OTHER_COLORS[sum(method.encode()) % len(_OTHER_COLORS)], '-', 'P'
+
+
+def add_legend(figure: Figure) -> None:
+    """Add the legend beside the axes."""
+    figure.legend(loc='outside right upper', frameon=False, fontsize=8)
+
+
+def _success_over_threshold(summaries: Sequence[Summary]) -> Figure:
+    figure, axes = new_axes('error threshold [m]', 'success')
+    limits = np.linspace(0.0, _MAX_ERROR_M, 401)
+    for one in summaries:
+        color, line, _ = _style(one.method)
+        errors = np.sort(one.errors_m.ravel())
+        axes.plot(limits, np.searchsorted(errors, limits) / errors.size, color=color,
+                  linestyle=line, linewidth=1.4, label=one.method)
+    axes.set(xlim=(0, _MAX_ERROR_M), ylim=(0, 1))
+    add_legend(figure)
+    return figure
+
+
+def _success_over_iterations(sweep: Mapping[str, Mapping[int, Summary]]) -> Figure:
+    figure, axes = new_axes('iterations', f'success (within {_SUCCESS_M:g} m)')
+    for method, by_count in sweep.items():
+        color, line, marker = _style(method)
+        rates = [one.success(_SUCCESS_M) for one in by_count.values()]
+        axes.plot([*by_count], rates, color=color, linestyle=line, marker=marker, markersize=4,
+                  linewidth=1.2, label=method)
+    counts = sorted({count for by_count in sweep.values() for count in by_count})
+    axes.set_xscale('log')
+    axes.set_xticks(counts, [f'{count:,}' for count in counts])
+    axes.set_xticks([], minor=True)
+    axes.set_ylim(0, 1)
+    add_legend(figure)
+    return figure
+
+
+def _best_iteration(summaries: Sequence[Summary]) -> Figure:
+    figure, axes = new_axes('iteration that found the best pose', '')
+    found = [one.best_iterations[np.isfinite(one.errors_m)] for one in summaries]
+    boxes = axes.boxplot(found, orientation='horizontal', widths=0.6, showfliers=False,
+                         patch_artist=True, medianprops={'color': 'black'})
+    for patch, one in zip(boxes['boxes'], summaries, strict=True):
+        patch.set(facecolor=_style(one.method)[0], alpha=0.6)
+    axes.set_yticks(range(1, len(summaries) + 1), [one.method for one in summaries])
+    axes.invert_yaxis()
+    axes.set_title('median, quartiles, and 1.5 of their distance', fontsize=9)
+    return figure
+
+
+def _success_by_boxes(summaries: Sequence[Summary]) -> Figure:
+    figure, axes = new_axes('detections in the image', f'success (within {_SUCCESS_M:g} m)')
+    boxes = summaries[0].boxes
+    bins = [(low, high, (boxes >= low) & (boxes <= high)) for low, high in _BOX_BINS]
+    bins = [one for one in bins if one[2].any()]
+    for one in summaries:
+        color, line, marker = _style(one.method)
+        rates = [(one.errors_m[:, chosen] < _SUCCESS_M).mean() for _, _, chosen in bins]
+        axes.plot(range(len(bins)), rates, color=color, linestyle=line, marker=marker,
+                  markersize=4, linewidth=1.2, label=one.method)
+    names = [f'{low} to {high}' if high < _BOX_BINS[-1][1] else f'{low} or more'
+             for low, high, _ in bins]
+    axes.set_xticks(range(len(bins)), [f'{name}\n{int(chosen.sum())} images'
+                                       for name, (*_, chosen) in zip(names, bins, strict=True)],
+                    fontsize=8)
+    axes.set_ylim(-0.02, 1.02)
+    add_legend(figure)
+    return figure
+
+
+def _precision_over_recall(summaries: Sequence[Summary]) -> Figure:
+    figure, axes = new_axes('recall: right poses that are accepted',
+                        f'precision: accepted poses within {_SUCCESS_M:g} m')
+    for one in summaries:
+        color, line, marker = _style(one.method)
+        recall, precision = precision_recall(one)
+        if not len(recall):
+            continue
+        axes.plot(recall, precision, color=color, linestyle=line, linewidth=1.2,
+                  label=one.method)
+        if one.accepted.any():
+            axes.plot(one.recall(), one.precision(), color=color, marker=marker, markersize=6,
+                      markeredgecolor='black', linestyle='none')
+    axes.set(xlim=(-0.02, 1.02))
+    axes.set_title('lines: all least confidences; markers: as run', fontsize=9)
+    add_legend(figure)
+    return figure
+
+
+def precision_recall(one: Summary, limit_m: float = _SUCCESS_M
+                     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return recall and precision of accepting all poses above each confidence.
+
+    Parameters
+    ----------
+    limit_m : float
+        Limit of success.
+
+    Returns
+    -------
+    recall, precision : ndarray (m,)
+        From the strictest threshold to the loosest; empty if no pose is right.
+    """
+    solved = np.isfinite(one.errors_m)
+    order = np.argsort(-one.confidence[solved], kind='stable')
+    right = (one.errors_m[solved] < limit_m)[order]
+    if not right.any():
+        return np.empty(0), np.empty(0)
+    accepted = np.cumsum(right)
+    # of equal confidence all poses are accepted, or none
+    last = np.append(np.diff(one.confidence[solved][order]) != 0, True)
+    return (accepted / right.sum())[last], (accepted / np.arange(1, right.size + 1))[last]
+
+
+def _reliability(one: Summary) -> Figure:
+    """Draw the reliability of the installed calibration."""
+    figure, axes = new_axes('confidence', f'share of poses within {_SUCCESS_M:g} m')
+    solved = np.isfinite(one.errors_m)
+    draw_reliability(axes, {one.method: (one.confidence[solved],
+                                         one.errors_m[solved] < _SUCCESS_M)})
+    axes.set_title('installed calibration', fontsize=9)
+    add_legend(figure)
+    return figure
+
+
+def _consistency(summaries: Sequence[Summary]) -> Figure:
+    """Draw the distribution of the normalized squared errors of accepted poses."""
+    figure, axes = new_axes('squared error in its own covariance (NEES)',
+                            'share of accepted poses below')
+    levels = np.linspace(0.0, float(chi2.ppf(0.999, _FREEDOM)), 400)
+    axes.plot(levels, chi2.cdf(levels, _FREEDOM), color='#888888', linewidth=1.6,
+              label='ideal')
+    axes.axvline(chi2.ppf(0.95, _FREEDOM), color='#888888', linewidth=0.8, linestyle=':',
+                 label='95 % ellipsoid')
+    judged = {one.method: one.nees[one.accepted] for one in summaries
+              if one.nees.size and one.accepted.any()}
+    for (name, squares), color in zip(judged.items(), cycle(_JUDGED_COLORS), strict=False):
+        axes.plot(levels, np.searchsorted(np.sort(squares), levels, side='right') / len(squares),
+                  color=color, linewidth=1.4,
+                  label=f'{name}: {within_ellipsoid(squares):.3f} within')
+    axes.set(xlim=(0, levels[-1]), ylim=(0, 1.02))
+    add_legend(figure)
+    return figure
+
+
+def _time_by_stage(summaries: Sequence[Summary], observing_ms: Mapping[str, float]) -> Figure:
+    figure, axes = new_axes('mean time [ms]', '')
+    rows = np.arange(len(summaries))
+    start = np.zeros(len(summaries))
+    for (stage, duration), shade in zip(observing_ms.items(), ('#BBBBBB', '#888888'),
+                                        strict=False):
+        axes.barh(rows, duration, left=start, color=shade, label=stage)
+        start += duration
+    keyframes = np.array([one.keyframes_ms.mean() if one.has_keyframes else 0.0
+                          for one in summaries])
+    if keyframes.any():
+        axes.barh(rows, keyframes, left=start, color='#56B4E9', label='keyframes')
+        start += keyframes
+    search = np.array([one.mean_search_ms for one in summaries])
+    axes.barh(rows, search, left=start, color=[_style(one.method)[0] for one in summaries])
+    for row, total, own in zip(rows, start + search, search, strict=True):
+        axes.annotate(f'search {own:,.1f}' + (f', all {total:,.1f}' if total > own else ''),
+                      (total, row), xytext=(3, 0), va='center', fontsize=8,
+                      textcoords='offset points')
+    axes.set_yticks(rows, [one.method for one in summaries])
+    axes.invert_yaxis()
+    has_stages = bool(observing_ms) or keyframes.any()
+    if (start + search).max() > 50 * (start + search).min() and not has_stages:
+        axes.set_xscale('log')
+    axes.margins(x=0.4)
+    if has_stages:
+        add_legend(figure)
+    return figure
+
+
+def _top_view(landmark_map: LandmarkMap, queries: Sequence[Query], results: Sequence[Result],
+              method: str) -> Figure:
+    truth = {query.number: query.map_from_camera for query in queries}
+    first = [one for one in results if one.trial == 0]
+    positions = np.array([pose[:2, 3] for pose in truth.values()])
+    points = np.concatenate([landmark_map.centers[:, :2], positions])
+    low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
+    width, height = high - low
+    scale = min(8.0 / width, 8.0 / height)
+    figure = Figure(figsize=(max(3.0, width * scale) + 2.6, max(3.0, height * scale) + 1.0),
+                    layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08))
+    axes = figure.add_subplot()
+    frame = landmark_map.frame_id
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect='equal',
+             xlabel=f'x in {frame} [m]', ylabel=f'y in {frame} [m]',
+             title=f'{method}: estimates joined to their truth')
+    draw_map(axes, landmark_map)
+    axes.plot(positions[:, 0], positions[:, 1], 'o', markersize=6, markerfacecolor='none',
+              color='#222222', label='truth', zorder=6)
+    for label, color, marker, verdict in (('accepted', '#0072B2', 'o', True),
+                                          ('refused', '#D55E00', 'X', False)):
+        chosen = [one for one in first if one.error_m is not None and one.accepted == verdict]
+        for number, one in enumerate(chosen):
+            (x, y), pose = truth[one.query][:2, 3], one.map_from_camera
+            assert pose is not None
+            axes.plot([x, pose[0][3]], [y, pose[1][3]], color=color, linewidth=0.9, zorder=5,
+                      marker=marker, markevery=[1], markersize=4,
+                      label=f'{label} ({len(chosen)})' if number == 0 else None)
+    add_legend(figure)
+    return figure
+
+
+def draw_reliability(axes: Axes, judged: Mapping[str, tuple[NDArray[np.float64],
+                                                            NDArray[np.bool_]]]) -> None:
+    """Draw the share of right poses over confidence, with 95 % intervals.
+
+    `judged` maps names to confidences (n,) and to whether each pose is right (n,).
+    """
+    axes.plot([0, 1], [0, 1], color='#888888', linewidth=1.0, label='ideal')
+    for number, (name, (confidence, right)) in enumerate(judged.items()):
+        bins = np.clip(np.digitize(confidence, _BINS) - 1, 0, len(_BINS) - 2)
+        color = _JUDGED_COLORS[number % len(_JUDGED_COLORS)]
+        for row in np.unique(bins):
+            chosen = bins == row
+            share, mean = right[chosen].mean(), confidence[chosen].mean()
+            low, high = wilson_interval(int(right[chosen].sum()), int(chosen.sum()))
+            axes.errorbar(mean, share, np.maximum([[share - low], [high - share]], 0.0),
+                          color=color, capsize=2, marker=_MARKERS[number % len(_MARKERS)],
+                          markersize=5, linewidth=1.0,
+                          label=f'{name} ({len(right)} poses)' if row == bins.min() else None)
+    axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
+
+
+def within_ellipsoid(squares: NDArray[np.float64], share: float = 0.95) -> float:
+    """Return the share of poses within the ellipsoids that should hold a given share."""
+    return float((squares < chi2.ppf(share, _FREEDOM)).mean())

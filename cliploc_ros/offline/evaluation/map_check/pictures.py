@@ -1,0 +1,258 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The pictures of a check: the map from above with landmarks, grid and recorded frames."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgba
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch, Polygon, Rectangle
+
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.files.page import FAINT
+from cliploc_ros.offline.evaluation.drawing import EDGED, draw_outline, png_of, write_name
+from cliploc_ros.offline.evaluation.map_check.page import (
+    FIRST_ADVICE,
+    GRADE_COLORS,
+    GRADE_NAMES,
+    LOOK_ALIKE,
+    MISLED,
+    VERDICT_COLORS,
+    grade,
+)
+from cliploc_ros.offline.mapping.check.places import RADIUS_M
+from cliploc_ros.offline.mapping.check.relocalization import Trial, count_verdicts, refused_spans
+from cliploc_ros.offline.mapping.check.report import CheckReport
+
+_DPI = 120
+_MARGIN_M = 0.4
+_LARGEST_IN = 6.4
+INK = '#222222'
+_HEAT = LinearSegmentedColormap.from_list('accepted', ['#FBE9C6', '#56B4E9', '#003E6B'])
+_UNSEEN = '#DDDDDD'
+_MOST_NAMES = 30
+_MOST_LOOK_ALIKES = 6
+
+
+def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
+                  ) -> Iterator[tuple[str, str, bytes]]:
+    """Yield the name, the caption and the PNG of each picture."""
+    canvas = _Canvas(landmark_map, report)
+    yield ('grid', 'Expected relocalization from above. A cell is a camera position: the darker, '
+           'the more of the headings with at least three detectable landmarks give an accepted, '
+           'right pose. Ticks point where the camera looked when a wrong pose was accepted. '
+           'Positions inside of a landmark, and beyond all objects, are left out. Numbers '
+           'are those of the advice.', png_of(_grid_figure(canvas), _DPI))
+    if report.recording is not None and report.recording.trials:
+        yield ('frames', 'Recorded frames, each relocalized in a map that was fitted without '
+               'frames of that time. The dot is the camera, the wedge where it looks. Times '
+               'are those of the longest runs of refused frames.',
+               png_of(_frames_figure(canvas, report.recording.trials), _DPI))
+        yield ('time', 'The same frames over time: how many landmarks of the map the detector '
+               'found, and the verdict.', png_of(_time_figure(report.recording.trials), _DPI))
+    yield ('landmarks', 'The landmarks from above. Names are those of landmarks with a fault; '
+           'where these are many, with a serious one.', png_of(_landmarks_figure(canvas), _DPI))
+    if report.look_alikes:
+        yield ('look_alikes', 'Places that look alike, joined in pairs.',
+               png_of(_look_alikes_figure(canvas), _DPI))
+
+
+class _Canvas:
+    """Makes figures of the map from above, all with the same bounds."""
+
+    def __init__(self, landmark_map: LandmarkMap, report: CheckReport):
+        self.map, self.report = landmark_map, report
+        grid, half = report.grid.positions[:, :2], report.grid.spacing_m / 2
+        self.path = None if report.recording is None else report.recording.path_xyz[:, :2]
+        #: (P,): the positions to draw. Beyond the objects and the path there may be walls.
+        self.shown = np.ones(len(grid), dtype=np.bool_)
+        points = [landmark_map.centers[:, :2]]
+        if self.path is not None:
+            points.append(self.path)
+            hull = cv2.convexHull(np.concatenate(points).astype(np.float32))
+            self.shown = report.grid.is_near | np.array([
+                cv2.pointPolygonTest(hull, one, False) > 0 for one in grid.tolist()])
+        every = np.concatenate([*points, grid[self.shown] - half, grid[self.shown] + half])
+        self._low = every.min(axis=0) - _MARGIN_M
+        self._high = every.max(axis=0) + _MARGIN_M
+        #: The longer side [m]
+        self.size = float((self._high - self._low).max())
+
+    def figure(self, title: str, face: str | Sequence[str], alpha: float = 0.35
+               ) -> tuple[Figure, Axes]:
+        """Return a figure with the landmarks in equal scales, and room for a legend below."""
+        width, height = (self._high - self._low) * _LARGEST_IN / self.size
+        figure = Figure(figsize=(max(6.5, width + 1.6), max(4.0, height + 1.6)),
+                        layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1))
+        axes = figure.add_subplot()
+        axes.set(xlim=(self._low[0], self._high[0]), ylim=(self._low[1], self._high[1]),
+                 aspect='equal')
+        # a frame_id is any text, also one that mathtext refuses
+        axes.set_xlabel(f'x in {self.map.frame_id} [m]', parse_math=False)
+        axes.set_ylabel(f'y in {self.map.frame_id} [m]', parse_math=False)
+        axes.set_title(title, fontsize=12)
+        axes.set_axisbelow(True)
+        faces = [face] * len(self.map) if isinstance(face, str) else face
+        for center, shape, color in zip(self.map.centers, self.map.shapes, faces, strict=True):
+            draw_outline(axes, center, shape, facecolor=color, edgecolor='#444444', linewidth=0.7,
+                         alpha=alpha, zorder=3, path_effects=EDGED if color == 'none' else None)
+        return figure, axes
+
+
+def _add_legend(figure: Figure, handles: Sequence[Line2D | Patch]) -> None:
+    figure.legend(handles=list(handles), loc='outside lower center', ncols=min(3, len(handles)),
+                  frameon=False, fontsize=9)
+
+
+def _grid_figure(canvas: _Canvas) -> Figure:
+    grid = canvas.report.grid
+    height = grid.positions[0, 2] if len(grid.positions) else 0.0
+    figure, axes = canvas.figure(f'Where a robot is accepted, camera {height:.2f} m high', 'none',
+                                 alpha=0.9)
+    shown = canvas.shown
+    side, inset = grid.spacing_m, 0.06 * grid.spacing_m
+    for position, near, accepted, useful in zip(
+            grid.positions[shown], grid.is_near[shown], grid.accepted[shown],
+            grid.useful[shown], strict=True):
+        x, y = position[:2] - side / 2
+        is_dark = useful == 0 and accepted == 0
+        axes.add_patch(Rectangle(
+            (x, y), side, side, linewidth=0.0, zorder=1,
+            facecolor=_UNSEEN if is_dark else _HEAT(min(1.0, accepted / max(1, useful)))))
+        if near and canvas.path is not None:
+            axes.add_patch(Rectangle((x + inset, y + inset), side - 2 * inset, side - 2 * inset,
+                                     fill=False, edgecolor='#555555', linewidth=0.6, zorder=2))
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color='#444444', marker='o', markerfacecolor='none', linestyle='none',
+               label='landmark'),
+        Patch(facecolor=_UNSEEN, label='fewer than 3 landmarks in view')]
+    if canvas.path is not None:
+        axes.plot(*canvas.path.T, color=INK, linewidth=1.0, zorder=4, linestyle=(0, (4, 2)),
+                  path_effects=EDGED)
+        handles += [Line2D([], [], color=INK, linewidth=1.0, linestyle=(0, (4, 2)),
+                           label='path of the recording'),
+                    Patch(facecolor='white', edgecolor='#555555', label='near the recording')]
+    wrong = [one for one in grid.trials if one.verdict == 'misled']
+    for one in wrong:
+        x, y = one.position[:2]
+        ahead = one.forward[:2] / max(float(np.linalg.norm(one.forward[:2])), 1e-9)
+        dx, dy = 0.45 * side * ahead
+        axes.plot([x, x + dx], [y, y + dy], color=MISLED, linewidth=2.5, zorder=7,
+                  path_effects=EDGED)
+        axes.plot(x, y, 'X', color=MISLED, markersize=9, markeredgecolor='white', zorder=8)
+    handles.append(Line2D([], [], color=MISLED, marker='X', linewidth=2.5,
+                          label=f'misled ({len(wrong)} of {len(grid.trials)} views)'))
+    rows = {name: row for row, name in enumerate(canvas.map.landmark_ids)}
+    for number, advice in enumerate(canvas.report.to_do[:FIRST_ADVICE], start=1):
+        place = (canvas.map.centers[rows[advice.landmarks[0]]] if advice.landmarks
+                 else None if advice.view is None else advice.view.position)
+        if place is not None:
+            axes.text(place[0], place[1], str(number), fontsize=10, fontweight='bold', zorder=10,
+                      color='white', ha='center', va='center',
+                      bbox={'boxstyle': 'circle,pad=0.25', 'facecolor': INK, 'edgecolor': 'white'})
+    bar = figure.colorbar(ScalarMappable(Normalize(0, 100), _HEAT), ax=axes, shrink=0.7,
+                          pad=0.02)
+    bar.set_label('right pose accepted\n[% of headings that show 3 landmarks]', fontsize=9)
+    _add_legend(figure, handles)
+    return figure
+
+
+def _frames_figure(canvas: _Canvas, trials: Sequence[Trial]) -> Figure:
+    figure, axes = canvas.figure('Recorded frames, cross-validated', '#BBBBBB')
+    size = 0.035 * canvas.size
+    for one in trials:
+        ahead, tip, color = one.forward[:2], one.position[:2], VERDICT_COLORS[one.verdict]
+        side, is_refused = np.array([-ahead[1], ahead[0]]) * 0.5, one.verdict == 'refused'
+        axes.add_patch(Polygon(
+            [tip, tip + size * (ahead + side), tip + size * (ahead - side)], closed=True,
+            facecolor=to_rgba(color, 0.0 if is_refused else 0.3), edgecolor=color,
+            linewidth=1.0, zorder=5))
+        axes.plot(tip[0], tip[1], marker='s' if is_refused else 'o', color=color, markersize=4,
+                  zorder=6)
+        if one.verdict == 'misled' and one.estimate is not None:
+            axes.plot([tip[0], one.estimate[0]], [tip[1], one.estimate[1]], color=MISLED,
+                      linewidth=1.5, zorder=7)
+    first = trials[0].stamp_s or 0.0
+    for run in [run for run in refused_spans(trials) if len(run) > 1][:8]:
+        middle = run[len(run) // 2]
+        behind = middle.position[:2] - 1.2 * size * middle.forward[:2]
+        write_name(axes, behind, f'{(middle.stamp_s or 0.0) - first:.0f} s')
+    counts = count_verdicts(trials)
+    _add_legend(figure, [
+        *(Line2D([], [], color=color, label=f'{verdict} ({counts[verdict]})', markersize=5,
+                 marker='s' if verdict == 'refused' else 'o')
+          for verdict, color in VERDICT_COLORS.items()),
+        Patch(facecolor='#BBBBBB', edgecolor='#444444', alpha=0.5, label='landmark')])
+    return figure
+
+
+def _time_figure(trials: Sequence[Trial]) -> Figure:
+    figure = Figure(figsize=(9.0, 2.8), layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.08))
+    axes = figure.add_subplot()
+    stamps = np.array([one.stamp_s or 0.0 for one in trials])
+    stamps -= stamps[0]
+    width = 0.8 * (float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0)
+    handles: list[Line2D | Patch] = []
+    for verdict, color in VERDICT_COLORS.items():
+        chosen = np.array([one.verdict == verdict for one in trials])
+        counts = np.array([one.landmarks for one in trials])
+        style: dict[str, Any] = {
+            'edgecolor': color, 'linewidth': 1.0,
+            'facecolor': 'white' if verdict == 'refused' else color,
+            'hatch': '////' if verdict == 'refused' else None}
+        axes.bar(stamps[chosen], counts[chosen], width=width, **style)
+        # a patch of its own, since bars that are missing give the legend no colour
+        handles.append(Patch(label=f'{verdict} ({chosen.sum()})', **style))
+        none = chosen & (counts == 0)
+        axes.plot(stamps[none], np.zeros(none.sum()), 'x', color=color, clip_on=False, zorder=5)
+    axes.set(xlabel='time from the first frame [s]', ylabel='landmarks detected')
+    axes.legend(handles=handles, frameon=False, fontsize=9, ncols=3, loc='lower right',
+                bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def _landmarks_figure(canvas: _Canvas) -> Figure:
+    landmark_map, checks = canvas.map, canvas.report.landmarks
+    grades = {one.landmark_id: grade(one) for one in checks}
+    colors = [GRADE_COLORS[grades[name]] for name in landmark_map.landmark_ids]
+    figure, axes = canvas.figure('Landmarks', colors, alpha=0.6)
+    named = [one for one in checks if one.faults]
+    if len(named) > _MOST_NAMES:
+        named = [one for one in named if grade(one) == 'faulty'][:_MOST_NAMES]
+    for one in named:
+        write_name(axes, one.center[:2], one.landmark_id)
+    if canvas.path is not None:
+        axes.plot(*canvas.path.T, color=FAINT, linewidth=0.8, zorder=2)
+    counts = Counter(grades.values())
+    _add_legend(figure, [Patch(facecolor=color, edgecolor='#444444', alpha=0.6,
+                               label=f'{GRADE_NAMES[name]} ({counts[name]})')
+                         for name, color in GRADE_COLORS.items()])
+    return figure
+
+
+def _look_alikes_figure(canvas: _Canvas) -> Figure:
+    figure, axes = canvas.figure('Places that look alike', '#BBBBBB')
+    for number, one in enumerate(canvas.report.look_alikes[:_MOST_LOOK_ALIKES], start=1):
+        for letter, place in (('a', one.first), ('b', one.second)):
+            axes.add_patch(Circle(place[:2], RADIUS_M, fill=False, edgecolor=LOOK_ALIKE,
+                                  linewidth=1.8, zorder=5))
+            axes.text(place[0], place[1] + 0.8 * RADIUS_M, f'{number}{letter}', fontsize=11,
+                      fontweight='bold', color=INK, ha='center', va='center', zorder=9,
+                      path_effects=EDGED, clip_on=True)
+        axes.plot([one.first[0], one.second[0]], [one.first[1], one.second[1]],
+                  color=LOOK_ALIKE, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4)
+    _add_legend(figure, [
+        Line2D([], [], color=LOOK_ALIKE, marker='o', markersize=12, markerfacecolor='none',
+               linestyle=(0, (4, 2)), label=f'pair of places, {RADIUS_M:g} m around'),
+        Patch(facecolor='#BBBBBB', edgecolor='#444444', alpha=0.5, label='landmark')])
+    return figure
+
+

@@ -1,0 +1,105 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Queries from recorded observations: every method gets the same input."""
+
+import logging
+import os
+import tempfile
+import time
+from collections import defaultdict, deque
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from cliploc_ros.core.keyframes.localization import query_features
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
+from cliploc_ros.models.map_rows import embed_map
+from cliploc_ros.offline.datasets.frames import Frames
+from cliploc_ros.offline.datasets.observations import Recorded
+from cliploc_ros.offline.datasets.queries import Queries, QueryFrame
+from cliploc_ros.offline.evaluation.trials import ImageFeatures, Query
+from cliploc_ros.offline.recording.recorder import RecordingOptions, observation_file, record_once
+
+logger = logging.getLogger(__name__)
+
+
+def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: RecordingOptions,
+                     map_files: Sequence[str], compare: str) -> Queries:
+    """Return the images with ground truth as queries; detector and CLIP run once.
+
+    CliplocError: from loading the networks and from recording. A folder that cannot be written
+    gives a warning only.
+
+    Parameters
+    ----------
+    options : RecordingOptions
+        Without CLIP, all similarities are 0: for methods that match by class.
+    map_files, compare
+        See load_encoder_for_map.
+    """
+    labels = (None if options.clip is None
+              else embed_map(options.clip, landmark_map, map_files, compare))
+    file = observation_file(frames, options)
+    if file.exists() or os.access(file.parent, os.W_OK):
+        return make_queries_of(record_once(frames, options), landmark_map, labels)
+    logger.warning('the next run must record again: %s cannot be written', file.parent)
+    with tempfile.TemporaryDirectory(prefix='cliploc_ros_') as folder:
+        recorded = record_once(frames, options, Path(folder) / file.name)
+    return make_queries_of(recorded, landmark_map, labels)
+
+
+def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap,
+                    labels: LabelEmbeddings | None) -> Queries:
+    """Return recorded frames as queries, each a group of its own; true landmarks are unknown."""
+    detections = recorded.detections
+    camera, names = detections.cameras[0], detections.class_names
+    frames = []
+    for frame, stamp_ns in enumerate(recorded.stamps_ns):
+        rows = slice(*map(int, detections.frame_offsets[frame:frame + 2]))
+        boxes = detections.bboxes_xyxy[rows]
+        if detections.camera_of(frame) != camera:  # queries have one camera
+            boxes = camera.bboxes_in_pixels(detections.camera_of(frame).normalize_bboxes(boxes))
+        similarities = np.zeros((len(boxes), len(landmark_map)))
+        if labels is not None:
+            assert detections.embeddings is not None
+            crops = detections.embeddings[rows].astype(np.float32)
+            similarities = np.asarray(CropSimilarities(crops, labels)).astype(np.float64)
+        frames.append(QueryFrame(
+            stamp_ns=int(stamp_ns), bboxes_xyxy=boxes,
+            class_ids=tuple(names[number] for number in detections.classes[rows]),
+            scores=detections.scores[rows], similarities=similarities,
+            true_landmark=np.full(len(boxes), -1, dtype=np.int64),
+            map_from_camera=detections.map_from_camera[frame], group=frame, is_main=True,
+            depths=None if detections.depths is None
+            else detections.depths[rows].astype(np.float64),
+            detector_ms=float(recorded.detector_ms[frame]),
+            clip_ms=float(recorded.clip_ms[frame])))
+    return Queries(landmark_map.landmark_ids, (camera.fx, camera.fy, camera.cx, camera.cy),
+                   tuple(frames))
+
+
+def with_features(queries: Sequence[Query], frames: Frames) -> tuple[Query, ...]:
+    """Return queries with the features of their images; those without an image stay.
+
+    The queries were recorded from these frames.
+    """
+    waiting: dict[int, deque[int]] = defaultdict(deque)
+    for row, query in enumerate(queries):
+        waiting[query.observation.stamp_ns].append(row)
+    found = list(queries)
+    wanted = frames.read_raw(lambda place, stamp_ns, pose: pose is not None
+                             and bool(waiting.get(stamp_ns)))
+    for raw in tqdm(wanted, 'features', len(queries), unit='image', disable=None):
+        if not waiting[raw.stamp_ns]:
+            continue  # of images of one stamp, more than were recorded
+        row = waiting[raw.stamp_ns].popleft()
+        frame = raw.decode()
+        begin = time.perf_counter()
+        features = query_features(frame.image_rgb)
+        spent_ms = 1e3 * (time.perf_counter() - begin)
+        found[row] = replace(queries[row], image=ImageFeatures(features, frame.camera, spent_ms))
+    return tuple(found)

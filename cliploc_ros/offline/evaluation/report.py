@@ -1,0 +1,57 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The page of compared methods: the best one first, then the table and all figures."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from cliploc_ros.files.page import (
+    figure,
+    first_screen,
+    fold,
+    note,
+    page,
+    side_by_side,
+    table,
+    tiles,
+    verdict,
+)
+from cliploc_ros.files.storage import write_text
+from cliploc_ros.offline.evaluation.summary import Summary, find_best
+
+PAGE = 'report.html'
+_TOP_VIEW = 'top_view'
+# Columns of the first screen: method, success, accepted, false accepts.
+_BRIEF = (0, 1, 2, 5, 7)
+_CAPTIONS = {
+    _TOP_VIEW: 'The map from above. A line joins each estimate of the best method to its truth.',
+    'success_over_threshold': 'Share of poses within a distance of the truth, accepted or not.',
+    'success_by_boxes': 'Success by the number of detections in the image.',
+    'precision_over_recall': 'What another least confidence would accept.',
+    'reliability': 'Whether the confidence is true, with 95 % intervals.',
+    'consistency': 'Whether the covariance is true.',
+    'time_by_stage': 'Mean time of an answer, by stage.',
+    'best_iteration': 'When the best pose was found.',
+    'success_over_iterations': 'Success over the length of the search.'}
+
+
+def write_report(folder: Path, summaries: Sequence[Summary], rows: Sequence[Sequence[str]],
+                 remarks: Sequence[str], pictures: Sequence[Path]) -> None:
+    """Write the page, with the table's rows, its header first, and embedded PNG files."""
+    best = find_best(summaries)
+    wrong, count = best.false_accepts(), best.errors_m.size
+    said = verdict(f'{best.method} is the best of {len(summaries)} methods on '
+                   f'{len(best.queries)} images' if len(summaries) > 1 else
+                   f'{best.method} on {len(best.queries)} images', not wrong)
+    numbers = tiles([
+        (f'{100 * best.success(1.0):.0f} %', 'of the poses within 1 m of the truth', True),
+        (f'{int(best.accepted.sum())} of {count}', 'accepted', bool(best.accepted.any())),
+        (str(wrong), 'accepted, but wrong by more than 1 m', not wrong)])
+    drawn = {one.stem: figure(one.read_bytes(), _CAPTIONS[one.stem], one.stem) for one in pictures}
+    head, *brief = [[row[column] for column in _BRIEF] for row in rows]
+    top_view = drawn.pop(_TOP_VIEW, '')
+    write_text(folder / PAGE, page(
+        'Evaluation',
+        first_screen([said, numbers, table(head, brief)], [top_view]),
+        fold('The whole table', table(rows[0], rows[1:]), *map(note, remarks)),
+        fold('Figures', side_by_side(drawn.values()), is_open=True)))

@@ -1,0 +1,314 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Methods compared: all trials on all queries, on all cores or on a cluster, and the files."""
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from itertools import batched, chain
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from cliploc_ros.core.geometry.transforms import quaternion_from_transform
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.map.joined_map import parts_of
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.errors import CliplocError, OptionsError
+from cliploc_ros.files.log import Log
+from cliploc_ros.files.parallel import run_tasks
+from cliploc_ros.files.storage import make_folder, write_text
+from cliploc_ros.offline.datasets.queries import QueryFrame
+from cliploc_ros.offline.evaluation.methods import Method
+from cliploc_ros.offline.evaluation.report import PAGE, write_report
+from cliploc_ros.offline.evaluation.summary import (
+    Summary,
+    as_csv,
+    as_json,
+    as_markdown,
+    as_text,
+    notes,
+    summarize,
+    table_rows,
+)
+from cliploc_ros.offline.evaluation.trials import Query, Result, run_trial
+from cliploc_ros.units import NS_PER_S
+
+# A stopped run loses at most this many queries of each core.
+_QUERIES_A_PART = 8
+# Separates the name of a method from a number of iterations.
+_AT = '@'
+
+
+class RunError(CliplocError):
+    """The run could not be finished."""
+
+
+class _Part(NamedTuple):
+    """One trial of a method on some queries, given by their rows in the input."""
+
+    method: Method
+    trial: int
+    places: tuple[int, ...]
+
+
+def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: Sequence[Query],
+                *, trials: int, workers: int = 1, scheduler: str = '',
+                done: Sequence[Result] = (), layer: KeyframeLayer | None = None,
+                noisy: Sequence[Sequence[Query]] = (),
+                advance: Callable[[list[Result]], object] = lambda results: None) -> list[Result]:
+    """Run methods on queries.
+
+    Parameters
+    ----------
+    methods : sequence of Method
+        A method that draws no samples runs one trial, unless the trials have noise of their own.
+    workers, scheduler : int, str
+        See cliploc_ros.files.parallel.run_tasks. Results do not depend on them.
+    done : sequence of Result
+        Results of an earlier run, which are not run again.
+    layer : KeyframeLayer, optional
+        Keyframes of the map, for methods that use them and queries with features.
+    noisy : sequence of sequence of Query, optional
+        For each trial the same queries with other noise of simulated sensors.
+    advance : callable, optional
+        Called with the results of each finished part.
+
+    Returns
+    -------
+    list of Result
+        By method, trial and query.
+
+    Raises
+    ------
+    RunError
+        Workers died again and again at some queries; all others are done.
+    WorkersError
+        From the workers.
+    """
+    known = {(result.method, result.trial, result.query) for result in done}
+    # those that draw no samples first, since they take longest
+    parts = [
+        _Part(method, trial, places)
+        for method in sorted(methods, key=lambda method: not method.draws_nothing)
+        for trial in range(count_trials(method, trials, bool(noisy)))
+        for places in batched((place for place, query in enumerate(queries)
+                               if (method.name, trial, query.number) not in known),
+                              1 if method.draws_nothing else _QUERIES_A_PART)]
+    results, lost = list(done), []
+    # a few queries are done sooner than a process starts
+    workers = workers if len(parts) > 1 else 1
+    make_search = _MakeSearch(landmark_map, noisy or [queries], layer)
+    with closing(run_tasks(make_search, parts, workers=workers, scheduler=scheduler)) as finished:
+        for part, found in finished:
+            if found is None:
+                lost.append(part)
+            else:
+                results += found
+                advance(found)
+    if lost:
+        first = lost[0]
+        raise RunError(f'workers died again and again at {len(lost)} of {len(parts)} parts, first '
+                       f'at {first.method.name}, trial {first.trial}, rows {first.places[0]}-'
+                       f'{first.places[-1]}; the others are done: continue with --resume and '
+                       'fewer --workers')
+    order = {method.name: number for number, method in enumerate(methods)}
+    return sorted(results, key=lambda one: (order[one.method], one.trial, one.query))
+
+
+def count_trials(method: Method, trials: int, are_noisy: bool = False) -> int:
+    """Return how many trials of a method differ, where its sensors have noise or not."""
+    return trials if are_noisy or not method.draws_nothing else 1
+
+
+@dataclass(frozen=True, eq=False)
+class _MakeSearch:
+    """Makes the function that runs a part; holds what all parts share."""
+
+    landmark_map: LandmarkMap
+    queries: Sequence[Sequence[Query]]  # of each trial, or of all of them
+    layer: KeyframeLayer | None = None
+
+    def __call__(self) -> Callable[[_Part], list[Result]]:
+        """Return the function, after the kernels are compiled: searches are timed."""
+        keyframes = None if self.layer is None else KeyframeLocalizer(self.layer)
+        Relocalizer(self.landmark_map,
+                    RelocalizerOptions(matching='class', algorithm='bf')).warm_up()
+
+        def run(part: _Part) -> list[Result]:
+            queries = self.queries[part.trial % len(self.queries)]
+            return run_trial(self.landmark_map, part.method, part.trial,
+                             [queries[place] for place in part.places], keyframes)
+        return run
+
+
+def compare_methods(landmark_map: LandmarkMap, queries: Sequence[Query],
+                    methods: Sequence[Method], out: Path, *, sweep: Sequence[int] = (),
+                    resume: bool = False, figures: bool = True,
+                    frames: Sequence[QueryFrame] = (), remarks: Sequence[str] = (),
+                    **running: Any) -> list[Summary]:
+    """Run methods, print the table, write all files to a folder; return their summaries.
+
+    CliplocError: the run cannot be resumed, or a file cannot be written.
+
+    Parameters
+    ----------
+    out : Path
+        An existing folder.
+    sweep : sequence of int
+        Further numbers of iterations for each sampling method, for a figure.
+    resume : bool
+        Continue an unfinished run.
+    frames : sequence of QueryFrame
+        Frames of the query file, for the times of detector and CLIP.
+    remarks : sequence of str
+        Notes on the input, shown with the table.
+    running
+        trials, workers, scheduler, layer, noisy: see run_methods.
+    """
+    swept = [replace(one, name=f'{one.name}{_AT}{count}',
+                     options=replace(one.options, iterations=count))
+             for one in methods if not one.draws_nothing
+             for count in sweep if figures and count != one.options.iterations]
+    everything = [*methods, *swept]
+    unfinished = out / 'unfinished.jsonl'
+    if unfinished.exists() and not resume:
+        raise OptionsError(f'{out} holds an unfinished run; continue with --resume, give '
+                           f'another --out, or remove {unfinished}')
+    total = len(queries) * sum(
+        count_trials(one, running['trials'], bool(running.get('noisy'))) for one in everything)
+    run = describe(landmark_map, queries, everything, running['trials'], running.get('layer'),
+                   running.get('noisy', ()))
+    with closing(Log(unfinished, OptionsError, 'make room and continue with --resume')) as log:
+        done = read_results(log, run)
+        with tqdm(total=total, initial=len(done), unit='search', disable=None) as bar:
+            def advance(results: list[Result]) -> None:
+                log.append([result.as_dict() for result in results])
+                bar.update(len(results))
+
+            results = run_methods(landmark_map, everything, queries, done=done, advance=advance,
+                                  **running)
+        own = [one for one in results if _AT not in one.method]
+        summaries = summarize(own)
+        rows = table_rows(summaries)
+        write_trajectories(out / 'trajectories', queries, own)
+        remarks = [*remarks, *notes(summaries)]
+        print('\n'.join(['', as_text(rows), *remarks, '']), flush=True)
+        write_text(out / 'table.md', '\n\n'.join([as_markdown(rows), *remarks]) + '\n')
+        write_text(out / 'results.json', as_json(own))
+        write_text(out / 'summary.csv', as_csv(summaries))
+        pictures = _draw(out, parts_of(landmark_map)[0].landmark_map, queries, results,
+                         summaries, methods, frames) if figures else []
+        write_report(out, summaries, rows, remarks, pictures)
+        log.remove()
+    print(f'results: {out.resolve() / PAGE}', flush=True)
+    return summaries
+
+
+def read_results(log: Log, run: Mapping[str, Any]) -> list[Result]:
+    """Return the results of an unfinished run, or begin the log of a new one.
+
+    `run` is the description of the run, as JSON keeps it. OptionsError: the log belongs to another
+    run (names what differs), or is damaged.
+    """
+    entries, is_damaged = log.read()
+    if not (entries or is_damaged):
+        log.append(run)
+        return []
+    try:
+        if is_damaged:
+            raise ValueError('a line in its middle cannot be read')
+        begun, *parts = entries
+        differing = [key for key in run if begun.get(key) != run[key]]
+        done = [Result(**fields) for part in parts for fields in part]
+    except (ValueError, TypeError, AttributeError) as error:
+        raise OptionsError(f'{log.path}: is damaged; remove it to start again') from error
+    if differing:
+        raise OptionsError(f'{log.path}: was begun with another {" and ".join(differing)}; '
+                           'give the same, or remove it to start again')
+    return done
+
+
+def describe(landmark_map: LandmarkMap, queries: Sequence[Query], methods: Sequence[Method],
+             trials: int, layer: KeyframeLayer | None, noisy: Sequence[Sequence[Query]]
+             ) -> dict[str, Any]:
+    """Return what identifies a run, as JSON keeps it."""
+    digest = hashlib.sha256()
+    for query in chain(queries, *noisy):
+        for one in (*query.neighbours, query.observation):
+            for part in (one.similarities, one.detections.bboxes_xyxy):
+                digest.update(np.ascontiguousarray(part).tobytes())
+            digest.update(repr((one.detections.class_ids, one.up_in_camera,
+                                one.odom_from_camera)).encode())
+        digest.update(np.ascontiguousarray(query.map_from_camera).tobytes())
+        digest.update(repr(query.number).encode())
+    world = hashlib.sha256(repr((landmark_map.landmark_ids, landmark_map.class_ids,
+                                 landmark_map.classes.members.tolist(),
+                                 landmark_map.centers.tolist(),
+                                 landmark_map.shapes.tolist())).encode())
+    run = {'queries': digest.hexdigest(), 'map': world.hexdigest(), 'trials': trials,
+           'methods': {one.name: {name: str(value) for name, value in asdict(one.options).items()}
+                       for one in methods}, 'keyframes': None}
+    if layer is not None:
+        digest = hashlib.sha256()
+        for query in queries:
+            if query.image is not None:
+                digest.update(query.image.features.descriptors.tobytes())
+        for array in (layer.map_from_camera, layer.points, layer.descriptors):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        run['keyframes'] = {'digest': digest.hexdigest(),
+                            'methods': [one.name for one in methods if one.keyframes]}
+    return run
+
+
+def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
+          results: Sequence[Result], summaries: Sequence[Summary], methods: Sequence[Method],
+          frames: Sequence[QueryFrame]) -> list[Path]:
+    try:
+        from cliploc_ros.offline.evaluation.figures import draw_all
+    except ImportError as error:
+        print(f'no figures: {error}; install matplotlib', flush=True)
+        return []
+    # the summaries of each sampling method, by their number of iterations
+    sweep: dict[str, dict[int, Summary]] = {}
+    iterations = {one.name: one.options.iterations for one in methods if not one.draws_nothing}
+    for one in summarize(results):
+        name, _, count = one.method.partition(_AT)
+        if name in iterations:
+            sweep.setdefault(name, {})[int(count or iterations[name])] = one
+    observing = {stage: np.array([getattr(frame, name) for frame in frames])
+                 for stage, name in (('detector', 'detector_ms'), ('CLIP', 'clip_ms'))}
+    return draw_all(
+        out, landmark_map, queries, [one for one in results if _AT not in one.method], summaries,
+        {name: dict(sorted(found.items())) for name, found in sweep.items() if len(found) > 1},
+        {stage: float(np.nanmean(times)) for stage, times in observing.items()
+         if np.isfinite(times).any()})
+
+
+def write_trajectories(folder: Path, queries: Sequence[Query], results: Sequence[Result]) -> None:
+    """Write ground_truth.txt, METHOD.txt and METHOD.accepted.txt of each method's first trial."""
+    make_folder(folder)
+    write_text(folder / 'ground_truth.txt', _tum_text(
+        (query.observation.stamp_ns / NS_PER_S, query.map_from_camera) for query in queries))
+    for method in dict.fromkeys(result.method for result in results):
+        found = [(one, np.array(one.map_from_camera)) for one in results
+                 if one.method == method and one.trial == 0 and one.solved]
+        write_text(folder / f'{method}.txt',
+                   _tum_text((one.timestamp, pose) for one, pose in found))
+        write_text(folder / f'{method}.accepted.txt',
+                   _tum_text((one.timestamp, pose) for one, pose in found if one.accepted))
+
+
+def _tum_text(poses: Iterable[tuple[float, NDArray[np.float64]]]) -> str:
+    lines = ['# timestamp tx ty tz qx qy qz qw']
+    for timestamp, pose in sorted(poses, key=lambda one: one[0]):
+        numbers = [*pose[:3, 3], *quaternion_from_transform(pose)]
+        lines.append(' '.join([f'{timestamp:.6f}', *(f'{number:.9f}' for number in numbers)]))
+    return '\n'.join(lines) + '\n'

@@ -1,0 +1,300 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Statistics of the results of methods, and the paper's table of them as text and files."""
+
+import csv
+import io
+import json
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
+from cliploc_ros.offline.evaluation.trials import Result
+
+#: Limits of success [m]. The paper does not state its own; 1 m reproduces its level.
+LIMITS_M = (0.25, 0.5, 1.0)
+_RESAMPLES = 10_000
+_HEADER = ('matching', 'algorithm', 'success at .25 / .5 / 1 m', 'error [m]: median, mean',
+           'search [ms]', 'accepted', 'precision (95 %)', 'false accepts')
+_WITHIN_NOISE = '~'
+# Columns of methods that use keyframes; the other methods leave them empty.
+_KEYFRAMES = ('pose by objects / keyframes / both', 'keyframe inliers', 'keyframes [ms]')
+_SOURCES = ('objects', 'keyframes', 'both')
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Results of one method on q queries in t trials."""
+
+    method: str
+    queries: tuple[int, ...]  #: Their numbers
+    #: (t, q): position error of the best pose; infinite where none was found
+    errors_m: NDArray[np.float64]
+    accepted: NDArray[np.bool_]  #: (t, q)
+    confidence: NDArray[np.float64]  #: (t, q)
+    search_ms: NDArray[np.float64]  #: (t, q)
+    coverage: NDArray[np.float64]  #: (t, q)
+    #: (t, q)
+    best_iterations: NDArray[np.int64]
+    hypotheses: NDArray[np.int64]
+    boxes: NDArray[np.int64]  #: (q,)
+    #: (t, q): infinite where no pose was found; empty where it was not recorded
+    nees: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    #: Share of a query's crops that were compared with labels, on average
+    crops_share: float = 1.0
+    #: How many were refused, by kind, the most frequent first
+    refusals: dict[str, int] = field(default_factory=dict)
+    #: (t, q) of str: what each pose comes from, see Result
+    sources: NDArray[np.str_] = field(default_factory=lambda: np.empty((0, 0), dtype=str))
+    #: (t, q)
+    keyframe_inliers: NDArray[np.int64] = field(
+        default_factory=lambda: np.empty((0, 0), dtype=np.int64))
+    #: (t, q): the three are empty where no query was compared with keyframes
+    keyframes_ms: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def has_keyframes(self) -> bool:
+        """Return whether queries were compared with keyframes."""
+        return self.sources.size > 0
+
+    def success(self, limit_m: float) -> float:
+        """Return the share of poses within a distance of the truth, accepted or not."""
+        return float((self.errors_m < limit_m).mean())
+
+    def success_deviation(self, limit_m: float) -> float:
+        """Return the standard deviation of the success over trials."""
+        return float((self.errors_m < limit_m).mean(axis=1).std())
+
+    @property
+    def median_error_m(self) -> float:
+        """Return the median error [m]; a query without a pose counts as infinitely far."""
+        return float(np.median(self.errors_m))
+
+    @property
+    def mean_error_m(self) -> float:
+        """Return the mean error of the poses found [m]; NaN if there is none."""
+        found = self.errors_m[np.isfinite(self.errors_m)]
+        return float(found.mean()) if len(found) else float('nan')
+
+    @property
+    def mean_search_ms(self) -> float:
+        """Return the mean time of a search [ms]."""
+        return float(self.search_ms.mean())
+
+    def false_accepts(self, limit_m: float = 1.0) -> int:
+        """Return how many accepted poses are farther from the truth than a limit."""
+        return int((self.accepted & ~(self.errors_m < limit_m)).sum())
+
+    def precision(self, limit_m: float = 1.0) -> float:
+        """Return the share of accepted poses that are right; 1 if none is accepted."""
+        accepted = int(self.accepted.sum())
+        return 1.0 - self.false_accepts(limit_m) / accepted if accepted else 1.0
+
+    def precision_interval(self, limit_m: float = 1.0) -> tuple[float, float]:
+        """Return the 95 % interval of the precision (Wilson); 0 to 1 if none is accepted.
+
+        Trials of one query are not independent, so all trials count as one.
+        """
+        count = self.accepted.sum() / len(self.accepted)
+        return wilson_interval(self.precision(limit_m) * count, count) if count else (0.0, 1.0)
+
+    def recall(self, limit_m: float = 1.0) -> float:
+        """Return the share of right poses that are accepted; 1 if none is right."""
+        right = self.errors_m < limit_m
+        return float(self.accepted[right].mean()) if right.any() else 1.0
+
+
+def wilson_interval(right: float, count: float, deviations: float = 1.96) -> tuple[float, float]:
+    """Return the 95 % interval of a share that was seen right times of count (Wilson 1927)."""
+    share, square = right / count, deviations**2
+    middle = (share + square / (2 * count)) / (1 + square / count)
+    half = deviations / (1 + square / count) * np.sqrt(
+        share * (1 - share) / count + square / (4 * count**2))
+    return max(0.0, float(middle - half)), min(1.0, float(middle + half))
+
+
+def summarize(results: Iterable[Result]) -> list[Summary]:
+    """Return a summary of each method, in their order.
+
+    The results are sorted by method, trial and query, as run_methods returns them.
+    """
+    return [_summary(method, list(rows))
+            for method, rows in groupby(results, key=lambda result: result.method)]
+
+
+def _summary(method: str, results: Sequence[Result]) -> Summary:
+    queries = tuple(dict.fromkeys(result.query for result in results))
+
+    def column(name: str) -> NDArray[Any]:
+        values = [getattr(result, name) for result in results]
+        values = [np.inf if value is None else value for value in values]
+        return np.array(values).reshape(-1, len(queries))
+
+    kinds = Counter(result.refusal_kind for result in results if result.refusal_kind)
+    keyframes = {}
+    if (column('keyframes_ms') > 0.0).any():
+        keyframes = {'sources': column('source'), 'keyframe_inliers': column('keyframe_inliers'),
+                     'keyframes_ms': column('keyframes_ms')}
+    return Summary(
+        method, queries, column('error_m'), column('accepted'), column('confidence'),
+        column('search_ms'), column('coverage'), column('best_iteration'), column('hypotheses'),
+        column('boxes')[0], column('nees'), float(column('crops_share').mean()),
+        dict(kinds.most_common()), **keyframes)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Success of one method less that of another, with its 95 % interval."""
+
+    mean: float
+    low: float
+    high: float
+
+    @property
+    def is_noise(self) -> bool:
+        """Return whether the queries are too few to separate the two."""
+        return self.low <= 0.0 <= self.high
+
+
+def compare(one: Summary, other: Summary, limit_m: float = 1.0, seed: int = 0) -> Difference:
+    """Compare two methods on the same queries.
+
+    The interval is that of the paired bootstrap (Efron and Tibshirani 1993): queries are drawn
+    with replacement, 10,000 times.
+
+    Parameters
+    ----------
+    one, other : Summary
+        Of the same queries; the success of the other is subtracted.
+    limit_m : float
+        Limit of success.
+    """
+    assert one.queries == other.queries
+    gains = ((one.errors_m < limit_m).mean(axis=0) - (other.errors_m < limit_m).mean(axis=0))
+    rng = np.random.default_rng(seed)
+    drawn = rng.integers(len(gains), size=(_RESAMPLES, len(gains)))
+    low, high = np.quantile(gains[drawn].mean(axis=1), (0.025, 0.975))
+    return Difference(float(gains.mean()), float(low), float(high))
+
+
+def find_best(summaries: Sequence[Summary], limit_m: float = 1.0) -> Summary:
+    """Return the summary of the greatest success; of equal ones that of the least error."""
+    return max(summaries, key=lambda one: (one.success(limit_m), -one.median_error_m))
+
+
+# ---- the table ----------------------------------------------------------------------------------
+
+
+def table_rows(summaries: Sequence[Summary]) -> list[tuple[str, ...]]:
+    """Return the cells of the table, its header first.
+
+    A '~' marks methods that the queries are too few to separate from the best one. Where a method
+    used keyframes, there are columns for the source of its poses. All summaries are of the same
+    queries.
+    """
+    best = find_best(summaries)
+    rows = [_HEADER, *(_row(one, best) for one in summaries)]
+    if not any(one.has_keyframes for one in summaries):
+        return rows
+    cells = [(' / '.join(str(int((one.sources == source).sum())) for source in _SOURCES),
+              f'{np.median(one.keyframe_inliers):.0f}', f'{one.keyframes_ms.mean():.1f}')
+             if one.has_keyframes else ('',) * len(_KEYFRAMES) for one in summaries]
+    return [row + more for row, more in zip(rows, [_KEYFRAMES, *cells], strict=True)]
+
+
+def _row(one: Summary, best: Summary) -> tuple[str, ...]:
+    matching, algorithm = (one.method.split('_', 1) if one.method in PAPER_METHODS
+                           else (one.method, ''))
+    rates = ' / '.join(_rate(one.success(limit)) for limit in LIMITS_M)
+    if len(one.errors_m) > 1:
+        rates += f' ± {_rate(one.success_deviation(LIMITS_M[-1]))}'
+    if one is not best and compare(one, best).is_noise:
+        rates += f' {_WITHIN_NOISE}'
+    cut = '' if one.coverage.min() == 1.0 else f' ({one.coverage.mean():.0%} tried)'
+    return (matching, algorithm, rates, f'{one.median_error_m:.3f}, {one.mean_error_m:.2f}',
+            f'{one.mean_search_ms:.1f}{cut}', _rate(float(one.accepted.mean())),
+            f'{_rate(one.precision())} ({" to ".join(map(_rate, one.precision_interval()))})',
+            f'{one.false_accepts()} of {int(one.accepted.sum())}')
+
+
+def _rate(value: float) -> str:
+    return f'{value:.2f}'.removeprefix('0')
+
+
+def notes(summaries: Sequence[Summary]) -> list[str]:
+    """Return sentences that explain the table."""
+    best = find_best(summaries)
+    counts = [len(one.errors_m) for one in summaries]
+    alone = ' (one of bf and auto, which draw no samples)' if min(counts) < max(counts) else ''
+    over = '; ± is the standard deviation over trials, at 1 m' if max(counts) > 1 else ''
+    lines = [f'{len(best.queries)} queries, trials: {max(counts)}{alone}{over}.',
+             'Confidences are fitted on simulated worlds.']
+    lines += [f'{one.method} refused: {_kinds(one)}.' for one in summaries if one.refusals]
+    lines += [f'{one.method} compared {one.crops_share:.0%} of the crops of a query with labels, '
+              'on average: --crops all compares all.'
+              for one in summaries if 0.0 < one.crops_share < 1.0]
+    if any(one.has_keyframes for one in summaries):
+        lines.append('Keyframes: number of poses from each source, median of the points that '
+                     'agree, and mean time besides the search; --no-keyframes leaves them out.')
+    if len(summaries) > 1:
+        lines.append(f'{_WITHIN_NOISE}: the queries are too few to separate it from {best.method} '
+                     '(at 1 m; paired bootstrap, 95 %).')
+    return lines
+
+
+def _kinds(one: Summary) -> str:
+    return ', '.join(f'{count} {kind}' for kind, count in one.refusals.items())
+
+
+def as_text(rows: Sequence[Sequence[str]]) -> str:
+    """Return a table for the terminal."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ['  '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+             for row in rows]
+    return '\n'.join([lines[0], '-' * len(lines[0]), *lines[1:]])
+
+
+def as_markdown(rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    lines = ['| ' + ' | '.join(row) + ' |' for row in rows]
+    return '\n'.join([lines[0], '|' + '---|' * len(rows[0]), *lines[1:]])
+
+
+def as_csv(summaries: Sequence[Summary]) -> str:
+    """Return a line of figures for each method."""
+    best = find_best(summaries)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator='\n')
+    writer.writerow(['method', 'queries', 'trials', *(f'success_{limit:g}m' for limit in LIMITS_M),
+                     *(f'success_{limit:g}m_std' for limit in LIMITS_M), 'median_error_m',
+                     'mean_error_m', 'mean_search_ms', 'coverage', 'accepted', 'precision_1m',
+                     'precision_1m_low', 'precision_1m_high', 'recall_1m', 'wrongly_accepted',
+                     'less_than_best_1m', 'less_than_best_low', 'less_than_best_high',
+                     'crops_share', 'refused_by_kind', *(f'from_{source}' for source in _SOURCES),
+                     'keyframe_inliers', 'keyframes_ms'])
+    for one in summaries:
+        difference = compare(one, best)
+        writer.writerow([
+            one.method, len(one.queries), len(one.errors_m),
+            *(one.success(limit) for limit in LIMITS_M),
+            *(one.success_deviation(limit) for limit in LIMITS_M), one.median_error_m,
+            one.mean_error_m, one.mean_search_ms, float(one.coverage.mean()),
+            float(one.accepted.mean()), one.precision(), *one.precision_interval(), one.recall(),
+            one.false_accepts(), difference.mean, difference.low, difference.high,
+            one.crops_share, _kinds(one),
+            *([*(float((one.sources == source).mean()) for source in _SOURCES),
+               float(np.median(one.keyframe_inliers)), float(one.keyframes_ms.mean())]
+              if one.has_keyframes else [''] * 5)])
+    return text.getvalue()
+
+
+def as_json(results: Sequence[Result]) -> str:
+    """Return all results, one on each line."""
+    lines = ',\n'.join(json.dumps(result.as_dict()) for result in results)
+    return f'[\n{lines}\n]\n'

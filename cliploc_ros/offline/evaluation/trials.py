@@ -1,0 +1,217 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Methods run on queries: the pose that each search found, and its error."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.fit.covariance import normalized_square
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes.features import Features
+from cliploc_ros.core.keyframes.localization import ImageRecognizer, KeyframeLocalizer
+from cliploc_ros.core.localizer import (
+    by_classes,
+    can_do_without_crops,
+    localize_on_demand,
+    recorded_crops,
+)
+from cliploc_ros.core.map.joined_map import place_of
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search.frame_search import SearchedFrame
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.queries import Queries
+from cliploc_ros.offline.evaluation.methods import Method
+from cliploc_ros.units import NS_PER_S
+
+
+class ImageFeatures(NamedTuple):
+    """Local features, the camera that they are of, and the time that they took [ms]."""
+
+    features: Features
+    camera: Camera
+    spent_ms: float
+
+
+@dataclass(frozen=True)
+class Query:
+    """An observation to localize, and the true pose."""
+
+    number: int  #: Number of the frame in its query file, from 0
+    observation: Observation
+    map_from_camera: NDArray[np.float64]  #: (4, 4): ground truth
+    #: Other frames, which odometry links to it, or those of other cameras at its instant
+    neighbours: tuple[Observation, ...] = ()
+    image: ImageFeatures | None = None  #: Its local features, for keyframes
+
+
+@dataclass(frozen=True)
+class Result:
+    """The result of one search."""
+
+    method: str
+    trial: int  #: From 0; added to the seed of the run
+    query: int  #: Number of the frame in its query file
+    timestamp: float  #: Of the image [s]
+    boxes: int  #: Number of detections
+    #: Whether a pose was found, and whether it was accepted
+    solved: bool
+    accepted: bool
+    map_from_camera: list[list[float]] | None  #: The best pose; None where none was found
+    #: Error of the best pose; None where none was found
+    error_m: float | None
+    error_deg: float | None
+    score: float  #: Sum of the IoUs of its inliers
+    confidence: float  #: Probability that it is within 1 m, according to the relocalizer
+    nees: float | None  #: Squared error in its own covariance, see normalized_square
+    inliers: int
+    hypotheses: int  #: Number of hypotheses tried
+    best_iteration: int  #: Iteration that found the best pose, from 1
+    coverage: float  #: Share of its samples that the search tried
+    reason: str  #: Reason of the refusal; empty when accepted
+    search_ms: float  #: Of the objects. The times are the only fields that differ from run to run.
+    crops_share: float = 1.0  #: Share of the crops of its frames that were compared with labels
+    #: Of several maps, the one of the pose, which is in the coordinates of the first map: on
+    #: another map, it is far away. Empty for a single map.
+    map: str = ''
+    refusal_kind: str = ''  #: See cliploc_ros.core.acceptance.verdict; empty when accepted
+    #: What the pose comes from: 'objects', 'keyframes' or 'both'; empty where none was found
+    source: str = ''
+    #: Points of keyframes that agree on their pose, whatever the pose comes from
+    keyframe_inliers: int = 0
+    keyframes_ms: float = 0.0  #: Time of features, matching and the pose from them [ms]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields, for JSON."""
+        return asdict(self)
+
+
+def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool = False
+                 ) -> tuple[Query, ...]:
+    """Return the queries of a file, with similarities in the map's order.
+
+    With `every_frame` the neighbouring frames are queries, too. DatasetError: the queries were
+    recorded against another map.
+    """
+    column = {one: number for number, one in enumerate(queries.landmark_ids)}
+    missing = [one for one in landmark_map.landmark_ids if one not in column]
+    if missing:
+        more = f' and {len(missing) - 1} more' if missing[1:] else ''
+        raise DatasetError(f"the queries lack the map's landmark '{missing[0]}'{more}: they were "
+                           'recorded with another map')
+    columns = [column[one] for one in landmark_map.landmark_ids]
+    fx, fy, cx, cy = queries.intrinsics_fx_fy_cx_cy
+    # the file does not hold the size of the image, and localizing does not use it
+    camera = Camera(max(1, round(2 * cx)), max(1, round(2 * cy)), fx, fy, cx, cy)
+    return tuple(
+        Query(number, Observation(
+            camera, Detections(frame.bboxes_xyxy, frame.class_ids, frame.scores),
+            np.ascontiguousarray(frame.similarities[:, columns], dtype=np.float32),
+            frame.stamp_ns, depths=frame.depths), frame.map_from_camera)
+        for number, frame in enumerate(queries.frames) if every_frame or frame.is_main)
+
+
+def join_cameras(queries: Mapping[str, Sequence[Query]], tolerance_s: float
+                 ) -> tuple[Query, ...]:
+    """Return the queries of the first camera, each with what the others saw at its instant.
+
+    The true poses tell how the cameras are mounted. DatasetError: no other image is so near in
+    time to one of the first camera.
+    """
+    (first, main), *others = queries.items()
+    stamps = {name: np.array([one.observation.stamp_ns for one in its]) for name, its in others}
+    found = []
+    for query in main:
+        stamp_ns, beside = query.observation.stamp_ns, []
+        for name, its in others:
+            near = np.abs(stamps[name] - stamp_ns)
+            if len(near) and near.min() <= tolerance_s * NS_PER_S:
+                one = its[int(near.argmin())]
+                beside.append(replace(one.observation, camera_name=name, stamp_ns=stamp_ns,
+                                      odom_from_camera=one.map_from_camera))
+        found.append(replace(query, neighbours=tuple(beside), observation=replace(
+            query.observation, camera_name=first, odom_from_camera=query.map_from_camera)))
+    if not any(one.neighbours for one in found):
+        raise DatasetError(f'no image of {", ".join(name for name, _ in others)} is within '
+                           f'{tolerance_s:g} s of one of {first}')
+    return tuple(found)
+
+
+def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Sequence[Query],
+              keyframes: KeyframeLocalizer | None = None) -> list[Result]:
+    """Run one trial of a method, numbered from 0, on some queries.
+
+    `keyframes` are of the map's layer, for methods that use keyframes and queries with features.
+    """
+    seed = method.options.random_seed + trial
+    relocalizer = Relocalizer(landmark_map, replace(method.options, random_seed=seed))
+    on_demand = method.options.crops == 'on_demand' and can_do_without_crops(method.options)
+    results = []
+    for query in queries:
+        recognizer, spent_ms = None, 0.0
+        observations = [*query.neighbours, query.observation]
+        if keyframes is not None and query.image is not None and method.keyframes:
+            recognizer = ImageRecognizer(keyframes, query.image.features, query.image.camera)
+        if on_demand:
+            found, crops_share = _localize_on_demand(relocalizer, observations, recognizer)
+        else:
+            found = relocalizer.relocalize(observations, recognizer)
+            crops_share = float(method.options.needs_similarities)
+        if recognizer is not None and query.image is not None:
+            spent_ms = query.image.spent_ms + recognizer.spent_ms
+        results.append(_judge(landmark_map, method.name, trial, query, found, crops_share,
+                              spent_ms))
+    return results
+
+
+def _localize_on_demand(relocalizer: Relocalizer, observations: Sequence[Observation],
+                        recognizer: ImageRecognizer | None) -> tuple[Relocalization, float]:
+    """Localize as the node does: with each frame after those before it, crops on demand.
+
+    Return the result and the share of crops that were compared.
+    """
+    frames: list[SearchedFrame] = []
+    count = len(relocalizer.landmark_map)
+    for observation in observations:
+        if observation.camera_name and observation is not observations[-1]:
+            frames.append(relocalizer.search(by_classes(observation, count)))
+            continue
+        frame, found = localize_on_demand(
+            relocalizer, frames, observation, recorded_crops(observation, relocalizer.options),
+            recognizer=recognizer if observation is observations[-1] else None)
+        frames.append(frame)
+    crops = sum(len(one.observation.detections) for one in frames)
+    compared = sum(int((one.observation.similarity_rows >= 0).sum()) for one in frames)
+    return found, compared / max(crops, 1)
+
+
+def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: Query,
+           found: Relocalization, crops_share: float, keyframes_ms: float) -> Result:
+    pose = found.map_from_camera
+    error_m, error_deg = (None, None) if pose is None else pose_error(pose, query.map_from_camera)
+    return Result(
+        method=method, trial=trial, query=query.number,
+        timestamp=float(query.observation.stamp_ns) / NS_PER_S,
+        boxes=len(query.observation.detections),
+        solved=found.solved, accepted=found.accepted,
+        map_from_camera=None if pose is None else pose.tolist(),
+        error_m=None if error_m is None else float(error_m),
+        error_deg=None if error_deg is None else float(error_deg), score=float(found.score),
+        confidence=float(found.confidence),
+        nees=None if pose is None or found.covariance is None
+        else normalized_square(pose, found.covariance, query.map_from_camera),
+        inliers=len(found.matches), hypotheses=int(found.tried),
+        best_iteration=int(found.best_iteration), coverage=float(found.coverage),
+        reason=found.reason, search_ms=float(found.search_ms), crops_share=crops_share,
+        map='' if pose is None else place_of(landmark_map, pose).name,
+        refusal_kind=found.refusal_kind or '',
+        source='' if pose is None else found.source,
+        keyframe_inliers=0 if found.recognized is None else found.recognized.inliers,
+        keyframes_ms=keyframes_ms)

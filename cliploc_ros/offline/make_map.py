@@ -1,0 +1,222 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Mapping as a library: what a recording shows becomes a map with labels, images and keyframes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, load_embeddings_of_map
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.errors import MappingError, ModelError
+from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
+from cliploc_ros.offline.datasets.frames import Frames
+from cliploc_ros.offline.mapping.building import MappingReport, build_map
+from cliploc_ros.offline.mapping.labelling import embed_landmarks, label_landmarks
+from cliploc_ros.offline.mapping.landmarks import classes_of
+from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.systematic import MountCorrection
+from cliploc_ros.offline.mapping.update.renewal import UpdateReport
+from cliploc_ros.offline.mapping.update.updating import update_map as update_landmarks
+from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
+from cliploc_ros.offline.vocabulary.phrase_embeddings import phrases_of_classes
+from cliploc_ros.offline.vocabulary.vocabulary import Vocabulary, load_vocabulary, shipped_phrases
+
+# Trial maps that find a scale by objects of known size, and when it has settled.
+_TRIALS, _SAME_SIZE = 4, 0.01
+
+
+@dataclass(frozen=True)
+class MadeMap:
+    """A map and what belongs next to it."""
+
+    landmark_map: LandmarkMap
+    report: MappingReport | UpdateReport  #: What was found and left out, and why
+    embeddings: LandmarkEmbeddings | None = None  #: What CLIP saw of each landmark
+    layer: KeyframeLayer | None = None
+    mount: MountCorrection | None = None  #: Where a correction was asked for
+
+
+@dataclass(frozen=True)
+class Labeller:
+    """Describes landmarks by phrases, or by their class where CLIP is missing."""
+
+    vocabulary: Vocabulary
+    #: The CLIP that made the embeddings of the recording, with its weights; None: labels are class
+    #: names
+    clip: ClipOptions | None = None
+    weights: ClipWeights | None = None
+    note: str = ''  #: Why labels are class names; '' where they are not
+
+    def describe(self, landmark_map: LandmarkMap, detections: PosedDetections,
+                 shown: NDArray[np.int64]) -> tuple[LandmarkMap, LandmarkEmbeddings | None]:
+        """Return the map with labels, and its image embeddings.
+
+        The array shown (n,) has the row of the landmark that each box shows, -1 for none.
+        CliplocError: the text tower cannot be loaded.
+        """
+        if not _has_embeddings(detections):
+            return landmark_map, None
+        embeddings = embed_landmarks(landmark_map.landmark_ids, detections, shown)
+        if self.clip is None or self.weights is None:
+            return landmark_map, embeddings
+        names = sorted({name for row in range(len(landmark_map))
+                        for name in classes_of(landmark_map, row)})
+        # in two parts: the user's phrases change more often than the shipped ones
+        phrases = phrases_of_classes(self.weights, self.clip, [
+            {name: shipped_phrases(name) for name in names},
+            {name: texts for name, texts in self.vocabulary.added.items() if name in names}])
+        return label_landmarks(landmark_map, embeddings, phrases), embeddings
+
+
+def find_labeller(detections: PosedDetections, clip: Callable[[], ClipOptions] | None,
+                  vocabulary: Path | None = None) -> Labeller:
+    """Return what labels the landmarks of a recording.
+
+    Parameters
+    ----------
+    clip : callable, optional
+        Returns the CLIP of the recording; called only where the recording has embeddings. None:
+        labels are class names.
+    vocabulary : Path, optional
+        Phrases by class (YAML), besides the shipped ones.
+
+    Raises
+    ------
+    OptionsError, ModelError
+        The vocabulary is invalid, or given where nothing can be labelled.
+    """
+    words = load_vocabulary(vocabulary)
+    try:
+        if clip is None:
+            raise ModelError('--no-clip was given')
+        if not _has_embeddings(detections):
+            raise ModelError('the observations have no CLIP embeddings that name their encoder; '
+                             'record them again with CLIP')
+        options = clip()
+        return Labeller(words, options, _weights_of(detections, options))
+    except ModelError as error:
+        if vocabulary is not None:
+            raise
+        return Labeller(words, note=f'labels are class names: {error}')
+
+
+def _weights_of(detections: PosedDetections, clip: ClipOptions) -> ClipWeights:
+    """Return the weights that made the embeddings; ModelError where they are not at hand."""
+    hint = 'give the --profile, or --clip-model and --clip-pretrained, of the recording'
+    theirs = detections.encoder_key.split(':')[0]
+    ours = Path(clip.model).stem if clip.model.endswith('.json') else clip.model.replace('/', '-')
+    # compared first, since the weights of another model would be downloaded in vain
+    if ours != theirs:
+        raise ModelError(f"the embeddings are of CLIP model '{theirs}', not '{ours}'; {hint}")
+    weights = resolve_clip_weights(clip)
+    if weights.key != detections.encoder_key:
+        raise ModelError(f'the embeddings are of the weights {detections.encoder_key}, not '
+                         f'{weights.key}; {hint}')
+    assert detections.embeddings is not None
+    if detections.embeddings.shape[1] != weights.embed_dim:
+        raise ModelError(f'the embeddings have {detections.embeddings.shape[1]} numbers, but '
+                         f'{weights.key} gives {weights.embed_dim}; record them again')
+    return weights
+
+
+def _has_embeddings(detections: PosedDetections) -> bool:
+    embeddings = detections.embeddings
+    return embeddings is not None and embeddings.size > 0 and bool(detections.encoder_key)
+
+
+def make_map(detections: PosedDetections, labeller: Labeller,
+             options: MappingOptions | None = None, frames: Frames | None = None,
+             layer: LayerOptions | None = None,
+             progress: Callable[[str, float], None] | None = None) -> MadeMap:
+    """Make a map of a recording.
+
+    Parameters
+    ----------
+    detections : PosedDetections
+        Boxes and poses of the recording: ``load_observations``, or ``record_once`` for images.
+    labeller : Labeller
+        See find_labeller.
+    frames : Frames, optional
+        The images, for the layer of keyframes.
+    layer : LayerOptions, optional
+        None: without keyframes.
+    progress : callable, optional
+        Called with the name of a stage and the share of it that is done, 0 to 1.
+
+    Raises
+    ------
+    CliplocError
+        No map can be made of this input; the message says what to correct.
+    """
+    built = build_map(detections, options, progress)
+    landmark_map, embeddings = labeller.describe(built.landmark_map, detections, built.shown)
+    return MadeMap(landmark_map, built.report, embeddings,
+                   None if frames is None or layer is None
+                   else build_layer(frames, landmark_map, layer), built.mount)
+
+
+def scale_of_objects(detections: PosedDetections, options: MappingOptions, class_name: str,
+                     metres: float) -> tuple[float, int]:
+    """Return metres of a unit of the poses, by the longest extent of the objects of a class [m].
+
+    Of the objects of a trial map the median counts. Mapping knows sizes in metres, so that the
+    trial is repeated with the scale found. The number of these objects is returned, too.
+
+    Raises
+    ------
+    MappingError
+        The detections have depth, which says the scale, or no object of the class is mapped.
+    """
+    if detections.depths is not None:
+        raise MappingError('--object-size: the recording has depth, which is in metres; give '
+                           '--scale where the poses are not')
+    scale = 1.0
+    for _ in range(_TRIALS):
+        built = build_map(detections.moved(scale, np.eye(3)), options).landmark_map
+        own = [row for row, one in enumerate(built.class_ids) if one == class_name]
+        if not own:
+            raise MappingError(
+                f"--object-size: no object of class '{class_name}' is mapped; there are "
+                f'{", ".join(sorted(set(built.class_ids)))}')
+        step = metres / float(np.median(2.0 * built.semi_axes[own].max(axis=1)))
+        scale *= step
+        if abs(step - 1.0) < _SAME_SIZE:
+            break
+    return scale, len(own)
+
+
+def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
+               options: MappingOptions) -> MadeMap:
+    """Bring a map file up to date with a recording; its file is not written.
+
+    Poses are refined against the map, as far as ``pose_errors`` or the boxes tell that they are
+    off.
+
+    Raises
+    ------
+    CliplocError
+        The map is invalid, the recording does not belong to it, or the text tower cannot be
+        loaded.
+    """
+    old = LandmarkMap.from_file(path)
+    old_embeddings = load_embeddings_of_map(path, old.landmark_ids)
+    updated = update_landmarks(old, detections, options, old_embeddings)
+    landmark_map, first = updated.landmark_map, updated.first_new
+    if first == len(landmark_map):
+        return MadeMap(landmark_map, updated.report, updated.embeddings)
+    # only the new landmarks get labels; the others keep theirs
+    new, _ = labeller.describe(landmark_map.select(range(first, len(landmark_map))), detections,
+                               np.where(updated.shown >= first, updated.shown - first, -1))
+    texts = dict(zip(new.landmark_ids, new.labels, strict=True))
+    return MadeMap(
+        replace(landmark_map, labels=landmark_map.labels[:first] + new.labels,
+                details=landmark_map.details[:first] + new.details),
+        replace(updated.report, new=tuple(
+            replace(one, label=texts[one.landmark_id]) for one in updated.report.new)),
+        updated.embeddings)

@@ -1,0 +1,175 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which box shows which landmark: one to one in every frame, by greatest overlap in sum."""
+
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.offline.mapping.landmarks import Landmarks, box_iou, project_box
+from cliploc_ros.offline.mapping.views import Views
+
+_GROUP_SIZE = 8
+# Rounding must not hide a landmark [m].
+_SLACK = 1e-6
+
+
+class Overlaps(NamedTuple):
+    """Pairs of a box and a landmark with its class that overlap, in the order of the boxes."""
+
+    #: (p,)
+    boxes: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+    ious: NDArray[np.float64]  #: (p,): of box and projected box, clipped to the image
+
+
+def find_overlaps(views: Views, landmarks: Landmarks, min_iou: float) -> Overlaps:
+    """Return the pairs that overlap more than min_iou, by each class of a landmark."""
+    classes = int(max(views.classes.max(initial=0), landmarks.names[:, 1].max(initial=0))) + 1
+    boxes, numbers, ious = _overlaps(views, landmarks.centers, landmarks.bases,
+                                     _make_groups(landmarks, classes), min_iou)
+    order = np.lexsort((numbers, boxes))
+    return Overlaps(boxes[order], numbers[order], ious[order])
+
+
+class _Groups(NamedTuple):
+    """Near landmarks of one class with a sphere about them, so that most need no projection.
+
+    Class k has the groups from starts[k] up to starts[k + 1], group g the landmarks
+    members[offsets[g]:offsets[g + 1]]. Landmark l lies within sizes[l] of its centre.
+    """
+
+    starts: NDArray[np.int64]
+    offsets: NDArray[np.int64]
+    members: NDArray[np.int64]
+    centers: NDArray[np.float64]
+    radii: NDArray[np.float64]
+    sizes: NDArray[np.float64]
+
+
+def _make_groups(landmarks: Landmarks, classes: int) -> _Groups:
+    """Return groups of landmarks; one without a class is in none."""
+    rows, of_names = landmarks.names.T
+    order = np.lexsort((_along_curve(landmarks.centers)[rows], of_names))
+    members, own = rows[order], of_names[order]
+    first = np.searchsorted(own, np.arange(classes + 1))
+    starts = np.concatenate([[0], np.cumsum(-(-np.diff(first) // _GROUP_SIZE))])
+    group_of = starts[own] + (np.arange(len(own)) - first[own]) // _GROUP_SIZE
+    offsets = np.searchsorted(group_of, np.arange(starts[-1] + 1))
+    sizes = np.linalg.norm(landmarks.bases, axis=(1, 2))  # never below a semi-axis
+    if len(members) == 0:
+        return _Groups(starts, offsets, members, np.empty((0, 3)), np.empty(0), sizes)
+    points = landmarks.centers[members]
+    centers = np.add.reduceat(points, offsets[:-1]) / np.diff(offsets)[:, None]
+    reaches = np.linalg.norm(points - centers[group_of], axis=1) + sizes[members]
+    return _Groups(starts, offsets, members, centers,
+                   np.maximum.reduceat(reaches, offsets[:-1]), sizes)
+
+
+def _along_curve(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the place of each point (n, 3) on Morton's curve, on which near points are near."""
+    offsets = points - points.min(axis=0, initial=np.inf)
+    cells = (offsets * (1023.0 / max(1e-9, offsets.max(initial=0.0)))).astype(np.int64)
+    places = np.zeros(len(points), dtype=np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            places |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return places
+
+
+@compiled
+def _overlaps(views, centers, bases, groups, min_iou):
+    """Return boxes, landmarks and IoUs."""
+    capacity = 4 * len(views.frames) + 64
+    boxes, landmarks = np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64)
+    ious = np.empty(capacity)
+    count = 0
+    projected = np.empty((len(centers), 4))
+    projected_in = np.full(len(centers), -1)
+    visible = np.zeros(len(centers), dtype=np.bool_)
+    for row in range(len(views.frames)):
+        frame, number = views.frames[row], views.classes[row]
+        for group in range(groups.starts[number], groups.starts[number + 1]):
+            if not _may_show(views, row, groups.centers[group], groups.radii[group]):
+                continue
+            for landmark in groups.members[groups.offsets[group]:groups.offsets[group + 1]]:
+                if not _may_show(views, row, centers[landmark], groups.sizes[landmark]):
+                    continue
+                if projected_in[landmark] != frame:
+                    projected_in[landmark] = frame
+                    visible[landmark] = project_box(
+                        views.rotations[frame], views.translations[frame], centers[landmark],
+                        bases[landmark], projected[landmark])
+                if not visible[landmark]:
+                    continue
+                iou = box_iou(projected[landmark], views.edges[row], views.bounds[frame])
+                if iou > min_iou:
+                    if count == capacity:
+                        capacity *= 2
+                        boxes = np.append(boxes, np.empty_like(boxes))
+                        landmarks = np.append(landmarks, np.empty_like(landmarks))
+                        ious = np.append(ious, np.empty_like(ious))
+                    boxes[count], landmarks[count], ious[count] = row, landmark, iou
+                    count += 1
+    return boxes[:count].copy(), landmarks[:count].copy(), ious[:count].copy()
+
+
+@compiled
+def _may_show(views, row, center, radius):
+    """Tell whether a box may show a part of a sphere: it reaches into the pyramid of its rays."""
+    r, t = views.rotations[views.frames[row]], views.translations[views.frames[row]]
+    z = r[2, 0] * center[0] + r[2, 1] * center[1] + r[2, 2] * center[2] + t[2]
+    if z < -radius:
+        return False
+    for axis in range(2):
+        x = (r[axis, 0] * center[0] + r[axis, 1] * center[1] + r[axis, 2] * center[2] + t[axis])
+        low, high = views.edges[row, axis], views.edges[row, axis + 2]
+        if (low * z - x > radius * sqrt(1.0 + low * low) + _SLACK
+                or x - high * z > radius * sqrt(1.0 + high * high) + _SLACK):
+            return False
+    return True
+
+
+def associate(views: Views, landmarks: Landmarks, min_iou: float) -> NDArray[np.int64]:
+    """Return the landmark (n,) that each box shows, -1 for none.
+
+    In every frame a landmark has at most one box and a box at most one landmark; the sum of
+    their IoUs is the greatest possible (Hungarian method). Pairs that overlap less than min_iou
+    are no candidates.
+    """
+    boxes, candidates, ious = find_overlaps(views, landmarks, min_iou)
+    shown = np.full(len(views.frames), -1, dtype=np.int64)
+    frames = views.frames[boxes]
+    sole = _is_sole(boxes) & _is_sole(frames * len(landmarks.centers) + candidates)
+    shown[boxes[sole]] = candidates[sole]
+    contested = np.nonzero(~sole)[0]
+    for part in np.split(contested, np.nonzero(np.diff(frames[contested]))[0] + 1):
+        rows, row_of = np.unique(boxes[part], return_inverse=True)
+        columns, column_of = np.unique(candidates[part], return_inverse=True)
+        gains = np.zeros((len(rows), len(columns)))
+        gains[row_of, column_of] = ious[part]
+        for row, column in zip(*linear_sum_assignment(gains, maximize=True), strict=True):
+            if gains[row, column] > 0.0:
+                shown[rows[row]] = columns[column]
+    return shown
+
+
+def _is_sole(values: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Tell which values occur once."""
+    _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
+    return np.asarray(counts[inverse] == 1)
+
+
+@compiled
+def ious_with(views, rows, center, basis):
+    """Return the IoU of an ellipsoid with each of some boxes; 0 where it is behind."""
+    ious, box = np.zeros(len(rows)), np.empty(4)
+    for place in range(len(rows)):
+        frame = views.frames[rows[place]]
+        if project_box(views.rotations[frame], views.translations[frame], center, basis, box):
+            ious[place] = box_iou(box, views.edges[rows[place]], views.bounds[frame])
+    return ious

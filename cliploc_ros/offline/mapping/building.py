@@ -1,0 +1,392 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The entry point of mapping: posed detections in, a map and a report out."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.mapping.association import associate
+from cliploc_ros.offline.mapping.doubles import close_pairs, merge_doubles, resolve_doubles
+from cliploc_ros.offline.mapping.evidence import (
+    Evidence,
+    explained_boxes,
+    gather_evidence,
+    reasons_against,
+)
+from cliploc_ros.offline.mapping.fitting import fit_landmarks
+from cliploc_ros.offline.mapping.joint import pose_changes, pose_errors, refine_jointly
+from cliploc_ros.offline.mapping.landmarks import (
+    Landmarks,
+    ellipsoid_numbers,
+    group_boxes,
+    join_landmarks,
+    no_landmarks,
+    unused_ids,
+)
+from cliploc_ros.offline.mapping.odometry import link_frames
+from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.offline.mapping.pose_noise import (
+    estimate_pose_errors,
+    estimated_note,
+    left_by_poses,
+    shared_by_neighbours,
+    significant_pose_errors,
+)
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.systematic import MountCorrection, refine_mount
+from cliploc_ros.offline.mapping.triangulation import (
+    SUPPORT_IOU,
+    add_depths,
+    correct_scale,
+    depth_scale,
+    options_with_depth,
+    triangulate,
+)
+from cliploc_ros.offline.mapping.views import (
+    Views,
+    check_input,
+    make_views,
+    map_from_cameras,
+    thin_out,
+)
+
+# Landmarks are found in windows of time that overlap: no pair of boxes is farther apart.
+_WINDOW_S, _OVERLAP_S = 90.0, 30.0
+_REASONS_SHOWN = 10
+
+#: Told the name of a stage and the share of it that is done, 0 to 1.
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A landmark that is not good enough for the map."""
+
+    class_id: str
+    center: tuple[float, float, float]  #: [m]
+    #: Frames that show it, and their viewpoints
+    support: int
+    viewpoints: int
+    reason: str
+
+
+class NothingFoundError(MappingError):
+    """The boxes show no landmark that is good enough for a map, but perhaps some that are not."""
+
+    def __init__(self, message: str, left_out: tuple[LeftOut, ...]):
+        super().__init__(message)
+        self.left_out = left_out
+
+
+def rounded(center: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Return a centre to the millimetre, for reports."""
+    x, y, z = center.round(3).tolist()
+    return x, y, z
+
+
+def left_out_lines(left_out: Sequence[LeftOut]) -> list[str]:
+    """Return what is left out as text."""
+    rows = [f'left out: {len(left_out)}'] if left_out else []
+    rows += [f'  {one.class_id} at {one.center[0]:.2f} {one.center[1]:.2f} '
+             f'{one.center[2]:.2f} with {one.support} frames: {one.reason}'
+             for one in left_out[:_REASONS_SHOWN]]
+    if len(left_out) > _REASONS_SHOWN:
+        rows.append(f'  and {len(left_out) - _REASONS_SHOWN} more')
+    return rows
+
+
+@dataclass(frozen=True)
+class MappingReport:
+    """The result of mapping in numbers and words: what it found, what it left out and why."""
+
+    frames: int
+    viewpoints: int
+    boxes: int
+    landmarks: int
+    #: Share of the boxes that a landmark of their class overlaps by more than an IoU of 0.3
+    explained: float
+    #: Of these boxes. Both are measured on the frames that the map was fitted to.
+    median_iou: float
+    #: Root mean square by which joint refinement moved the poses
+    pose_change_m: float
+    pose_change_deg: float
+    left_out: tuple[LeftOut, ...]  #: The one with the greatest support first
+    notes: tuple[str, ...]  #: What is wrong with the input, and what to do about it
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as plain values, for JSON."""
+        return asdict(self)
+
+    def lines(self) -> list[str]:
+        """Return the report as text."""
+        rows = [f'{self.landmarks} landmarks from {self.frames} frames of {self.viewpoints} '
+                f'viewpoints with {self.boxes} boxes',
+                f'explained boxes: {self.explained:.1%}, median IoU {self.median_iou:.3f} '
+                '(on the frames used for fitting)']
+        if self.pose_change_m > 0.0:
+            rows.append(f'poses refined by {self.pose_change_m * 100:.1f} cm and '
+                        f'{self.pose_change_deg:.2f} degrees (root mean square)')
+        rows += [f'note: {note}' for note in self.notes]
+        return rows + left_out_lines(self.left_out)
+
+
+@dataclass(frozen=True)
+class BuiltMap:
+    """The result of mapping: F frames, n boxes."""
+
+    landmark_map: LandmarkMap
+    report: MappingReport
+    shown: NDArray[np.int64]  #: (n,): row of the landmark that each box shows, -1 for none
+    map_from_camera: NDArray[np.float64]  #: (F, 4, 4): the poses, refined where that was asked for
+    mount: MountCorrection | None = None  #: Where a correction was asked for
+
+
+def build_map(detections: PosedDetections, options: MappingOptions | None = None,
+              progress: Progress | None = None) -> BuiltMap:
+    """Build a map from posed detections.
+
+    MappingError: no map can be made of this input; the message says what to correct.
+    """
+    options = options or MappingOptions()
+    if options.refine_mount and len(detections.cameras) > 1:
+        raise MappingError(f'the mounts of {len(detections.cameras)} cameras cannot be corrected '
+                           'together; correct each with a map of --cameras NAME alone')
+    tell = progress or (lambda stage, share: None)
+    given = make_views(detections, options)
+    notes = check_input(detections, given, options)
+    rng = np.random.default_rng(options.random_seed)
+    draft = _draft(given, options, rng, tell)
+    if detections.depths is not None:
+        # the draft of boxes alone tells the scale of depth
+        evidence = gather_evidence(given, draft.landmarks, draft.shown)
+        given = add_depths(given, detections)
+        scales = [depth_scale(given, draft.landmarks, np.where(
+            given.cameras[given.frames] == number, draft.shown, -1), evidence.baseline_deg)
+            for number in range(len(detections.cameras))]
+        given, depth_notes = correct_scale(given, detections, scales)
+        notes += depth_notes
+        options = options_with_depth(options)
+        draft = _draft(given, options, rng, tell)
+    mount, odometry = None, detections.odom_from_camera
+    if options.refine_mount:
+        views = given
+        for number in range(options.rebuilds + 1):
+            if len(draft.landmarks.centers) == 0:
+                break
+            tell('refining the mount', number / (options.rebuilds + 1))
+            mount = refine_mount(given, draft.landmarks, draft.shown, views)
+            views = mount.views
+            draft = _draft(views, options, rng, tell)
+    if mount is not None:
+        given, notes = mount.views, notes + mount.lines()
+        odometry = None if odometry is None else odometry @ mount.given_from_corrected
+    views, draft, errors, pose_notes = _with_poses(given, odometry, draft, options, rng, tell)
+    tell('done', 1.0)
+    if len(draft.landmarks.centers) == 0:
+        raise NothingFoundError(
+            _why_none(draft.reasons) if draft.reasons else
+            'no boxes of one class meet in space; check that poses and stamps belong to these '
+            'images, that the poses are of the camera (z forward), and the intrinsics',
+            _left_out(detections, draft))
+    built = _finish(detections, given, views, draft, errors, options, notes + pose_notes)
+    return replace(built, mount=mount)
+
+
+class _Draft(NamedTuple):
+    """Landmarks with the boxes that show them, and those left out."""
+
+    landmarks: Landmarks
+    shown: NDArray[np.int64]
+    left_out: Landmarks
+    reasons: list[str]
+    evidence_against: Evidence
+
+
+def _draft(views: Views, options: MappingOptions, rng: np.random.Generator, tell: Progress
+           ) -> _Draft:
+    """Return the landmarks that the views show, for the poses that they have."""
+    landmarks, shown = no_landmarks(), np.full(len(views.frames), -1, dtype=np.int64)
+    for number in range(options.discovery_rounds):
+        found = _discover(views, shown < 0, options, rng, tell)
+        tell('fitting landmarks', number / options.discovery_rounds)
+        landmarks, shown = _settle(views, join_landmarks(landmarks, found), options)
+    evidence = gather_evidence(views, landmarks, shown)
+    reasons = reasons_against(landmarks, evidence, options)
+    kept = np.array([reason is None for reason in reasons], dtype=np.bool_)
+    landmarks, left_out = landmarks.select(kept), landmarks.select(~kept)
+    # boxes of what is left out may belong to what stays
+    shown = associate(views, landmarks, options.association_iou)
+    landmarks = fit_landmarks(views, landmarks, group_boxes(shown, len(landmarks.centers)))
+    return _Draft(landmarks, associate(views, landmarks, options.association_iou), left_out,
+                  [reason for reason in reasons if reason is not None], evidence.select(~kept))
+
+
+def _discover(views: Views, free: NDArray[np.bool_], options: MappingOptions,
+              rng: np.random.Generator, tell: Progress) -> Landmarks:
+    """Return landmarks that explain the free boxes, class by class and minute by minute.
+
+    Landmarks that a window of time has found explain boxes of the next one, so that the work grows
+    with the length of the recording only.
+    """
+    free = free & thin_out(views, options.frames_per_viewpoint)[views.frames]
+    found = [no_landmarks()]
+    for first, last in _windows(views.stamps_s):
+        tell('finding landmarks', first / len(views.stamps_s))
+        window = views.between(first, last)
+        left = free[views.offsets[first]:views.offsets[last]].copy()
+        left &= associate(window, found[-1], SUPPORT_IOU) < 0
+        found.append(join_landmarks(*(
+            triangulate(window, np.nonzero(left & (window.classes == number))[0], options, rng)
+            for number in np.unique(window.classes[left]))))
+    return join_landmarks(*found)
+
+
+def _windows(stamps_s: NDArray[np.float64]) -> list[tuple[int, int]]:
+    """Return the first frame of each window of time, and the one after its last."""
+    windows, begin_s = [], stamps_s[0]
+    while True:
+        first, last = np.searchsorted(stamps_s, [begin_s, begin_s + _WINDOW_S])
+        if last > first:
+            windows.append((int(first), int(last)))
+        if last == len(stamps_s):
+            return windows
+        begin_s = stamps_s[last] - _OVERLAP_S
+
+
+def _settle(views: Views, landmarks: Landmarks, options: MappingOptions
+            ) -> tuple[Landmarks, NDArray[np.int64]]:
+    """Associate, merge and fit until landmarks and boxes agree; return both."""
+    for _ in range(options.settling_rounds):
+        shown = associate(views, landmarks, options.association_iou)
+        pairs = [(first, second) for first, second, _ in close_pairs(landmarks)
+                 if landmarks.classes[first] == landmarks.classes[second]]
+        landmarks, shown = _keep(*merge_doubles(views, landmarks, shown, pairs, options), shown)
+        boxes = group_boxes(shown, len(landmarks.centers))
+        seen = [len(np.unique(views.viewpoints[views.frames[rows]])) >= options.min_viewpoints
+                for rows in boxes]
+        landmarks = fit_landmarks(views, landmarks, boxes).select(np.array(seen, dtype=np.bool_))
+    return landmarks, associate(views, landmarks, options.association_iou)
+
+
+def _keep(landmarks: Landmarks, into: NDArray[np.int64], shown: NDArray[np.int64]
+          ) -> tuple[Landmarks, NDArray[np.int64]]:
+    """Return the landmarks that are no part of another one, and the one that each box shows."""
+    is_kept = into == np.arange(len(into))
+    numbers = np.append((np.cumsum(is_kept) - 1)[into], -1)
+    return landmarks.select(is_kept), numbers[shown]
+
+
+def _one_of_each(views: Views, landmarks: Landmarks, options: MappingOptions
+                 ) -> tuple[Landmarks, NDArray[np.int64]]:
+    """Return landmarks without doubles, fitted to their boxes, and the one that each box shows."""
+    while True:
+        shown = associate(views, landmarks, options.association_iou)
+        found, of_found = _keep(*resolve_doubles(views, landmarks, shown, options), shown)
+        is_shown = np.bincount(of_found[of_found >= 0], minlength=len(found.centers)) > 0
+        if is_shown.sum() == len(landmarks.centers):
+            return landmarks, shown
+        landmarks = found.select(is_shown)
+        shown = associate(views, landmarks, options.association_iou)
+        landmarks = fit_landmarks(views, landmarks, group_boxes(shown, len(landmarks.centers)))
+
+
+def _why_none(reasons: Sequence[str]) -> str:
+    """Return why no landmark is good enough, the commonest reason first, and what to do."""
+    kinds = Counter(reason.partition(':')[0] for reason in reasons)
+    counts = ', '.join(f'{count} {kind}' for kind, count in kinds.most_common())
+    return (f'no landmark is good enough for a map; {len(reasons)} were left out ({counts}), the '
+            f'first one because: {reasons[0]}. Record while the camera moves past the objects, '
+            'not only turns, or map images with depth')
+
+
+def _with_poses(given: Views, odometry: NDArray[np.float64] | None, draft: _Draft,
+                options: MappingOptions, rng: np.random.Generator, tell: Progress
+                ) -> tuple[Views, _Draft, PoseErrors | None, list[str]]:
+    """Return the views with refined poses, the landmarks that fit them, errors, and notes.
+
+    Poses are refined where their errors are given, or estimated and significant. None: they are
+    taken as exact.
+    """
+    views, errors, notes = given, options.pose_errors, list[str]()
+    is_estimated = errors is None and options.estimate_pose_errors
+    if is_estimated:
+        tell('estimating pose errors', 0.0)
+        errors = significant_pose_errors(given, draft.landmarks, draft.shown)
+    if errors is None:
+        return views, draft, None, [] if odometry is None else [
+            'odometry is not used: the poses are taken as they are']
+    for number in range(options.rebuilds + 1):
+        tell('refining poses', number / (options.rebuilds + 1))
+        steps, link_note = None, ''
+        if odometry is not None:
+            steps, link_note = link_frames(given, odometry, errors, options.odometry_errors)
+        # Errors of the poses split objects in two. Poses and parts move towards each other in
+        # turns, until the parts merge.
+        for _ in range(options.refinements):
+            views, landmarks = refine_jointly(given, views, draft.landmarks, draft.shown, errors,
+                                              steps=steps)
+            landmarks, shown = _settle(views, landmarks, options)
+            draft = draft._replace(landmarks=landmarks, shown=shown)
+        if number < options.rebuilds:
+            draft = _draft(views, options, rng, tell)
+            if is_estimated:
+                # objects that were split before tell more now
+                errors = estimate_pose_errors(given, draft.landmarks, draft.shown, views) or errors
+    if is_estimated:
+        notes.append(estimated_note(errors))
+    return views, draft, errors, notes + ([link_note] if link_note else [])
+
+
+def _finish(detections: PosedDetections, given: Views, views: Views, draft: _Draft,
+            errors: PoseErrors | None, options: MappingOptions, notes: Sequence[str]) -> BuiltMap:
+    """Return the map of a draft, with labels that are the class names, and its report."""
+    landmarks, shown = _one_of_each(views, draft.landmarks, options)
+    count = len(landmarks.centers)
+    evidence = gather_evidence(views, landmarks, shown)
+    explained, median_iou = explained_boxes(views, landmarks, shown)
+    report = MappingReport(
+        len(detections), int(views.viewpoints.max()) + 1, len(detections.classes), count,
+        explained, median_iou, *pose_changes(given, views), _left_out(detections, draft),
+        tuple(notes))
+    evidence = evidence._replace(position_sigma=np.hypot(
+        evidence.position_sigma,
+        left_by_poses(views, np.square(pose_errors(given, views)), shown, count)))
+    shared = None if errors is None else shared_by_neighbours(views, shown, count, errors)
+    weights = [_class_weights(detections, boxes) for boxes in group_boxes(shown, count)]
+    details = tuple(
+        evidence.details(row, LandmarkDetails(
+            class_weights=one if len(one) > 1 else None,
+            shared_sigma=None if shared is None else float(shared[row, 0]),
+            shared_sigma_deg=None if shared is None else float(shared[row, 1]),
+            source=options.source))
+        for row, one in enumerate(weights))
+    names = tuple(one[0][0] for one in weights)
+    return BuiltMap(
+        LandmarkMap(options.frame_id, unused_ids(names), names, names, landmarks.centers,
+                    *ellipsoid_numbers(landmarks.bases), details),
+        report, shown, map_from_cameras(views))
+
+
+def _left_out(detections: PosedDetections, draft: _Draft) -> tuple[LeftOut, ...]:
+    """Return what a draft leaves out, the landmark with the greatest support first."""
+    against = draft.evidence_against
+    return tuple(LeftOut(
+        detections.class_names[draft.left_out.classes[row]], rounded(draft.left_out.centers[row]),
+        int(against.support[row]), int(against.viewpoints[row]), draft.reasons[row])
+        for row in np.argsort(-against.support, kind='stable'))
+
+
+def _class_weights(detections: PosedDetections, rows: NDArray[np.int64]
+                   ) -> tuple[tuple[str, float], ...]:
+    """Return the classes of some boxes with their shares, the greatest first."""
+    counts = np.bincount(detections.classes[rows], minlength=len(detections.class_names))
+    return tuple((detections.class_names[number], float(counts[number] / counts.sum()))
+                 for number in np.argsort(-counts, kind='stable') if counts[number])

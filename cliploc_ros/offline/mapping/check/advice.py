@@ -1,0 +1,240 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Advice in words: what to do about a map, the most urgent first.
+
+Causes come before what they lead to: a robot that is misled in a place with a double does not need
+an advice of its own.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.offline.mapping.check.places import RADIUS_M, LookAlike
+from cliploc_ros.offline.mapping.check.relocalization import Trial, refused_spans
+from cliploc_ros.offline.mapping.check.report import SERIOUS, Advice, CheckReport, GridCheck
+
+_MOST_OF_A_KIND, _MOST_MISLED = 5, 3
+# A shorter run of refused frames is no side of a room.
+_MIN_SPAN = 2
+# Cosine of the angle between views of one side: 45 degrees, a guess.
+_ONE_SIDE = 0.7
+_FEW_LANDMARKS = 3
+# Fewer frames of a landmark leave others unmapped, if besides more than this share of the boxes
+# belongs to none. Guesses, between maps of fr3 from every 10th and from every 30th frame.
+_FEW_FRAMES, _MANY_UNEXPLAINED = 12, 0.12
+# A wrong pose this near to where a double would put the camera is due to the double [m]. A guess.
+_SAME_POSE_M = 1.0
+# A camera sees a place from this far, twice the radius of what counts as one place [m].
+_SIGHT_M = 2.0 * RADIUS_M
+_NUMBERS = ('no', 'one', 'two', 'three', 'four', 'five', 'six', 'seven', 'eight', 'nine', 'ten')
+
+
+def give_advice(report: CheckReport) -> list[Advice]:
+    """Return what to do, one sentence or two each."""
+    advice = [*_on_look_alikes(report), *_on_landmarks(report), *_on_corrections(report),
+              *_on_misled(report), *_on_spans(report), *_on_grid(report)]
+    return advice or [Advice('nothing to do: the map reaches all thresholds that were checked')]
+
+
+def _some(advice: Sequence[Advice], what: str) -> list[Advice]:
+    """Return the first ones, and how many more there are."""
+    more = [Advice(f'and {len(advice) - _MOST_OF_A_KIND} more {what}')]
+    return [*advice[:_MOST_OF_A_KIND], *(more if len(advice) > _MOST_OF_A_KIND else [])]
+
+
+def _on_look_alikes(report: CheckReport) -> list[Advice]:
+    texts = []
+    for one in report.look_alikes:
+        matched = len(one.matched)
+        told_apart = ('their labels are equal, so nothing tells them apart: map an object that '
+                      'only one of them has, or describe what differs') \
+            if one.same_labels == matched else (
+            f'{_count(matched - one.same_labels)} labels differ: make sure that they are right')
+        mistaken = sum(_takes_for(trial, one) for trial in _misled(report))
+        distance_m = np.hypot(one.first[0] - one.second[0], one.first[1] - one.second[1])
+        alike = (f'the place around {_place(one.first)} looks the same when turned by '
+                 f'{abs(one.turn_deg):.0f} degrees') if distance_m < _SAME_POSE_M else (
+            f'the places around {_place(one.first)} and {_place(one.second)} look alike')
+        texts.append(Advice(
+            f'{alike} ({matched} of {one.landmarks} landmarks)'
+            + (f', and {mistaken} of the checked views are accepted in the wrong one'
+               if mistaken else '') + f': {told_apart}', one.matched[0] if one.matched else ()))
+    return _some(texts, 'pairs of places that look alike')
+
+
+def _on_landmarks(report: CheckReport) -> Iterator[Advice]:
+    """Yield advice on duplicates, on too few views, and on faults of single landmarks."""
+    pairs = [(report.map_ids[one.first], report.map_ids[one.second])
+             for one in report.overlaps if one.is_duplicate]
+    yield from _some([Advice(f'{" and ".join(pair)} are the same object: delete one of them', pair)
+                      for pair in pairs], 'pairs of duplicates')
+    if report.recording is not None:
+        frames = float(np.median([one.support or 0 for one in report.landmarks]))
+        unexplained = 1.0 - report.recording.as_given.explained
+        if frames < _FEW_FRAMES and unexplained > _MANY_UNEXPLAINED:
+            yield Advice(
+                f'record more views: of {report.recording.frames} frames, {frames:.0f} show a '
+                f'landmark (median), and {unexplained:.0%} of the boxes belong to none; pass '
+                f'all objects slowly, until {_FEW_FRAMES} frames or more show each of them')
+    yield from _some([
+        Advice(f'{one.landmark_id} {one.faults[0]}', (one.landmark_id,))
+        for one in report.landmarks
+        if one.severity >= SERIOUS and one.faults and 'same object as' not in one.faults[0]],
+        'landmarks with a serious fault: record the place again, and update the map')
+
+
+def _on_corrections(report: CheckReport) -> Iterator[Advice]:
+    found = [one for one in (report.recording.corrections if report.recording else ())
+             if one.is_significant]
+    if not found:
+        return
+    what = {'intrinsics': 'calibrate the camera and map again',
+            'mount': 'measure how the camera is mounted on the robot',
+            'stamps': 'check the clock and the delay of the images'}
+    best = max(found, key=lambda one: one.explained)
+    # those of one fit, of one camera: what is wrong with it makes others look wrong, too
+    cause, of_best = best.cause, [one for one in found if (one.cause, one.explained) == (
+        best.cause, best.explained)]
+    numbers = [f'{one.name} by {one.value:+.2f} {one.unit} (± {one.deviation:.2f})'
+               for one in sorted(of_best, key=lambda one: -one.effect_px)]
+    left = sorted({one.cause for one in found if not one.follows} - {cause})
+    follow = sorted({one.cause for one in found if one.follows} - {cause, *left})
+    then = f'; after that, {" and ".join(what[one] for one in left)}' if left else ''
+    if follow:
+        then += f'; only if that was right, look at the {" and the ".join(follow)}'
+    place = ' in its camera_info or camera file' if cause == 'intrinsics' else ''
+    yield Advice(f'{what[cause]}: the boxes fit better if you change {", ".join(numbers)}{place}'
+                 f'{then}')
+
+
+def _on_misled(report: CheckReport) -> Iterator[Advice]:
+    wrong = [one for one in _misled(report)
+             if not any(_takes_for(one, pair) for pair in report.look_alikes)]
+    for one in sorted(wrong, key=lambda one: -(one.error_m or 0.0))[:_MOST_MISLED]:
+        yield Advice(f'a robot at {_place(one.position)} looking {_heading(one)} would be misled '
+                     f'by {one.error_m:.1f} m: raise the parameter min_confidence, or map more '
+                     'distinct objects there', view=one)
+    if len(wrong) > _MOST_MISLED:
+        yield Advice(f'and {len(wrong) - _MOST_MISLED} more views that mislead')
+
+
+def _on_spans(report: CheckReport) -> Iterator[Advice]:
+    if report.recording is None:
+        return
+    sides: list[list[list[Trial]]] = []  # runs that show one side are told once
+    for run in refused_spans(report.recording.trials):
+        if len(run) < _MIN_SPAN:
+            continue
+        same = next((side for side in sides if _is_one_side(side[0], run)), None)
+        if same is None:
+            sides.append([run])
+        else:
+            same.append(run)
+    for side in sides[:_MOST_OF_A_KIND]:
+        run = side[0]
+        seen, halfway = int(np.median([one.landmarks for one in run])), run[len(run) // 2]
+        if run[0].stamp_s is None or run[-1].stamp_s is None:
+            continue
+        if seen > _FEW_LANDMARKS and _sees_double(halfway.position, report):
+            continue
+        first = report.recording.trials[0].stamp_s or 0.0
+        middle = 0.5 * (run[0].stamp_s + run[-1].stamp_s) - first
+        center = np.mean([one.position for one in run], axis=0)
+        what = 'record this side' if seen <= _FEW_LANDMARKS else (
+            'describe these objects better in their labels, or record this side again')
+        frames = f'{len(run)} frames' if len(side) == 1 else (
+            f'{sum(map(len, side))} frames of {len(side)} passes, most')
+        yield Advice(f'{what}: {frames} at {middle:.0f} s, around {_place(center)} '
+                     f'looking {_heading(halfway)}, show {_landmarks(seen)} and none is accepted',
+                     view=halfway)
+
+
+def _is_one_side(first: Sequence[Trial], second: Sequence[Trial]) -> bool:
+    """Return whether two runs of frames look the same way at nearly the same place."""
+    one, other = first[len(first) // 2], second[len(second) // 2]
+    return bool(np.linalg.norm(one.position - other.position) < RADIUS_M
+                and one.forward @ other.forward > _ONE_SIDE)
+
+
+def _on_grid(report: CheckReport) -> Iterator[Advice]:
+    """Yield advice on areas without an accepted heading, and on those without a keyframe."""
+    grid = report.grid
+    for rows in _areas(grid, np.nonzero(grid.is_near & (grid.accepted == 0))[0])[:_MOST_OF_A_KIND]:
+        if np.mean([_sees_double(one, report) for one in grid.positions[rows]]) <= 0.5:
+            best = int(grid.visible[rows].max())
+            fullest = int(rows[0] * grid.headings + grid.visible[rows[0]].argmax())
+            reached = report.keyframes is not None and (report.keyframes.headings[rows] > 0).all()
+            yield Advice(f'no heading is accepted by objects at {_area(grid, rows)}'
+                         f'{", only keyframes reach them" if reached else ""}: a view from there '
+                         f'shows {_landmarks(best)} at most; map more objects that can be seen '
+                         'from there', view=grid.trials[fullest])
+    if report.keyframes is not None:
+        yield from _some([
+            Advice(f'no keyframe is within reach of {_area(grid, rows)}: drive there when the '
+                   'layer is made again, or rely on the landmarks')
+            for rows in _areas(grid, report.keyframes.without)], 'areas that no keyframe reaches')
+
+
+def _misled(report: CheckReport) -> list[Trial]:
+    trials = [*(report.recording.trials if report.recording else ()), *report.queries,
+              *report.grid.trials]
+    return [one for one in trials if one.verdict == 'misled']
+
+
+def _takes_for(trial: Trial, pair: LookAlike) -> bool:
+    """Return whether a wrong pose takes one of two places that look alike for the other."""
+    if trial.estimate is None:
+        return False
+    for here, there, turn_deg in ((pair.first, pair.second, pair.turn_deg),
+                                  (pair.second, pair.first, -pair.turn_deg)):
+        turn = Rotation.from_euler('z', turn_deg, degrees=True)
+        mistaken = turn.apply(trial.position - np.array(here)) + np.array(there)
+        if np.linalg.norm(mistaken - trial.estimate) < _SAME_POSE_M:
+            return True
+    return False
+
+
+def _sees_double(position: NDArray[np.float64], report: CheckReport) -> bool:
+    """Return whether a camera is near a place that looks like another one."""
+    return any(np.hypot(position[0] - place[0], position[1] - place[1]) < _SIGHT_M
+               for pair in report.look_alikes for place in (pair.first, pair.second))
+
+
+def _areas(grid: GridCheck, dead: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Return rows of a grid as areas of neighbours, the largest first."""
+    if len(dead) == 0:
+        return []
+    cells = np.round((grid.positions[:, :2] - grid.positions[:, :2].min(axis=0))
+                     / grid.spacing_m).astype(np.int64)
+    picture = np.zeros(cells.max(axis=0) + 1, dtype=np.bool_)
+    picture[cells[dead, 0], cells[dead, 1]] = True
+    areas, count = label(picture)
+    found = [dead[areas[cells[dead, 0], cells[dead, 1]] == number + 1] for number in range(count)]
+    return sorted((rows for rows in found if len(rows) >= _MIN_SPAN), key=len, reverse=True)
+
+
+def _area(grid: GridCheck, rows: NDArray[np.int64]) -> str:
+    low, high = grid.positions[rows].min(axis=0), grid.positions[rows].max(axis=0)
+    return (f'{len(rows)} positions near the recording, x {low[0]:.1f} to {high[0]:.1f}, y '
+            f'{low[1]:.1f} to {high[1]:.1f}')
+
+
+def _place(point: NDArray[np.float64] | tuple[float, ...]) -> str:
+    return f'x {point[0]:.1f}, y {point[1]:.1f}'
+
+
+def _heading(trial: Trial) -> str:
+    """Return where a camera looks, as an angle from the map's x axis."""
+    return f'to {np.degrees(np.arctan2(trial.forward[1], trial.forward[0])):.0f} degrees'
+
+
+def _count(number: int) -> str:
+    return _NUMBERS[number] if 0 <= number < len(_NUMBERS) else str(number)
+
+
+def _landmarks(number: int) -> str:
+    return f'{_count(number)} landmark{"" if number == 1 else "s"}'

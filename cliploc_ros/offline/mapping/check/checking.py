@@ -1,0 +1,200 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The entry point of checking: a map and, if there is one, a recording in, a report out."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from cliploc_ros.core.geometry.tilt import tilt_note
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.mapping.building import Progress
+from cliploc_ros.offline.mapping.check.advice import give_advice
+from cliploc_ros.offline.mapping.check.landmark_faults import (
+    Witness,
+    check_landmarks,
+    find_map_overlaps,
+    hear_witness,
+)
+from cliploc_ros.offline.mapping.check.places import Grid, find_look_alikes, make_grid
+from cliploc_ros.offline.mapping.check.relocalization import (
+    ImageOf,
+    PosedObservation,
+    RecordedKeyframes,
+    Trial,
+    box_quality,
+    make_folds,
+    measure_detector,
+    sample_frames,
+    try_observations,
+    try_poses,
+    try_recording,
+)
+from cliploc_ros.offline.mapping.check.report import (
+    BlockQuality,
+    CheckReport,
+    GridCheck,
+    RecordingCheck,
+    check_keyframes,
+    find_measures,
+)
+from cliploc_ros.offline.mapping.evidence import best_ious
+from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.systematic import find_corrections
+from cliploc_ros.offline.mapping.views import Views, check_input, make_views
+from cliploc_ros.offline.simulation.detector import DetectorModel, guess_detector
+
+_NOTES = (
+    'similarities of crops and labels are simulated, except for queries: labels of equal text '
+    'look equal, and labels that share words look alike',
+    'the grid assumes that the map is right and that walls hide nothing that the recording did '
+    'not show to be hidden')
+_NO_RECORDING = (
+    'no recording: the detector is a guess that finds 60 % of the objects in view within 5 m, in '
+    'images of 640 x 480 px with a focal length of 525 px')
+
+
+def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = None,
+              queries: Sequence[PosedObservation] = (), options: CheckOptions | None = None,
+              thresholds: Thresholds | None = None, progress: Progress | None = None,
+              layer: KeyframeLayer | None = None, image_of: ImageOf | None = None
+              ) -> CheckReport:
+    """Check a map.
+
+    Parameters
+    ----------
+    detections : PosedDetections, optional
+        A recording of the place. Without one, the report is shorter.
+    queries : sequence of PosedObservation
+        Observations with recorded similarities to the map's labels.
+    thresholds : Thresholds, optional
+        What the map has to reach.
+    layer : KeyframeLayer, optional
+        The keyframes next to the map.
+    image_of : callable, optional
+        Returns the undistorted image (h, w, 3) of a frame of the recording, red first; None where
+        it is missing. With a layer, frames are relocalized by keyframes, too.
+
+    Raises
+    ------
+    MappingError
+        The recording says nothing of this map; the message says what to correct.
+    """
+    options, tell = options or CheckOptions(), progress or (lambda stage, share: None)
+    notes, views, witness, recording = [*_NOTES], None, None, None
+    recorded = None if detections is None else detections.map_from_camera
+    if detections is None:
+        notes.append(_NO_RECORDING)
+        model = guess_detector(landmark_map, (options.mapping.edge_sigma_px,
+                                              options.mapping.edge_sigma_share))
+    else:
+        tell('judging landmarks', 0.0)
+        views = make_views(detections, options.mapping)
+        notes += check_input(detections, views, options.mapping)
+        witness = hear_witness(views, landmark_map, detections.class_names, options.mapping)
+        if not (witness.shown >= 0).any():
+            raise MappingError(_unrelated(landmark_map, detections))
+        models = [measure_detector(landmark_map, detections, views, witness, options.mapping,
+                                   number) for number in range(len(detections.cameras))]
+        model = models[0]
+        if len(models) > 1:
+            notes.append(f'the grid has one camera, {detections.camera_names[0]}, the first of '
+                         f'{len(models)}')
+        recording = _check_recording(
+            landmark_map, detections, views, witness, models, options, tell,
+            None if layer is None or image_of is None else RecordedKeyframes(layer, image_of))
+        notes += _notes_on(recording)
+        if note := tilt_note(detections.map_from_camera):
+            notes.append(note)
+    overlaps = find_map_overlaps(landmark_map, witness, views)
+    places = make_grid(landmark_map, None if detections is None else detections.of_first_camera,
+                       options)
+    grid = judge_grid(places, model, try_poses(
+        model, landmark_map, places.poses, options,
+        partial(tell, 'relocalizing on the grid')), options.headings)
+    report = CheckReport(
+        landmarks=tuple(check_landmarks(landmark_map, witness, overlaps, options.mapping)),
+        overlaps=tuple(overlaps), look_alikes=tuple(find_look_alikes(landmark_map)),
+        grid=grid, recording=recording,
+        queries=tuple(try_observations(landmark_map, queries, options,
+                                       partial(tell, 'relocalizing queries'))),
+        notes=tuple(notes), map_ids=landmark_map.landmark_ids,
+        keyframes=None if layer is None else check_keyframes(layer, grid, recorded))
+    tell('done', 1.0)
+    return replace(report, to_do=tuple(give_advice(report)),
+                   measures=tuple(find_measures(report, thresholds or Thresholds())))
+
+
+def judge_grid(grid: Grid, model: DetectorModel, trials: Sequence[Trial], headings: int
+               ) -> GridCheck:
+    """Return what trials say of a grid, or of its first positions.
+
+    The trials were made with the model, heading by heading of each position.
+    """
+    count = len(trials) // headings
+    trials = trials[:count * headings]
+    verdicts = np.array([one.verdict for one in trials]).reshape(count, headings)
+    visible = np.array([model.expected_detections(pose) for pose in grid.poses[:len(trials)]])
+    return GridCheck(grid.positions[:count], grid.is_near[:count],
+                     (verdicts == 'accepted').sum(axis=1), (verdicts == 'misled').sum(axis=1),
+                     visible.reshape(count, headings), grid.spacing_m, tuple(trials))
+
+
+def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
+                     witness: Witness, models: Sequence[DetectorModel], options: CheckOptions,
+                     tell: Progress, keyframes: RecordedKeyframes | None) -> RecordingCheck:
+    tell('cross-validating', 0.0)
+    folds, blocks, held_out = [], [], []
+    for fold in make_folds(views, witness, options):
+        # a box whose landmark no other part of the recording shows says nothing of the map
+        is_known = (witness.shown < 0) | np.isin(witness.shown, fold.rows)
+        ious = best_ious(views, fold.landmarks)[np.isin(views.frames, fold.frames) & is_known]
+        folds.append(fold)
+        held_out.append(ious)
+        blocks.append(BlockQuality(len(fold.frames), len(fold.rows), box_quality(ious)))
+        tell('cross-validating', len(folds) / options.folds)
+    trials = try_recording(landmark_map, detections, witness.shown, folds, options,
+                           partial(tell, 'relocalizing recorded frames'), keyframes)
+    sampled = sample_frames(detections, options.frames)
+    simulated = [trial for number, model in enumerate(models) for trial in try_poses(
+        model, landmark_map,
+        detections.map_from_camera[sampled[detections.frame_cameras[sampled] == number]], options,
+        partial(tell, 'relocalizing simulated frames'))]
+    tell('looking for systematic errors', 0.0)
+    return RecordingCheck(
+        frames=len(detections), boxes=len(detections.classes),
+        duration_s=float(detections.stamps_s[-1] - detections.stamps_s[0]),
+        path_xyz=detections.map_from_camera[:, :3, 3],
+        as_given=box_quality(best_ious(views, witness.landmarks)),
+        held_out=box_quality(np.concatenate(held_out)), folds=tuple(blocks),
+        trials=tuple(trials), simulated=tuple(simulated),
+        corrections=tuple(find_corrections(detections, views, witness.fitted, witness.shown)),
+        edge_scale=models[0].edge_scale)
+
+
+def _notes_on(recording: RecordingCheck) -> list[str]:
+    """Return why some figures of a recording do not count."""
+    notes = []
+    if not recording.can_judge_boxes:
+        notes.append(f'cross-validation cannot judge boxes: of {recording.as_given.boxes}, other '
+                     f'parts of the recording show the objects of {recording.held_out.boxes}')
+    if not recording.can_judge_frames:
+        notes.append(f'cross-validation cannot judge frames: other parts of the recording show '
+                     f'the objects of {len(recording.judged)} of {len(recording.trials)}; the '
+                     'verdict takes simulated boxes; pass each place twice to know better')
+    return notes
+
+
+def _unrelated(landmark_map: LandmarkMap, detections: PosedDetections) -> str:
+    shared = set(landmark_map.class_ids) & set(detections.class_names)
+    if not shared:
+        return ("the recording's classes are none of the map's "
+                f'({", ".join(sorted(set(landmark_map.class_ids))[:3])}): use the detector that '
+                'the map was made with')
+    return ('no box of the recording overlaps a landmark of its class: check that poses and map '
+            'have the same coordinate frame, and that the poses are of the camera (z forward)')

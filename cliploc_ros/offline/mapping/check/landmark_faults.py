@@ -1,0 +1,248 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Each landmark of a map: how well a recording supports it, and its faults."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.errors import misspelt_classes
+from cliploc_ros.offline.mapping.association import associate
+from cliploc_ros.offline.mapping.doubles import close_pairs, find_doubles
+from cliploc_ros.offline.mapping.evidence import Evidence, gather_evidence
+from cliploc_ros.offline.mapping.fitting import fit_landmarks
+from cliploc_ros.offline.mapping.landmarks import (
+    Landmarks,
+    classes_of,
+    group_boxes,
+    landmarks_of_map,
+)
+from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.update.sight import look_for
+from cliploc_ros.offline.mapping.views import Views
+from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
+
+# A class has so many words at most to be looked for in labels.
+_MOST_WORDS = 3
+# A thinner landmark was seen from one side, or is a sheet: boxes tell little of its position.
+_MIN_THINNESS = 0.05
+# A landmark is missing if this number of frames should show it and none does.
+_MIN_EXPECTED = 10
+# A landmark that its boxes put farther away than all of these is in the wrong place. Guesses.
+_MIN_OFFSET_M, _OFFSET_SHARE, _OFFSET_SIGMAS = 0.1, 0.3, 4.0
+
+
+class Overlap(NamedTuple):
+    """Two landmarks that lie in one another."""
+
+    #: Rows in the map
+    first: int
+    second: int
+    distance: float  #: Normalized, see cliploc_ros.core.geometry.ellipsoid.STANDS_IN
+    #: They are one thing: no frames show two. Where no frame shows either, by a common class.
+    is_duplicate: bool
+
+
+@dataclass(frozen=True)
+class LandmarkCheck:
+    """What is known of one landmark. Values that nothing tells are None."""
+
+    landmark_id: str
+    label: str
+    class_id: str
+    center: tuple[float, float, float]  #: [m]
+    #: Frames that show it, and frames that should
+    support: int | None
+    expected: int | None
+    seen_ratio: float | None  #: Share of the latter in which it was detected
+    #: Greatest angle between two directions from which it was seen [deg]
+    baseline_deg: float | None
+    position_sigma_m: float | None  #: Standard deviation of its centre on the worst axis [m]
+    #: From its centre to where its boxes put it [m]; None where they may put it anywhere
+    offset_m: float | None
+    median_iou: float | None  #: Of its boxes
+    thinness: float  #: Least semi-axis divided by the greatest one
+    #: Landmarks that lie in it, and their normalized distances
+    overlaps: tuple[tuple[str, float], ...]
+    faults: tuple[str, ...] = ()  #: The faults and what to do, the worst first
+    severity: float = 0.0  #: 0: nothing; 1 and more: a serious fault
+    weight: float = 1.0  #: Frames that it was mapped from; 1 for all if the map does not say it
+
+
+class Witness(NamedTuple):
+    """What a recording says of a map."""
+
+    class_names: tuple[str, ...]  #: Of the recording
+    landmarks: Landmarks  #: Of the map, with the recording's classes
+    shown: NDArray[np.int64]  #: (n,): the landmark that each box shows, -1 for none
+    evidence: Evidence
+    #: (L,): frames that should show each landmark, those without a box included
+    expected: NDArray[np.int64]
+    fitted: Landmarks  #: The landmarks fitted to the boxes that show them
+    fitted_sigmas: NDArray[np.float64]  #: (L,): deviations of these centres [m]
+
+
+def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str, ...],
+                 options: MappingOptions) -> Witness:
+    """Return what a recording says of a map."""
+    landmarks = landmarks_of_map(landmark_map, class_names)
+    shown = associate(views, landmarks, options.association_iou)
+    evidence = gather_evidence(views, landmarks, shown)
+    # a landmark that nothing shows may be hidden
+    sight = look_for(views, landmarks, shown, np.ones(len(landmarks.centers), dtype=np.bool_))
+    expected = np.where(evidence.support == 0, sight.expected_frames, evidence.expected)
+    fitted = fit_landmarks(views, landmarks, group_boxes(shown, len(landmarks.centers)))
+    return Witness(class_names, landmarks, shown, evidence, expected, fitted,
+                   gather_evidence(views, fitted, shown).position_sigma)
+
+
+def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views: Views | None
+                      ) -> list[Overlap]:
+    """Return the landmarks of a map that stand in one another, the nearest first."""
+    doubles, shown = set[tuple[int, int]](), np.empty(0, dtype=np.int64)
+    if witness is not None and views is not None:
+        shown, doubles = witness.shown, {*find_doubles(views, witness.landmarks, witness.shown)}
+    is_shown = np.isin(np.arange(len(landmark_map)), shown)
+    names = [{*classes_of(landmark_map, row)} for row in range(len(landmark_map))]
+    found = [Overlap(first, second, distance, (first, second) in doubles
+                     if is_shown[[first, second]].any() else bool(names[first] & names[second]))
+             for first, second, distance in close_pairs(landmarks_of_map(landmark_map, ()))]
+    return sorted(found, key=lambda one: (not one.is_duplicate, one.distance))
+
+
+def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
+                    overlaps: list[Overlap], options: MappingOptions) -> list[LandmarkCheck]:
+    """Return each landmark's check, the worst first; of equal ones, the one that is seen least.
+
+    Without a recording, support comes from the map's own fields. The options have the limits.
+    """
+    ids, classes = landmark_map.landmark_ids, landmark_map.class_ids
+    partners: list[list[tuple[int, Overlap]]] = [[] for _ in ids]
+    for one in overlaps:
+        partners[one.first].append((one.second, one))
+        partners[one.second].append((one.first, one))
+    supports = [one.support for one in landmark_map.details]
+    misspelt = (misspelt_classes(classes, shipped_classes()) if witness is None
+                else misspelt_classes(classes, witness.class_names, all_known=True))
+    by_words = {tuple(_words(name)): name for name in sorted(set(classes), reverse=True)}
+    weights = np.array(supports if all(supports) else [], dtype=np.float64)
+    checks = []
+    for row, others in enumerate(partners):
+        semi_axes = landmark_map.semi_axes[row]
+        x, y, z = landmark_map.centers[row].tolist()
+        check = LandmarkCheck(
+            ids[row], landmark_map.labels[row], classes[row], (x, y, z),
+            **_support(landmark_map, row, witness),
+            thinness=float(semi_axes.min() / semi_axes.max()),
+            overlaps=tuple((ids[other], one.distance) for other, one in others))
+        faults = [(1.5, f'is the same object as {ids[other]}: delete one of them')
+                  for other, one in others if one.is_duplicate]
+        if hint := misspelt.get(classes[row]):
+            faults.append((1.0, f"may have a misspelt class: '{classes[row]}'{hint}")
+                          if witness is None else
+                          (1.6, f"has the class '{classes[row]}', which the detector does not "
+                                f'have{hint}: correct its class_id'))
+        if not faults:
+            faults += _support_faults(check, float(np.linalg.norm(semi_axes)), options)
+        faults += [(0.4, f'lies in {ids[other]} of class {classes[other]}: one object under two '
+                         'classes, or one on the other; keep one if it is one object')
+                   for other, one in others if witness is None and not one.is_duplicate]
+        if check.thinness < _MIN_THINNESS:
+            faults.append((0.3, f'is a sheet: its axes have the ratio {check.thinness:.3f}; '
+                                'record it from another side, or give it thickness'))
+        if other := _class_of_label(check.label, check.class_id, by_words):
+            faults.append((0.6, f"is labelled '{check.label:.60}', a {other} by that, and has the "
+                                f'class {check.class_id}: correct the wrong one'))
+        faults.sort(key=lambda one: -one[0])
+        checks.append(replace(
+            check, faults=tuple(text for _, text in faults),
+            severity=faults[0][0] + 0.05 * (len(faults) - 1) if faults else 0.0,
+            weight=float(weights[row]) if len(weights) else 1.0))
+    return sorted(checks, key=lambda one: (
+        -one.severity, 1.0 if one.seen_ratio is None else one.seen_ratio))
+
+
+def _words(text: str) -> list[str]:
+    return re.findall(r'\w+', text.casefold())
+
+
+def _class_of_label(label: str, class_id: str, by_words: Mapping[tuple[str, ...], str]
+                    ) -> str | None:
+    """Return a class that a label names, in singular or plural, unless it names its own, too.
+
+    `by_words` has the classes of the map by their words.
+    """
+    if any(word in label.casefold() for word in _words(class_id)):
+        return None
+    words = _words(label)
+    for start in range(len(words)):
+        for end in range(start + 1, min(start + _MOST_WORDS, len(words)) + 1):
+            *first, last = words[start:end]
+            for ending in ('', 's', 'es'):
+                if last.endswith(ending) and (
+                        other := by_words.get((*first, last.removesuffix(ending)))):
+                    return other
+    return None
+
+
+def _support(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> dict[str, Any]:
+    """Return the numbers of a landmark's support: from a recording, or from the map itself."""
+    names = ('support', 'expected', 'seen_ratio', 'baseline_deg', 'position_sigma_m', 'offset_m',
+             'median_iou')
+    if witness is None:
+        given = landmark_map.details[row] if landmark_map.details else LandmarkDetails()
+        values: tuple[Any, ...] = (
+            given.support, None, given.seen_ratio, given.baseline_deg, given.position_sigma, None,
+            None)
+    elif (support := int(witness.evidence.support[row])) == 0:
+        expected = int(witness.expected[row])
+        values = (0, expected, 0.0 if expected else None, None, None, None, None)
+    else:
+        evidence = witness.evidence
+        offset = float(np.linalg.norm(witness.fitted.centers[row]
+                                      - witness.landmarks.centers[row]))
+        is_told = offset > _OFFSET_SIGMAS * witness.fitted_sigmas[row] or offset < _MIN_OFFSET_M
+        values = (support, int(witness.expected[row]), float(evidence.seen_ratio[row]),
+                  float(evidence.baseline_deg[row]), float(evidence.position_sigma[row]),
+                  offset if is_told else None, float(evidence.median_iou[row]))
+    return dict(zip(names, values, strict=True))
+
+
+def _support_faults(check: LandmarkCheck, size_m: float, options: MappingOptions
+                    ) -> list[tuple[float, str]]:
+    """Return the faults of a landmark's support, with a weight each."""
+    support, expected, ratio = check.support, check.expected, check.seen_ratio
+    if support == 0:
+        if expected is not None and expected < _MIN_EXPECTED:
+            return [(0.5, f'was in view in {expected} frames: record this place')]
+        return [(1.4, f'is never detected, although {expected} frames should show it: delete it '
+                      'if it is gone, or map again')]
+    faults = []
+    if support is not None and support < options.min_viewpoints:
+        frames = 'frame' if support == 1 else 'frames'
+        faults.append((1.1, f'was seen in {support} {frames}: record it from more sides'))
+    if ratio is not None and ratio < options.min_seen_ratio:
+        faults.append((1.2, f'is detected in {ratio:.1%} of the frames that should show it: '
+                            'delete it if it has moved, or is hard to detect'))
+    iou, baseline, sigma = check.median_iou, check.baseline_deg, check.position_sigma_m
+    if iou is not None and iou < options.min_median_iou:
+        faults.append((1.2, f'does not fit its boxes (median IoU {iou:.2f}), as if it had moved '
+                            'or were two objects: delete it or map again'))
+    if baseline is not None and baseline < options.min_baseline_deg:
+        faults.append((0.7, f'was seen from one side only, {baseline:.0f} degrees wide: record it '
+                            'from another side'))
+    if (offset := check.offset_m) is not None and offset > max(
+            _MIN_OFFSET_M, _OFFSET_SHARE * size_m, _OFFSET_SIGMAS * (sigma or 0.0)):
+        faults.append((1.1, f'is {offset * 100:.0f} cm away from where its boxes put it: delete '
+                            'it or map again'))
+    if sigma is not None and sigma > max(options.max_position_sigma_m,
+                                         options.max_position_sigma_share * size_m):
+        faults.append((0.7, f'may be {sigma * 100:.0f} cm off (standard deviation): record it '
+                            'from more sides'))
+    return faults

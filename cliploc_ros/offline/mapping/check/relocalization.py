@@ -1,0 +1,360 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Relocalize in recorded frames, and in simulated ones.
+
+Cross-validation over time: recorded frames are judged with landmarks fitted to other blocks of the
+recording. Simulated frames have the errors of the recording's detector.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.keyframes.localization import (
+    ImageRecognizer,
+    KeyframeLocalizer,
+    query_features,
+)
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.offline.mapping.check.landmark_faults import Witness
+from cliploc_ros.offline.mapping.evidence import REACH, best_ious, explained, is_expected
+from cliploc_ros.offline.mapping.fitting import fit_landmarks
+from cliploc_ros.offline.mapping.landmarks import Landmarks, ellipsoid_numbers, group_boxes
+from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.systematic import linearize_boxes
+from cliploc_ros.offline.mapping.views import Views, camera_centers
+from cliploc_ros.offline.simulation.detector import GUESSED_MIN_SIDE_PX, DetectorModel, Sightings
+from cliploc_ros.offline.simulation.labels import LabelModel
+
+_MAX_SAMPLED_FRAMES = 600
+_CLUTTER_IOU = 0.1
+# Half a block of cross-validation.
+_SAME_TIME_S = 0.5 * CheckOptions.block_s
+#: A pose needs this number of landmarks.
+LANDMARKS_FOR_A_POSE = 3
+
+Verdict = Literal['accepted', 'refused', 'misled']
+Tell = Callable[[float], None]
+#: Returns the undistorted image (h, w, 3) of a recorded frame, red first; None without one.
+ImageOf = Callable[[int], NDArray[np.uint8] | None]
+
+
+class Fold(NamedTuple):
+    """A part of a recording, and the map without it."""
+
+    frames: NDArray[np.int64]  #: (k,): the frames to judge
+    #: (l,): the landmarks of the whole map that the other frames suffice for
+    rows: NDArray[np.int64]
+    landmarks: Landmarks  #: These landmarks, fitted to the other frames
+    training: NDArray[np.bool_]  #: (F,): these other frames
+
+
+class RecordedKeyframes(NamedTuple):
+    """The keyframes next to a map, and the images of the recording."""
+
+    layer: KeyframeLayer
+    image_of: ImageOf
+
+    def recognizer(self, detections: PosedDetections, frame: int) -> ImageRecognizer | None:
+        """Return the keyframe search of a frame, without keyframes of its time; None without."""
+        is_other = np.abs(detections.stamps_s[_frames_of(self.layer, detections)]
+                          - detections.stamps_s[frame]) > _SAME_TIME_S
+        image = self.image_of(frame) if is_other.any() else None
+        return None if image is None else ImageRecognizer(
+            KeyframeLocalizer(self.layer.select(is_other)), query_features(image),
+            detections.camera_of(frame))
+
+
+@dataclass(frozen=True)
+class BoxQuality:
+    """How well landmarks explain boxes."""
+
+    boxes: int
+    #: Share of the boxes that a landmark of their class overlaps by more than an IoU of 0.3
+    explained: float
+    median_iou: float  #: Of these
+
+
+def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterator[Fold]:
+    """Return the folds of a recording, each with the map as the others show it.
+
+    Folds take blocks of time in turn, at least one block each. A landmark that fits its boxes is
+    fitted again, to the boxes outside of the fold; it is left out if they are too few. A landmark
+    that does not fit its boxes, or has none, stays as it is: a robot would use it as it is.
+    """
+    stamps_s, mapping = views.stamps_s, options.mapping
+    elapsed = stamps_s - stamps_s[0]
+    block_s = min(options.block_s, max(float(elapsed[-1]), 1e-9) / options.folds)
+    of_frames = (elapsed / block_s).astype(np.int64) % options.folds
+    gap_s = min(options.gap_s, 0.25 * float(elapsed[-1]) / options.folds)
+    fits = witness.evidence.median_iou >= mapping.min_median_iou
+    all_boxes = group_boxes(witness.shown, len(fits))
+    for number in range(options.folds):
+        judged = np.nonzero(of_frames == number)[0]
+        if len(judged) == 0:
+            continue
+        # frames within a gap of one that is judged train nothing
+        times = stamps_s[judged]
+        after = np.searchsorted(times, stamps_s).clip(0, len(times) - 1)
+        nearest = np.minimum(np.abs(times[after] - stamps_s),
+                             np.abs(times[(after - 1).clip(0)] - stamps_s))
+        training = nearest > gap_s
+        kept, boxes = np.ones(len(fits), dtype=np.bool_), []
+        for row, rows in enumerate(all_boxes):
+            rows = rows[training[views.frames[rows]] & fits[row]]
+            if fits[row]:
+                seen_from = np.unique(views.viewpoints[views.frames[rows]])
+                kept[row] = len(seen_from) >= mapping.min_viewpoints
+            boxes.append(rows if kept[row] else rows[:0])
+        yield Fold(judged, np.nonzero(kept)[0],
+                   fit_landmarks(views, witness.landmarks, boxes).select(kept), training)
+
+
+def box_quality(ious: NDArray[np.float64]) -> BoxQuality:
+    """Return how well landmarks explain boxes, by the best IoU of each with one of its class."""
+    return BoxQuality(len(ious), *explained(ious))
+
+
+def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
+                     witness: Witness, options: MappingOptions, camera: int = 0
+                     ) -> DetectorModel:
+    """Return the detector of a recording, on the images of one of its cameras.
+
+    A landmark that was never detected does not exist: the model never detects it.
+    """
+    landmarks, cameras = witness.landmarks, camera_centers(views)
+    frames = detections.every(-(-len(detections) // _MAX_SAMPLED_FRAMES))
+    reach, sightings = np.zeros(len(landmark_map)), []
+    for row, rows in enumerate(group_boxes(witness.shown, len(landmark_map))):
+        center, basis = landmarks.centers[row], landmarks.bases[row]
+        if len(rows):
+            offsets = center - cameras[views.frames[rows]]
+            reach[row] = REACH * np.linalg.norm(offsets, axis=1).max()
+        offsets = center - cameras
+        distances = np.linalg.norm(offsets, axis=1)
+        expected = frames[(is_expected(views, cameras, center, basis, reach[row])
+                           & (distances > 0.0))[frames]]
+        sightings.append(Sightings(offsets[expected] / distances[expected, None],
+                                    np.isin(expected, views.frames[rows])))
+    own = detections.frame_cameras == camera
+    sides = np.diff(detections.bboxes_xyxy[own[views.frames]].reshape(-1, 2, 2), axis=1
+                    ).min(axis=(1, 2))
+    min_side = float(np.quantile(sides, 0.01)) if len(sides) else GUESSED_MIN_SIDE_PX
+    # the boxes that no landmark explains, by frame
+    is_clutter = best_ious(views, landmarks) < _CLUTTER_IOU
+    clutter = []
+    for frame in frames[own[frames]]:
+        rows = np.arange(*detections.frame_offsets[frame:frame + 2])
+        rows = rows[is_clutter[rows]]
+        clutter.append((detections.bboxes_xyxy[rows],
+                        tuple(detections.class_names[one] for one in detections.classes[rows])))
+    # the robust deviation of closed edges, in standard deviations
+    rows = np.nonzero(witness.shown >= 0)[0]
+    linear = linearize_boxes(views, rows, witness.shown[rows], landmarks)
+    residuals = np.abs(linear.residuals[linear.weights > 0.0])
+    scale = float(np.clip(1.4826 * np.median(residuals), 0.3, 5.0)) if len(residuals) else 1.0
+    return DetectorModel(
+        landmark_map, detections.cameras[camera], tuple(sightings), witness.evidence.seen_ratio,
+        reach, (options.edge_sigma_px, options.edge_sigma_share), scale, min_side, tuple(clutter))
+
+
+class PosedObservation(NamedTuple):
+    """An observation with similarities to the labels of the map, and the true pose."""
+
+    observation: Observation
+    map_from_camera: NDArray[np.float64]
+    stamp_s: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One relocalization and its verdict."""
+
+    #: 'accepted' (a right pose), 'refused', or 'misled' (a wrong pose was accepted)
+    verdict: Verdict
+    #: (3,): of the camera in the map [m], and the direction in which it looks
+    position: NDArray[np.float64]
+    forward: NDArray[np.float64]
+    #: Boxes, and the landmarks of the map among them
+    detections: int
+    landmarks: int
+    estimate: NDArray[np.float64] | None  #: (3,): position of the best pose [m]
+    error_m: float | None
+    reason: str  #: Of a refusal
+    stamp_s: float | None = None  #: Of a recorded frame [s]
+    #: Of a recorded frame: the verdict without keyframes, where they were used; and whether the
+    #: other frames show enough of its objects to judge the map by it, whatever the verdict
+    by_objects: Verdict | None = None
+    is_judged: bool = True
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the trial as plain values, for JSON."""
+        return {
+            'verdict': self.verdict, 'stamp_s': self.stamp_s, 'by_objects': self.by_objects,
+            'is_judged': self.is_judged,
+            'position': self.position.round(4).tolist(),
+            'forward': self.forward.round(4).tolist(), 'detections': self.detections,
+            'landmarks': self.landmarks,
+            'estimate': None if self.estimate is None else self.estimate.round(4).tolist(),
+            'error_m': self.error_m, 'reason': self.reason}
+
+
+def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
+                  shown: NDArray[np.int64], folds: Sequence[Fold], options: CheckOptions,
+                  tell: Tell, keyframes: RecordedKeyframes | None = None) -> list[Trial]:
+    """Relocalize recorded frames in the map that the other frames show, in the order of time.
+
+    Boxes, poses and images are the recording's, similarities are simulated; shown (n,) has the
+    landmark of each box, -1 for none. The callable tell is told the share that is done.
+    """
+    labels = LabelModel.of(landmark_map)
+    chosen = set(sample_frames(detections, options.frames).tolist())
+    taken_at = None if keyframes is None else _frames_of(keyframes.layer, detections)
+    trials: list[Trial] = []
+    for fold in folds:
+        frames = [frame for frame in fold.frames.tolist() if frame in chosen]
+        if not frames:
+            continue
+        relocalizer = None
+        if len(fold.rows):
+            semi_axes, quats_xyzw = ellipsoid_numbers(fold.landmarks.bases)
+            relocalizer = _relocalizer(replace(
+                landmark_map.select(fold.rows.tolist()), centers=fold.landmarks.centers,
+                semi_axes=semi_axes, quats_xyzw=quats_xyzw), options)
+        localizer = None
+        if keyframes is not None and fold.training[taken_at].any():
+            localizer = KeyframeLocalizer(keyframes.layer.select(fold.training[taken_at]))
+        for frame in frames:
+            rows = slice(*detections.frame_offsets[frame:frame + 2])
+            rng = np.random.default_rng([options.random_seed, frame])
+            class_ids = tuple(detections.class_names[one] for one in detections.classes[rows])
+            boxes, seen = detections.bboxes_xyxy[rows], shown[rows]
+            pose, stamp_s = detections.map_from_camera[frame], float(detections.stamps_s[frame])
+            tell((len(trials) + 1) / len(chosen))
+            known = int(np.isin(seen, fold.rows).sum())
+            is_judged = known >= min(LANDMARKS_FOR_A_POSE, int((seen >= 0).sum()))
+            if relocalizer is None:
+                trials.append(Trial('refused', pose[:3, 3], pose[:3, 2], len(boxes), 0, None,
+                                    None, 'the other parts show no landmark', stamp_s,
+                                    is_judged=is_judged))
+                continue
+            similarities = labels.similarities(seen, class_ids, boxes, rng)[:, fold.rows]
+            camera = detections.camera_of(frame)
+            judge = partial(_try, relocalizer, camera, Detections(
+                boxes, class_ids, detections.scores[rows]), similarities, pose,
+                int((seen >= 0).sum()), options, stamp_s)
+            trial = replace(judge(), is_judged=is_judged)
+            if (localizer is not None and keyframes is not None
+                    and (image := keyframes.image_of(frame)) is not None):
+                both = judge(ImageRecognizer(localizer, query_features(image), camera))
+                trial = replace(both, by_objects=trial.verdict, is_judged=is_judged)
+            trials.append(trial)
+    return sorted(trials, key=lambda one: one.stamp_s or 0.0)
+
+
+def _frames_of(layer: KeyframeLayer, detections: PosedDetections) -> NDArray[np.int64]:
+    """Return the recorded frame (K,) that is nearest to each keyframe, in place and direction."""
+    places, queries = (np.column_stack([poses[:, :3, 3], poses[:, :3, 2], poses[:, :3, 0]])
+                       for poses in (detections.map_from_camera, layer.map_from_camera))
+    return np.asarray(cKDTree(places).query(queries)[1])
+
+
+def sample_frames(detections: PosedDetections, limit: int) -> NDArray[np.int64]:
+    """Return at most a limit of frames, evenly spread over the cameras and over time."""
+    count = len(detections)
+    step = max(1, -(-count // limit))
+    return detections.every(step, min(step // 2, count - 1))
+
+
+def try_poses(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np.float64],
+              options: CheckOptions, tell: Tell) -> list[Trial]:
+    """Relocalize simulated frames, see each_pose; tell is told the share that is done."""
+    trials = []
+    for trial in each_pose(model, landmark_map, poses, options):
+        trials.append(trial)
+        tell(len(trials) / len(poses))
+    return trials
+
+
+def each_pose(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np.float64],
+              options: CheckOptions) -> Iterator[Trial]:
+    """Relocalize simulated frames, one at each step.
+
+    The model has what there is to see, the map what the relocalizer knows; poses (k, 4, 4) are
+    the true map_from_camera.
+    """
+    labels, relocalizer = LabelModel.of(landmark_map), _relocalizer(landmark_map, options)
+    for number, pose in enumerate(poses):
+        rng = np.random.default_rng([options.random_seed, number])
+        detections, shown = model.detect(pose, rng)
+        similarities = labels.similarities(shown, detections.class_ids, detections.bboxes_xyxy,
+                                           rng)
+        yield _try(relocalizer, model.camera, detections, similarities, pose,
+                   int((shown >= 0).sum()), options)
+
+
+def try_observations(landmark_map: LandmarkMap, observations: Sequence[PosedObservation],
+                     options: CheckOptions, tell: Tell) -> list[Trial]:
+    """Relocalize observations with recorded similarities."""
+    relocalizer = _relocalizer(landmark_map, options)
+    trials = []
+    for number, (one, pose, stamp_s) in enumerate(observations, start=1):
+        assert one.similarities is not None
+        trials.append(_try(relocalizer, one.camera, one.detections, np.asarray(one.similarities),
+                           pose, len(one.detections), options, stamp_s))
+        tell(number / len(observations))
+    return trials
+
+
+def count_verdicts(trials: Sequence[Trial]) -> dict[str, int]:
+    """Return how many trials were accepted, refused and misled."""
+    return {name: sum(one.verdict == name for one in trials)
+            for name in ('accepted', 'refused', 'misled')}
+
+
+def refused_spans(trials: Sequence[Trial]) -> Iterator[list[Trial]]:
+    """Yield the runs of recorded frames without an accepted right pose, the longest first.
+
+    Frames that do not tell are left out.
+    """
+    runs: list[list[Trial]] = [[]]
+    for one in trials:
+        if one.verdict == 'accepted' or not one.is_judged:
+            runs.append([])
+        else:
+            runs[-1].append(one)
+    yield from sorted((run for run in runs if run), key=len, reverse=True)
+
+
+def _relocalizer(landmark_map: LandmarkMap, options: CheckOptions) -> Relocalizer:
+    k = min(options.relocalizer.k, len(landmark_map))
+    return Relocalizer(landmark_map, replace(options.relocalizer, k=k))
+
+
+def _try(relocalizer: Relocalizer, camera: Camera, detections: Detections,
+         similarities: NDArray[np.float32], map_from_camera: NDArray[np.float64], landmarks: int,
+         options: CheckOptions, stamp_s: float | None = None,
+         recognizer: ImageRecognizer | None = None) -> Trial:
+    up = map_from_camera[2, :3] if options.use_vertical else None  # the map's z in the camera
+    result = relocalizer.relocalize([Observation(camera, detections, similarities,
+                                                 up_in_camera=up)], recognizer)
+    estimate, error_m = result.map_from_camera, None
+    if estimate is not None:
+        error_m = float(pose_error(estimate, map_from_camera)[0])
+    verdict: Verdict = 'refused'
+    if result.accepted and error_m is not None:
+        verdict = 'misled' if error_m > options.wrong_m else 'accepted'
+    return Trial(verdict, map_from_camera[:3, 3], map_from_camera[:3, 2], len(detections),
+                 landmarks, None if estimate is None else estimate[:3, 3], error_m, result.reason,
+                 stamp_s)

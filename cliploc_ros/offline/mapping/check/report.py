@@ -1,0 +1,355 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The result of a check: figures, verdict and advice."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.keyframes.localization import NEAR_DEG, NEAR_M
+from cliploc_ros.offline.mapping.check.landmark_faults import LandmarkCheck, Overlap
+from cliploc_ros.offline.mapping.check.places import LookAlike
+from cliploc_ros.offline.mapping.check.relocalization import (
+    LANDMARKS_FOR_A_POSE,
+    BoxQuality,
+    Trial,
+    count_verdicts,
+)
+from cliploc_ros.offline.mapping.options import Thresholds
+from cliploc_ros.offline.mapping.systematic import Correction
+
+#: A landmark of this severity has a serious fault.
+SERIOUS = 1.0
+
+
+class Advice(NamedTuple):
+    """What to do, and where it is to be seen."""
+
+    text: str
+    landmarks: tuple[str, ...] = ()  #: Ids of the landmarks that it is about
+    view: Trial | None = None  #: The view that it is about
+
+
+class Measure(NamedTuple):
+    """A figure of the map, and its threshold."""
+
+    name: str
+    value: float
+    limit: float
+    is_most: bool  #: The value may be the limit at most; else it has to be the limit at least
+    unit: Literal['share', 'number', 'count'] = 'share'
+
+    @property
+    def is_missed(self) -> bool:
+        """Return whether the map misses the threshold."""
+        return self.value > self.limit if self.is_most else self.value < self.limit
+
+    def show(self, value: float) -> str:
+        """Return a value in words, with enough digits to show that it is beyond its limit."""
+        if self.unit != 'share':
+            return f'{value:.4g}'
+        told_apart = _percent(self.value, 2) != _percent(self.limit, 2)
+        return _percent(value, 2 if told_apart or not self.is_missed else 4)
+
+
+@dataclass(frozen=True)
+class BlockQuality:
+    """The boxes of one fold, judged with landmarks fitted to the others."""
+
+    frames: int
+    landmarks: int  #: Landmarks that the other folds suffice for
+    boxes: BoxQuality
+
+
+@dataclass(frozen=True)
+class RecordingCheck:
+    """The check of a map against a recording."""
+
+    frames: int
+    boxes: int
+    duration_s: float
+    path_xyz: NDArray[np.float64]  #: (F, 3): where the camera went [m]
+    #: Of the map as it is. If it was built from this recording, it was fitted to these boxes.
+    as_given: BoxQuality
+    held_out: BoxQuality  #: Cross-validated over time
+    folds: tuple[BlockQuality, ...]
+    trials: tuple[Trial, ...]  #: Recorded frames in cross-validated maps, in the order of time
+    #: The same poses in the map as it is, with simulated boxes: as many should be accepted as with
+    #: recorded ones, else the grid is too optimistic or too pessimistic
+    simulated: tuple[Trial, ...]
+    corrections: tuple[Correction, ...]
+    edge_scale: float  #: Deviation of box edges, in units of build_map's assumption
+
+    @property
+    def judged(self) -> tuple[Trial, ...]:
+        """Return the recorded frames by which the map can be judged."""
+        return tuple(one for one in self.trials if one.is_judged)
+
+    @property
+    def can_judge_frames(self) -> bool:
+        """Return whether cross-validation tells how many frames are accepted."""
+        return 2 * len(self.judged) >= len(self.trials)
+
+    @property
+    def can_judge_boxes(self) -> bool:
+        """Return whether the other parts of the recording show the landmarks of most boxes."""
+        return 2 * self.held_out.boxes >= self.as_given.boxes
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the check as plain values, for JSON."""
+        return {
+            'frames': self.frames, 'boxes': self.boxes, 'duration_s': self.duration_s,
+            'as_given': asdict(self.as_given), 'held_out': asdict(self.held_out),
+            'folds': [asdict(one) for one in self.folds], 'edge_scale': self.edge_scale,
+            'verdicts': count_verdicts(self.trials),
+            'verdicts_by_objects': count_by_objects(self.trials),
+            'judged_frames': len(self.judged),
+            'verdicts_with_simulated_boxes': count_verdicts(self.simulated),
+            'corrections': [asdict(one) for one in self.corrections],
+            'trials': [one.as_dict() for one in self.trials]}
+
+
+@dataclass(frozen=True)
+class GridCheck:
+    """Relocalization over a grid of camera positions."""
+
+    positions: NDArray[np.float64]  #: (P, 3): [m]
+    is_near: NDArray[np.bool_]  #: (P,): the recording passed near; without a recording, all
+    #: (P,): headings of each position in which a right, and a wrong pose is accepted
+    accepted: NDArray[np.int64]
+    misled: NDArray[np.int64]
+    #: (P, H): how many landmarks the detector finds on average, by heading
+    visible: NDArray[np.float64]
+    spacing_m: float
+    trials: tuple[Trial, ...]  #: Heading by heading of each position
+
+    @property
+    def headings(self) -> int:
+        """Return the number of headings at each position."""
+        return self.visible.shape[1]
+
+    @property
+    def useful(self) -> NDArray[np.int64]:
+        """Return the number of headings (P,) that show enough landmarks for a pose."""
+        return np.asarray((self.visible >= LANDMARKS_FOR_A_POSE).sum(axis=1))
+
+    @property
+    def accepted_positions(self) -> float:
+        """Return the share of the positions near the recording with an accepted heading."""
+        near = self.accepted[self.is_near]
+        return float((near > 0).mean()) if len(near) else 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the check as plain values, for JSON."""
+        return {
+            'headings': self.headings, 'spacing_m': self.spacing_m,
+            'accepted_positions_near_recording': self.accepted_positions,
+            'verdicts': count_verdicts(self.trials),
+            'positions': [
+                {'x_y_z': row, 'near_recording': bool(near), 'accepted': int(accepted),
+                 'misled': int(misled), 'expected_detections': visible.round(2).tolist()}
+                for row, near, accepted, misled, visible in zip(
+                    self.positions.round(3).tolist(), self.is_near, self.accepted, self.misled,
+                    self.visible, strict=True)],
+            'misled': [one.as_dict() for one in self.trials if one.verdict == 'misled']}
+
+
+@dataclass(frozen=True)
+class KeyframeCheck:
+    """What the keyframes next to a map reach."""
+
+    keyframes: int
+    points: int
+    #: (F,): recorded frames within reach of a keyframe; empty without a recording
+    recorded: NDArray[np.bool_]
+    headings: NDArray[np.int64]  #: (P,): headings of each grid position within reach
+    positions: NDArray[np.float64]  #: (P, 3): of the grid [m]
+    is_near: NDArray[np.bool_]  #: (P,): see GridCheck
+
+    @property
+    def without(self) -> NDArray[np.int64]:
+        """Return the rows of the grid positions near the recording that no keyframe reaches."""
+        return np.nonzero(self.is_near & (self.headings == 0))[0]
+
+    @property
+    def reached_positions(self) -> float:
+        """Return the share of the grid positions near the recording with a heading in reach."""
+        near = int(self.is_near.sum())
+        return 1.0 - len(self.without) / near if near else 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the check as plain values, for JSON."""
+        return {
+            'keyframes': self.keyframes, 'points': self.points,
+            'recorded_frames_in_reach': float(self.recorded.mean()) if len(self.recorded)
+            else None,
+            'positions_in_reach_near_recording': self.reached_positions,
+            'positions_without': self.positions[self.without].round(3).tolist()}
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """The result of a check."""
+
+    landmarks: tuple[LandmarkCheck, ...]  #: The worst first
+    overlaps: tuple[Overlap, ...]
+    look_alikes: tuple[LookAlike, ...]
+    grid: GridCheck
+    recording: RecordingCheck | None = None
+    #: Recorded queries with recorded similarities; empty without any
+    queries: tuple[Trial, ...] = ()
+    measures: tuple[Measure, ...] = ()  #: What decides whether the map is good enough
+    to_do: tuple[Advice, ...] = ()  #: The most urgent first
+    notes: tuple[str, ...] = ()  #: What the figures rest on
+    #: What the keyframes next to the map reach; None without any
+    keyframes: KeyframeCheck | None = None
+    map_ids: tuple[str, ...] = ()  #: Ids in the map's order, which overlaps refer to
+
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """Return the thresholds that the map misses; empty if it is good enough."""
+        return tuple(f'{one.name}: {one.show(one.value)} {">" if one.is_most else "<"} '
+                     f'{one.show(one.limit)}' for one in self.measures if one.is_missed)
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """Return what to do, the most urgent first."""
+        return tuple(one.text for one in self.to_do)
+
+    @property
+    def passed(self) -> bool:
+        """Return whether the map reaches all thresholds."""
+        return not self.failures
+
+    @property
+    def _by_images(self) -> list[Trial]:
+        """Return the recorded frames that were relocalized by keyframes, too."""
+        return [] if self.recording is None else [
+            one for one in self.recording.judged if one.by_objects is not None]
+
+    @property
+    def evidence(self) -> str:
+        """Return what gives the accepted poses that count, in words."""
+        return 'by objects or keyframes' if self.keyframes is not None and self._by_images else (
+            'by objects')
+
+    @property
+    def accepted_positions(self) -> float:
+        """Return the share of the grid positions near the recording with an accepted heading.
+
+        A keyframe within reach counts where recorded images were relocalized by the keyframes of
+        other parts of the recording, by the share of them that was accepted.
+        """
+        if self.keyframes is None or not (by_images := self._by_images):
+            return self.grid.accepted_positions
+        near = self.grid.is_near
+        chance = share(by_images, 'accepted') * (self.keyframes.headings[near] > 0)
+        accepted = np.where(self.grid.accepted[near] > 0, 1.0, chance)
+        return float(accepted.mean()) if len(accepted) else 0.0
+
+    @property
+    def duplicates(self) -> int:
+        """Return the number of pairs of landmarks that are one object."""
+        return sum(one.is_duplicate for one in self.overlaps)
+
+    @property
+    def faulty(self) -> float:
+        """Return the share of the landmarks with a serious fault.
+
+        A landmark counts as often as it was seen: one of a few frames is seen as rarely again.
+        """
+        return sum(one.weight for one in self.landmarks if one.severity >= SERIOUS) / sum(
+            one.weight for one in self.landmarks)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as plain values, for JSON."""
+        return {
+            'passed': self.passed, 'failures': list(self.failures), 'advice': list(self.advice),
+            'notes': list(self.notes), 'faulty_landmarks': self.faulty,
+            'duplicates': self.duplicates,
+            'landmarks': [asdict(one) for one in self.landmarks],
+            'overlaps': [{'first': self.map_ids[one.first], 'second': self.map_ids[one.second],
+                          'distance': one.distance, 'is_duplicate': one.is_duplicate}
+                         for one in self.overlaps],
+            'look_alikes': [asdict(one) for one in self.look_alikes],
+            'grid': self.grid.as_dict(),
+            'recording': None if self.recording is None else self.recording.as_dict(),
+            'queries': [one.as_dict() for one in self.queries],
+            'keyframes': None if self.keyframes is None else self.keyframes.as_dict()}
+
+
+def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
+    """Return the figures of a report that have a threshold."""
+    measures: list[Measure] = []
+
+    def demand(*numbers: Any) -> None:
+        measures.append(Measure(*numbers))
+
+    views = [*report.grid.trials, *report.queries]
+    demand('landmarks with a serious fault', report.faulty, limits.max_faulty, True)
+    demand('pairs of duplicates', report.duplicates, limits.max_duplicates, True, 'count')
+    demand('pairs of places that look alike', len(report.look_alikes), limits.max_look_alikes,
+           True, 'count')
+    if (recording := report.recording) is not None:
+        views += recording.trials
+        if recording.can_judge_boxes:
+            demand('held-out boxes explained', recording.held_out.explained,
+                   limits.min_explained, False)
+            demand('held-out median IoU', recording.held_out.median_iou, limits.min_iou, False,
+                   'number')
+        if recording.can_judge_frames:
+            demand(f'recorded frames accepted {report.evidence}',
+                   share(recording.judged, 'accepted'), limits.min_accepted, False)
+        else:  # a map of a walk that passes each object once
+            demand('recorded frames accepted with simulated boxes',
+                   share(recording.simulated, 'accepted'), limits.min_accepted, False)
+    demand(f'positions with a heading accepted {report.evidence}', report.accepted_positions,
+           limits.min_positions, False)
+    demand('views that mislead a robot', share(views, 'misled'), limits.max_misled, True)
+    return measures
+
+
+def _percent(value: float, digits: int) -> str:
+    return np.format_float_positional(100.0 * value, digits, unique=False, fractional=False,
+                                      trim='-') + ' %'
+
+
+def count_by_objects(trials: Sequence[Trial]) -> dict[str, int]:
+    """Return how many trials are accepted, refused and misled without keyframes."""
+    return count_verdicts([replace(one, verdict=one.by_objects or one.verdict)
+                           for one in trials])
+
+
+def share(trials: Sequence[Trial], verdict: str) -> float:
+    """Return the share of the trials with a verdict; 0 of none."""
+    return count_verdicts(trials)[verdict] / len(trials) if trials else 0.0
+
+
+def check_keyframes(layer: KeyframeLayer, grid: GridCheck,
+                    recorded: NDArray[np.float64] | None) -> KeyframeCheck:
+    """Return what keyframes reach; recorded (F, 4, 4) has the poses of a recording."""
+    poses = np.empty((0, 4, 4)) if recorded is None else recorded
+    reached = in_reach(layer, np.array([one.position for one in grid.trials]),
+                       np.array([one.forward for one in grid.trials]))
+    return KeyframeCheck(
+        len(layer), int(layer.offsets[-1]), in_reach(layer, poses[:, :3, 3], poses[:, :3, 2]),
+        reached.reshape(-1, grid.headings).sum(axis=1), grid.positions, grid.is_near)
+
+
+def in_reach(layer: KeyframeLayer, positions: NDArray[np.float64],
+             forward: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which views (n,) have a keyframe within reach.
+
+    Cameras are at positions (n, 3) [m] and look along unit vectors (n, 3).
+    """
+    places, axes = layer.map_from_camera[:, :3, 3], layer.map_from_camera[:, :3, 2]
+    found = np.zeros(len(positions), dtype=np.bool_)
+    for row, (position, axis) in enumerate(zip(positions, forward, strict=True)):
+        angles = np.degrees(np.arccos(np.clip(axes @ axis, -1.0, 1.0)))
+        costs = np.linalg.norm(places - position, axis=1) / NEAR_M + angles / NEAR_DEG
+        found[row] = bool((costs < 1.0).any())
+    return found

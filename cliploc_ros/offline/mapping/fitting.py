@@ -1,0 +1,224 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Fit ellipsoids, each to the edges of its boxes, by robust least squares.
+
+Each edge that does not lie at the image border gives a residual: projected edge minus detected
+edge, in standard deviations. An edge at the border only bounds the object: it counts where the
+projection ends inside of it. A measured depth gives one more residual. Residuals r pass through
+the Cauchy loss c^2/2 log(1 + r^2/c^2). A weak prior draws the logarithms of the semi-axes to
+their mean, since boxes from similar directions leave the thickness open.
+"""
+
+from collections.abc import Sequence
+from math import log, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.offline.mapping.landmarks import (
+    LANDMARK_SIZE,
+    POSE_SIZE,
+    Landmarks,
+    linearize_box,
+    move_ellipsoid,
+)
+from cliploc_ros.offline.mapping.views import Views
+
+#: Scale of the Cauchy loss, in standard deviations of an edge.
+LOSS_SCALE = 1.5
+# Standard deviation of the logarithm of a semi-axis about the mean of the three. A guess.
+_AXIS_SPREAD = 0.7
+# An ellipsoid that is not wholly in front of a camera costs what four edges this far off cost.
+_BEHIND_RESIDUAL = 20.0
+_MAX_DAMPING = 1e7
+_LEAST_IMPROVEMENT = 1e-4
+# Greatest change of a logarithm, and of the centre in greatest semi-axes, in one step.
+_MAX_STEP = 1.0
+
+
+class Fit(NamedTuple):
+    """A fitted ellipsoid."""
+
+    #: (3,), (3, 3): in the map; the basis' columns are the semi-axes [m]
+    center: NDArray[np.float64]
+    basis: NDArray[np.float64]
+    cost: float  #: Robust cost, the prior included
+    #: (9, 9): of centre and shape, see cliploc_ros.offline.mapping.landmarks
+    information: NDArray[np.float64]
+
+
+def fit_landmarks(views: Views, landmarks: Landmarks, boxes: Sequence[NDArray[np.int64]],
+                  iterations: int = 30) -> Landmarks:
+    """Return landmarks, each fitted to its boxes; one without boxes stays as it is."""
+    centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
+    for number, rows in enumerate(boxes):
+        if len(rows):
+            fit = fit_ellipsoid(views, rows, centers[number], bases[number], iterations)
+            centers[number], bases[number] = fit.center, fit.basis
+    return landmarks._replace(centers=centers, bases=bases)
+
+
+def fit_ellipsoid(views: Views, rows: NDArray[np.int64], center: NDArray[np.float64],
+                  basis: NDArray[np.float64], iterations: int = 30) -> Fit:
+    """Fit an ellipsoid to the boxes of some rows, from a start.
+
+    It takes at most this number of steps of Levenberg and Marquardt.
+    """
+    center, basis = center.copy(), basis.copy()
+    information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
+    cost = descend(views, np.ascontiguousarray(rows, dtype=np.int64), center, basis, iterations,
+                   information)
+    return Fit(center, basis, cost, information)
+
+
+@compiled
+def descend(views, rows, center, basis, iterations, information):
+    """Improve center and basis in place; write the information there; return the cost."""
+    gradient = np.zeros(LANDMARK_SIZE)
+    trial_information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
+    trial_gradient = np.zeros(LANDMARK_SIZE)
+    trial_center, trial_basis = np.zeros(3), np.zeros((3, 3))
+    cost = accumulate(views, rows, center, basis, information, gradient)
+    damping = 1e-3
+    for _ in range(iterations):
+        damped = information.copy()
+        for i in range(LANDMARK_SIZE):
+            damped[i, i] += damping * information[i, i] + 1e-9
+        step = np.linalg.solve(damped, -gradient)
+        limit_step(step, basis)
+        move_ellipsoid(center, basis, step, trial_center, trial_basis)
+        trial_cost = accumulate(views, rows, trial_center, trial_basis, trial_information,
+                                trial_gradient)
+        if trial_cost < cost:
+            improvement = cost - trial_cost
+            center[:], basis[:] = trial_center, trial_basis
+            information[:], gradient[:] = trial_information, trial_gradient
+            cost = trial_cost
+            damping *= 0.2
+            if improvement < _LEAST_IMPROVEMENT * cost:
+                break
+        else:
+            damping *= 5.0
+            if damping > _MAX_DAMPING:
+                break
+    return cost
+
+
+@compiled
+def limit_step(step, basis):
+    """Shorten a step (9,) that leaves the range in which its linearization can hold."""
+    size = sqrt((basis * basis).sum())
+    largest = sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2]) / size
+    for i in range(3, LANDMARK_SIZE):
+        largest = max(largest, abs(step[i]))
+    if largest > _MAX_STEP:
+        step *= _MAX_STEP / largest
+
+
+@compiled
+def accumulate(views, rows, center, basis, information, gradient):
+    """Write the normal equations of one landmark; return its cost."""
+    information[:] = 0.0
+    gradient[:] = 0.0
+    box = np.empty(4)
+    by_landmark, by_pose = np.empty((4, LANDMARK_SIZE)), np.empty((4, POSE_SIZE))
+    cost = 0.0
+    for row in rows:
+        frame = views.frames[row]
+        share = views.weights[frame]
+        if not linearize_box(views.rotations[frame], views.translations[frame], center, basis,
+                             box, by_landmark, by_pose):
+            cost += share * 4.0 * robust_cost(_BEHIND_RESIDUAL)
+            continue
+        for edge in range(4):
+            residual = edge_residual(views, row, edge, box)
+            cost += share * robust_cost(residual)
+            stiffness = views.stiffness[row, edge]
+            weight = share * robust_weight(residual)
+            if residual == 0.0:
+                continue
+            for i in range(LANDMARK_SIZE):
+                scaled = weight * stiffness * by_landmark[edge, i]
+                gradient[i] += scaled * residual
+                for j in range(i + 1):
+                    information[i, j] += scaled * stiffness * by_landmark[edge, j]
+        cost += share * add_depth(views, row, center, share, information, gradient)
+    cost += add_axis_prior(basis, information, gradient)
+    for i in range(LANDMARK_SIZE):
+        for j in range(i):
+            information[j, i] = information[i, j]
+    return cost
+
+
+@compiled
+def add_depth(views, row, center, share, information, gradient):
+    """Add the measured depth of a box to the normal equations; return its cost."""
+    stiffness = views.depth_stiffness[row]
+    if stiffness == 0.0:
+        return 0.0
+    frame = views.frames[row]
+    direction = views.rotations[frame, 2]
+    depth = views.translations[frame, 2]
+    for i in range(3):
+        depth += direction[i] * center[i]
+    residual = (depth - views.depths[row]) * stiffness
+    weight = share * robust_weight(residual)
+    for i in range(3):
+        scaled = weight * stiffness * direction[i]
+        gradient[i] += scaled * residual
+        for j in range(i + 1):
+            information[i, j] += scaled * stiffness * direction[j]
+    return robust_cost(residual)
+
+
+@compiled
+def edge_residual(views, row, edge, box):
+    """Return how far a projected edge is off, in standard deviations."""
+    residual = (box[edge] - views.edges[row, edge]) * views.stiffness[row, edge]
+    if views.is_open[row, edge]:
+        return max(0.0, residual) if edge < 2 else min(0.0, residual)
+    return residual
+
+
+@compiled
+def robust_cost(residual):
+    """Return the Cauchy loss of a residual."""
+    ratio = residual / LOSS_SCALE
+    return 0.5 * LOSS_SCALE * LOSS_SCALE * log(1.0 + ratio * ratio)
+
+
+@compiled
+def robust_weight(residual):
+    """Return the weight of a residual in the next step."""
+    ratio = residual / LOSS_SCALE
+    return 1.0 / (1.0 + ratio * ratio)
+
+
+@compiled
+def add_axis_prior(basis, information, gradient):
+    """Add the prior on the semi-axes to the normal equations; return its cost.
+
+    The logarithm of a semi-axis changes by half of its diagonal element of D.
+    """
+    logs = np.empty(3)
+    for k in range(3):
+        logs[k] = log(sqrt(basis[0, k] ** 2 + basis[1, k] ** 2 + basis[2, k] ** 2))
+    mean = logs.mean()
+    cost = 0.0
+    diagonal = (3, 6, 8)  # of D among a landmark's numbers
+    for k in range(3):
+        residual = (logs[k] - mean) / _AXIS_SPREAD
+        cost += 0.5 * residual * residual
+        for i in range(3):
+            slope = ((0.5 if i == k else 0.0) - 1.0 / 6.0) / _AXIS_SPREAD
+            gradient[diagonal[i]] += slope * residual
+            for j in range(i + 1):
+                other = ((0.5 if j == k else 0.0) - 1.0 / 6.0) / _AXIS_SPREAD
+                information[diagonal[i], diagonal[j]] += slope * other
+    # The numbers beside the diagonal turn the axes, which boxes of a sphere leave open: a weak
+    # hold keeps the equations regular, and has no target.
+    for off in (4, 5, 7):
+        information[off, off] += 0.5 / (_AXIS_SPREAD * _AXIS_SPREAD)
+    return cost

@@ -1,0 +1,332 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Refine landmarks and poses together.
+
+A process of errors holds on to the given poses (Prior). Odometry, where there is any, joins
+successive frames (cliploc_ros.offline.mapping.odometry). Box edges give the same residuals as in
+cliploc_ros.offline.mapping.fitting.
+
+The normal equations have a block for each landmark, blocks for each pose and its successor, and
+a block for each box, which joins the two. Poses are eliminated: their part is banded. The
+rest for the landmarks is solved by conjugate gradients, so that memory grows with the number of
+boxes only (Agarwal et al., "Bundle Adjustment in the Large", ECCV 2010).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.sparse import bsr_matrix
+from scipy.sparse.linalg import LinearOperator, cg
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.offline.mapping.fitting import (
+    add_axis_prior,
+    edge_residual,
+    limit_step,
+    robust_cost,
+    robust_weight,
+)
+from cliploc_ros.offline.mapping.landmarks import (
+    LANDMARK_SIZE,
+    POSE_SIZE,
+    Landmarks,
+    linearize_box,
+    move_ellipsoid,
+)
+from cliploc_ros.offline.mapping.odometry import Steps
+from cliploc_ros.offline.mapping.options import INSTANT_S, PoseErrors
+from cliploc_ros.offline.mapping.views import Views, camera_centers
+
+_BEHIND_COST = 4.0 * 20.0
+_SOLVER_ITERATIONS = 200
+_SOLVER_TOLERANCE = 1e-3
+_LEAST_IMPROVEMENT = 1e-3
+_MAX_DAMPING = 1e4
+
+
+class Prior(NamedTuple):
+    """The information of the process of errors: its diagonal and next-to-diagonal (F, 6)."""
+
+    diagonal: NDArray[np.float64]
+    beside: NDArray[np.float64]
+
+    @staticmethod
+    def of(stamps_s: NDArray[np.float64], errors: PoseErrors) -> 'Prior':
+        """Return the prior of frames at some times."""
+        kept = np.zeros(len(stamps_s))
+        kept[:-1] = errors.kept(np.maximum(np.diff(stamps_s), INSTANT_S))
+        # information of the innovation between a frame and the next one
+        gain = 1.0 / (1.0 - kept[:-1] ** 2)
+        diagonal = np.ones(len(stamps_s))
+        diagonal[1:] = gain
+        diagonal[:-1] += gain * kept[:-1] ** 2
+        beside = np.zeros(len(stamps_s))
+        beside[:-1] = -gain * kept[:-1]
+        weights = 1.0 / errors.sigmas ** 2
+        return Prior(diagonal[:, None] * weights, beside[:, None] * weights)
+
+    def log_determinant(self) -> float:
+        """Return the logarithm of the determinant of the information."""
+        # Q = L D L': each pivot is what the frames before leave of the diagonal
+        pivots = self.diagonal.copy()
+        for frame in range(1, len(pivots)):
+            pivots[frame] -= self.beside[frame - 1] ** 2 / pivots[frame - 1]
+        return float(np.log(pivots).sum())
+
+    def gradient(self, errors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the information times errors (F, 6)."""
+        product = self.diagonal * errors
+        product[:-1] += self.beside[:-1] * errors[1:]
+        product[1:] += self.beside[:-1] * errors[:-1]
+        return product
+
+
+def pose_bands(of_poses: NDArray[np.float64], prior: Prior,
+               of_steps: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """Return the poses' part of the equations with the prior, as lower bands.
+
+    Each pose has a block (6, 6), and with odometry one below: the rows of the next pose, the
+    columns of this one. The bands are (7, 6 F), or (12, 6 F) with blocks below.
+    """
+    count = POSE_SIZE + 1 if of_steps is None else 2 * POSE_SIZE
+    bands = np.zeros((count, len(of_poses), POSE_SIZE))
+    for below in range(POSE_SIZE):
+        for column in range(POSE_SIZE - below):
+            bands[below, :, column] = of_poses[:, column + below, column]
+    bands[0] += prior.diagonal
+    bands[POSE_SIZE] = prior.beside
+    if of_steps is not None:
+        for row, column in np.ndindex(POSE_SIZE, POSE_SIZE):
+            bands[POSE_SIZE + row - column, :, column] += of_steps[:, row, column]
+    return bands.reshape(count, -1)
+
+
+class Equations(NamedTuple):
+    """Normal equations: F poses, L landmarks, m boxes; with odometry, poses and the next ones."""
+
+    of_landmarks: NDArray[np.float64]    # (L, 9, 9)
+    of_poses: NDArray[np.float64]        # (F, 6, 6)
+    of_boxes: NDArray[np.float64]        # (m, 6, 9)
+    landmark_gradient: NDArray[np.float64]  # (L, 9)
+    pose_gradient: NDArray[np.float64]   # (F, 6)
+    of_steps: NDArray[np.float64] | None = None  # (F, 6, 6)
+
+
+class Anchors(NamedTuple):
+    """Where L landmarks are known to be: centres (L, 3) and their deviations (L,) [m]."""
+
+    centers: NDArray[np.float64]
+    sigmas: NDArray[np.float64]
+
+
+def refine_jointly(given: Views, views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
+                   errors: PoseErrors, iterations: int = 20, anchors: Anchors | None = None,
+                   steps: Steps | None = None) -> tuple[Views, Landmarks]:
+    """Return the views with refined poses, and the refined landmarks.
+
+    The prior holds on to the given poses, anchors to the landmarks' known places, and steps to the
+    odometry between successive frames; views has the poses to start from. It takes at most this
+    number of steps of Levenberg and Marquardt.
+    """
+    rows = np.nonzero(shown >= 0)[0]
+    problem = Problem(views, rows, shown[rows], Prior.of(views.stamps_s, errors), anchors, steps)
+    state = State(views, landmarks, pose_errors(given, views))
+    cost, equations = problem.linearize(state)
+    damping = 1e-4
+    for _ in range(iterations):
+        trial = state.moved(*problem.solve(equations, damping))
+        trial_cost, trial_equations = problem.linearize(trial)
+        if trial_cost < cost:
+            improvement = cost - trial_cost
+            state, cost, equations = trial, trial_cost, trial_equations
+            damping *= 0.2
+            if improvement < _LEAST_IMPROVEMENT * cost:
+                break
+        else:
+            damping = max(10.0 * damping, 1e-4)
+            if damping > _MAX_DAMPING:
+                break
+    return state.views, state.landmarks
+
+
+def pose_errors(given: Views, present: Views) -> NDArray[np.float64]:
+    """Return by how much given poses are off (F, 6): x, y, z [m], rotation vector [rad].
+
+    Errors are those of the rig's first camera. Another camera's centre is off by its lever's turn,
+    too.
+    """
+    offsets = camera_centers(present) - camera_centers(given)
+    turns = np.einsum('fji,fjk->fik', present.rotations, given.rotations)
+    rotvecs = Rotation.from_matrix(turns).as_rotvec()
+    return np.concatenate([offsets - np.cross(rotvecs, given.levers), rotvecs], axis=1)
+
+
+def pose_changes(given: Views, present: Views) -> tuple[float, float]:
+    """Return the root mean square by which poses changed: [m], [deg]."""
+    squares = np.square(pose_errors(given, present))
+    return (float(np.sqrt(squares[:, :3].sum(axis=1).mean())),
+            float(np.degrees(np.sqrt(squares[:, 3:].sum(axis=1).mean()))))
+
+
+class State(NamedTuple):
+    """Views with their present poses, landmarks, and the errors (F, 6) of the given poses."""
+
+    views: Views
+    landmarks: Landmarks
+    errors: NDArray[np.float64]
+
+    def moved(self, landmark_steps: NDArray[np.float64], pose_steps: NDArray[np.float64]
+              ) -> 'State':
+        """Return the state after steps (L, 9) and (F, 6)."""
+        centers = np.empty_like(self.landmarks.centers)
+        bases = np.empty_like(self.landmarks.bases)
+        _move_all(self.landmarks.centers, self.landmarks.bases, landmark_steps, centers, bases)
+        turned = Rotation.from_rotvec(pose_steps[:, 3:]).as_matrix().transpose(0, 2, 1)
+        origins = camera_centers(self.views)
+        rotations = np.ascontiguousarray(self.views.rotations @ turned)
+        shifts = pose_steps[:, :3] + np.cross(pose_steps[:, 3:], self.views.levers)
+        translations = -np.einsum('fij,fj->fi', rotations, origins + shifts)
+        return State(self.views._replace(rotations=rotations, translations=translations),
+                      self.landmarks._replace(centers=centers, bases=bases),
+                      self.errors + pose_steps)
+
+
+class Problem(NamedTuple):
+    """What stays the same over the iterations: m boxes and the landmark that each shows."""
+
+    views: Views
+    rows: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+    prior: Prior
+    anchors: Anchors | None = None
+    steps: Steps | None = None
+
+    def linearize(self, state: State) -> tuple[float, Equations]:
+        """Return the cost of a state and its normal equations."""
+        count, frames = len(state.landmarks.centers), len(state.errors)
+        arrays = (np.zeros((count, LANDMARK_SIZE, LANDMARK_SIZE)),
+                  np.zeros((frames, POSE_SIZE, POSE_SIZE)),
+                  np.zeros((len(self.rows), POSE_SIZE, LANDMARK_SIZE)),
+                  np.zeros((count, LANDMARK_SIZE)), np.zeros((frames, POSE_SIZE)))
+        cost = _accumulate(state.views, self.rows, self.landmarks, state.landmarks.centers,
+                           state.landmarks.bases, *arrays)
+        equations = Equations(*arrays)
+        if self.anchors is not None:
+            weights = 1.0 / np.square(self.anchors.sigmas)[:, None]
+            offsets = state.landmarks.centers - self.anchors.centers
+            equations.landmark_gradient[:, :3] += weights * offsets
+            equations.of_landmarks[:, np.arange(3), np.arange(3)] += weights
+            cost += 0.5 * float((weights * np.square(offsets)).sum())
+        pull = self.prior.gradient(state.errors)
+        equations.pose_gradient[:] += pull
+        cost += 0.5 * float((pull * state.errors).sum())
+        if self.steps is None:
+            return cost, equations
+        own_cost, of_poses, of_steps, gradient = self.steps.linearize(state.views)
+        return cost + own_cost, equations._replace(
+            of_poses=equations.of_poses + of_poses, of_steps=of_steps,
+            pose_gradient=equations.pose_gradient + gradient)
+
+    def solve(self, equations: Equations, damping: float
+              ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the steps of the landmarks (L, 9) and of the poses (F, 6)."""
+        count, frames = len(equations.of_landmarks), len(equations.of_poses)
+        bands = pose_bands(equations.of_poses, self.prior, equations.of_steps)
+        bands[0] *= 1.0 + damping
+        factor = cholesky_banded(bands, lower=True)
+        of_landmarks = equations.of_landmarks.copy()
+        diagonal = np.arange(LANDMARK_SIZE)
+        of_landmarks[:, diagonal, diagonal] *= 1.0 + damping
+        of_landmarks[:, diagonal, diagonal] += 1e-9
+        coupling = self.coupling(equations.of_boxes, frames, count)
+        inverses = np.linalg.inv(of_landmarks)
+
+        def reduced(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+            own = np.einsum('lij,lj->li', of_landmarks, vector.reshape(count, -1)).ravel()
+            return np.asarray(own - coupling.T @ cho_solve_banded((factor, True),
+                                                                  coupling @ vector))
+
+        def precondition(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.einsum('lij,lj->li', inverses, vector.reshape(count, -1)).ravel()
+
+        size = count * LANDMARK_SIZE
+        of_gradient = cho_solve_banded((factor, True), equations.pose_gradient.ravel())
+        right = coupling.T @ of_gradient - equations.landmark_gradient.ravel()
+        steps, _ = cg(LinearOperator((size, size), matvec=reduced, dtype=np.float64), right,
+                      rtol=_SOLVER_TOLERANCE, maxiter=_SOLVER_ITERATIONS,
+                      M=LinearOperator((size, size), matvec=precondition, dtype=np.float64))
+        poses = cho_solve_banded((factor, True),
+                                 -equations.pose_gradient.ravel() - coupling @ steps)
+        return steps.reshape(count, -1), poses.reshape(frames, -1)
+
+    def coupling(self, of_boxes: NDArray[np.float64], frames: int, count: int) -> bsr_matrix:
+        """Return the part (6 F, 9 L) of the equations that joins poses and landmarks."""
+        order = np.lexsort((self.landmarks, self.views.frames[self.rows]))
+        starts = np.searchsorted(self.views.frames[self.rows][order], np.arange(frames + 1))
+        return bsr_matrix((of_boxes[order], self.landmarks[order], starts),
+                          shape=(frames * POSE_SIZE, count * LANDMARK_SIZE))
+
+
+@compiled
+def _move_all(centers, bases, steps, new_centers, new_bases):
+    for number in range(len(centers)):
+        limit_step(steps[number], bases[number])
+        move_ellipsoid(centers[number], bases[number], steps[number], new_centers[number],
+                       new_bases[number])
+
+
+@compiled
+def _accumulate(views, rows, landmarks, centers, bases, of_landmarks, of_poses, of_boxes,
+                landmark_gradient, pose_gradient):
+    """Add up the normal equations of all boxes; return their cost, the axis prior included."""
+    cost, box = 0.0, np.empty(4)
+    by_landmark, by_motion = np.empty((4, LANDMARK_SIZE)), np.empty((4, POSE_SIZE))
+    for place in range(len(rows)):
+        row, landmark = rows[place], landmarks[place]
+        frame = views.frames[row]
+        rotation = views.rotations[frame]
+        share = views.weights[frame]
+        if not linearize_box(rotation, views.translations[frame], centers[landmark],
+                             bases[landmark], box, by_landmark, by_motion):
+            cost += share * _BEHIND_COST
+            continue
+        # a pose's error in the map's axes moves the map against it in the camera's
+        by_pose = np.concatenate((-by_motion[:, :3] @ rotation, -by_motion[:, 3:] @ rotation),
+                                 axis=1)
+        x, y, z = views.levers[frame]
+        for edge in range(4):
+            across = by_pose[edge, :3]
+            by_pose[edge, 3] += y * across[2] - z * across[1]
+            by_pose[edge, 4] += z * across[0] - x * across[2]
+            by_pose[edge, 5] += x * across[1] - y * across[0]
+        for edge in range(4):
+            residual = edge_residual(views, row, edge, box)
+            if residual == 0.0:
+                continue
+            cost += share * robust_cost(residual)
+            stiffness = views.stiffness[row, edge]
+            weight = share * robust_weight(residual) * stiffness * stiffness
+            pull = share * robust_weight(residual) * stiffness * residual
+            for i in range(LANDMARK_SIZE):
+                landmark_gradient[landmark, i] += pull * by_landmark[edge, i]
+                for j in range(LANDMARK_SIZE):
+                    of_landmarks[landmark, i, j] += (weight * by_landmark[edge, i]
+                                                     * by_landmark[edge, j])
+            for i in range(POSE_SIZE):
+                pose_gradient[frame, i] += pull * by_pose[edge, i]
+                for j in range(POSE_SIZE):
+                    of_poses[frame, i, j] += weight * by_pose[edge, i] * by_pose[edge, j]
+                for j in range(LANDMARK_SIZE):
+                    of_boxes[place, i, j] += weight * by_pose[edge, i] * by_landmark[edge, j]
+    for landmark in range(len(centers)):
+        lower = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
+        cost += add_axis_prior(bases[landmark], lower, landmark_gradient[landmark])
+        for i in range(LANDMARK_SIZE):
+            for j in range(i + 1):
+                of_landmarks[landmark, i, j] += lower[i, j]
+                if i != j:
+                    of_landmarks[landmark, j, i] += lower[i, j]
+    return cost

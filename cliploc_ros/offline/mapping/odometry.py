@@ -1,0 +1,223 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Odometry between frames: how the camera moved from each frame to the next one.
+
+Odometry measures the second of two cameras from the first, R and t. With their rotations R_k into
+the map and centres c_k, it is off in the map's axes by
+
+    p = c_k+1 - c_k - R_k t,   q = log(R_k+1 (R_k R)'),
+
+whose errors are those of a random walk: their variances grow with the way. The loss is Huber's,
+which is convex: given poses with independent errors contradict odometry at first. Where wheels
+slip, its pull is bounded. Steps that contradict the given poses beyond the errors of both are left
+out.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.offline.mapping.landmarks import POSE_SIZE
+from cliploc_ros.offline.mapping.options import OdometryErrors, PoseErrors
+from cliploc_ros.offline.mapping.views import Views, camera_centers
+
+# From this length on, in standard deviations, the loss is linear.
+_LOSS_SCALE = 3.0
+# Odometry and poses contradict each other from this length on, in standard deviations of both.
+# Three numbers are longer once in a thousand times.
+_CONTRADICTION = 4.0
+# Between successive frames, odometry jumps beyond this length. Estimated deviations of the poses
+# may be half of the true ones: a lower limit leaves out what odometry corrects most. A guess.
+_JUMP = 8.0
+# Wrong units, mounts and clocks show over windows of time, more than this share of which then
+# contradict the poses. A guess.
+_WINDOW_S, _MAX_CONTRADICTIONS = 5.0, 0.3
+# Odometry that is longer or shorter by more than this share is left out. A guess: on TUM fr3,
+# a tenth did no harm to a map of poses off by 5 cm, three tenths doubled its errors.
+_MAX_SCALE_ERROR = 0.15
+
+
+class Steps(NamedTuple):
+    """How the camera moved between m pairs of successive frames, by odometry."""
+
+    frames: NDArray[np.int64]  #: (m,): the first frame of each pair
+    #: (m, 3), (m, 3, 3): origin [m] and axes of the second camera in the first
+    shifts: NDArray[np.float64]
+    turns: NDArray[np.float64]
+    #: (m, 2): inverse standard deviations on each axis of shift [1/m] and turn [1/rad]
+    stiffness: NDArray[np.float64]
+
+    def linearize(self, views: Views) -> tuple[float, NDArray[np.float64], NDArray[np.float64],
+                                               NDArray[np.float64]]:
+        """Return cost and normal equations at the present F poses.
+
+        These are a block for each pose (F, 6, 6), the block below it (F, 6, 6), whose rows are the
+        next pose's, and the gradient (F, 6). Derivatives are those for small q; the gradient is
+        exact for any q, since the left Jacobian of a rotation leaves its axis alone.
+        """
+        firsts, seconds = self.frames, self.frames + 1
+        residuals = np.stack(_residuals(views, firsts, seconds, self.shifts, self.turns), axis=1)
+        lengths = np.linalg.norm(residuals, axis=2) * self.stiffness
+        linear = np.maximum(lengths, _LOSS_SCALE)
+        # by the square up to the scale, by the length beyond it
+        cost = float((_LOSS_SCALE * (lengths - 0.5 * _LOSS_SCALE))[lengths > _LOSS_SCALE].sum()
+                     + 0.5 * np.square(lengths[lengths <= _LOSS_SCALE]).sum())
+        weights = np.repeat(_LOSS_SCALE / linear * self.stiffness ** 2, 3, axis=1)
+        jacobian = np.zeros((len(firsts), POSE_SIZE, 2 * POSE_SIZE))
+        axes = np.arange(POSE_SIZE)
+        jacobian[:, axes, axes], jacobian[:, axes, POSE_SIZE + axes] = -1.0, 1.0
+        # a turn of the rig moves what odometry predicts, and both cameras
+        ahead = np.einsum('fji,fj->if', views.rotations[firsts], self.shifts)
+        for column, (x, y, z) in ((0, ahead + views.levers[firsts].T),
+                                  (POSE_SIZE, -views.levers[seconds].T)):
+            jacobian[:, 0, column + 4], jacobian[:, 0, column + 5] = -z, y
+            jacobian[:, 1, column + 3], jacobian[:, 1, column + 5] = z, -x
+            jacobian[:, 2, column + 3], jacobian[:, 2, column + 4] = -y, x
+        weighted = jacobian * weights[:, :, None]
+        blocks = weighted.transpose(0, 2, 1) @ jacobian
+        pulls = np.einsum('mij,mi->mj', weighted, residuals.reshape(-1, POSE_SIZE))
+        of_poses = np.zeros((len(views.rotations), POSE_SIZE, POSE_SIZE))
+        of_steps, gradient = of_poses.copy(), np.zeros((len(of_poses), POSE_SIZE))
+        of_poses[firsts] += blocks[:, :POSE_SIZE, :POSE_SIZE]
+        of_poses[seconds] += blocks[:, POSE_SIZE:, POSE_SIZE:]
+        of_steps[firsts] = blocks[:, POSE_SIZE:, :POSE_SIZE]
+        gradient[firsts] += pulls[:, :POSE_SIZE]
+        gradient[seconds] += pulls[:, POSE_SIZE:]
+        return cost, of_poses, of_steps, gradient
+
+
+def link_frames(given: Views, odom_from_camera: NDArray[np.float64], errors: PoseErrors,
+                noise: OdometryErrors) -> tuple[Steps | None, str]:
+    """Return the steps of odometry that do not contradict the given poses, and a note on them.
+
+    Odometry (F, 4, 4) is NaN where unknown. Of several cameras, the one with the most frames tells
+    whether odometry as a whole contradicts the poses. No steps: it does, or joins no frames.
+    """
+    frames = np.nonzero(np.isfinite(odom_from_camera).all(axis=(1, 2)))[0]
+    before = np.nonzero(np.diff(frames) == 1)[0]
+    if len(before) == 0:
+        return None, 'odometry is left out: no two successive frames have it'
+    with np.errstate(over='ignore', invalid='ignore'):  # NaN contradicts the poses, too
+        known = _Known(given, frames, odom_from_camera[frames], errors, noise)
+        if complaint := known.of_one_camera.contradiction():
+            return None, complaint
+        pairs = known.compare(before, before + 1)
+    kept = pairs.excess <= _JUMP
+    if not kept.any():
+        return None, 'odometry is left out: it contradicts the poses between all frames'
+    note = f'odometry joins {np.count_nonzero(kept)} of {len(given.rotations) - 1} pairs of frames'
+    if not kept.all():
+        first_s = given.stamps_s[frames[before[~kept][0]]]
+        note += (f'; it jumps {np.count_nonzero(~kept)} times, first at {first_s:.2f} s, which is '
+                 'left out')
+    return Steps(frames[before[kept]], pairs.shifts[kept], pairs.turns[kept],
+                 1.0 / pairs.sigmas[kept]), note
+
+
+class _Compared(NamedTuple):
+    """Odometry against poses for m pairs of frames."""
+
+    #: (m, 3), (m, 3, 3), (m, 2): of odometry, as in Steps; standard deviations [m] [rad]
+    shifts: NDArray[np.float64]
+    turns: NDArray[np.float64]
+    sigmas: NDArray[np.float64]
+    excess: NDArray[np.float64]  #: (m,): how far the two differ, in standard deviations of both
+    #: (m, 2): these deviations alone do not explain that the camera shifts, or turns
+    is_motion: NDArray[np.bool_]
+    #: (2, m): how far the camera moves by odometry and by the poses [m]
+    motions_m: NDArray[np.float64]
+    #: (m,): how far it moves by the poses in the direction of odometry [m]
+    along_m: NDArray[np.float64]
+
+
+class _Known:
+    """The frames with odometry: m of F."""
+
+    def __init__(self, given: Views, frames: NDArray[np.int64], poses: NDArray[np.float64],
+                 errors: PoseErrors, noise: OdometryErrors):
+        self._given, self._frames, self._poses = given, frames, poses
+        self._errors, self._noise = errors, noise
+        self._stamps_s = given.stamps_s[frames]
+        cameras = given.cameras[frames]
+        self._is_leading = cameras == np.argmax(np.bincount(cameras))
+        # by odometry since the first frame, along the way [m] [rad] of the camera with the most
+        # frames: from one camera to the next there is no way
+        own, times = poses[self._is_leading], self._stamps_s[self._is_leading]
+        steps_m = np.linalg.norm(np.diff(own[:, :3, 3], axis=0), axis=1)
+        turns = own[:-1, :3, :3].transpose(0, 2, 1) @ own[1:, :3, :3]
+        self._distances_m, self._angles = (
+            np.interp(self._stamps_s, times, np.cumsum([0.0, *steps]))
+            for steps in (steps_m, Rotation.from_matrix(turns).magnitude()))
+
+    @property
+    def of_one_camera(self) -> '_Known':
+        """Return the frames of the camera with the most of them."""
+        rows = self._is_leading
+        return _Known(self._given, self._frames[rows], self._poses[rows], self._errors,
+                      self._noise)
+
+    def contradiction(self) -> str:
+        """Return how odometry as a whole contradicts the poses; '' where it does not."""
+        starts = np.arange(len(self._frames) - 1)
+        ends = np.searchsorted(self._stamps_s, self._stamps_s[:-1] + _WINDOW_S)
+        windows = self.compare(starts, np.clip(ends, starts + 1, len(starts)))
+        is_far = ~(windows.excess <= _CONTRADICTION)
+        tells = is_far | windows.is_motion.any(axis=1)
+        if np.count_nonzero(is_far) <= _MAX_CONTRADICTIONS * np.count_nonzero(tells):
+            # the motion by the poses as a multiple of odometry's
+            moving = windows.is_motion[:, 0] & ~is_far
+            far_m = windows.motions_m[0, moving]
+            scale = float(far_m @ windows.along_m[moving] / (far_m @ far_m)) if len(far_m) else 1.0
+            return '' if abs(scale - 1.0) <= _MAX_SCALE_ERROR else (
+                f'odometry is left out: it contradicts the poses in its scale; by the poses the '
+                f'camera moves {scale:.2f} times as far; check its wheel radius or unit')
+        by_odometry, by_poses = np.median(windows.motions_m[:, is_far], axis=1)
+        return (f'odometry is left out: it contradicts the poses in '
+                f'{is_far.sum() / tells.sum():.0%} of the windows of {_WINDOW_S:.0f} s; the '
+                f'camera moves {by_odometry:.2f} m by odometry and {by_poses:.2f} m by the poses '
+                'there (medians); check unit, clock and mount of the odometry, and the noise of '
+                'the poses')
+
+    def compare(self, firsts: NDArray[np.int64], seconds: NDArray[np.int64]) -> _Compared:
+        """Compare the motions between pairs of these frames."""
+        frames, errors = self._frames, self._errors
+        axes = self._poses[firsts, :3, :3].transpose(0, 2, 1)
+        offsets = self._poses[seconds, :3, 3] - self._poses[firsts, :3, 3]
+        shifts, turns = np.einsum('mij,mj->mi', axes, offsets), axes @ self._poses[seconds, :3, :3]
+        far_m = np.linalg.norm(offsets, axis=1)
+        sigmas = self._noise.sigmas(self._distances_m[seconds] - self._distances_m[firsts],
+                                    self._angles[seconds] - self._angles[firsts])
+        # deviations of motions by odometry and by given poses
+        seconds_s = self._stamps_s[seconds] - self._stamps_s[firsts]
+        kept = errors.kept(seconds_s)
+        sigma_m, sigma_rad = errors.sigmas[[0, 3]]
+        of_turns = np.square(sigmas[:, 1]) + 2.0 * sigma_rad ** 2 * (1.0 - kept)
+        # a rotation that is off moves what is far away
+        of_shifts = (np.square(sigmas[:, 0]) + 2.0 * sigma_m ** 2 * (1.0 - kept)
+                     + np.square(far_m) * (np.square(sigmas[:, 1]) + sigma_rad ** 2))
+        of_both = np.sqrt(np.column_stack([of_shifts, of_turns]))
+        residuals = _residuals(self._given, frames[firsts], frames[seconds], shifts, turns)
+        by_poses = (camera_centers(self._given, frames[seconds])
+                    - camera_centers(self._given, frames[firsts]))
+        # p is the rest of the motion by the poses after that by odometry
+        ahead = (by_poses * (by_poses - residuals[0])).sum(axis=1)
+        motions_m = np.stack([far_m, np.linalg.norm(by_poses, axis=1)])
+        lengths = np.linalg.norm(residuals, axis=2).T
+        motions = np.column_stack([motions_m.max(axis=0),
+                                   Rotation.from_matrix(turns).magnitude()])
+        return _Compared(shifts, turns, sigmas, (lengths / of_both).max(axis=1),
+                         motions > _CONTRADICTION * of_both, motions_m,
+                         ahead / np.maximum(far_m, 1e-9))
+
+
+def _residuals(views: Views, firsts: NDArray[np.int64], seconds: NDArray[np.int64],
+               shifts: NDArray[np.float64], turns: NDArray[np.float64]
+               ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return p and q (m, 3) for measured motions from first to second frames."""
+    axes = views.rotations[firsts].transpose(0, 2, 1)
+    offsets = (camera_centers(views, seconds) - camera_centers(views, firsts)
+               - np.einsum('mij,mj->mi', axes, shifts))
+    rotations = views.rotations[seconds].transpose(0, 2, 1) @ (axes @ turns).transpose(0, 2, 1)
+    return offsets, Rotation.from_matrix(rotations).as_rotvec()

@@ -1,0 +1,248 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Estimate from the boxes how far the given poses are off, and what this leaves in a map.
+
+Errors of a pose move all boxes of a frame together; errors of the detector move each box on its
+own. The estimate maximizes the marginal likelihood of the boxes over the standard deviations of
+the poses, the time for which an error lasts, and the scale s of the edges' deviations (empirical
+Bayes; Laplace's approximation, MacKay, "Bayesian Interpolation", 1992). With H the normal
+equations of the boxes about the best landmarks and poses, b their gradient, and Q the information
+of the process of pose errors e (see cliploc_ros.offline.mapping.joint),
+
+    -log p = r' W r / 2 s^2 + N log s + e' Q e / 2 - b' (H / s^2 + Q)^-1 b / 2
+             + log det (H / s^2 + Q) / 2 - log det Q / 2.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+from scipy.optimize import minimize
+from scipy.sparse import csr_matrix
+
+from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.offline.mapping.fitting import edge_residual, robust_weight
+from cliploc_ros.offline.mapping.joint import (
+    Prior,
+    Problem,
+    State,
+    pose_bands,
+    pose_errors,
+    refine_jointly,
+)
+from cliploc_ros.offline.mapping.landmarks import POSE_SIZE, Landmarks, group_boxes, project_box
+from cliploc_ros.offline.mapping.options import INSTANT_S, PoseErrors
+from cliploc_ros.offline.mapping.views import Views
+
+# The estimate uses at most this number of frames and landmarks: more add time, hardly precision.
+_MAX_FRAMES, _MAX_LANDMARKS = 200, 25
+# They are from the middle of a long recording: frames far apart show no landmark in common.
+_MAX_SPAN = 3000
+_MIN_FRAMES, _MIN_LANDMARKS, _MIN_BOXES = 20, 3, 3
+# Smaller errors than these stay. A guess: motion capture and clock of TUM fr3 are estimated to be
+# off by 6 mm and 0.2 degrees.
+_HARMLESS = PoseErrors(0.01, 0.3)
+# A wide start lets poses follow their boxes; from a narrow one, far boxes count as outliers.
+_START = PoseErrors(0.1, 2.0, 0.3)
+_ROUNDS, _REFINEMENTS, _EVALUATIONS = 3, 6, 40
+# Bounds of sigma [m] [deg], time constant [s] and scale of the edges' deviations.
+_LOWEST = np.log([0.001, 0.02, 0.05, 0.3])
+_HIGHEST = np.log([1.0, 20.0, 100.0, 5.0])
+# Errors of poses in one span of time are alike, the default of PoseErrors.correlation_s [s].
+_POSE_ERROR_S = 3.0
+# Boxes that are matched wrongly before the poses are refined bend the map: parts of it are off by
+# this many times the mean error of their poses. Chosen on maps of TUM fr3 from poses off by 5
+# and 10 cm over 3 s (seeds 0 to 4 of studies/speed/pose_errors.py).
+_BENDING = 1.6
+
+
+def significant_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[np.int64]
+                            ) -> PoseErrors | None:
+    """Return how the errors of the given poses seem to behave; None where they do no harm."""
+    errors = estimate_pose_errors(given, landmarks, shown, given)
+    if errors is None or (errors.sigma_m < _HARMLESS.sigma_m
+                          and errors.sigma_deg < _HARMLESS.sigma_deg):
+        return None
+    return errors
+
+
+def estimated_note(errors: PoseErrors) -> str:
+    """Return what the user should know of estimated errors of the poses."""
+    return (f'poses are off by about {100 * errors.sigma_m:.1f} cm and {errors.sigma_deg:.1f} '
+            f'degrees on each axis for {errors.correlation_s:.1f} s, estimated from the boxes; '
+            'refined')
+
+
+def estimate_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[np.int64],
+                         start: Views) -> PoseErrors | None:
+    """Return how the errors of the given poses seem to behave; None with too few boxes.
+
+    The landmarks were fitted to the poses of start.
+    """
+    frames, rows = _sample(given)
+    counts = np.bincount(shown[rows][shown[rows] >= 0], minlength=len(landmarks.centers))
+    chosen = np.argsort(-counts, kind='stable')[:_MAX_LANDMARKS]
+    chosen = chosen[counts[chosen] >= _MIN_BOXES]
+    if len(frames) < _MIN_FRAMES or len(chosen) < _MIN_LANDMARKS:
+        return None
+    numbers = np.full(len(counts) + 1, -1)  # the last one is that of no landmark
+    numbers[chosen] = np.arange(len(chosen))
+    shown, landmarks = numbers[shown[rows]], landmarks.select(chosen)
+    views, refined = _pick(given, frames, rows), _pick(start, frames, rows)
+    errors, logs = _START, np.log([_START.sigma_m, _START.sigma_deg, _START.correlation_s, 1.0])
+    for _ in range(_ROUNDS):
+        refined, landmarks = refine_jointly(views, refined, landmarks, shown, errors,
+                                            _REFINEMENTS)
+        found = minimize(_cost_function(views, refined, landmarks, shown), logs,
+                         method='Nelder-Mead', bounds=list(zip(_LOWEST, _HIGHEST, strict=True)),
+                         options={'maxfev': _EVALUATIONS, 'xatol': 0.05, 'fatol': 0.1,
+                                  'initial_simplex': logs + 0.7 * np.eye(5, 4, -1)})
+        logs = found.x
+        errors = PoseErrors(*map(float, np.exp(logs[:3])))
+    return errors
+
+
+def _sample(views: Views) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return one frame of each of some viewpoints, evenly chosen, and the rows of their boxes."""
+    order = np.argsort(views.viewpoints, kind='stable')
+    _, firsts, counts = np.unique(views.viewpoints[order], return_index=True, return_counts=True)
+    middles = np.sort(order[firsts + counts // 2])
+    left_out = max(0, len(middles) - _MAX_SPAN)
+    places = np.linspace(left_out // 2, len(middles) - 1 - (left_out - left_out // 2),
+                         _MAX_FRAMES).astype(np.int64)
+    frames = middles[np.unique(places)]
+    return frames, np.nonzero(np.isin(views.frames, frames))[0]
+
+
+def _pick(views: Views, frames: NDArray[np.int64], rows: NDArray[np.int64]) -> Views:
+    """Return some frames with their rows, each of full weight."""
+    offsets = np.searchsorted(rows, views.offsets)
+    return views._replace(
+        rotations=views.rotations[frames], translations=views.translations[frames],
+        stamps_s=views.stamps_s[frames], cameras=views.cameras[frames],
+        levers=views.levers[frames], bounds=views.bounds[frames],
+        viewpoints=np.arange(len(frames)), weights=np.ones(len(frames)),
+        offsets=np.append(offsets[frames], len(rows)),
+        frames=np.searchsorted(frames, views.frames[rows]), classes=views.classes[rows],
+        edges=views.edges[rows], stiffness=views.stiffness[rows], is_open=views.is_open[rows],
+        depths=views.depths[rows], depth_stiffness=views.depth_stiffness[rows])
+
+
+def _cost_function(given: Views, refined: Views, landmarks: Landmarks, shown: NDArray[np.int64]
+                   ) -> Callable[[NDArray[np.float64]], float]:
+    """Return -log p as a function of the logarithms of sigma [m] [deg], time [s] and scale.
+
+    The boxes are linearized at refined poses and landmarks.
+    """
+    rows = np.nonzero(shown >= 0)[0]
+    frames, size = len(given.rotations), len(landmarks.centers)
+    nothing = Prior(np.zeros((frames, POSE_SIZE)), np.zeros((frames, POSE_SIZE)))
+    problem = Problem(refined, rows, shown[rows], nothing)
+    errors = pose_errors(given, refined)
+    _, equations = problem.linearize(State(refined, landmarks, errors))
+    joint = problem.coupling(equations.of_boxes, frames, size).toarray()
+    squares, weights = _sum_squares(refined, rows, shown[rows], landmarks.centers, landmarks.bases)
+
+    def cost(logs: NDArray[np.float64]) -> float:
+        sigma_m, sigma_deg, correlation_s, scale = np.exp(logs)
+        prior = Prior.of(given.stamps_s, PoseErrors(sigma_m, sigma_deg, correlation_s))
+        gain, every = scale ** -2, np.arange(size)
+        bands = pose_bands(gain * equations.of_poses, prior)
+        of_landmarks = np.zeros((size, 9, size, 9))
+        of_landmarks[every, :, every] = gain * equations.of_landmarks + 1e-6 * np.eye(9)
+        pull, coupling = prior.gradient(errors), gain * joint
+        by_pose = (gain * equations.pose_gradient + pull).ravel()
+        try:
+            factor = cholesky_banded(bands, lower=True)
+            held = cho_solve_banded((factor, True), np.column_stack([coupling, by_pose]))
+            schur = of_landmarks.reshape(9 * size, -1) - coupling.T @ held[:, :-1]
+            right = gain * equations.landmark_gradient.ravel() - coupling.T @ held[:, -1]
+            root = cho_factor(schur, lower=True)
+        except LinAlgError:
+            return np.inf
+        gained = by_pose @ held[:, -1] + right @ cho_solve(root, right)
+        return float(0.5 * gain * squares + weights * logs[3] + 0.5 * (pull * errors).sum()
+                     - 0.5 * gained + np.log(factor[0]).sum() + np.log(np.diag(root[0])).sum()
+                     - 0.5 * prior.log_determinant())
+
+    return cost
+
+
+@compiled
+def _sum_squares(views, rows, landmarks, centers, bases):
+    """Return the sum of the weighted squares of all residuals, and the sum of their weights."""
+    squares, weights, box = 0.0, 0.0, np.empty(4)
+    for place in range(len(rows)):
+        row, landmark = rows[place], landmarks[place]
+        frame = views.frames[row]
+        if not project_box(views.rotations[frame], views.translations[frame], centers[landmark],
+                           bases[landmark], box):
+            continue
+        for edge in range(4):
+            if views.is_open[row, edge]:
+                continue
+            residual = edge_residual(views, row, edge, box)
+            weight = views.weights[frame] * robust_weight(residual)
+            squares += weight * residual * residual
+            weights += weight
+    return squares, weights
+
+
+def left_by_poses(views: Views, changes: NDArray[np.float64], shown: NDArray[np.int64],
+                  count: int) -> NDArray[np.float64]:
+    """Return by how much errors of the poses displace each landmark on each axis (count,) [m].
+
+    The part that a landmark's frames have in common stays: the mean of as many independent errors
+    as there are spans of time in which it was seen. Changes (F, 6) are the squares of the changes
+    by refinement; 0 where the poses were taken as they are.
+    """
+    squares = np.zeros(count)
+    for row, boxes in enumerate(group_boxes(shown, count)):
+        frames = np.unique(views.frames[boxes])
+        spans = len(np.unique(views.stamps_s[frames] // _POSE_ERROR_S))
+        if spans:
+            squares[row] = changes[frames, :3].mean() / spans
+    return np.sqrt(squares)
+
+
+def shared_by_neighbours(views: Views, shown: NDArray[np.int64], count: int, errors: PoseErrors
+                         ) -> NDArray[np.float64]:
+    """Return by how much each landmark's part of the map is off as a whole (count, 2) [m] [deg].
+
+    The part is the landmarks that some frame shows together with it, and the frames that saw any
+    of them. It is displaced on each axis, and turned about the cameras that saw it. The mean of
+    errors of a stationary process of deviation sigma that forgets itself as exp(-|t - s| / tau)
+    has, over n frames, the variance
+
+        sigma^2 / n_eff,   1 / n_eff = sum of exp(-|t_i - t_j| / tau) over i and j, over n^2.
+    """
+    rows = np.nonzero(shown >= 0)[0]
+    seen = csr_matrix((np.ones(len(rows), dtype=np.int32), (views.frames[rows], shown[rows])),
+                      shape=(len(views.rotations), count))
+    # frames (F, L) that saw a landmark which is seen together with each
+    near = (seen @ ((seen.T @ seen) > 0).astype(np.int32)).tocsc()
+    near.sort_indices()
+    shares = np.array([_share_left(
+        views.stamps_s[frames], views.weights[frames], errors.correlation_s)
+        for frames in np.split(near.indices, near.indptr[1:-1])])
+    return np.asarray(_BENDING * np.sqrt(shares)[:, None] * [errors.sigma_m, errors.sigma_deg])
+
+
+@compiled
+def _share_left(stamps_s, weights, correlation_s):
+    """Return the share of the variance that the weighted mean of some errors keeps.
+
+    Stamps ascend.
+    """
+    before, total, squares = 0.0, 0.0, 0.0
+    for place in range(len(stamps_s)):
+        if place > 0:
+            step = stamps_s[place] - stamps_s[place - 1]
+            kept = 1.0 if step <= INSTANT_S else 0.0
+            if correlation_s > 0.0:
+                kept = np.exp(-step / correlation_s)
+            before = kept * (before + weights[place - 1])
+        squares += weights[place] * (weights[place] + 2.0 * before)
+        total += weights[place]
+    return squares / (total * total) if total > 0.0 else 1.0

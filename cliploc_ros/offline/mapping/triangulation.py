@@ -1,0 +1,309 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Find landmarks among the boxes of one class: sequential RANSAC over pairs of boxes.
+
+A pair of boxes with enough parallax gives a hypothesis: a sphere where the rays of their centres
+meet, fitted to the eight edges. Its support are the frames with a box that it overlaps well. The
+hypothesis with the greatest support is fitted to that support and takes its boxes away; then the
+next. Every box is the seed of some hypotheses, so that rare objects get their share.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.mapping.fitting import LANDMARK_SIZE, descend, fit_ellipsoid
+from cliploc_ros.offline.mapping.landmarks import (
+    Landmarks,
+    box_iou,
+    group_boxes,
+    no_landmarks,
+    project_box,
+)
+from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.views import Views
+
+# How far the centre lies behind the surface, in radii that the box suggests, and the standard
+# deviation of this share. Guesses: 1 for a ball, 0 for a picture on a wall.
+_CENTER_SHARE, _CENTER_SIGMA = 0.6, 0.5
+# Error of the measured depth itself, as a share of it.
+_DEPTH_SIGMA = 0.05
+# Landmarks with this much parallax tell the scale of depth without it.
+_LEAST_BASELINE_DEG = 20.0
+_LEAST_LANDMARKS = 3
+# A scale this far from 1 is a wrong unit, not an error of calibration.
+_UNIT_FACTOR = 1.6
+# A smaller error of scale is below what this estimate can tell.
+_LEAST_CORRECTION = 0.02
+
+# With depth a landmark may deviate this much [m]: along the rays, which its boxes hardly show.
+# Chosen on the kitchen's frames, where .05 m leaves out a sixth of the explained boxes.
+_MAX_POSITION_SIGMA_M = 0.1
+# Angles between the rays of a pair: less leaves the depth open, more shows other sides.
+_PARALLAX_DEG = (5.0, 75.0)
+_GREATEST_COSINE, _LEAST_COSINE = (float(value) for value in np.cos(np.radians(_PARALLAX_DEG)))
+_MAX_GAP_S = 30.0
+# The rays of a pair pass each other within this share of the object's radius, and the radii that
+# both boxes suggest differ by at most this factor.
+_MAX_MISS = 0.6
+_MAX_RADIUS_RATIO = 1.6
+_MIN_DEPTH_M = 0.1
+_PAIR_STEPS = 6
+#: A frame supports a landmark that overlaps one of its boxes more than this.
+SUPPORT_IOU = 0.45
+
+
+def options_with_depth(options: MappingOptions) -> MappingOptions:
+    """Return options for boxes with depth: the deviation of a position replaces parallax."""
+    return replace(options, min_baseline_deg=0.0, max_position_sigma_m=max(
+        options.max_position_sigma_m, _MAX_POSITION_SIGMA_M))
+
+
+def add_depths(views: Views, detections: PosedDetections,
+               scales: NDArray[np.float64] | None = None) -> Views:
+    """Return views that know how deep the centre of each box's object lies.
+
+    The scales are true depth divided by measured depth, of each camera; None: all are 1.
+    """
+    assert detections.depths is not None
+    scale = 1.0 if scales is None else scales[views.cameras[views.frames]]
+    surfaces = scale * detections.depths.astype(np.float64)
+    spreads = (np.zeros_like(surfaces) if detections.depth_spreads is None
+               else scale * detections.depth_spreads)
+    radii = box_radii(views, np.arange(len(surfaces)))
+    # the half extent of a box at the centre's depth, which lies deeper by a share of it
+    centers = surfaces / np.maximum(0.2, 1.0 - _CENTER_SHARE * radii)
+    sigmas = np.sqrt(np.square(_DEPTH_SIGMA * centers) + np.square(spreads)
+                     + np.square(_CENTER_SIGMA * radii * centers))
+    known = np.isfinite(centers) & np.isfinite(sigmas)
+    return views._replace(depths=np.where(known, centers, 0.0), depth_stiffness=np.where(
+        known, 1.0 / np.where(known, sigmas, 1.0), 0.0))
+
+
+def box_radii(views: Views, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the half extents (m,) of boxes on the plane z = 1, geometric means of both."""
+    extents = views.edges[rows, 2:] - views.edges[rows, :2]
+    return np.asarray(0.5 * np.sqrt(np.prod(np.maximum(extents, 0.0), axis=1)))
+
+
+def depth_hypotheses(views: Views, rows: NDArray[np.int64]
+                     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return centres (h, 3) and bases (h, 3, 3) of spheres where depth says that objects are."""
+    rows = rows[views.depth_stiffness[rows] > 0.0]
+    edges, depths, frames = views.edges[rows], views.depths[rows], views.frames[rows]
+    points = np.concatenate([0.5 * (edges[:, :2] + edges[:, 2:]), np.ones((len(rows), 1))], axis=1)
+    in_camera = points * depths[:, None]
+    centers = np.einsum('fji,fj->fi', views.rotations[frames],
+                        in_camera - views.translations[frames])
+    radii = np.maximum(box_radii(views, rows), 1e-3) * depths
+    return centers, radii[:, None, None] * np.eye(3)
+
+
+def depth_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
+                baselines_deg: NDArray[np.float64]) -> float | None:
+    """Return true depth divided by measured depth; None where too few landmarks tell.
+
+    The landmarks are fitted to boxes only; those with enough parallax tell. The array shown (n,)
+    is -1 for boxes of other cameras.
+    """
+    ratios = []
+    for number, rows in enumerate(group_boxes(shown, len(landmarks.centers))):
+        rows = rows[views.depth_stiffness[rows] > 0.0]
+        if len(rows) == 0 or baselines_deg[number] < _LEAST_BASELINE_DEG:
+            continue
+        frames = views.frames[rows]
+        depths = (views.rotations[frames, 2] @ landmarks.centers[number]
+                  + views.translations[frames, 2])
+        ratios.append(float(np.median(depths / views.depths[rows])))
+    return float(np.median(ratios)) if len(ratios) >= _LEAST_LANDMARKS else None
+
+
+def correct_scale(views: Views, detections: PosedDetections, scales: Sequence[float | None]
+                  ) -> tuple[Views, list[str]]:
+    """Return the views with depth of the right scale, and notes; each camera has its own scale.
+
+    MappingError: a scale is so far off that depth must have another unit.
+    """
+    kept, notes = np.ones(len(scales)), list[str]()
+    for number, scale in enumerate(scales):
+        if scale is None or abs(scale - 1.0) < _LEAST_CORRECTION:
+            continue
+        name = f' of {detections.camera_names[number]}' if len(scales) > 1 else ''
+        if not 1.0 / _UNIT_FACTOR < scale < _UNIT_FACTOR:
+            raise MappingError(
+                f'measured depth{name} is {1.0 / scale:.3g} times what boxes and poses say: wrong '
+                f'unit? multiply --depth-unit by {scale:.3g}, check the poses are in metres, or '
+                'leave depth out')
+        kept[number] = scale
+        notes.append(f'measured depth{name} is {1.0 / scale:.3f} times what boxes and poses say; '
+                     'it is corrected by that')
+    return (add_depths(views, detections, kept) if notes else views), notes
+
+
+def triangulate(views: Views, rows: NDArray[np.int64], options: MappingOptions,
+                rng: np.random.Generator) -> Landmarks:
+    """Return landmarks that explain boxes of one class, given in the order of time.
+
+    Each is the hypothesis that covers the most free boxes; a box belongs to at most one.
+    """
+    if len(rows) < options.min_viewpoints:
+        return no_landmarks()
+    seeds = np.repeat(rows, options.pairs_per_box)
+    of_pairs = _pair_hypotheses(views, rows, seeds, rng.random(len(seeds)))
+    centers, bases = map(np.concatenate, zip(of_pairs, depth_hypotheses(views, rows),
+                                             strict=True))
+    frames, starts = np.unique(views.frames[rows], return_index=True)
+    starts = np.append(starts, len(rows))
+    supports = [_support(views, rows, frames, starts, center, basis)
+                for center, basis in zip(centers, bases, strict=True)]
+    boxes = np.concatenate([np.empty(0, dtype=np.int64), *supports])
+    of_boxes = np.repeat(np.arange(len(centers)), [len(support) for support in supports])
+    found: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+    is_free = np.zeros(len(views.frames), dtype=np.bool_)
+    is_free[rows] = True
+    viewpoints = views.viewpoints[views.frames]
+    discarded = np.zeros(len(centers), dtype=np.bool_)
+    while len(centers):
+        gains = np.bincount(of_boxes[is_free[boxes]], minlength=len(centers))
+        gains[discarded] = 0
+        best = int(np.argmax(gains))
+        if gains[best] < options.min_viewpoints:
+            break
+        discarded[best] = True
+        own = supports[best]
+        center, basis, support = _settle(views, rows[is_free[rows]], own[is_free[own]],
+                                         centers[best], bases[best])
+        if len(np.unique(viewpoints[support])) >= options.min_viewpoints:
+            found.append((center, basis))
+            is_free[support] = False
+    if not found:
+        return no_landmarks()
+    return Landmarks(np.array([center for center, _ in found]),
+                     np.array([basis for _, basis in found]),
+                     np.full(len(found), views.classes[rows[0]]))
+
+
+def _settle(views: Views, free_rows: NDArray[np.int64], support: NDArray[np.int64],
+            center: NDArray[np.float64], basis: NDArray[np.float64]
+            ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Fit a hypothesis to its support as long as that grows; return ellipsoid and support."""
+    frames, starts = np.unique(views.frames[free_rows], return_index=True)
+    starts = np.append(starts, len(free_rows))
+    for _ in range(5):
+        fit = fit_ellipsoid(views, support, center, basis)
+        wider = _support(views, free_rows, frames, starts, fit.center, fit.basis)
+        if len(wider) < len(support):
+            break
+        grows = len(wider) > len(support)
+        center, basis, support = fit.center, fit.basis, wider
+        if not grows:
+            break
+    return center, basis, support
+
+
+@compiled
+def _pair_hypotheses(views, rows, seeds, draws):
+    """Return centres (h, 3) and bases (h, 3, 3) of pairs: each seed with a random partner."""
+    centers, bases = np.empty((len(seeds), 3)), np.empty((len(seeds), 3, 3))
+    origins, rays, radii = _rays_of(views, rows)
+    stamps = views.stamps_s[views.frames[rows]]
+    places = np.searchsorted(rows, seeds)
+    partners = np.empty(len(rows), dtype=np.int64)
+    information = np.empty((LANDMARK_SIZE, LANDMARK_SIZE))
+    point = np.empty(3)
+    pair = np.empty(2, dtype=np.int64)
+    count, valid = 0, 0
+    for number in range(len(seeds)):
+        first = places[number]
+        if number == 0 or places[number - 1] != first:
+            low = np.searchsorted(stamps, stamps[first] - _MAX_GAP_S)
+            high = np.searchsorted(stamps, stamps[first] + _MAX_GAP_S)
+            valid = 0
+            for second in range(low, high):
+                if _meet(origins, rays, radii, first, second, point) > 0.0:
+                    partners[valid] = second
+                    valid += 1
+        if valid == 0:
+            continue
+        second = partners[min(valid - 1, int(draws[number] * valid))]
+        radius = _meet(origins, rays, radii, first, second, point)
+        centers[count] = point
+        bases[count] = radius * np.eye(3)
+        pair[0], pair[1] = rows[first], rows[second]
+        descend(views, pair, centers[count], bases[count], _PAIR_STEPS, information)
+        count += 1
+    return centers[:count].copy(), bases[:count].copy()
+
+
+@compiled
+def _rays_of(views, rows):
+    """Return origins (m, 3), unit rays (m, 3) in the map, and radii (m,) at distance 1."""
+    origins, rays = np.empty((len(rows), 3)), np.empty((len(rows), 3))
+    radii = np.empty(len(rows))
+    for place in range(len(rows)):
+        row = rows[place]
+        rotation = views.rotations[views.frames[row]]
+        box = views.edges[row]
+        ray = np.array([0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]), 1.0])
+        length = sqrt((ray * ray).sum())
+        origins[place] = -(rotation.T @ views.translations[views.frames[row]])
+        rays[place] = rotation.T @ (ray / length)
+        radii[place] = 0.5 * sqrt((box[2] - box[0]) * (box[3] - box[1])) / length
+    return origins, rays, radii
+
+
+@compiled
+def _meet(origins, rays, radii, first, second, point):
+    """Write the point where two rays meet; return the object's radius, 0 where they do not."""
+    cosine = (rays[first, 0] * rays[second, 0] + rays[first, 1] * rays[second, 1]
+              + rays[first, 2] * rays[second, 2])
+    if not _LEAST_COSINE <= cosine <= _GREATEST_COSINE:
+        return 0.0
+    along_first = along_second = 0.0
+    for i in range(3):
+        offset = origins[second, i] - origins[first, i]
+        along_first += offset * rays[first, i]
+        along_second += offset * rays[second, i]
+    scale = 1.0 / (1.0 - cosine * cosine)
+    depth_first = (along_first - cosine * along_second) * scale
+    depth_second = (cosine * along_first - along_second) * scale
+    if not (depth_first > _MIN_DEPTH_M and depth_second > _MIN_DEPTH_M):
+        return 0.0
+    radius_first, radius_second = radii[first] * depth_first, radii[second] * depth_second
+    if max(radius_first, radius_second) > _MAX_RADIUS_RATIO * min(radius_first, radius_second):
+        return 0.0
+    radius = 0.5 * (radius_first + radius_second)
+    miss = 0.0
+    for i in range(3):
+        one = origins[first, i] + depth_first * rays[first, i]
+        other = origins[second, i] + depth_second * rays[second, i]
+        miss += (one - other) ** 2
+        point[i] = 0.5 * (one + other)
+    return radius if miss < (_MAX_MISS * radius) ** 2 else 0.0
+
+
+@compiled
+def _support(views, rows, frames, starts, center, basis):
+    """Return the best box (s,) of each frame that overlaps an ellipsoid well."""
+    found = np.empty(len(frames), dtype=np.int64)
+    count = 0
+    box = np.empty(4)
+    for place in range(len(frames)):
+        frame = frames[place]
+        if not project_box(views.rotations[frame], views.translations[frame], center, basis, box):
+            continue
+        best = SUPPORT_IOU
+        for row in rows[starts[place]:starts[place + 1]]:
+            iou = box_iou(box, views.edges[row], views.bounds[frame])
+            if iou > best:
+                best = iou
+                found[count] = row
+        if best > SUPPORT_IOU:
+            count += 1
+    return found[:count].copy()

@@ -1,0 +1,233 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Bring the recording's poses into the coordinate frame of the old map.
+
+The recording may have a coordinate frame of its own, a little off, and its poses may have errors:
+they may come from the relocalizer. The landmarks that are still in their places tell both.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.geometry.ellipsoid import normalized_lengths
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.offline.mapping.association import associate
+from cliploc_ros.offline.mapping.fitting import fit_ellipsoid
+from cliploc_ros.offline.mapping.joint import Anchors, pose_changes, pose_errors, refine_jointly
+from cliploc_ros.offline.mapping.landmarks import (
+    Landmarks,
+    group_boxes,
+    join_landmarks,
+    landmarks_of_map,
+    no_landmarks,
+)
+from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.offline.mapping.pose_noise import significant_pose_errors
+from cliploc_ros.offline.mapping.views import Views, camera_from_map, map_from_cameras
+
+# A position is known no better than this [m]: objects are no ellipsoids. A guess.
+_LEAST_SIGMA_M = 0.01
+# Deviation of a centre where the map does not say it [m]. A guess.
+_UNKNOWN_SIGMA_M = 0.05
+# An object has moved if it is farther away than all three: [m], in units of its old and new shape
+# (1: they touch), and in standard deviations of both positions. A smaller change is a better fit.
+# Guesses.
+_LEAST_MOVE_M, LEAST_MOVE_SHAPES, LEAST_MOVE_SIGMAS = 0.1, 0.6, 4.0
+#: A recording that confirms fewer landmarks does not belong to the map.
+MIN_CONFIRMED = 3
+_ROUNDS = 4
+# The first association tolerates an offset.
+_LOOSE_IOU = 0.1
+# How large an offset may be: the deviations of a weak prior. Guesses.
+_OFFSET_SIGMA_M, _OFFSET_SIGMA_DEG = 0.5, 5.0
+# Objects that were nudged by this much do not disturb it [m]. A guess.
+_NUDGE_M = 0.02
+_SETTLED_M = 1e-3
+_LOSS_SCALE = 2.0
+# The median length of a normal vector of three numbers, and the square that one of six exceeds
+# once in a thousand times: a smaller offset is none.
+_MEDIAN_LENGTH, _SIGNIFICANT = 1.54, 22.5
+
+
+class OldMap(NamedTuple):
+    """L landmarks of the old map as the recording's classes name them."""
+
+    landmarks: Landmarks  #: Class -1: no box of the recording has a class of this landmark
+    sigmas: NDArray[np.float64]  #: (L,): deviations of the centres [m]
+    details: tuple[LandmarkDetails, ...]
+    landmark_ids: tuple[str, ...]
+    class_ids: tuple[str, ...]
+
+    @property
+    def names(self) -> set[tuple[int, int]]:
+        """Return all pairs of a landmark and one of its classes."""
+        return {(row, name) for row, name in self.landmarks.names.tolist()}
+
+    def shown(self, views: Views, min_iou: float, is_gone: NDArray[np.bool_] | None = None,
+              others: Landmarks | None = None) -> NDArray[np.int64]:
+        """Return the old landmark (n,) that each box shows, or L + the other one; -1 for none.
+
+        Those that are gone (L,) have none.
+        """
+        kept = np.ones(len(self.sigmas), dtype=np.bool_) if is_gone is None else ~is_gone
+        others = others or no_landmarks()
+        rows = np.concatenate([np.nonzero(kept)[0],
+                               len(kept) + np.arange(len(others.centers)), [-1]])
+        return rows[associate(views, join_landmarks(self.landmarks.select(kept), others), min_iou)]
+
+
+def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...]) -> OldMap:
+    """Return the landmarks of a map for a recording with some classes."""
+    details = old.details or (LandmarkDetails(),) * len(old)
+    sigmas = np.array([_UNKNOWN_SIGMA_M if one.position_sigma is None
+                       else one.position_sigma for one in details])
+    return OldMap(landmarks_of_map(old, class_names), np.maximum(sigmas, _LEAST_SIGMA_M), details,
+                  old.landmark_ids, old.class_ids)
+
+
+class Refits(NamedTuple):
+    """L landmarks where the recording puts them; unchanged where it does not tell."""
+
+    landmarks: Landmarks
+    #: (L, 3, 3): of the centres [m^2]; infinite where the recording does not tell
+    covariances: NDArray[np.float64]
+
+    def select(self, rows: NDArray[np.int64]) -> 'Refits':
+        """Return some of the landmarks."""
+        return Refits(self.landmarks.select(rows), self.covariances[rows])
+
+    @property
+    def is_known(self) -> NDArray[np.bool_]:
+        """Return which landmarks (L,) the recording places."""
+        return np.isfinite(self.covariances[:, 0, 0])
+
+    @property
+    def sigmas(self) -> NDArray[np.float64]:
+        """Return the deviations (L,) of the centres on the worst axis [m]."""
+        sigmas = np.full(len(self.covariances), np.inf)
+        own = self.covariances[self.is_known]
+        sigmas[self.is_known] = np.sqrt(np.linalg.eigvalsh(own)[:, -1])
+        return sigmas
+
+
+def refit(views: Views, landmarks: Landmarks, shown: NDArray[np.int64], min_viewpoints: int
+          ) -> Refits:
+    """Fit landmarks to the boxes that show them from enough viewpoints."""
+    centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
+    covariances = np.full((len(centers), 3, 3), np.inf)
+    for number, rows in enumerate(group_boxes(shown, len(centers))):
+        if len(np.unique(views.viewpoints[views.frames[rows]])) >= min_viewpoints:
+            fit = fit_ellipsoid(views, rows, centers[number], bases[number])
+            centers[number], bases[number] = fit.center, fit.basis
+            covariances[number] = (np.linalg.inv(fit.information)[:3, :3]
+                                   + _LEAST_SIGMA_M ** 2 * np.eye(3))
+    return Refits(landmarks._replace(centers=centers, bases=bases), covariances)
+
+
+class Aligned(NamedTuple):
+    """The recording in the coordinate frame of the map."""
+
+    views: Views
+    #: How far the recording's coordinate frame was off, in the middle of the landmarks
+    offset_m: float
+    offset_deg: float
+    #: Root mean square by which the poses were refined after that
+    change_m: float
+    change_deg: float
+    changes: NDArray[np.float64]  #: (F, 6): by how much each pose was refined [m] [rad]
+    estimated: PoseErrors | None  #: The errors of the poses, where they were estimated
+
+
+def align(given: Views, known: OldMap, options: MappingOptions) -> Aligned:
+    """Return the views with poses in the coordinate frame of the old map."""
+    views, total = given, np.eye(4)
+    for number in range(_ROUNDS):
+        min_iou = options.association_iou if number else _LOOSE_IOU
+        found = refit(views, known.landmarks, known.shown(views, min_iou),
+                      options.min_viewpoints)
+        if np.count_nonzero(found.is_known) < MIN_CONFIRMED:
+            break
+        step = _offset(known, found)
+        rotations, translations = camera_from_map(step @ map_from_cameras(views))
+        views = views._replace(rotations=rotations, translations=translations)
+        total = step @ total
+        middle = known.landmarks.centers[found.is_known].mean(axis=0)
+        if np.linalg.norm(step[:3, :3] @ middle + step[:3, 3] - middle) < _SETTLED_M:
+            break
+    middle = known.landmarks.centers.mean(axis=0)
+    offset_m = float(np.linalg.norm(total[:3, :3].T @ (middle - total[:3, 3]) - middle))
+    offset_deg = float(np.degrees(Rotation.from_matrix(total[:3, :3]).magnitude()))
+    errors, estimated = options.pose_errors, None
+    if errors is None and options.estimate_pose_errors:
+        shown = known.shown(views, options.association_iou)
+        found = refit(views, known.landmarks, shown, options.min_viewpoints)
+        errors = estimated = significant_pose_errors(views, found.landmarks, shown)
+    refined = views if errors is None else _refine(views, known, errors, options)
+    return Aligned(refined, offset_m, offset_deg, *pose_changes(views, refined),
+                   pose_errors(views, refined), estimated)
+
+
+def _offset(known: OldMap, refits: Refits) -> NDArray[np.float64]:
+    """Return map_from_recording (4, 4): the rigid motion of fitted landmarks onto old ones."""
+    rows = refits.is_known
+    fitted, old = refits.landmarks.centers[rows], known.landmarks.centers[rows]
+    middle = fitted.mean(axis=0)
+    own = np.square(known.sigmas[rows]) + _NUDGE_M ** 2
+    whiten = np.linalg.inv(np.linalg.cholesky(
+        refits.covariances[rows] + own[:, None, None] * np.eye(3)))
+    scales = np.repeat([_OFFSET_SIGMA_M, np.radians(_OFFSET_SIGMA_DEG)], 3)
+
+    def residuals(motion: NDArray[np.float64]) -> NDArray[np.float64]:
+        turned = Rotation.from_rotvec(motion[3:]).apply(fitted - middle) + middle + motion[:3]
+        # the loss sees one number for each landmark, so that it leaves out those that moved
+        lengths = np.linalg.norm(np.einsum('lij,lj->li', whiten, turned - old), axis=1)
+        return np.concatenate([lengths, motion / scales])
+
+    found = least_squares(residuals, np.zeros(6), loss='cauchy', f_scale=_LOSS_SCALE)
+    lengths, step = found.fun[:-6], np.eye(4)
+    # positions err more than their deviations say: objects are no ellipsoids
+    inflation = max(1.0, float(np.median(lengths)) / _MEDIAN_LENGTH)
+    if float(found.x @ (found.jac.T @ found.jac) @ found.x) >= _SIGNIFICANT * inflation ** 2:
+        step[:3, :3] = Rotation.from_rotvec(found.x[3:]).as_matrix()
+        step[:3, 3] = middle + found.x[:3] - step[:3, :3] @ middle
+    return step
+
+
+def _refine(aligned: Views, known: OldMap, errors: PoseErrors, options: MappingOptions) -> Views:
+    """Return the views with poses refined against the old landmarks that are in their place."""
+    views = aligned
+    anchors = Anchors(known.landmarks.centers, known.sigmas)
+    for _ in range(options.refinements):
+        shown = known.shown(views, options.association_iou)
+        found = refit(views, known.landmarks, shown, options.min_viewpoints)
+        away = has_moved(known.landmarks, known.sigmas, found)
+        shown[np.isin(shown, np.nonzero(away)[0])] = -1
+        if not (shown >= 0).any():
+            return views
+        views, _ = refine_jointly(aligned, views, known.landmarks, shown, errors, anchors=anchors)
+    return views
+
+
+def has_moved(old: Landmarks, sigmas: NDArray[np.float64], found: Refits) -> NDArray[np.bool_]:
+    """Tell which landmarks (L,) the recording puts so far away that they must have moved."""
+    offsets = found.landmarks.centers - old.centers
+    far = found.is_known & (np.linalg.norm(offsets, axis=1) > _LEAST_MOVE_M)
+    rows = np.nonzero(far)[0]
+    bases, others = old.bases[rows], found.landmarks.bases[rows]
+    shapes = bases @ bases.transpose(0, 2, 1) + others @ others.transpose(0, 2, 1)
+    far[rows] = ((normalized_lengths(offsets[rows], shapes) > LEAST_MOVE_SHAPES)
+                 & (deviations(old.select(rows), sigmas[rows], found.select(rows))
+                    > LEAST_MOVE_SIGMAS))
+    return far
+
+
+def deviations(old: Landmarks, sigmas: NDArray[np.float64], found: Refits
+               ) -> NDArray[np.float64]:
+    """Return by how many standard deviations (L,) old and new positions of landmarks differ."""
+    covariances = found.covariances + np.square(sigmas)[:, None, None] * np.eye(3)
+    return normalized_lengths(found.landmarks.centers - old.centers, covariances)

@@ -1,0 +1,339 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Judge each place of a map by a recording: its object is there, it is gone, or neither.
+
+Boxes that no old landmark explains show new objects, which hide old places in turn.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import betaln, expit
+
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.offline.mapping.association import find_overlaps
+from cliploc_ros.offline.mapping.building import LeftOut, NothingFoundError, build_map, rounded
+from cliploc_ros.offline.mapping.doubles import Relation, close_pairs, relation
+from cliploc_ros.offline.mapping.evidence import gather_evidence
+from cliploc_ros.offline.mapping.landmarks import (
+    Landmarks,
+    group_boxes,
+    join_landmarks,
+    landmarks_of_map,
+    no_landmarks,
+)
+from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.pose_noise import left_by_poses
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.update.alignment import (
+    LEAST_MOVE_SHAPES,
+    Aligned,
+    OldMap,
+    Refits,
+    has_moved,
+    refit,
+)
+from cliploc_ros.offline.mapping.update.sight import Sight, look_for
+from cliploc_ros.offline.mapping.views import Views, map_from_cameras
+
+# A recording in which objects are seen less or more often than before changes all ratios.
+_FACTOR_RANGE = (0.3, 2.0)
+_RATIO_RANGE = (0.02, 0.95)
+# Landmarks and viewpoints of each from which the scatter of the ratio is learned, and the least
+# that a usual ratio is worth [views]. Guesses.
+_MEDIAN_SQUARE = 0.455  # of a standard normal variable
+_FEW_LANDMARKS, _FEW_VIEWS, _LEAST_WORTH = 5, 3, 0.5
+# Share of the objects that are usually still in their place; of the views in which an object is
+# detected, where neither map nor recording tell; and of those in which a wrong box appears in an
+# empty place. Guesses, as all below.
+_STAYS, _SEEN_RATIO, _CHANCE_RATIO = 0.9, 0.9, 0.03
+# The seen ratio is worth this number of views at most: an object may be hard to see from one side.
+_PRIOR_VIEWS = 4.0
+# An object is gone, or there, below and above these probabilities of being there; the second one
+# where another object was found in its place.
+_GONE_BELOW, _GONE_BELOW_IF_TAKEN, _THERE_ABOVE = 0.05, 0.5, 0.95
+#: Its place must be in view from this number of viewpoints before an object can be missing.
+LEAST_VIEWS = 5
+# A new landmark must be detected this often, and one in its place, in units of how often the old
+# ones are. The second one was chosen on blocks of TUM fr3, between landmarks that were displaced
+# in the map (at most 0.17) and those that were not (at least 0.2, but for 3 of 47).
+_MIN_NEW_SHARE, _MIN_SHARE_IN_PLACE = 0.4, 0.15
+
+
+class Finds(NamedTuple):
+    """New landmarks: m of them."""
+
+    landmarks: Landmarks
+    class_ids: tuple[str, ...]
+    details: tuple[LandmarkDetails, ...]
+    left_out: tuple[LeftOut, ...]  #: Objects that are not good enough for a map, or are old ones
+
+    def without(self, reasons: Sequence[str | None], sight: Sight) -> 'Finds':
+        """Return the finds without those that have a reason (m,), which are left out.
+
+        The last ones in sight are the finds.
+        """
+        kept = [row for row, reason in enumerate(reasons) if reason is None]
+        own = sight.select(slice(len(sight.seen) - len(reasons), None))
+        return Finds(
+            self.landmarks.select(np.array(kept, dtype=np.int64)),
+            tuple(self.class_ids[row] for row in kept), tuple(self.details[row] for row in kept),
+            self.left_out + tuple(
+                LeftOut(self.class_ids[row], rounded(self.landmarks.centers[row]),
+                        int(own.seen_frames[row]), int(own.seen[row]), reason)
+                for row, reason in enumerate(reasons) if reason is not None))
+
+
+class Judgement(NamedTuple):
+    """What the recording says: L old landmarks, m finds, n boxes."""
+
+    #: (n,): the old landmark that each box shows in its place, L + the find, or -1 for none
+    shown: NDArray[np.int64]
+    finds: Finds
+    sight: Sight  #: Of the old places, then of the finds
+    is_gone: NDArray[np.bool_]  #: (L,)
+    is_there: NDArray[np.bool_]  #: (L,): Neither: the recording does not tell
+    #: (L,): not proven to be gone, although boxes put it elsewhere, or hardly any shows it
+    is_doubtful: NDArray[np.bool_]
+
+
+def judge(detections: PosedDetections, views: Views, known: OldMap, options: MappingOptions
+          ) -> Judgement:
+    """Return what the recording says of each place of the map, and what else it shows.
+
+    The views have poses in the coordinate frame of the map.
+    """
+    count = len(known.landmarks.centers)
+    finds = _find_new(detections, views, _free(views, known, options), options)
+    # old landmarks and finds compete for the boxes: an old one may have those of a neighbour
+    shown, _ = _look(views, known, finds, np.zeros(count, dtype=np.bool_), options)
+    refits = refit(views, known.landmarks, np.where(shown < count, shown, -1),
+                   options.min_viewpoints)
+    displaced = has_moved(known.landmarks, known.sigmas, refits)
+    finds = _with_displaced(finds, refits, displaced, known.class_ids)
+    shown, sight = _look(views, known, finds, displaced, options)
+    is_gone = displaced | _is_absent(known, sight.select(slice(count)), _GONE_BELOW)
+    # a new object may be in the place of an old one of which a wrong box remains
+    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 1.0)
+    _, sight = _look(views, known, finds, is_gone, options)
+    # finds are seen about as often as the old landmarks, which come first
+    ratios = sight.seen_ratio[:count][sight.seen[:count] > 0]
+    usual = float(np.median(ratios)) if len(ratios) else 1.0
+    least = _MIN_NEW_SHARE * usual
+    finds = finds.without([
+        None if ratio >= least else f'seen in {100 * ratio:.1f} % of the frames that show its '
+        f'place, not {100 * least:.1f} %, {_MIN_NEW_SHARE:g} of what is usual'
+        for ratio in sight.seen_ratio[count:]], sight)
+    # new objects hide old places
+    shown, sight = _look(views, known, finds, is_gone, options)
+    # an old landmark is hardly there if a find with more boxes is in its place
+    of_old, of_new = _boxes(shown, count, finds)
+    limits = np.full(count, _GONE_BELOW)
+    for new, row, _ in _pairs_between(finds.landmarks, known.landmarks):
+        if len(of_new[new]) > len(of_old[row]):
+            limits[row] = _GONE_BELOW_IF_TAKEN
+    is_gone = displaced | _is_absent(known, sight.select(slice(count)), limits)
+    shown, sight = _look(views, known, finds, is_gone, options)
+    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 0.0)
+    # objects that are gone hide nothing
+    shown, sight = _look(views, known, finds, is_gone, options)
+    own = sight.select(slice(count))
+    is_gone |= _is_absent(known, own, limits)
+    shown[np.isin(shown, np.nonzero(is_gone)[0])] = -1
+    of_landmarks = np.where(shown < count, shown, -1)
+    refits = refit(views, known.landmarks, of_landmarks, options.min_viewpoints)
+    fits = gather_evidence(views, refits.landmarks, of_landmarks).median_iou
+    is_rare = ((own.seen_ratio < _MIN_SHARE_IN_PLACE * usual)
+               & (own.expected >= LEAST_VIEWS))
+    is_there = (~is_gone & ~is_rare & (fits >= options.min_median_iou)
+                & (refits.is_known | (_probability_there(known, own) > _THERE_ABOVE)))
+    # boxes put it elsewhere, but may not make a landmark there: then nothing says that it is gone
+    is_doubtful = (is_gone & ~_is_absent(known, own, limits)) | (
+        ~is_there & ~is_gone & (is_rare | _is_absent(known, own, _STAYS))
+        & (known.landmarks.classes >= 0))
+    return Judgement(shown, finds, sight, is_gone, is_there, is_doubtful)
+
+
+def _is_absent(known: OldMap, sight: Sight, limits: NDArray[np.float64] | float
+               ) -> NDArray[np.bool_]:
+    """Tell which objects (L,) are in their place with less than some probabilities.
+
+    A detector that never found a class in this recording may not know it, or not at these sizes.
+    """
+    is_told = (known.landmarks.classes >= 0) & (sight.expected >= LEAST_VIEWS)
+    return np.asarray(is_told & (_probability_there(known, sight) < limits))
+
+
+def _probability_there(known: OldMap, sight: Sight) -> NDArray[np.float64]:
+    """Return for each place (L,) the probability that its object is there.
+
+    The recording should show an object in a usual share of the views: that of the old recording,
+    times how much more often the new one shows all objects; without an old one, the share of the
+    landmarks seen in this recording.
+    """
+    seen = sight.seen > 0
+    share = float(sight.seen[seen].sum()) / max(1.0, float(sight.expected[seen].sum()))
+    given = np.array([np.nan if one.seen_ratio is None else one.seen_ratio
+                      for one in known.details])
+    ratios = np.where(np.isnan(given), min(_SEEN_RATIO, share), given)
+    told = seen & ~np.isnan(given)
+    if told.any():
+        expected = float((given[told] * sight.expected[told]).sum())
+        factor = np.clip(sight.seen[told].sum() / max(expected, 1e-9), *_FACTOR_RANGE)
+        ratios = np.where(np.isnan(given), ratios, factor * ratios)
+    ratios = np.clip(ratios, *_RATIO_RANGE)
+    # the usual ratios are worth few views if this recording scatters about them: a beta variable
+    # of mean r and n views has the variance r (1 - r) / (n + 1)
+    certainty, rows = _PRIOR_VIEWS, seen & (sight.expected >= _FEW_VIEWS)
+    if np.count_nonzero(rows) >= _FEW_LANDMARKS:
+        shares, usual = sight.seen[rows] / sight.expected[rows], ratios[rows]
+        # the median, since objects that are gone are no scatter
+        scatter = np.median(np.square(shares - usual) / (usual * (1.0 - usual))) / _MEDIAN_SQUARE
+        certainty = float(np.clip(1.0 / max(float(scatter), 1e-3) - 1.0, _LEAST_WORTH,
+                                  _PRIOR_VIEWS))
+    there = _log_evidence(sight, ratios, certainty)
+    away = _log_evidence(sight, np.full(len(ratios), _CHANCE_RATIO), _PRIOR_VIEWS)
+    return np.asarray(expit(np.log(_STAYS / (1.0 - _STAYS)) + there - away))
+
+
+def _log_evidence(sight: Sight, ratios: NDArray[np.float64], views: float) -> NDArray[np.float64]:
+    """Return the logarithm of the beta-binomial probability, without the binomial coefficient."""
+    a, b = views * ratios, views * (1.0 - ratios)
+    return np.asarray(betaln(a + sight.seen, b + sight.expected - sight.seen) - betaln(a, b))
+
+
+def _look(views: Views, known: OldMap, finds: Finds, is_gone: NDArray[np.bool_],
+          options: MappingOptions) -> tuple[NDArray[np.int64], Sight]:
+    """Return the landmark or find that each box shows, and the sight of all their places."""
+    shown = known.shown(views, options.association_iou, is_gone, finds.landmarks)
+    is_solid = np.concatenate([~is_gone, np.ones(len(finds.details), dtype=np.bool_)])
+    return shown, look_for(views, join_landmarks(known.landmarks, finds.landmarks), shown,
+                           is_solid)
+
+
+def _boxes(shown: NDArray[np.int64], count: int, finds: Finds
+           ) -> tuple[list[NDArray[np.int64]], list[NDArray[np.int64]]]:
+    """Return the boxes of each of the old landmarks, and of each of the finds."""
+    boxes = group_boxes(shown, count + len(finds.details))
+    return boxes[:count], boxes[count:]
+
+
+def _free(views: Views, known: OldMap, options: MappingOptions) -> NDArray[np.bool_]:
+    """Tell which boxes (n,) may show new objects: those that no old landmark fits well.
+
+    Nor is a box free on a landmark that has at least as many of its own: it may be another name
+    for it.
+    """
+    own = known.shown(views, options.min_median_iou)
+    nameless = find_overlaps(
+        views._replace(classes=np.zeros_like(views.classes)),
+        Landmarks(known.landmarks.centers, known.landmarks.bases,
+                  np.zeros_like(known.landmarks.classes)), options.min_median_iou)
+    others = own[nameless.boxes] < 0
+    on, count = nameless.landmarks[others], len(known.sigmas)
+    is_named = np.bincount(own[own >= 0], minlength=count) >= np.bincount(on, minlength=count)
+    free = own < 0
+    free[nameless.boxes[others][is_named[on]]] = False
+    return free
+
+
+def _find_new(detections: PosedDetections, views: Views, is_free: NDArray[np.bool_],
+              options: MappingOptions) -> Finds:
+    """Return the landmarks that the free boxes show, for the poses of the views."""
+    nothing = Finds(no_landmarks(), (), (), ())
+    if not is_free.any():
+        return nothing
+    posed = detections.with_poses(map_from_cameras(views)).select_boxes(is_free)
+    try:
+        built = build_map(posed, replace(options, pose_errors=None, estimate_pose_errors=False,
+                                         refine_mount=False))
+    except NothingFoundError as error:
+        return nothing._replace(left_out=error.left_out)
+    return Finds(landmarks_of_map(built.landmark_map, detections.class_names),
+                 built.landmark_map.class_ids, built.landmark_map.details, built.report.left_out)
+
+
+def _with_displaced(finds: Finds, refits: Refits, displaced: NDArray[np.bool_],
+                    class_ids: Sequence[str]) -> Finds:
+    """Return the finds with the landmarks that stand a little off their place, if not found."""
+    rows = np.nonzero(displaced)[0]
+    again = {moved for moved, _, _ in _pairs_between(refits.landmarks.select(rows),
+                                                     finds.landmarks)}
+    rows = rows[[moved not in again for moved in range(len(rows))]]
+    return finds._replace(
+        landmarks=join_landmarks(finds.landmarks, refits.landmarks.select(rows)),
+        class_ids=finds.class_ids + tuple(class_ids[row] for row in rows.tolist()),
+        details=finds.details + (LandmarkDetails(),) * len(rows))
+
+
+def _without_copies(views: Views, finds: Finds, old: Landmarks, known: OldMap,
+                    shown: NDArray[np.int64], sight: Sight, majority: float) -> Finds:
+    """Return the new landmarks without those that are an old one in its place.
+
+    An old landmark is in its place if it has a box, and a majority for each of the new one's. Of
+    two landmarks that lie in one another, the boxes are those of one object: parts of it, or
+    another name for it. If they only touch, frames that show both tell them apart.
+    """
+    of_old, of_new = _boxes(shown, len(old.centers), finds)
+    reasons: list[str | None] = [None] * len(of_new)
+    every = join_landmarks(old, finds.landmarks)
+    for new, row, distance in _pairs_between(finds.landmarks, old):
+        is_one_class = old.classes[row] == finds.landmarks.classes[new]
+        if len(of_old[row]) >= max(1.0, majority * len(of_new[new])) and (
+                (is_one_class and distance < LEAST_MOVE_SHAPES)
+                or relation(views, every, of_old + of_new, (row, len(of_old) + new))
+                is not Relation.TWO):
+            reasons[new] = f'it is {known.landmark_ids[row]} in its place'
+    return finds.without(reasons, sight)
+
+
+def _pairs_between(new: Landmarks, old: Landmarks) -> list[tuple[int, int, float]]:
+    """Return pairs of a new and an old landmark that stand in one another, see close_pairs."""
+    count = len(new.centers)
+    return [(first, second - count, distance) for first, second, distance
+            in close_pairs(join_landmarks(new, old)) if first < count <= second]
+
+
+class Shown(NamedTuple):
+    """The objects that the recording shows: m, old landmarks in their places and finds."""
+
+    refits: Refits  #: Where they are
+    owners: NDArray[np.int64]  #: (m,): the old landmark in whose place it was seen, -1 for none
+    #: For each, the old landmarks that it may be although it is a little off their place
+    near: tuple[frozenset[int], ...]
+    shown: NDArray[np.int64]  #: (n,): the object that each box shows, -1 for none
+    sight: Sight
+    given: tuple[LandmarkDetails, ...]  #: Classes and source of the finds
+
+    @property
+    def landmarks(self) -> Landmarks:
+        """Return the objects as landmarks."""
+        return self.refits.landmarks
+
+
+def gather_objects(aligned: Aligned, known: OldMap, judged: Judgement, options: MappingOptions
+                   ) -> Shown:
+    """Return the objects that the recording shows."""
+    views, count, finds = aligned.views, len(known.sigmas), judged.finds
+    in_place = np.nonzero(judged.is_there)[0]
+    places = np.concatenate([in_place, count + np.arange(len(finds.details))])
+    numbers = np.full(count + len(finds.details) + 1, -1, dtype=np.int64)
+    numbers[places] = np.arange(len(places))
+    shown = numbers[judged.shown]
+    refits = refit(views, join_landmarks(known.landmarks.select(in_place), finds.landmarks), shown,
+                   options.min_viewpoints)
+    left_m = left_by_poses(views, np.square(aligned.changes), shown, len(places))
+    refits = refits._replace(
+        covariances=refits.covariances + np.square(left_m)[:, None, None] * np.eye(3))
+    near: list[set[int]] = [set() for _ in places]
+    names = known.names
+    for new, row, _ in _pairs_between(finds.landmarks, known.landmarks):
+        if not judged.is_there[row] and (row, int(finds.landmarks.classes[new])) in names:
+            near[len(in_place) + new].add(row)
+    return Shown(
+        refits, np.concatenate([in_place, np.full(len(finds.details), -1, dtype=np.int64)]),
+        tuple(map(frozenset, near)), shown, judged.sight.select(places),
+        (LandmarkDetails(),) * len(in_place) + finds.details)

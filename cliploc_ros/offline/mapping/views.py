@@ -1,0 +1,226 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Posed detections as the kernels of mapping read them: boxes and poses on the plane z = 1."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+
+# Two frames less than this apart in both show a landmark from one viewpoint.
+_VIEWPOINT_DISTANCE_M = 0.1
+_VIEWPOINT_ANGLE_DEG = 5.0
+# No robot or person with a camera is faster.
+_MAX_SPEED_M_PER_S = 10.0
+_MAX_TURN_DEG_PER_S = 720.0
+_LEAST_JUMP_M, _LEAST_JUMP_DEG = 0.5, 30.0
+_MAX_EMPTY_SHARE = 0.5
+# A camera that moves by more than this, seen from the first one, is on no rig with it.
+_MOST_PLAY_M = 0.5
+
+
+class Views(NamedTuple):
+    """F frames with n boxes. Everything in the image is on the plane z = 1."""
+
+    #: (F, 3, 3), (F, 3): of camera_from_map
+    rotations: NDArray[np.float64]
+    translations: NDArray[np.float64]
+    stamps_s: NDArray[np.float64]  #: (F,): [s]
+    cameras: NDArray[np.int64]  #: (F,): number of the camera of each frame
+    #: (F, 3): where each camera is in the map's axes, seen from the first camera at that time [m]:
+    #: a rigid rig errs as a whole, so that a turn of it moves this camera, too
+    levers: NDArray[np.float64]
+    #: (F,): number of the viewpoint of each frame, ascending for each camera: frames that a camera
+    #: took without moving share one
+    viewpoints: NDArray[np.int64]
+    #: (F,): one over the number of frames of the same viewpoint: their boxes err alike
+    weights: NDArray[np.float64]
+    offsets: NDArray[np.int64]  #: (F + 1,): first box of each frame
+    #: (n,): of each box
+    frames: NDArray[np.int64]
+    classes: NDArray[np.int64]
+    edges: NDArray[np.float64]  #: (n, 4): Left, top, right, bottom, clipped to the image
+    stiffness: NDArray[np.float64]  #: (n, 4): inverse standard deviation of each edge
+    #: (n, 4): the edge lies at the image border: the object may extend beyond it
+    is_open: NDArray[np.bool_]
+    bounds: NDArray[np.float64]  #: (F, 4): Left, top, right, bottom of the image
+    #: (n,): measured depth of the object's centre [m], and its inverse standard deviation; 0 where
+    #: unknown
+    depths: NDArray[np.float64]
+    depth_stiffness: NDArray[np.float64]
+
+    def between(self, first: int, last: int) -> 'Views':
+        """Return the frames from first up to last, last excluded; nothing is copied."""
+        frames = slice(first, last)
+        boxes = slice(int(self.offsets[first]), int(self.offsets[last]))
+        return Views(
+            self.rotations[frames], self.translations[frames], self.stamps_s[frames],
+            self.cameras[frames], self.levers[frames], self.viewpoints[frames],
+            self.weights[frames],
+            self.offsets[first:last + 1] - boxes.start, self.frames[boxes] - first,
+            self.classes[boxes], self.edges[boxes], self.stiffness[boxes], self.is_open[boxes],
+            self.bounds[frames], self.depths[boxes], self.depth_stiffness[boxes])
+
+
+def make_views(detections: PosedDetections, options: MappingOptions) -> Views:
+    """Return what the kernels read of posed detections."""
+    boxes_px, is_open = detections.bboxes_xyxy, detections.open_edges
+    of_boxes = detections.frame_cameras[detections.frames]
+    sizes = np.array([[one.width, one.height] * 2 for one in detections.cameras], dtype=np.float64)
+    focals = np.array([[one.fx, one.fy] * 2 for one in detections.cameras])
+    principals = np.array([[one.cx, one.cy] * 2 for one in detections.cameras])
+    bounds_px = np.concatenate([0.0 * sizes[:, :2], sizes[:, 2:]], axis=1)
+    if is_open is None:
+        boxes_px = np.clip(boxes_px, 0.0, sizes[of_boxes])
+        is_open = at_border(boxes_px, sizes[of_boxes], options.border_px)
+    else:
+        for number, bounds in enumerate(bounds_px):
+            own, own_open = boxes_px[of_boxes == number], is_open[of_boxes == number]
+            reach = np.concatenate([own[:, :2].min(axis=0, initial=np.inf),
+                                    own[:, 2:].max(axis=0, initial=-np.inf)])
+            bounds_px[number] = np.where(own_open.any(axis=0), reach, bounds)
+    extents_px = np.tile(boxes_px[:, 2:] - boxes_px[:, :2], 2)
+    deviations_px = np.hypot(options.edge_sigma_px, options.edge_sigma_share * extents_px)
+    viewpoints = number_viewpoints(detections)
+    return Views(
+        *camera_from_map(detections.map_from_camera),
+        np.ascontiguousarray(detections.stamps_s, dtype=np.float64), detections.frame_cameras,
+        _levers(detections), viewpoints, 1.0 / np.bincount(viewpoints)[viewpoints],
+        detections.frame_offsets, detections.frames, detections.classes,
+        (boxes_px - principals[of_boxes]) / focals[of_boxes], focals[of_boxes] / deviations_px,
+        is_open, ((bounds_px - principals) / focals)[detections.frame_cameras],
+        np.zeros(len(boxes_px)), np.zeros(len(boxes_px)))
+
+
+def at_border(boxes_px: NDArray[np.float64], sizes: NDArray[np.float64], border_px: float
+              ) -> NDArray[np.bool_]:
+    """Return which edges of boxes (n, 4) lie at the border of their images.
+
+    The sizes (n, 4), or (4,), are width, height, width, height [px].
+    """
+    return np.hstack([boxes_px[:, :2] <= border_px,
+                      boxes_px[:, 2:] >= sizes[..., 2:] - border_px])
+
+
+def _levers(detections: PosedDetections) -> NDArray[np.float64]:
+    """Return the levers (F, 3) of Views [m].
+
+    A camera's place on the rig is the median of where it was, seen from the first camera, whose
+    poses are interpolated. Of a camera that moves on its robot it is an approximation. Cameras
+    that move on their own, as those of a folder of photos, have none.
+    """
+    cameras, poses = detections.frame_cameras, detections.map_from_camera
+    levers, first = np.zeros((len(cameras), 3)), np.nonzero(cameras == 0)[0]
+    for number in range(1, len(detections.cameras) if len(first) else 0):
+        own = np.nonzero(cameras == number)[0]
+        if len(own):
+            there = np.stack([np.interp(detections.stamps_s[own], detections.stamps_s[first],
+                                        poses[first, axis, 3]) for axis in range(3)], axis=1)
+            axes = poses[own, :3, :3]
+            places = np.einsum('fji,fj->fi', axes, poses[own, :3, 3] - there)
+            place = np.median(places, axis=0)
+            if np.median(np.linalg.norm(places - place, axis=1)) < _MOST_PLAY_M:
+                levers[own] = axes @ place
+    return levers
+
+
+def camera_from_map(map_from_camera: NDArray[np.float64]
+                    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return rotations (F, 3, 3) and translations (F, 3) of the inverses of poses (F, 4, 4)."""
+    rotations = np.ascontiguousarray(map_from_camera[:, :3, :3].transpose(0, 2, 1))
+    translations = -np.einsum('fij,fj->fi', rotations, map_from_camera[:, :3, 3])
+    return rotations, np.ascontiguousarray(translations)
+
+
+def thin_out(views: Views, most: int) -> NDArray[np.bool_]:
+    """Return a mask (F,) of a number of frames of each viewpoint at most, evenly chosen."""
+    order = np.argsort(views.viewpoints, kind='stable')
+    _, starts, of_frames, counts = np.unique(
+        views.viewpoints[order], return_index=True, return_inverse=True, return_counts=True)
+    places = np.empty(len(order), dtype=np.int64)
+    places[order] = np.arange(len(order)) - starts[of_frames]
+    totals = np.empty_like(places)
+    totals[order] = np.maximum(counts[of_frames], most)
+    return np.asarray((places * most) // totals != ((places - 1) * most) // totals)
+
+
+def map_from_cameras(views: Views) -> NDArray[np.float64]:
+    """Return the poses map_from_camera (F, 4, 4) of all frames."""
+    poses = np.tile(np.eye(4), (len(views.rotations), 1, 1))
+    poses[:, :3, :3] = views.rotations.transpose(0, 2, 1)
+    poses[:, :3, 3] = camera_centers(views)
+    return poses
+
+
+def camera_centers(views: Views, frames: NDArray[np.int64] | slice = slice(None)
+                   ) -> NDArray[np.float64]:
+    """Return where the camera was in some frames, or in all (k, 3) [m]."""
+    return np.asarray(-np.einsum('fji,fj->fi', views.rotations[frames],
+                                 views.translations[frames]))
+
+
+def number_viewpoints(detections: PosedDetections) -> NDArray[np.int64]:
+    """Return which viewpoint each of F frames belongs to, ascending from 0, camera by camera.
+
+    A viewpoint ends with the first frame of its camera that differs from its first one by 10 cm or
+    5 degrees.
+    """
+    poses, cameras = detections.map_from_camera, detections.frame_cameras
+    viewpoints = np.zeros(len(poses), dtype=np.int64)
+    least_cosine = np.cos(np.radians(_VIEWPOINT_ANGLE_DEG))
+    order = detections.by_camera.tolist()
+    first, number = order[0] if order else 0, 0
+    for frame in order[1:]:
+        here, there = poses[frame], poses[first]
+        cosine = 0.5 * (np.sum(here[:3, :3] * there[:3, :3]) - 1.0)
+        distance = np.linalg.norm(here[:3, 3] - there[:3, 3])
+        if (cosine < least_cosine or distance > _VIEWPOINT_DISTANCE_M
+                or cameras[frame] != cameras[first]):
+            first, number = frame, number + 1
+        viewpoints[frame] = number
+    return viewpoints
+
+
+def check_input(detections: PosedDetections, views: Views, options: MappingOptions) -> list[str]:
+    """Return notes on the input.
+
+    MappingError: no map can be made of it; the message says what to correct.
+    """
+    if len(detections.classes) == 0:
+        raise MappingError(f'the {len(detections)} frames have no detections; check the detector, '
+                           'its classes and its confidence threshold')
+    viewpoints = int(views.viewpoints.max()) + 1
+    if viewpoints < options.min_viewpoints:
+        raise MappingError(f'the camera took {viewpoints} viewpoints, at least '
+                           f'{options.min_viewpoints} are needed; move it around the objects, and '
+                           'check that the poses are those of the images')
+    # the pose moves faster than any camera does
+    jumps = np.sort(np.concatenate([
+        _jumps(detections.map_from_camera[own], detections.stamps_s[own])
+        for own in (views.cameras == number for number in range(len(detections.cameras)))]))
+    notes = []
+    if len(jumps):
+        notes.append(f'the poses jump {len(jumps)} times, first at {jumps[0]:.2f} s; check the '
+                     'localization that they come from')
+    empty = float(np.mean(np.diff(detections.frame_offsets) == 0))
+    if empty > _MAX_EMPTY_SHARE:
+        notes.append(f'{empty:.0%} of the frames have no detections; check the detector')
+    if len(detections.class_names) == 1:
+        notes.append(f"all boxes are of the class '{detections.class_names[0]}'; maps with more "
+                     'classes relocalize better')
+    return notes
+
+
+def _jumps(poses: NDArray[np.float64], stamps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the stamps [s] of those of one camera's poses that it is too slow to reach."""
+    seconds = np.maximum(np.diff(stamps), 1e-3)
+    distances = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    traces = np.einsum('fij,fij->f', poses[1:, :3, :3], poses[:-1, :3, :3])
+    angles = np.degrees(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)))
+    far = (distances > _LEAST_JUMP_M) & (distances > _MAX_SPEED_M_PER_S * seconds)
+    far |= (angles > _LEAST_JUMP_DEG) & (angles > _MAX_TURN_DEG_PER_S * seconds)
+    return stamps[1:][far]

@@ -1,0 +1,195 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes of a recording: which images, which of their features, and where these are."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.depth_image import depths_of_points
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.keyframes.features import extract, unit_rows
+from cliploc_ros.core.keyframes.layer import (
+    FROM_DEPTH,
+    PIXEL_SCALE,
+    TRIANGULATED,
+    KeyframeLayer,
+    learn_words,
+    nearest_words,
+)
+from cliploc_ros.core.keyframes.triangulation import PosedFeatures, triangulate
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.errors import MappingError, OptionsError
+from cliploc_ros.offline.datasets.frames import Frames, PosedImage, undistorted
+
+# Features that are found in an image, before those without a point are left out.
+_MOST_FOUND = 2000
+# An image with fewer points is no keyframe.
+_LEAST_POINTS = 20
+# Stored images are for people: 7 to 9 kB each.
+_IMAGE_PX, _JPEG_QUALITY = 256, 60
+
+
+@dataclass(frozen=True)
+class LayerOptions:
+    """Which images become keyframes, and how many points each keeps."""
+
+    #: An image becomes a keyframe unless one of them is nearer than both. 0: every image.
+    distance_m: float = 0.1
+    angle_deg: float = 5.0
+    #: Of a keyframe. A point takes 146 bytes, so 600 make 4.4 MB of 50 keyframes.
+    most_points: int = 600
+    #: Whether to store small images of the keyframes, too, for people to look at
+    images: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse values that make no layer."""
+        if not (self.distance_m >= 0.0 and self.angle_deg >= 0.0):
+            raise OptionsError(f'keyframes {self.distance_m} m or {self.angle_deg} degrees apart: '
+                               'give 0 or more')
+        if not _LEAST_POINTS <= self.most_points <= _MOST_FOUND:
+            raise OptionsError(f'{self.most_points} points of a keyframe: give {_LEAST_POINTS} '
+                               f'to {_MOST_FOUND}')
+
+
+_DEFAULT = LayerOptions()
+
+
+class _Keyframe(NamedTuple):
+    """A keyframe: its features (strongest first), their depths, its JPEG, and its camera."""
+
+    posed: PosedFeatures
+    depths: NDArray[np.float64]
+    jpeg: bytes
+    camera: Camera  #: Of the undistorted image
+
+
+def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions = _DEFAULT
+                ) -> KeyframeLayer:
+    """Return the keyframes of each camera of a recording, in the coordinate frame of its poses.
+
+    Parameters
+    ----------
+    frames : Frames
+        With depth, or posed images that overlap, which triangulate the points.
+    landmark_map : LandmarkMap
+        The map that the layer belongs to.
+
+    Raises
+    ------
+    MappingError
+        No image has enough points.
+    """
+    seen = [_look(frame, options) for part in frames.each for frame in _chosen(part, options)]
+    images = [one.posed for one in seen]
+    points = [_points(images, row, one.depths) for row, one in enumerate(seen)]
+    # the strongest features that have a point
+    kept = [np.nonzero(np.isfinite(found).all(axis=1))[0][:options.most_points]
+            for found in points]
+    rows = [row for row, found in enumerate(kept) if len(found) >= _LEAST_POINTS]
+    if not rows:
+        raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images none has '
+                           f'{_LEAST_POINTS} features with a place in the map; record depth, or '
+                           'images that overlap and are 5 cm or more apart')
+    layer = _assemble(landmark_map, [seen[row].camera for row in rows],
+                      [images[row] for row in rows],
+                      [points[row] for row in rows], [kept[row] for row in rows],
+                      FROM_DEPTH if any(np.isfinite(one.depths).any() for one in seen)
+                      else TRIANGULATED)
+    if not options.images:
+        return layer
+    jpegs = [seen[row].jpeg for row in rows]
+    return replace(layer, images=np.frombuffer(b''.join(jpegs), dtype=np.uint8),
+                   image_offsets=np.cumsum([0, *map(len, jpegs)]))
+
+
+def _chosen(frames: Frames, options: LayerOptions) -> Iterator[PosedImage]:
+    """Yield the images whose view no earlier one of them has, decoded."""
+    size = options.distance_m or 1.0  # of the cells that poses lie in; no pose is nearer than 0
+    cells: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
+
+    def is_new(place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
+        if pose is None:
+            return False
+        cell = np.floor(pose[:3, 3] / size).astype(np.int64)
+        near = np.array([other for step in np.ndindex(3, 3, 3)
+                         for other in cells.get(tuple((cell + step - 1).tolist()), ())]
+                        ).reshape(-1, 4, 4)
+        near = near[np.linalg.norm(near[:, :3, 3] - pose[:3, 3], axis=1) < options.distance_m]
+        turns = pose[:3, :3].T @ near[:, :3, :3]
+        if len(near) and (np.degrees(Rotation.from_matrix(turns).magnitude())
+                          < options.angle_deg).any():
+            return False
+        cells.setdefault(tuple(cell.tolist()), []).append(pose)
+        return True
+    for raw in frames.read_raw(is_new):
+        yield raw.decode()
+
+
+def _look(frame: PosedImage, options: LayerOptions) -> _Keyframe:
+    """Return the features of an image; with depth, only those that have some."""
+    assert frame.map_from_camera is not None
+    features = extract(frame.image_rgb, _MOST_FOUND)
+    bearings = frame.camera.normalize_points(features.pixels)
+    depths = np.full(len(features), np.nan)
+    known = np.isfinite(bearings).all(axis=1)
+    if frame.depth is not None:
+        depths = depths_of_points(frame.depth, frame.camera, features.pixels).astype(np.float64)
+        known &= np.isfinite(depths)
+        known &= np.cumsum(known) <= options.most_points
+    return _Keyframe(PosedFeatures(frame.map_from_camera, bearings[known],
+                                   features.descriptors[known]), depths[known],
+                     _small_jpeg(frame) if options.images else b'', frame.camera.pinhole)
+
+
+def _small_jpeg(frame: PosedImage) -> bytes:
+    """Return an image, undistorted and small, as JPEG."""
+    camera = frame.camera
+    scale = min(1.0, _IMAGE_PX / max(camera.width, camera.height))
+    width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
+    x, y = width / camera.width, height / camera.height
+    small = replace(camera, width=width, height=height, fx=x * camera.fx, fy=y * camera.fy,
+                    cx=x * (camera.cx + 0.5) - 0.5, cy=y * (camera.cy + 0.5) - 0.5)
+    image = undistorted(np.asarray(cv2.resize(
+        frame.image_rgb, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8), small)
+    _, content = cv2.imencode('.jpg', np.ascontiguousarray(image[..., ::-1]),
+                              [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    return bytes(content)
+
+
+def _points(images: Sequence[PosedFeatures], row: int, depths: NDArray[np.float64]
+            ) -> NDArray[np.float64]:
+    """Return the points (n, 3) of a keyframe in its own coordinate frame; NaN where unknown."""
+    if np.isfinite(depths).any():
+        bearings = images[row].bearings
+        return np.column_stack([bearings, np.ones(len(bearings))]) * depths[:, None]
+    return triangulate(images, row)
+
+
+def _assemble(landmark_map: LandmarkMap, cameras: Sequence[Camera],
+              images: Sequence[PosedFeatures], points: Sequence[NDArray[np.float64]],
+              kept: Sequence[NDArray[np.int64]], deviation_per_metre: float) -> KeyframeLayer:
+    descriptors = np.concatenate([one.descriptors[rows]
+                                  for one, rows in zip(images, kept, strict=True)])
+    pixels = np.concatenate([
+        one.bearings[rows] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        for one, rows, camera in zip(images, kept, cameras, strict=True)])
+    camera, *others = dict.fromkeys(cameras)
+    vocabulary = learn_words(descriptors)
+    return KeyframeLayer(
+        landmark_map.frame_id, landmark_map.landmark_ids,
+        landmark_map.centers.astype(np.float32), camera,
+        np.array([one.map_from_camera for one in images]),
+        np.cumsum([0, *map(len, kept)]),
+        np.clip(np.round(pixels * PIXEL_SCALE), 0, 65535).astype(np.uint16),
+        np.concatenate([one[rows] for one, rows in zip(points, kept, strict=True)]
+                       ).astype(np.float32),
+        descriptors, nearest_words(unit_rows(descriptors), unit_rows(vocabulary)
+                                   ).astype(np.uint16), vocabulary, deviation_per_metre,
+        other_cameras=tuple(others), camera_rows=None if not others else np.array(
+            [[camera, *others].index(one) for one in cameras]))

@@ -1,0 +1,138 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""One frame through detector and CLIP: what becomes of it in an observation file."""
+
+import io
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.depth_image import depths_of_boxes
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.models.clip_encoder import ClipEncoder
+from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.models.devices import set_threads
+from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.protocols import DetectorOptions, ImageTextEncoder
+from cliploc_ros.offline.datasets.frames import RawFrame
+from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.views import at_border
+
+#: The most detections of an image that are used, as in the relocalizer node.
+MAX_DETECTIONS = 50
+
+
+@dataclass(frozen=True)
+class SeenFrame:
+    """What detector and CLIP said about a frame: n boxes."""
+
+    #: Number of the image in its source, name of its camera ('' for one), and its stamp [ns]
+    place: int
+    camera: str
+    stamp_ns: int
+    map_from_camera: NDArray[np.float64]  #: (4, 4)
+    #: (2,), (4,): width and height, and fx, fy, cx, cy of the undistorted image [px]
+    image_size: NDArray[np.int64]
+    intrinsics: NDArray[np.float64]
+    bboxes_xyxy: NDArray[np.float64]  #: (n, 4): undistorted [px]
+    #: (n, 4) or (0, 4): see PosedDetections; without rows for a lens without distortion
+    open_edges: NDArray[np.bool_]
+    #: (n,)
+    class_ids: NDArray[np.str_]
+    scores: NDArray[np.float64]
+    embeddings: NDArray[np.float16]  #: (n, d): of the crops; d is 0 without CLIP
+    #: (n,): [m]; NaN where unknown
+    depths: NDArray[np.float32]
+    depth_spreads: NDArray[np.float32]
+    #: Time taken [ms]
+    detector_ms: float
+    clip_ms: float
+
+    def to_bytes(self) -> bytes:
+        """Return the frame as bytes, without pickles."""
+        buffer = io.BytesIO()
+        arrays: dict[str, Any] = {name: np.asarray(value) for name, value in vars(self).items()}
+        np.savez(buffer, **arrays)
+        return buffer.getvalue()
+
+    @staticmethod
+    def from_bytes(data: bytes) -> 'SeenFrame':
+        """Return the frame that was written as bytes."""
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            return SeenFrame(**{name: array.item() if array.ndim == 0 else array
+                                for name, array in arrays.items()})
+
+
+@dataclass(frozen=True)
+class LoadNetworks:
+    """Loads detector and CLIP in the process that uses them."""
+
+    detector: DetectorOptions
+    clip: ClipOptions | None  #: None: classes and boxes only
+    threads: int = 0  #: Of a network on a CPU; 0 leaves its own choice
+
+    def __call__(self) -> Callable[[RawFrame], SeenFrame]:
+        """Return the function that looks at a frame.
+
+        ModelError or OptionsError: from loading.
+        """
+        if self.threads:
+            set_threads(self.threads)
+        encoder = (None if self.clip is None
+                   else ClipEncoder(resolve_clip_weights(self.clip), self.clip))
+        return RunNetworks(load_detector(self.detector).detect, encoder)
+
+
+@dataclass(frozen=True)
+class RunNetworks:
+    """Runs detector and encoder on a raw frame."""
+
+    #: ObjectDetector.detect, or another function that returns the objects in an image
+    detect: Callable[[NDArray[np.uint8]], Detections]
+    encoder: ImageTextEncoder | None = None
+
+    def __call__(self, raw: RawFrame) -> SeenFrame:
+        """Return what the networks say about a frame with a pose.
+
+        DatasetError: the image or depth image cannot be used.
+        """
+        frame = raw.decode()
+        camera = frame.camera
+        assert frame.map_from_camera is not None
+        start = time.perf_counter()
+        detections = self.detect(frame.image_rgb).usable(camera.width, camera.height,
+                                                         MAX_DETECTIONS)
+        detected = time.perf_counter()
+        bboxes, open_edges = _undistorted(detections, camera)
+        rows = np.nonzero((bboxes[:, 2:] > bboxes[:, :2]).all(axis=1))[0]  # never true of NaN
+        sound = detections.select(rows)
+        embeddings = (np.empty((len(rows), 0)) if self.encoder is None
+                      else self.encoder.encode_crops(frame.image_rgb, sound.bboxes_xyxy))
+        embedded = time.perf_counter()
+        depths = spreads = np.full(len(rows), np.nan, dtype=np.float32)
+        if frame.depth is not None:
+            depths, spreads = depths_of_boxes(frame.depth, camera, sound.bboxes_xyxy)
+        return SeenFrame(
+            raw.place, raw.camera, raw.stamp_ns, frame.map_from_camera,
+            np.array([camera.width, camera.height]),
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy]), bboxes[rows],
+            open_edges if camera.is_pinhole else open_edges[rows],
+            np.array(sound.class_ids, dtype=np.str_), sound.scores,
+            embeddings.astype(np.float16), depths, spreads,
+            (detected - start) * 1e3, (embedded - detected) * 1e3)
+
+
+def _undistorted(detections: Detections, camera: Camera
+                 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return undistorted boxes (n, 4) [px], and which edges lay at the border of the image."""
+    boxes = detections.bboxes_xyxy
+    if camera.is_pinhole:
+        return boxes, np.empty((0, 4), dtype=np.bool_)
+    is_open = at_border(boxes, np.array([camera.width, camera.height] * 2),
+                        MappingOptions.border_px)
+    return camera.bboxes_in_pixels(camera.normalize_bboxes(boxes)), is_open

@@ -1,0 +1,376 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Record observations once: an observation file next to the recording.
+
+The file's name depends on all that its content depends on: source, networks and keyframes. A run
+that is stopped leaves its partial results beside it, and the next run goes on.
+"""
+
+import base64
+import hashlib
+import json
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, replace
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from cliploc_ros.core.depth_image import check_depth_unit
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
+from cliploc_ros.files.log import Log
+from cliploc_ros.files.parallel import run_tasks
+from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.offline.datasets.frames import Frames, RawFrame
+from cliploc_ros.offline.datasets.observations import (
+    Recorded,
+    camera_from_numbers,
+    load_recorded,
+    save_recorded,
+)
+from cliploc_ros.offline.datasets.poses import Poses
+from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.posed_detections import (
+    PosedDetections,
+    group_cameras,
+    names_of_group,
+)
+from cliploc_ros.offline.mapping.views import at_border
+from cliploc_ros.offline.recording.networks import LoadNetworks, SeenFrame
+from cliploc_ros.units import NS_PER_S
+
+logger = logging.getLogger(__name__)
+# The unit of depth is judged by the boxes of this number of frames.
+# In the name of an observation file beside its source.
+_BESIDE = '.cliploc-'
+_FRAMES_FOR_UNIT = 10
+_UNKNOWN = np.full((4, 4), np.nan)
+
+
+@dataclass(frozen=True)
+class KeyframeOptions:
+    """How far apart keyframes are: either is enough."""
+
+    #: [m] [deg]. 0 takes every frame with a pose.
+    distance_m: float = 0.1
+    angle_deg: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Refuse negative values."""
+        if not (self.distance_m >= 0.0 and self.angle_deg >= 0.0):
+            raise OptionsError(f'keyframes {self.distance_m} m or {self.angle_deg} degrees apart: '
+                               'give 0 or more')
+
+
+#: Every frame with a pose.
+EVERY_FRAME = KeyframeOptions(0.0, 0.0)
+
+
+class KeyframeFilter:
+    """Asked once for each frame of a camera in order, tells whether it is a keyframe."""
+
+    def __init__(self, options: KeyframeOptions) -> None:
+        self._options = options
+        self._last: NDArray[np.float64] | None = None
+        self.asked = self.without_pose = self.keyframes = 0
+
+    def __call__(self, place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
+        """Tell whether the frame with this pose is a keyframe."""
+        self.asked += 1
+        if pose is None:
+            self.without_pose += 1
+            return False
+        if self._last is not None:
+            distance, angle = pose_error(pose, self._last)
+            if distance < self._options.distance_m and angle < self._options.angle_deg:
+                return False
+        self._last = pose
+        self.keyframes += 1
+        return True
+
+
+_DEFAULT_KEYFRAMES = KeyframeOptions()
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """How to look at a recording."""
+
+    detector: DetectorOptions
+    clip: ClipOptions | None  #: None: no embeddings
+    keyframes: KeyframeOptions = _DEFAULT_KEYFRAMES
+    #: Says all else that the frames depend on, such as topics, mount and depth format
+    reading: str = ''
+    workers: int = 1  #: Local processes. The result does not depend on it.
+    scheduler: str = ''  #: Address of a Dask scheduler; '' for none
+
+    @property
+    def networks(self) -> LoadNetworks:
+        """Return what loads the networks.
+
+        PyTorch rounds in another way on another number of threads. With one for each worker, the
+        result is the same on any number of workers and on a cluster.
+        """
+        threads = 0 if self.workers == 1 and not self.scheduler else 1
+        return LoadNetworks(self.detector, self.clip, threads)
+
+
+def observation_file(frames: Frames, options: RecordingOptions) -> Path:
+    """Return the observation file beside a source, named after all that it depends on."""
+    source = frames.source.resolve()
+    digest = hashlib.sha256(describe(frames, options).encode()).hexdigest()[:12]
+    return source.with_name(f'{source.name}{_BESIDE}{digest}.npz')
+
+
+def source_of(observations: Path) -> Path | None:
+    """Return the source that an observation file lies beside, see observation_file; else None."""
+    name, _, rest = observations.name.partition(_BESIDE)
+    source = observations.with_name(name or observations.name)
+    return source if rest and source.exists() else None
+
+
+def describe(frames: Frames, options: RecordingOptions) -> str:
+    """Return all that the observations depend on, as JSON."""
+    clip = options.clip
+    files = [options.detector.model]
+    if options.detector.text_model:
+        files.append(options.detector.text_model)
+    if clip is not None:
+        files += [clip.model, clip.pretrained, clip.checkpoint_path]
+    return json.dumps({
+        'source': [frames.source.name, _state(frames.source.resolve()), frames.count,
+                   *([frames.digest] if frames.digest else [])],
+        'yolo': _settings(options.detector), 'clip': None if clip is None else _settings(clip),
+        # the path of '' would be the working folder, which changes with every file written there
+        'files': [_state(Path(file)) if file else None for file in files],
+        'keyframes': asdict(options.keyframes), 'reading': options.reading})
+
+
+def record_once(frames: Frames, options: RecordingOptions, file: Path | None = None,
+                odometry: Mapping[str, Poses] | None = None) -> Recorded:
+    """Return the observations of a source: those of an earlier run, or record them.
+
+    Odometry is no part of what the networks depend on: an earlier run without it serves as well.
+
+    Parameters
+    ----------
+    file : Path, optional
+        The observation file; None: see observation_file.
+    odometry : dict, optional
+        Poses of each camera by its name, with odometry's coordinate frame in the place of the
+        map's.
+
+    Raises
+    ------
+    CliplocError
+        From loading the networks, from reading the source, or from writing the file.
+    """
+    described = describe(frames, options)
+    file = file or observation_file(frames, options)
+    if file.exists():
+        try:
+            recorded = load_recorded(file)
+            if recorded.described == described:
+                logger.warning('using the observations of an earlier run: %s', file)
+                linked = _with_odometry(recorded, odometry)
+                old = recorded.detections.odom_from_camera
+                new = linked.detections.odom_from_camera
+                if new is not None and (old is None or not np.array_equal(old, new, True)):
+                    save_recorded(file, linked)
+                return linked
+            logger.warning('recording again, with other options: %s', file)
+        except DatasetError as error:
+            logger.warning('recording again: %s', error)
+    with closing(Log(file.with_name(f'.{file.name}.unfinished'), DatasetError,
+                     'make room or name another file with --record-to, then run again: it goes '
+                     'on from here', _parse_entry)) as log:
+        recorded = _with_odometry(_record(frames, options, described, log), odometry)
+        save_recorded(file, recorded)
+        log.remove()
+    logger.warning('wrote %s', file)
+    return recorded
+
+
+def _with_odometry(recorded: Recorded, odometry: Mapping[str, Poses] | None) -> Recorded:
+    """Return observations with the odometry at their stamps, in the place of any other one."""
+    placed = None
+    if odometry is not None:
+        poses = [odometry[recorded.detections.name_of(frame)].pose_at(int(stamp_ns))
+                 for frame, stamp_ns in enumerate(recorded.stamps_ns)]
+        placed = np.array([_UNKNOWN if pose is None else pose for pose in poses])
+    return replace(recorded, detections=replace(recorded.detections, odom_from_camera=placed))
+
+
+def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame]) -> Recorded:
+    """Return what networks at hand say of every frame with a pose; nothing is written."""
+    with _read_keyframes(frames, EVERY_FRAME) as (raws, filters):
+        seen = [look(raw) for raw in raws]
+    return _assemble(seen, frames, filters, '', '')
+
+
+def _record(frames: Frames, options: RecordingOptions, described: str, log: Log) -> Recorded:
+    """Look at all keyframes that are not in the log of an unfinished run."""
+    # another release may have other fields
+    run = {'run': described, 'fields': list(SeenFrame.__dataclass_fields__)}
+    entries, _ = log.read()
+    seen: dict[int, SeenFrame] = {}
+    if entries[:1] == [run]:
+        seen = {one.place: one for one in entries[1:] if isinstance(one, SeenFrame)}
+    else:
+        log.restart([run])
+    if seen:
+        logger.warning('going on after %d frames of an unfinished run', len(seen))
+    try:
+        with _read_keyframes(frames, options.keyframes) as (raws, filters):
+            tasks = (raw for raw in raws if raw.place not in seen)
+            for _, result in run_tasks(options.networks, tasks, workers=options.workers,
+                                       scheduler=options.scheduler):
+                if result is not None:
+                    log.append({'frame': base64.b64encode(result.to_bytes()).decode()})
+                    seen[result.place] = result
+                    _judge_depth(seen, frames.source)
+    except BaseException:
+        if seen:
+            logger.warning('%d frames are kept in %s: run again to go on from there, or delete it',
+                           len(seen), log.path)
+        else:
+            log.remove()
+        raise
+    encoder_key = '' if options.clip is None else resolve_clip_weights(options.clip).key
+    try:
+        return _assemble(list(seen.values()), frames, filters, encoder_key, described)
+    except CliplocError:
+        log.remove()  # the same frames fail again
+        raise
+
+
+def _parse_entry(line: bytes) -> Any:
+    """Return what run it is, which the first entry says, or the frame of any other entry."""
+    entry = json.loads(line)
+    return entry if 'run' in entry else SeenFrame.from_bytes(base64.b64decode(entry['frame']))
+
+
+@contextmanager
+def _read_keyframes(frames: Frames, options: KeyframeOptions
+                    ) -> Iterator[tuple[Iterator[RawFrame], dict[str, KeyframeFilter]]]:
+    """Yield the keyframes of each camera and its filter, and show a bar on a terminal."""
+    filters = {part.camera: KeyframeFilter(options) for part in frames.each}
+    with tqdm(total=frames.count, desc='detector and CLIP', unit='image', disable=None) as bar:
+        def wanted_of(part: Frames) -> Iterator[RawFrame]:
+            def is_wanted(place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
+                bar.update()
+                return filters[part.camera](place, stamp_ns, pose)
+            return part.read_raw(is_wanted)
+        yield chain.from_iterable(map(wanted_of, frames.each)), filters
+
+
+def _judge_depth(seen: Mapping[int, SeenFrame], source: Path) -> None:
+    """Refuse an implausible unit of depth early, before the work of hours is done."""
+    depths = [one.depths for one in islice(seen.values(), _FRAMES_FOR_UNIT + 1)]
+    if len(depths) <= _FRAMES_FOR_UNIT:
+        check_depth_unit(np.concatenate(depths), str(source))
+
+
+def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, KeyframeFilter],
+              encoder_key: str, described: str) -> Recorded:
+    """Return the observations of frames in the order of time.
+
+    DatasetError: a camera has no frames, or changes.
+    """
+    seen, source = sorted(seen, key=lambda one: (one.stamp_ns, one.place)), frames.source
+    cameras = tuple(_camera_of([one for one in seen if one.camera == name], f'{source}: {name}:'
+                               if name else f'{source}:', keyframes.asked, frames.varies)
+                    for name, keyframes in filters.items())
+    camera_names = tuple(filters)
+    rows = np.array([camera_names.index(one.camera) for one in seen])
+    if frames.varies:
+        own = [camera_from_numbers(one.image_size, one.intrinsics) for one in seen]
+        cameras, rows = group_cameras(own)
+        camera_names = names_of_group(cameras)
+        seen = [_seen_by(one, camera, cameras[row])
+                for one, camera, row in zip(seen, own, rows, strict=True)]
+    names = np.concatenate([one.class_ids for one in seen])
+    class_names, classes = np.unique(names, return_inverse=True)
+    depths = np.concatenate([one.depths for one in seen])
+    has_depth = bool(np.isfinite(depths).any())
+    open_edges = np.concatenate([one.open_edges for one in seen])
+    if 0 < len(open_edges) < len(names):  # some lenses have distortion
+        open_edges = np.concatenate([
+            one.open_edges if len(one.open_edges) else at_border(
+                one.bboxes_xyxy, np.tile(one.image_size, 2), MappingOptions.border_px)
+            for one in seen])
+    detections = PosedDetections(
+        cameras=cameras,
+        map_from_camera=np.array([one.map_from_camera for one in seen]),
+        stamps_s=np.array([one.stamp_ns / NS_PER_S for one in seen]),
+        frame_offsets=np.cumsum([0, *(len(one.scores) for one in seen)]),
+        bboxes_xyxy=np.concatenate([one.bboxes_xyxy for one in seen]),
+        class_names=tuple(str(name) for name in class_names), classes=classes.reshape(-1),
+        scores=np.concatenate([one.scores for one in seen]),
+        depths=depths if has_depth else None,
+        depth_spreads=(np.concatenate([one.depth_spreads for one in seen]) if has_depth
+                       else None),
+        embeddings=(np.concatenate([one.embeddings for one in seen])
+                    if any(one.embeddings.shape[1] for one in seen) else None),
+        encoder_key=encoder_key, open_edges=open_edges if len(open_edges) else None,
+        camera_rows=None if camera_names == ('',) else rows,
+        camera_names=camera_names)
+    return Recorded(
+        detections, np.array([one.stamp_ns for one in seen], dtype=np.int64),
+        np.array([one.detector_ms for one in seen]), np.array([one.clip_ms for one in seen]),
+        sum(one.asked for one in filters.values()),
+        sum(one.without_pose for one in filters.values()), described)
+
+
+def _seen_by(seen: SeenFrame, camera: Camera, other: Camera) -> SeenFrame:
+    """Return the boxes of a frame as another pinhole of its place shows them."""
+    if camera == other:
+        return seen
+    boxes, is_open = seen.bboxes_xyxy, seen.open_edges
+    if not len(is_open):
+        is_open = at_border(boxes, np.tile(seen.image_size, 2), MappingOptions.border_px)
+    return replace(seen, bboxes_xyxy=other.bboxes_in_pixels(camera.normalize_bboxes(boxes)),
+                   open_edges=is_open)
+
+
+def _camera_of(seen: list[SeenFrame], where: str, images: int, varies: bool) -> Camera:
+    """Return the camera of frames that one camera took, or of the first one where it varies.
+
+    DatasetError: there are none, they are of several cameras, or their depth has another unit.
+    """
+    if not seen:
+        raise DatasetError(f'{where} none of {images} images has a pose; interpolate over wider '
+                           'gaps with --max-gap, or record poses with the images')
+    first = seen[0]
+    for one in seen:
+        if not varies and ((one.image_size != first.image_size).any()
+                           or (one.intrinsics != first.intrinsics).any()):
+            raise DatasetError(f'{where} the camera changes at {one.stamp_ns / NS_PER_S:.6f}, but '
+                               'observations of one name have one camera; name several with '
+                               '--cameras')
+    check_depth_unit(np.concatenate([one.depths for one in seen]), where.removesuffix(':'))
+    return camera_from_numbers(first.image_size, first.intrinsics)
+
+
+def _settings(options: DetectorOptions | ClipOptions) -> dict[str, Any]:
+    """Return the options that change what a network says."""
+    return {name: value for name, value in asdict(options).items()
+            if name not in ('cache_dir', 'max_batch', 'inference')
+            and (value or name not in ('prompts', 'text_model'))}  # as files of before have it
+
+
+def _state(path: Path) -> tuple[int, int] | None:
+    """Return what changes with a file; None for the name of a published model."""
+    try:
+        stat = path.stat()
+    except OSError:
+        return None
+    return (0, stat.st_mtime_ns) if path.is_dir() else (stat.st_size, stat.st_mtime_ns)

@@ -1,0 +1,362 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Publish a recording: the recorded bytes, with the recorded QoS, at the recorded times.
+
+Own code, because neither PyPI's ROS nor ROS's base installation has `ros2 bag play`.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from itertools import chain, islice
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    LivelinessPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability
+from rosgraph_msgs.msg import Clock
+
+from cliploc_ros.command import Interruption
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.bags import BagMessage, BagReader, BagTopic
+from cliploc_ros.units import NS_PER_S
+
+CLOCK_TOPIC = '/clock'
+_POLL_S = 0.02
+#: Wait this long after a subscriber appears here: it must discover this publisher too, and ROS
+#: does not report that.
+_DISCOVERY_S = 0.2
+#: Depth where the recording has none: discovery does not report a publisher's history.
+DEFAULT_DEPTH = 10
+#: A recorded duration of this or more is infinite. Foxy's Fast DDS wrote the least such value.
+_INFINITE_S = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """How to play a recording."""
+
+    #: Speed; 1 is as recorded.
+    rate: float = 1.0
+    #: Begin this long after the recording's start.
+    start_offset_s: float = 0.0
+    #: Play these only.
+    topics: Collection[str] | None = None
+    #: Leave these out.
+    exclude: Collection[str] = ()
+    #: New names of topics, by recorded name.
+    remap: Mapping[str, str] = field(default_factory=dict)
+    #: Publish the recording's time on /clock this often per second of real time.
+    clock_hz: float | None = None
+    #: Begin again at the end, until stopped.
+    loop: bool = False
+
+
+@dataclass(frozen=True)
+class PlayReport:
+    """What was published."""
+
+    #: Messages by recorded topic name.
+    counts: Counter[str]
+    #: How often the recording was played to its end.
+    passes: int = 0
+    #: Messages that the recording lists but that were not found in it.
+    unread: int = 0
+    #: The longest that a message was published after its time.
+    worst_lateness_s: float = 0.0
+
+
+class Player:
+    """Publishes an open recording; `stop` ends every wait and the playback within milliseconds.
+
+    DatasetError: if nothing is left to play, a topic is not recorded, or a type is not installed
+    or has another definition.
+    """
+
+    def __init__(
+        self, node: Node, reader: BagReader, options: PlayOptions, stop: Interruption
+    ) -> None:
+        self._reader, self._options, self._stop = reader, options, stop
+        self.topics, self.without_type = _playable(select_topics(reader, options), options)
+        self.start_ns = reader.start_ns + round(options.start_offset_s * NS_PER_S)
+        self.end_ns = reader.end_ns
+        if self.start_ns > self.end_ns:
+            length_s = (reader.end_ns - reader.start_ns) / NS_PER_S
+            raise DatasetError(
+                f'{reader.path}: start offset {options.start_offset_s} s lies after its end at '
+                f'{length_s:.3f} s'
+            )
+        self._publishers = {
+            topic.name: create_publisher(node, topic, options.remap.get(topic.name, topic.name))
+            for topic in self.topics
+        }
+        self._clock = node.create_publisher(Clock, CLOCK_TOPIC, 10) if options.clock_hz else None
+
+    def wait_for_subscribers(self, topics: Iterable[str], timeout_s: float) -> None:
+        """Wait until each of some topics, by recorded name, has a subscriber; of all if empty.
+
+        DatasetError: if a topic is not played, or has no subscriber in time; the message names it.
+        """
+        names = list(topics) or list(self._publishers)
+        if unknown := [name for name in names if name not in self._publishers]:
+            raise DatasetError(f'{unknown[0]} is not among the topics played: '
+                               f'{", ".join(self._publishers)}')
+        publishers = [self._publishers[name] for name in names]
+        deadline = time.monotonic() + timeout_s
+        while lonely := [one for one in publishers if not one.get_subscription_count()]:
+            if time.monotonic() >= deadline:
+                raise DatasetError(f'no subscriber within {timeout_s:g} s on '
+                                   f'{", ".join(one.topic_name for one in lonely)}')
+            if self._stop.wait(_POLL_S):
+                return
+        self._stop.wait(_DISCOVERY_S)
+
+    def play(self, on_message: Callable[[BagMessage], None] = lambda message: None) -> PlayReport:
+        """Publish the messages, each at its time; `on_message` is called after each.
+
+        DatasetError: where the recording is damaged.
+        """
+        counts = self._publish_latched()
+        messages = self._read_ahead()
+        origin_ns = time.monotonic_ns()
+        passes, unread, worst_s = 0, 0, 0.0
+        while not self._stop.is_set():
+            played, late_s = self._play_once(messages, origin_ns, on_message)
+            counts += played
+            worst_s = max(worst_s, late_s)
+            if self._stop.is_set():
+                break
+            passes += 1
+            # a recording does not list how many messages follow a start offset
+            unread = 0 if self.start_ns > self._reader.start_ns else max(
+                sum(topic.message_count for topic in self.topics) - played.total(), 0)
+            if not self._options.loop:
+                break
+            # The next pass follows at the mean distance of messages, and never at once.
+            length_ns = self.end_ns - self.start_ns
+            gap_ns = length_ns // max(played.total() - 1, 1) or NS_PER_S
+            origin_ns += round((length_ns + gap_ns) / self._options.rate)
+            messages = self._read_ahead()
+        return PlayReport(counts, passes, unread, worst_s)
+
+    def wait_for_acknowledgement(self, timeout_s: float) -> tuple[str, ...]:
+        """Wait until all reliable subscribers have acknowledged all messages, or until stopped.
+
+        The middleware resends lost messages only while their publisher exists: a process that
+        ends right after its last message loses it under load. Fast DDS requests acknowledgements
+        every 3 s. Returns the topics with a subscriber that did not acknowledge all in time.
+        """
+        deadline = time.monotonic() + timeout_s
+        waiting = list(self._publishers.values())
+        while not self._stop.is_set():
+            waiting = [one for one in waiting if not one.wait_for_all_acked(Duration())]
+            if not waiting or time.monotonic() >= deadline:
+                return tuple(publisher.topic_name for publisher in waiting)
+            self._stop.wait(_POLL_S)
+        return ()
+
+    def _read_ahead(self) -> Iterator[BagMessage]:
+        """Read the first message already, so that opening files makes no message late."""
+        messages = self._reader.messages(self._publishers, start_ns=self.start_ns)
+        return chain(list(islice(messages, 1)), messages)
+
+    def _play_once(
+        self,
+        messages: Iterator[BagMessage],
+        origin_ns: int,
+        on_message: Callable[[BagMessage], None],
+    ) -> tuple[Counter[str], float]:
+        """Publish messages; return how many on each topic, and the greatest lateness [s]."""
+        timeline = _Timeline(origin_ns, self.start_ns, self._options.rate, self._stop)
+        ticker = None
+        if self._clock is not None and self._options.clock_hz:
+            ticker = _Ticker(self._clock, timeline, self._options.clock_hz)
+        counts: Counter[str] = Counter()
+        worst_lateness_s = 0.0
+        for message in messages:
+            while ticker is not None and ticker.next_ns <= message.stamp_ns \
+                    and timeline.wait_for(ticker.next_ns):
+                ticker.tick()
+            if not timeline.wait_for(message.stamp_ns):
+                break
+            worst_lateness_s = max(worst_lateness_s, timeline.lateness_s(message.stamp_ns))
+            self._publishers[message.topic].publish(message.data)
+            counts[message.topic] += 1
+            on_message(message)
+        return counts, worst_lateness_s
+
+    def _publish_latched(self) -> Counter[str]:
+        """Publish what a late subscriber would still receive from before the start offset."""
+        counts: Counter[str] = Counter()
+        latched = [topic.name for topic in self.topics if is_latched(topic.offered_qos)]
+        if self.start_ns == self._reader.start_ns or not latched:
+            return counts
+        for message in self._reader.messages(latched, stop_ns=self.start_ns):
+            self._publishers[message.topic].publish(message.data)
+            counts[message.topic] += 1
+        return counts
+
+
+class _Timeline:
+    """Maps recorded stamps to the monotonic clock from one origin, so that no drift adds up."""
+
+    def __init__(self, origin_ns: int, start_ns: int, rate: float, stop: Interruption) -> None:
+        self.start_ns, self.rate = start_ns, rate
+        self._origin_ns, self._stop = origin_ns, stop
+
+    def wait_for(self, stamp_ns: int) -> bool:
+        """Sleep until a stamp's time; return False if stopped instead."""
+        left_s = -self.lateness_s(stamp_ns)
+        return not self._stop.wait(left_s) if left_s > 0 else not self._stop.is_set()
+
+    def lateness_s(self, stamp_ns: int) -> float:
+        """Return how long ago a stamp's time was [s]; negative for the future."""
+        due_ns = self._origin_ns + (stamp_ns - self.start_ns) / self.rate
+        return (time.monotonic_ns() - due_ns) / NS_PER_S
+
+    def now_ns(self) -> int:
+        """Return the recording's time now [ns]."""
+        return self.start_ns + round((time.monotonic_ns() - self._origin_ns) * self.rate)
+
+
+class _Ticker:
+    """Publishes /clock on a regular grid of real time."""
+
+    def __init__(self, publisher: Publisher, timeline: _Timeline, clock_hz: float) -> None:
+        self._publisher, self._timeline = publisher, timeline
+        self._step_ns = max(round(timeline.rate * NS_PER_S / clock_hz), 1)
+        self.next_ns = timeline.start_ns
+
+    def tick(self) -> None:
+        """Publish the tick that is due, and skip those already missed."""
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = divmod(self.next_ns, NS_PER_S)
+        self._publisher.publish(message)
+        missed = max(self._timeline.now_ns() - self.next_ns, 0) // self._step_ns
+        self.next_ns += self._step_ns * max(missed, 1)
+
+
+def select_topics(reader: BagReader, options: PlayOptions) -> list[BagTopic]:
+    """Return the topics to play.
+
+    DatasetError: if a named topic is not recorded, or nothing is left to play.
+    """
+    names = list(reader.topics) if options.topics is None else list(options.topics)
+    for name in (*names, *options.exclude, *options.remap):
+        reader.topic(name)
+    left_out = set(options.exclude)
+    if options.clock_hz:
+        left_out.add(CLOCK_TOPIC)  # two clocks would contradict each other
+    topics = [reader.topic(name) for name in dict.fromkeys(names) if name not in left_out]
+    if not sum(topic.message_count for topic in topics):
+        raise DatasetError(f'{reader.path}: holds no messages on the topics to play')
+    return topics
+
+
+def _playable(topics: list[BagTopic], options: PlayOptions
+              ) -> tuple[list[BagTopic], list[BagTopic]]:
+    """Return the topics whose types are installed, and the others.
+
+    DatasetError: a topic that is asked for by name, or each of them, lacks its type.
+    """
+    lacking = []
+    for topic in topics:
+        try:
+            message_class(topic)
+        except DatasetError:
+            if options.topics is not None:
+                raise
+            lacking.append(topic)
+    playable = [topic for topic in topics if topic not in lacking]
+    if not sum(topic.message_count for topic in playable):
+        message_class(lacking[0])
+    return playable, lacking
+
+
+def create_publisher(node: Node, topic: BagTopic, name: str) -> Publisher:
+    """Make a publisher, named before ROS's own remapping, with the QoS that was recorded.
+
+    DatasetError: if the type is not installed, or differs from the recorded one.
+    """
+    publisher: Publisher = node.create_publisher(
+        message_class(topic), name, qos_profile(topic.offered_qos)
+    )
+    _check_definition(node, topic, publisher.topic_name)
+    return publisher
+
+
+def message_class(topic: BagTopic) -> Any:
+    """Return the installed class of a topic's messages.
+
+    DatasetError: naming the package to install.
+    """
+    package, _, name = topic.msgtype.partition('/')
+    namespace, _, name = name.rpartition('/')
+    try:
+        return getattr(import_module(f'{package}.{namespace or "msg"}'), name)
+    except (ImportError, AttributeError):
+        raise DatasetError(
+            f'{topic.name} needs {topic.msgtype}, but the package {package} with this type is not '
+            f'installed or not sourced: apt install ros-jazzy-{package.replace("_", "-")}, or '
+            f'leave the topic out: --exclude {topic.name}'
+        ) from None
+
+
+def qos_profile(offered: Collection[Qos]) -> QoSProfile:
+    """Return the profile that replays what a topic's publishers offered.
+
+    Of several publishers' offers it takes the strongest reliability and durability, which
+    match all their subscribers. The history's depth is 10 where none was recorded.
+    """
+    if not offered:
+        return QoSProfile(depth=DEFAULT_DEPTH)
+    first = next(iter(offered))
+    best_effort = all(one.reliability == QosReliability.BEST_EFFORT for one in offered)
+    profile = QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=first.depth or DEFAULT_DEPTH,
+        reliability=(
+            ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
+        ),
+        durability=(
+            DurabilityPolicy.TRANSIENT_LOCAL if is_latched(offered) else DurabilityPolicy.VOLATILE
+        ),
+    )
+    if first.history == QosHistory.KEEP_ALL:
+        profile.history = HistoryPolicy.KEEP_ALL
+    if first.liveliness == QosLiveliness.MANUAL_BY_TOPIC:
+        profile.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC
+    for name in ('deadline', 'lifespan', 'liveliness_lease_duration'):
+        recorded = getattr(first, name)
+        if recorded.sec < _INFINITE_S and (recorded.sec or recorded.nsec):
+            setattr(profile, name, Duration(seconds=recorded.sec, nanoseconds=recorded.nsec))
+    return profile
+
+
+def is_latched(offered: Collection[Qos]) -> bool:
+    """Return whether a recorded publisher kept messages for late subscribers."""
+    return any(one.durability == QosDurability.TRANSIENT_LOCAL for one in offered)
+
+
+def _check_definition(node: Node, topic: BagTopic, name: str) -> None:
+    """Refuse bytes that were recorded with another definition than the installed one."""
+    if not topic.type_hash.startswith('RIHS01_'):
+        return  # recorded before Iron, which introduced the hash
+    for endpoint in node.get_publishers_info_by_topic(name):
+        if endpoint.node_name == node.get_name() and str(endpoint.topic_type_hash) not in (
+            topic.type_hash, 'INVALID'
+        ):
+            raise DatasetError(
+                f'{topic.name} was recorded with another definition of {topic.msgtype} than the '
+                f'installed one; leave it out: --exclude {topic.name}'
+            )

@@ -1,0 +1,145 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is around the landmarks: surfaces as a coloured cloud, the walls of an occupancy grid.
+
+The cloud is the recording's depth, or else the points of the keyframes. Both are thinned, and end
+where neither a camera nor a landmark is: a ceiling would hide the room from above.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.depth_image import points_in_color
+from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, KeyframeLayer
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.studio.floor import FREE, OCCUPIED, OccupancyGrid
+from cliploc_ros.offline.studio.images import Images
+from cliploc_ros.offline.studio.viewpoint import Bounds, wxyz_of
+
+#: More points slow the browser down.
+MAX_POINTS = 100_000
+# Views whose depth is read, and every n-th pixel of them in each direction.
+_DEPTH_VIEWS, _DEPTH_STEP = 50, 5
+# Depth beyond this is mostly noise [m].
+_MOST_DEPTH_M = 8.0
+# One point is kept of each cube of this side, or of a larger one where too many are left [m].
+_LEAST_SIDE_M, _GROWTH = 0.02, 1.25
+_HEADROOM_M = 0.2
+_PALE, _POINT_RGB = 0.25, (110, 120, 135)
+# A larger image of a grid slows the browser down [px].
+_MOST_PIXELS = 2048
+_WALL_RGBA, _FREE_RGBA = (70, 80, 100, 255), (225, 232, 240, 150)
+# Below the lines of the floor, which would flicker through.
+_BELOW_M = 0.01
+
+
+class Cloud(NamedTuple):
+    """Points of surfaces."""
+
+    points: NDArray[np.float32]  #: (n, 3), in the map [m]
+    colors: NDArray[np.uint8]  #: (n, 3)
+    side_m: float  #: One point is left of each cube of this side
+
+
+def find_cloud(detections: PosedDetections | None, images: Images | None,
+               layer: KeyframeLayer | None, extent: Bounds) -> Cloud | None:
+    """Return the points of a map's surfaces; None where nothing is known of them.
+
+    CliplocError: an image or depth image cannot be read.
+    """
+    parts = [] if detections is None or images is None else _points_of_depth(detections, images)
+    if not parts and layer is not None:
+        parts = [_points_of_keyframe(layer, row) for row in range(len(layer))]
+    if not parts:
+        return None
+    points = np.concatenate([part[0] for part in parts]).astype(np.float32)
+    colors = np.concatenate([part[1] for part in parts])
+    with np.errstate(invalid='ignore'):  # the edges of a lens have no ray
+        is_low = points @ extent.up.astype(np.float32) < extent.top_m + _HEADROOM_M
+    return _thinned(points[is_low], colors[is_low])
+
+
+def _points_of_depth(detections: PosedDetections, images: Images
+                     ) -> list[tuple[NDArray[np.float64], NDArray[np.uint8]]]:
+    parts = []
+    for view in np.unique(np.linspace(0, len(detections) - 1, _DEPTH_VIEWS).astype(np.int64)):
+        found = images.depth_near(float(detections.stamps_s[view]), detections.name_of(view))
+        if found is None:
+            continue
+        image, camera, depth = found
+        pixels, depths_m = points_in_color(depth, camera, _DEPTH_STEP)
+        columns, rows = np.round(pixels).astype(np.int64)
+        is_inside = ((columns >= 0) & (rows >= 0) & (columns < camera.width)
+                     & (rows < camera.height) & (depths_m < _MOST_DEPTH_M))
+        rays = camera.normalize_points(pixels.T[is_inside])
+        points = np.column_stack([rays, np.ones(len(rays))]) * depths_m[is_inside, None]
+        pose = detections.map_from_camera[view]
+        parts.append((points @ pose[:3, :3].T + pose[:3, 3],
+                      image[rows[is_inside], columns[is_inside]]))
+    return parts
+
+
+def _points_of_keyframe(layer: KeyframeLayer, keyframe: int
+                        ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    points, image = layer.points_in_map(keyframe), layer.image_rgb(keyframe)
+    if image is None:
+        return points, np.full((len(points), 3), _POINT_RGB, dtype=np.uint8)
+    scale = image.shape[1] / layer.camera_of(keyframe).width / PIXEL_SCALE
+    places = np.asarray(layer.pixels[layer.rows(keyframe)], dtype=np.float64) * scale
+    columns, rows = np.clip(places.astype(np.int64), 0, np.array(image.shape[1::-1]) - 1).T
+    return points, image[rows, columns]
+
+
+def _thinned(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> Cloud:
+    """Return one point of each cube, and its colour, a little paler than the landmarks'."""
+    side = _LEAST_SIDE_M / _GROWTH
+    rows = np.arange(len(points))
+    while side < _LEAST_SIDE_M or len(rows) > MAX_POINTS:
+        side *= _GROWTH
+        cubes = np.floor(points / side).astype(np.int64) & 0x1FFFFF
+        rows = np.unique(cubes @ np.array([1, 1 << 21, 1 << 42]), return_index=True)[1]
+    pale = (1.0 - _PALE) * colors[rows] + _PALE * 255.0
+    return Cloud(points[rows], pale.astype(np.uint8), side)
+
+
+def draw_cloud(scene: viser.SceneApi, cloud: Cloud) -> viser.PointCloudHandle:
+    """Draw the points, so large that they nearly touch."""
+    return scene.add_point_cloud('/cloud', cloud.points, cloud.colors, precision='float32',
+                                 point_size=0.25 * cloud.side_m, point_shading='flat',
+                                 point_shape='square')
+
+
+def draw_lines(scene: viser.SceneApi, extent: Bounds) -> viser.GridHandle:
+    """Draw the lines of the floor, half a metre apart."""
+    side = 2.0 * float(np.ceil(1.3 * extent.radius_m)) + 2.0
+    below = extent.middle - (extent.middle @ extent.up - extent.floor_m) * extent.up
+    return scene.add_grid('/floor', width=side, height=side, cell_size=0.5, fade_strength=2.0,
+                          cell_color=(225, 225, 225), section_color=(190, 190, 190),
+                          position=below, wxyz=wxyz_of(extent.upright))
+
+
+def draw_walls(scene: viser.SceneApi, grid: OccupancyGrid) -> viser.ImageHandle:
+    """Draw an occupancy grid at z = 0: walls dark, free cells light, the rest clear."""
+    step = max(1, -(-max(grid.cells.shape) // _MOST_PIXELS))
+    rows, columns = (-(-side // step) * step for side in grid.cells.shape)
+    cells = np.pad(grid.cells, [(0, rows - grid.cells.shape[0]),
+                                (0, columns - grid.cells.shape[1])], constant_values=-1)
+    # a wall of one cell stays
+    cells = cells.reshape(rows // step, step, columns // step, step).max(axis=(1, 3))
+    picture = np.zeros((*cells.shape, 4), dtype=np.uint8)
+    picture[cells == FREE], picture[cells == OCCUPIED] = _FREE_RGBA, _WALL_RGBA
+    least = max(1, -(-512 // max(cells.shape)))  # few cells would be blurred
+    picture = np.repeat(np.repeat(picture, least, axis=0), least, axis=1)
+    x, y, yaw = grid.origin
+    turn = Rotation.from_euler('z', yaw)
+    size = np.array([columns, rows]) * grid.resolution_m
+    middle = np.array([x, y, -_BELOW_M]) + turn.apply([*(0.5 * size), 0.0])
+    # viser's images have y down, and z away from who looks at them: seen from above
+    flipped = turn * Rotation.from_euler('x', np.pi)
+    return scene.add_image('/walls', picture[::-1], *size, format='png', cast_shadow=False,
+                           receive_shadow=False, position=middle,
+                           wxyz=wxyz_of(flipped.as_matrix()))

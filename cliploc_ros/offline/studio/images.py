@@ -1,0 +1,193 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The images of a recording, and where landmarks lie in its views."""
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.depth_image import DepthImage
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import (
+    ellipses_in_pixels,
+    project_ellipsoids,
+    shape_matrices,
+)
+from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_images
+from cliploc_ros.offline.datasets.folders import FolderOptions, find_layout, read_folder
+from cliploc_ros.offline.datasets.frames import read_color, read_depth, undistorted
+from cliploc_ros.offline.datasets.map_recording import MapRecording
+from cliploc_ros.offline.mapping.posed_detections import (
+    PosedDetections,
+    group_cameras,
+    names_of_group,
+)
+from cliploc_ros.offline.studio.landmark import Landmark
+from cliploc_ros.units import NS_PER_S
+
+# A view and its image have the same stamp; files hold it to a microsecond or so.
+_MAX_DELAY_NS = 20_000_000
+_IMAGES_KEPT = 32
+_NO_OPTIONS = FolderOptions()
+
+#: x and y [px].
+Pixel = Sequence[float] | NDArray[np.float64]
+
+
+class Images:
+    """The images of a folder or a recording, taken at stamps (F,) [ns].
+
+    ``read`` returns image and camera of a place, 0 to F - 1; ``cameras`` are the names (F,) of
+    several cameras; of a folder, whose stamps differ, the stamp is enough. ``read_depth`` returns
+    the depth image of a place, or None.
+    """
+
+    def __init__(self, stamps_ns: NDArray[np.int64],
+                 read: Callable[[int], tuple[NDArray[np.uint8], Camera]],
+                 cameras: Sequence[str] = (),
+                 read_depth: Callable[[int], DepthImage | None] = lambda place: None):
+        self._stamps_ns = stamps_ns
+        self._read_raw, self._read_depth = read, read_depth
+        self._cameras = np.array(cameras, dtype=np.str_)
+        self._lock = threading.Lock()  # readers of recordings are for one thread at a time
+        self._read: Callable[[int, Camera | None], NDArray[np.uint8]] = lru_cache(_IMAGES_KEPT)(
+            lambda place, pinhole: undistorted(*read(place), pinhole))
+
+    def near(self, stamp_s: float, camera: str = '', pinhole: Camera | None = None
+             ) -> NDArray[np.uint8] | None:
+        """Return the undistorted image (h, w, 3) of a camera at a time [s], red first.
+
+        It is as a pinhole shows it, such as that of the boxes. None without one.
+        """
+        place = self._place(stamp_s, camera)
+        with self._lock:
+            return None if place is None else self._read(place, pinhole)
+
+    def depth_near(self, stamp_s: float, camera: str = ''
+                   ) -> tuple[NDArray[np.uint8], Camera, DepthImage] | None:
+        """Return a camera's image at a time [s], distorted as it is, with its depth image."""
+        place = self._place(stamp_s, camera)
+        with self._lock:
+            depth = None if place is None else self._read_depth(place)
+            return None if place is None or depth is None else (*self._read_raw(place), depth)
+
+    def _place(self, stamp_s: float, camera: str) -> int | None:
+        places = (np.nonzero(self._cameras == camera)[0] if len(self._cameras)
+                  else np.arange(len(self._stamps_ns)))
+        if not len(places):
+            return None
+        offsets = np.abs(self._stamps_ns[places] - round(stamp_s * NS_PER_S))
+        nearest = int(np.argmin(offsets))
+        return int(places[nearest]) if offsets[nearest] <= _MAX_DELAY_NS else None
+
+
+def images_of_recording(recording: MapRecording, cameras: Sequence[str]) -> Images | None:
+    """Open the images that a map was built from; None where they are gone."""
+    if recording.source is None:
+        return None
+    return open_images(recording.source, BagTopics(
+        recording.image, recording.camera_info, recording.rectified), cameras, FolderOptions(
+        recording.intrinsics, images=recording.images, layout=recording.layout))
+
+
+def open_images(path: Path, topics: BagTopics, cameras: Sequence[str] = ('',),
+                folder: FolderOptions = _NO_OPTIONS) -> Images:
+    """Open the images of a folder, or those of each camera of a rosbag2 recording.
+
+    DatasetError: it is neither, or lacks a camera.
+    """
+    if not path.exists():
+        raise DatasetError(f'{path}: no such folder or recording')
+    if (layout := find_layout(path, folder.layout)) is not None:
+        capture = layout.read(path, folder)
+        files = capture.files
+        return Images(np.array([one.stamp_ns for one in files], dtype=np.int64),
+                      lambda place: read_color(files[place]), (),
+                      lambda place: (None if files[place].depth is None
+                                     else read_depth(files[place], capture.depth)))
+    of_cameras = [bag_images(path, topics.of_camera(name)) for name in cameras]
+    places = [(one, place) for one in of_cameras for place in range(len(one.times_ns))]
+    names = np.repeat(np.array(cameras), [len(one.times_ns) for one in of_cameras])
+    return Images(np.concatenate([one.times_ns[:, 0] for one in of_cameras]),
+                  lambda number: places[number][0].read(places[number][1]), names.tolist())
+
+
+def views_of_folder(path: Path) -> PosedDetections:
+    """Return the poses of a folder as views without boxes; DatasetError: it has no poses."""
+    layout = find_layout(path)
+    if layout is None:
+        raise DatasetError(f'{path}: has no poses to look from; give --observations, too')
+    capture = layout.read(path, FolderOptions())
+    if not capture.is_metric:
+        raise DatasetError(f'{path}: {layout.name} does not know its unit; give --observations, '
+                           'too: build_map makes them, with --scale')
+    posed, cameras = [], []
+    for raw in read_folder(path).read_raw(lambda place, stamp_ns, pose: pose is not None):
+        posed.append((raw.stamp_ns, raw.map_from_camera))
+        cameras.append(capture.files[raw.place].camera.pinhole)
+    if not posed:
+        raise DatasetError(f'{path}: no image has a pose')
+    each, rows = group_cameras(cameras)
+    names = names_of_group(each)
+    return PosedDetections(
+        cameras=each, map_from_camera=np.array([pose for _, pose in posed]),
+        stamps_s=np.array([stamp for stamp, _ in posed]) / NS_PER_S,
+        frame_offsets=np.zeros(len(posed) + 1, dtype=np.int64), bboxes_xyxy=np.empty((0, 4)),
+        class_names=(), classes=np.empty(0, dtype=np.int64), scores=np.empty(0),
+        camera_rows=None if names == ('',) else rows, camera_names=names)
+
+
+class Outline(NamedTuple):
+    """The outline of a landmark in a view: cx, cy, exx, exy, eyy [px]."""
+
+    landmark_id: str
+    ellipse: NDArray[np.float64]
+    distance_m: float
+
+
+def outlines_of(landmarks: Mapping[str, Landmark], camera: Camera,
+                map_from_camera: NDArray[np.float64]) -> list[Outline]:
+    """Return the outlines of the landmarks in a view, the nearest first."""
+    if not landmarks:
+        return []
+    centers = np.array([one.center for one in landmarks.values()])
+    shapes = shape_matrices(np.array([one.semi_axes for one in landmarks.values()]),
+                            np.array([one.quat_xyzw for one in landmarks.values()]))
+    camera_from_map = invert_transform(map_from_camera)
+    ellipses = ellipses_in_pixels(project_ellipsoids(camera_from_map, centers, shapes), camera)
+    distances = np.linalg.norm(centers - map_from_camera[:3, 3], axis=1)
+    half = np.sqrt(ellipses[:, [2, 4]])
+    with np.errstate(invalid='ignore'):
+        inside = ((ellipses[:, :2] + half > 0.0).all(axis=1)
+                  & (ellipses[:, :2] - half < (camera.width, camera.height)).all(axis=1))
+    ids = list(landmarks)
+    return sorted((Outline(ids[row], ellipses[row], float(distances[row]))
+                   for row in np.nonzero(inside)[0]), key=lambda one: one.distance_m)
+
+
+def landmark_at(outlines: Sequence[Outline], pixel: Pixel) -> str | None:
+    """Return the landmark with the smallest outline around a pixel (2,)."""
+    around = []
+    for one in outlines:
+        cx, cy, exx, exy, eyy = one.ellipse
+        x, y = pixel[0] - cx, pixel[1] - cy
+        determinant = exx * eyy - exy * exy
+        if (eyy * x * x - 2.0 * exy * x * y + exx * y * y) <= determinant:
+            around.append((determinant, one.landmark_id))
+    return min(around)[1] if around else None
+
+
+def box_at(boxes_xyxy: NDArray[np.float64], pixel: Pixel) -> int | None:
+    """Return the row of the smallest box (n, 4) around a pixel (2,)."""
+    x, y = pixel
+    left, top, right, bottom = boxes_xyxy.T
+    rows = np.nonzero((left <= x) & (x <= right) & (top <= y) & (y <= bottom))[0]
+    areas = (right - left) * (bottom - top)
+    return int(rows[np.argmin(areas[rows])]) if len(rows) else None

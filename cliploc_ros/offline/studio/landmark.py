@@ -1,0 +1,205 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""One landmark as the studio holds it: its fields of the map file, and its look.
+
+The relocalizer refuses a map with unknown fields, since a misspelled field would be silently
+without effect. The studio opens such a map, keeps these fields, and says that they are refused.
+
+A look is what an image encoder saw of a landmark. It is a part of the landmark, so it follows its
+landmark through merge, split, delete, undo and redo.
+"""
+
+import base64
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.map.landmark_details import OPTIONAL_FIELDS, LandmarkDetails, read_details
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.offline.mapping.labelling import choose_medoids
+
+KNOWN_FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation', *OPTIONAL_FIELDS)
+#: Edited numbers are rounded to these, so that the file holds exactly what the studio shows.
+DECIMALS = 6
+#: The least semi-axis that an edit may set [m]; the file format allows less.
+LEAST_SEMI_AXIS_M = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Encoded:
+    """What an image encoder saw of one landmark."""
+
+    mean: NDArray[np.float16]  #: (d,): the mean direction of its crops, of unit length
+    #: (m, d): crops that stand for all of its crops, unit rows; at most five
+    medoids: NDArray[np.float16]
+    encoder_key: str
+
+    @cached_property
+    def key(self) -> str:
+        """The digest that tells one look from another."""
+        content = self.encoder_key.encode() + self.mean.tobytes() + self.medoids.tobytes()
+        return hashlib.sha256(content).hexdigest()[:24]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the look as JSON holds it."""
+        return {'look': self.key, 'encoder': self.encoder_key,
+                'mean': base64.b64encode(self.mean.tobytes()).decode(),
+                'medoids': base64.b64encode(self.medoids.tobytes()).decode()}
+
+
+def look_from_json(tree: Mapping[str, Any]) -> Encoded | None:
+    """Return a look from JSON; None where it is damaged."""
+    try:
+        mean, medoids = (np.frombuffer(base64.b64decode(tree[name], validate=True), np.float16)
+                         for name in ('mean', 'medoids'))
+        look = Encoded(mean, medoids.reshape(-1, len(mean)), str(tree['encoder']))
+    except (KeyError, TypeError, ValueError):
+        return None
+    return look if look.key == tree.get('look') else None
+
+
+def merge_looks(looks: Sequence[Encoded | None], weights: Sequence[float]) -> Encoded | None:
+    """Return the look of one landmark that several become; None where no look is known.
+
+    The weights are, for example, the numbers of boxes. Looks of another encoder than the first
+    one's do not count.
+    """
+    known = [(look, weight) for look, weight in zip(looks, weights, strict=True)
+             if look is not None]
+    known = [(look, weight) for look, weight in known
+             if (look.encoder_key, len(look.mean)) == (known[0][0].encoder_key,
+                                                       len(known[0][0].mean))]
+    if len(known) < 2:
+        return known[0][0] if known else None
+    mean = np.sum([weight * look.mean.astype(np.float32) for look, weight in known], axis=0)
+    length = float(np.linalg.norm(mean))
+    if not length > 0.0:
+        return None
+    crops = np.concatenate([look.medoids for look, _ in known]).astype(np.float32)
+    shares = np.concatenate([np.full(len(look.medoids), weight / max(1, len(look.medoids)))
+                             for look, weight in known])
+    return Encoded(
+        (mean / length).astype(np.float16),
+        crops[choose_medoids(crops, shares)].astype(np.float16), known[0][0].encoder_key)
+
+
+def looks_of(embeddings: LandmarkEmbeddings) -> dict[str, Encoded]:
+    """Return the known looks by id of the landmark."""
+    offsets = embeddings.medoid_offsets
+    return {landmark_id: Encoded(embeddings.means[row],
+                                 embeddings.medoids[offsets[row]:offsets[row + 1]],
+                                 embeddings.encoder_key)
+            for row, landmark_id in enumerate(embeddings.landmark_ids)
+            if embeddings.is_known[row]}
+
+
+@dataclass(frozen=True)
+class Marks:
+    """What the studio keeps of a landmark; the map file does not hold it."""
+
+    is_locked: bool = False  #: Edits are refused
+    is_hidden: bool = False  #: The scene and the views leave it out
+    decision: str = ''  #: Of the review: accepted, fixed; '' for none
+
+    @classmethod
+    def from_json(cls, tree: Any) -> 'Marks':
+        """Return marks from JSON; what is none of them is left out."""
+        known = tree if isinstance(tree, dict) else {}
+        decision = known.get('decision')
+        return cls(known.get('is_locked') is True, known.get('is_hidden') is True,
+                   decision if decision in ('accepted', 'fixed') else '')
+
+
+@dataclass(frozen=True)
+class Landmark:
+    """A landmark of the map that is edited."""
+
+    fields: Mapping[str, Any]  #: As in the map file, below the landmark's id
+    marks: Marks = Marks()
+    look: Encoded | None = field(default=None, compare=False)  #: From the file next to the map
+
+    @cached_property
+    def details(self) -> LandmarkDetails:
+        """The optional fields."""
+        return read_details(self.fields, 'landmark')
+
+    @property
+    def label(self) -> str:
+        """The label; of several, the one with the greatest weight."""
+        if 'label' in self.fields:
+            return str(self.fields['label'])
+        return max(self.details.labels or (('', 0.0),), key=lambda pair: pair[1])[0]
+
+    @property
+    def class_id(self) -> str:
+        """The detector class."""
+        return str(self.fields['class_id'])
+
+    @cached_property
+    def center(self) -> NDArray[np.float64]:
+        """The centre (3,) [m]."""
+        return _read_only(np.array(self.fields['center'], dtype=np.float64))
+
+    @cached_property
+    def semi_axes(self) -> NDArray[np.float64]:
+        """The semi-axes (3,) [m]."""
+        return _read_only(np.array(self.fields['semi_axes'], dtype=np.float64))
+
+    @cached_property
+    def quat_xyzw(self) -> NDArray[np.float64]:
+        """The unit quaternion (4,) from landmark axes to map axes."""
+        quat_xyzw = np.array(self.fields['orientation'], dtype=np.float64)
+        return _read_only(quat_xyzw / np.linalg.norm(quat_xyzw))
+
+    @property
+    def basis(self) -> NDArray[np.float64]:
+        """The basis (3, 3), whose columns are the semi-axes in the map [m]."""
+        return np.asarray(Rotation.from_quat(self.quat_xyzw).as_matrix() * self.semi_axes)
+
+    def changed(self, **fields: Any) -> 'Landmark':
+        """Return the landmark with other values; a field that is None is left out."""
+        together = {**self.fields, **fields}
+        return replace(self, fields={name: value for name, value in together.items()
+                                     if value is not None or name not in fields})
+
+
+def _read_only(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    values.setflags(write=False)
+    return values
+
+
+def map_of(landmarks: Mapping[str, Landmark], frame_id: Any, source: str) -> LandmarkMap:
+    """Return landmarks as the relocalizer knows them, without unknown fields.
+
+    MapError: there are none, or one is invalid. Names the source, the landmark and the field.
+    """
+    known = {landmark_id: {name: value for name, value in one.fields.items()
+                           if name in KNOWN_FIELDS} for landmark_id, one in landmarks.items()}
+    return LandmarkMap.from_mapping({'frame_id': frame_id, 'landmarks': known}, source)
+
+
+def rounded(values: Iterable[float]) -> list[float]:
+    """Return numbers as an edit writes them."""
+    return [round(float(value), DECIMALS) + 0.0 for value in values]
+
+
+def shape_fields(center: NDArray[np.float64], basis: NDArray[np.float64]) -> dict[str, Any]:
+    """Return the fields of an ellipsoid with a centre (3,) and a basis (3, 3) in the map.
+
+    The basis' columns are orthogonal semi-axes [m].
+    """
+    lengths = np.linalg.norm(basis, axis=0)
+    rotation = basis / np.maximum(lengths, 1e-12)
+    if np.linalg.det(rotation) < 0.0:
+        rotation = rotation * (1.0, 1.0, -1.0)
+    quat_xyzw = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    return {'center': rounded(center),
+            'semi_axes': rounded(np.maximum(lengths, LEAST_SEMI_AXIS_M)),
+            'orientation': rounded(quat_xyzw)}

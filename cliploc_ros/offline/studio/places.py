@@ -1,0 +1,203 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where a robot would be accepted, refused or misled in the map, and places that look alike.
+
+Both are check_map's. The positions are fewer, in an order that spreads them: where time runs out,
+those that were tried lie all over the map.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.errors import CliplocError
+from cliploc_ros.offline.mapping.check.checking import judge_grid
+from cliploc_ros.offline.mapping.check.landmark_faults import hear_witness
+from cliploc_ros.offline.mapping.check.places import Grid, LookAlike, find_look_alikes, make_grid
+from cliploc_ros.offline.mapping.check.relocalization import (
+    Trial,
+    count_verdicts,
+    each_pose,
+    measure_detector,
+)
+from cliploc_ros.offline.mapping.check.report import GridCheck
+from cliploc_ros.offline.mapping.options import CheckOptions
+from cliploc_ros.offline.simulation.detector import DetectorModel, guess_detector
+from cliploc_ros.offline.studio.document import fields_of
+from cliploc_ros.offline.studio.edits import EditError, Landmarks
+from cliploc_ros.offline.studio.landmark import map_of
+from cliploc_ros.offline.studio.recording import Recording
+from cliploc_ros.offline.studio.studio import Studio
+
+#: No position is begun after this [s].
+LIMIT_S = 60.0
+_OPTIONS = CheckOptions(max_positions=100, headings=8)
+
+
+class Coverage(NamedTuple):
+    """The coverage and the look-alikes of a map."""
+
+    landmarks: Landmarks  #: That were checked
+    grid: Grid  #: All positions, the tried ones first
+    check: GridCheck  #: Of the tried positions
+    look_alikes: tuple[LookAlike, ...]
+    detector: str  #: The source of the detector's errors, in words
+
+    @property
+    def figures(self) -> dict[str, str]:
+        """The figures by name."""
+        count, verdicts = len(self.check.positions), count_verdicts(self.check.trials)
+        views = len(self.check.trials)
+        return {'positions with a heading accepted by objects':
+                f'{int((self.check.accepted > 0).sum())} of {count}',
+                'views accepted': f'{verdicts["accepted"]} of {views}',
+                'views misled': f'{verdicts["misled"]} of {views}',
+                'pairs of places that look alike': str(len(self.look_alikes))}
+
+    def lines(self, before: 'Coverage | None') -> list[str]:
+        """Return the figures in lines, with those of the time before."""
+        old = before.figures if before is not None else {}
+        lines = [f'{name}: {value}' + (f' (was {old[name]})' if old else '')
+                 for name, value in self.figures.items()]
+        if len(self.check.positions) < len(self.grid.positions):
+            lines.append(f'time ran out: {len(self.grid.positions)} positions were planned')
+        return [*lines, f'{self.detector}; similarities are simulated']
+
+
+def find_places(landmarks: Landmarks, recording: Recording | None, before: Coverage | None,
+                tell: Callable[[float], None], limit_s: float = LIMIT_S) -> Coverage:
+    """Return the places of a map where a robot would be accepted, refused or misled.
+
+    The recording gives the camera's height and the detector's errors. The positions of the time
+    before are tried again where they suit, so that only edits change the figures. ``tell`` is
+    called with the share that is done; an error that it raises ends the search. No position is
+    begun after the limit. MapError: there are no landmarks.
+    """
+    tell(0.0)
+    landmark_map = map_of(landmarks, 'map', 'studio')
+    model, detector = _detector(landmark_map, recording)
+    grid = _grid(landmark_map, recording, before)
+    trials: list[Trial] = []
+    begin = time.monotonic()
+    for trial in each_pose(model, landmark_map, grid.poses, _OPTIONS):
+        if not trials:
+            begin = time.monotonic()  # the first one may have compiled kernels
+        trials.append(trial)
+        tell(len(trials) / len(grid.poses))
+        is_whole = len(trials) % _OPTIONS.headings == 0
+        if is_whole and time.monotonic() - begin > limit_s:
+            break
+    look_alikes = find_look_alikes(landmark_map)
+    return Coverage(landmarks, grid, judge_grid(grid, model, trials, _OPTIONS.headings),
+                    tuple(look_alikes), detector)
+
+
+def _detector(landmark_map: LandmarkMap, recording: Recording | None
+              ) -> tuple[DetectorModel, str]:
+    guess = guess_detector(landmark_map, (_OPTIONS.mapping.edge_sigma_px,
+                                          _OPTIONS.mapping.edge_sigma_share))
+    if recording is None:
+        return guess, 'without a recording, the camera and the detector are guesses'
+    detections = recording.detections
+    guess = replace(guess, camera=detections.cameras[0])
+    if len(detections.classes) == 0:
+        return guess, 'without boxes, the detector is a guess'
+    witness = hear_witness(recording.views, landmark_map, detections.class_names,
+                           recording.options)
+    if not (witness.shown >= 0).any():
+        return guess, 'no box of the recording shows a landmark: the detector is a guess'
+    return (measure_detector(landmark_map, detections, recording.views, witness,
+                             recording.options), 'the detector is as in the recording')
+
+
+def _grid(landmark_map: LandmarkMap, recording: Recording | None, before: Coverage | None) -> Grid:
+    """Return positions all over the map, those of the time before if their corners agree."""
+    poses = None if recording is None else recording.detections.of_first_camera
+    grid = make_grid(landmark_map, poses, _OPTIONS)
+    if before is not None and len(grid.positions) and len(before.grid.positions):
+        offset_m = max(np.abs(corner(grid.positions, axis=0)
+                              - corner(before.grid.positions, axis=0)).max()
+                       for corner in (np.min, np.max))
+        if offset_m <= grid.spacing_m:
+            return before.grid
+    order = np.random.default_rng(_OPTIONS.random_seed).permutation(len(grid.positions))
+    by_position = grid.poses.reshape(len(order), _OPTIONS.headings, 4, 4)
+    return Grid(grid.positions[order], grid.is_near[order],
+                by_position[order].reshape(-1, 4, 4), grid.spacing_m)
+
+
+class PlacesSearch:
+    """A search in a thread of its own, one at a time.
+
+    ``on_change`` is called in any thread when there is something new to show.
+    """
+
+    def __init__(self, studio: Studio, on_change: Callable[[], None]):
+        self._studio, self._on_change = studio, on_change
+        self._thread: threading.Thread | None = None
+        self._stopped = threading.Event()
+        self._lock = threading.Lock()
+        self.share = 0.0
+        # the last two results, and why the last search found nothing
+        self.before: Coverage | None = None
+        self.last: Coverage | None = None
+        self.failure = ''
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a search is under way."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def start(self) -> None:
+        """Begin a search in the map as it is; EditError: one is under way, or the map is empty."""
+        with self._lock:
+            if self.is_running:
+                raise EditError('a search of places is under way: wait for it, or stop it')
+            landmarks = self._studio.document.landmarks
+            if not landmarks:
+                raise EditError('the map is empty: create a landmark first')
+            self._stopped.clear()
+            self.share, self.failure = 0.0, ''
+            self._thread = threading.Thread(target=self._run, args=(landmarks,), daemon=True,
+                                            name='places')
+            self._thread.start()
+        self._on_change()
+
+    def stop(self) -> None:
+        """Stop the search, and wait until it has stopped; the last result stays."""
+        self._stopped.set()
+        if (thread := self._thread) is not None:
+            thread.join()
+        self._on_change()
+
+    def is_stale(self) -> bool:
+        """Return whether the map was edited since the last result."""
+        last, landmarks = self.last, self._studio.document.landmarks
+        return last is not None and last.landmarks is not landmarks \
+            and fields_of(last.landmarks) != fields_of(landmarks)
+
+    def _run(self, landmarks: Landmarks) -> None:
+        try:
+            found = find_places(landmarks, self._studio.recording, self.last, self._tell)
+            self.before, self.last = self.last, found
+        except CliplocError as error:
+            self.failure = str(error)
+        except Exception as error:  # a thread that dies silently would leave the page waiting
+            self.failure = f'internal error: {error}'
+            raise
+        finally:
+            self._thread = None
+            self._on_change()
+
+    def _tell(self, share: float) -> None:
+        if self._stopped.is_set():
+            raise CliplocError('stopped')
+        if share - self.share >= 0.01:
+            self.share = share
+            self._on_change()
+

@@ -1,0 +1,175 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The review: each landmark of the map once, the worst first, until a person has decided on all.
+
+The order is that of the last check, so that a decision moves no landmark below the person's hand.
+Landmarks that are newer come last. Decisions are marks of the landmarks: undo takes them back,
+and they survive a restart.
+"""
+
+from collections.abc import Sequence
+
+from cliploc_ros.offline.mapping.check.landmark_faults import (
+    LandmarkCheck,
+    check_landmarks,
+    find_map_overlaps,
+)
+from cliploc_ros.offline.mapping.check.report import SERIOUS
+from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.studio import edits
+from cliploc_ros.offline.studio.document import Document
+from cliploc_ros.offline.studio.edits import EditError
+from cliploc_ros.offline.studio.landmark import map_of
+from cliploc_ros.offline.studio.recording import Recording
+
+
+class ReviewQueue:
+    """The queue of landmarks, and the decisions on them."""
+
+    def __init__(self, document: Document, recording: Recording | None):
+        self._document, self._recording = document, recording
+        self._checks: dict[str, LandmarkCheck] = {}
+        self._duplicates: list[tuple[str, str]] = []
+        self._order: tuple[str, ...] = ()
+
+    # ---- what is known --------------------------------------------------------------------------
+
+    @property
+    def has_boxes(self) -> bool:
+        """Whether a recording's boxes judge the landmarks; else the map's own figures do."""
+        return self._recording is not None and len(self._recording.detections.classes) > 0
+
+    def check_of(self, landmark_id: str) -> LandmarkCheck | None:
+        """Return the last check of a landmark."""
+        return self._checks.get(landmark_id)
+
+    @property
+    def order(self) -> list[str]:
+        """The landmarks of the last check, the worst first, deleted ones included; newer ones."""
+        return list(dict.fromkeys([*self._order, *self._document.landmarks]))
+
+    def decision(self, landmark_id: str) -> str:
+        """Return the decision on a landmark, '' for none; an undone deletion is none."""
+        one = self._document.landmarks.get(landmark_id)
+        return 'deleted' if one is None else one.marks.decision
+
+    def severity(self, landmark_id: str) -> float:
+        """Return how bad the faults of a landmark are; 0 once a person has decided on it."""
+        check = self._checks.get(landmark_id)
+        return 0.0 if check is None or self.decision(landmark_id) else check.severity
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of landmarks in the queue, 0 before it, and of each decision."""
+        found = [self.decision(key) for key in self.order] if self._order else []
+        return {'total': len(found), **{name: found.count(name)
+                                        for name in ('accepted', 'fixed', 'deleted')}}
+
+    # ---- what a person does ---------------------------------------------------------------------
+
+    def check(self) -> str:
+        """Judge all landmarks; once more after a complete review, a new one begins."""
+        self._judge()
+        with self._document.lock:
+            landmarks = self._document.landmarks
+            begins_anew = self._order and all(self.decision(key) for key in landmarks)
+            if begins_anew:
+                self._document.apply(edits.mark(landmarks, landmarks, 'review', decision=''))
+        self._order = tuple(self._checks)
+        serious = sum(one.severity >= SERIOUS for one in self._checks.values())
+        source = '' if self.has_boxes else ' by the map alone: there are no boxes of a recording'
+        what = f'checked {len(self._order)} landmarks{source}: {serious} with a serious fault'
+        # what a person has chosen meanwhile stays
+        return what if self._document.selection and not begins_anew else self._go_on('', what)
+
+    def accept(self) -> str:
+        """Accept the selection as it is, whatever the check says, and go on."""
+        ids = self._selected()
+        return self._decide(ids, 'accepted', f'accepted {", ".join(ids)}')
+
+    def delete(self) -> str:
+        """Delete the selection, and go on."""
+        ids = self._selected()
+        self._document.apply(edits.delete(self._document.landmarks, ids))
+        if self._document.landmarks and any({*pair} & {*ids} for pair in self._duplicates):
+            self._judge()  # or else its duplicate would be called one
+        return self._go_on(ids[-1], f'deleted {", ".join(ids)}')
+
+    def fix(self) -> str:
+        """Do what the check advises: merge a duplicate, fit any other landmark to its boxes.
+
+        The landmark is checked once more; the review goes on if no serious fault is left. The
+        boxes of a moved object may still lie where it was: look at the result.
+        """
+        landmark_id = self._selected()[0]
+        if self._recording is None or not self.has_boxes:
+            raise EditError(f'{landmark_id}: there are no boxes to fit it to: edit, accept or '
+                            'delete it')
+        landmarks = self._document.landmarks
+        pairs = [pair for pair in self._duplicates if landmark_id in pair
+                 and all(key in landmarks for key in pair)]
+        if pairs:  # the nearest first
+            partner = pairs[0][pairs[0][0] == landmark_id]
+            change, how = self._recording.merged(landmarks, [landmark_id, partner])
+            what = f'merged {landmark_id} with {partner} {how}'
+        else:
+            change, left_out = self._recording.refitted(landmarks, [landmark_id])
+            if left_out:
+                raise EditError(f'{landmark_id} {left_out[landmark_id]}: edit, accept or delete '
+                                'it')
+            what = f'fitted {landmark_id} to its boxes'
+        gesture = object()  # one undo takes back both
+        self._document.apply(change, gesture)
+        self._judge()
+        left = self._checks[landmark_id]
+        if left.severity >= SERIOUS:
+            self._document.select([landmark_id])
+            return f'{what}; it still {left.faults[0]}'
+        return self._decide([landmark_id], 'fixed', what, gesture)
+
+    def step(self, count: int) -> str | None:
+        """Select the landmark that lies some places farther in the queue."""
+        ids = [key for key in self.order if key in self._document.landmarks]
+        if not ids:
+            raise EditError('there are no landmarks')
+        selection = self._document.selection
+        place = ids.index(selection[0]) + count if selection else 0
+        self._document.select([ids[place % len(ids)]])
+        return None
+
+    # ---------------------------------------------------------------------------------------------
+
+    def _selected(self) -> tuple[str, ...]:
+        if not self._document.selection:
+            raise EditError('select a landmark first')
+        return self._document.selection
+
+    def _decide(self, ids: Sequence[str], decision: str, what: str, gesture: object = None
+                ) -> str:
+        """Keep a decision, and select the next landmark without one."""
+        self._document.apply(edits.mark(self._document.landmarks, ids, decision,
+                                        decision=decision), gesture)
+        return self._go_on(ids[-1], what)
+
+    def _go_on(self, last: str, what: str) -> str:
+        order = self.order
+        start = order.index(last) + 1 if last in order else 0
+        rest = [key for key in order[start:] + order[:start] if not self.decision(key)]
+        if not rest:
+            return f'{what}; the review is complete'
+        self._document.select(rest[:1])
+        return what
+
+    def _judge(self) -> None:
+        landmarks = self._document.landmarks
+        if not landmarks:
+            raise EditError('there are no landmarks to review: create one first')
+        if self._recording is not None and self.has_boxes:
+            found, overlaps = self._recording.check(landmarks)
+        else:
+            landmark_map = map_of(landmarks, 'map', 'studio')
+            overlaps = find_map_overlaps(landmark_map, None, None)
+            found = check_landmarks(landmark_map, None, overlaps, MappingOptions())
+        ids = list(landmarks)
+        self._checks = {one.landmark_id: one for one in found}
+        self._duplicates = [(ids[one.first], ids[one.second]) for one in overlaps
+                            if one.is_duplicate]

@@ -1,0 +1,180 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The phrases of each detector class: shipped ones for COCO, and those of a user's file."""
+
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.map.parameter_file import read_parameter_file
+from cliploc_ros.errors import OptionsError
+
+#: Symbols with a meaning of their own: the first kind, and a colour other than the first one.
+NAME, SECOND = 'name', 'second'
+#: The most phrases of one class. ViT-L-14 reads about 30 phrases per second of a processor.
+MOST_PHRASES = 2000
+# CLIP reads 77 tokens.
+_MOST_CHARACTERS = 200
+_MOST_STEPS = 20
+_SYMBOL = re.compile(r'\{(\w+)\}')
+_A_BEFORE_VOWEL = re.compile(r'\b(a)(?= (?:[aeio]|u(?!ni|se)))', re.IGNORECASE)
+
+Rules = Mapping[str, Sequence[str]]
+_FOLDER = Path(__file__).parent
+_GENERAL = 'general'
+
+
+class Phrases(NamedTuple):
+    """Some phrases: P texts and their embeddings (P, d), unit rows."""
+
+    texts: tuple[str, ...]
+    embeddings: NDArray[np.float32]
+
+
+def expand_phrases(rules: Rules) -> tuple[str, ...]:
+    """Return all phrases of a grammar, each once, in the order of its templates.
+
+    Parameters
+    ----------
+    rules : mapping of str to sequence of str
+        ``phrases`` are the templates. A word in braces is a symbol: each of its alternatives
+        fills its place, the same one wherever it occurs in a phrase. Alternatives may hold
+        symbols, too. ``{name}`` is the first ``kind``; ``{second}`` is each ``colour`` but the
+        one that fills ``{colour}``.
+
+    Raises
+    ------
+    OptionsError
+        A symbol has no rule, rules do not end, or the phrases are too many or too long.
+    """
+    phrases = [_A_BEFORE_VOWEL.sub(r'\1n', phrase) for template in rules['phrases']
+               for phrase in islice(_expand(template, rules, {}, 0), MOST_PHRASES + 1)]
+    if len(phrases) > MOST_PHRASES:
+        raise OptionsError(f'more than {MOST_PHRASES} phrases; use fewer words or templates')
+    return tuple(dict.fromkeys(phrases))
+
+
+def _expand(text: str, rules: Rules, chosen: dict[str, str], steps: int) -> Iterator[str]:
+    """Yield a text with its symbols replaced, from left to right."""
+    if len(text) > _MOST_CHARACTERS:
+        raise OptionsError(f"'{text[:40]}...' has more than {_MOST_CHARACTERS} characters")
+    if steps > _MOST_STEPS:
+        raise OptionsError(f"'{text}' does not end: rules refer to each other")
+    symbol = _SYMBOL.search(text)
+    if symbol is None:
+        yield text
+        return
+    name = symbol[1]
+    words = [chosen[name]] if name in chosen else _alternatives(name, rules, chosen)
+    for word in words:
+        yield from _expand(text[:symbol.start()] + word + text[symbol.end():], rules,
+                           chosen | {name: word}, steps + 1)
+
+
+def _alternatives(name: str, rules: Rules, chosen: dict[str, str]) -> Sequence[str]:
+    if name == NAME:
+        return rules['kind'][:1]
+    if name == SECOND:
+        words = [word for word in rules['colour'] if word != chosen.get('colour')]
+        if not words:
+            raise OptionsError('{second} needs two colours')
+        return words
+    if name not in rules or name == 'phrases':
+        raise OptionsError(f'{{{name}}} has no words; add the rule {name}')
+    return rules[name]
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """Phrases by class."""
+
+    added: Mapping[str, tuple[str, ...]]  #: Phrases of a user besides the shipped ones
+
+    def phrases(self, class_name: str) -> tuple[str, ...]:
+        """Return the phrases of a class, each once; the user's come first.
+
+        A class that is not in the vocabulary is described by the general grammar.
+        """
+        return tuple(dict.fromkeys(self.added.get(class_name, ()) + shipped_phrases(class_name)))
+
+
+def load_vocabulary(path: str | os.PathLike[str] | None = None) -> Vocabulary:
+    """Return the shipped vocabulary, with the phrases of a file besides.
+
+    Parameters
+    ----------
+    path : str or path, optional
+        A YAML file: class names to a list of phrases, or to rules as in coco.yaml.
+
+    Raises
+    ------
+    CliplocError
+        The file is invalid; the message names file, class and rule.
+    """
+    if path is None:
+        return Vocabulary({})
+    entries = read_parameter_file(path)
+    if not entries:
+        raise OptionsError(f'{path}: holds no classes')
+    return Vocabulary({name: _phrases_of(name, entry, f"{path}: class '{name}'")
+                       for name, entry in entries.items()})
+
+
+def shipped_classes() -> tuple[str, ...]:
+    """Return the classes that the shipped vocabulary knows by name."""
+    return tuple(_shipped('coco.yaml'))
+
+
+def shipped_phrases(name: str) -> tuple[str, ...]:
+    """Return the phrases of a class without those of a user."""
+    return _phrases_of(name, _shipped('coco.yaml').get(name, {}), f"class '{name}'")
+
+
+@cache
+def _shipped(file: str) -> dict[str, Any]:
+    return read_parameter_file(_FOLDER / file)
+
+
+def _phrases_of(name: str, entry: Any, where: str) -> tuple[str, ...]:
+    """Return the phrases of a class from a list of templates or a mapping of rules."""
+    if isinstance(entry, list):
+        entry = {'phrases': entry}
+    if not isinstance(entry, Mapping):
+        raise OptionsError(f'{where}: expected a list of phrases or a mapping of rules, '
+                           f'not {entry!r:.60}')
+    rules = {rule: _words(words, f'{where}: {rule}') for rule, words in entry.items()
+             if rule != 'grammar'}
+    # a detector may name a class tv_monitor; braces would be symbols
+    plain = ' '.join(re.sub(r'[_{}]', ' ', name).split()) or 'object'
+    grammar = _grammar(entry.get('grammar', _GENERAL), where)
+    try:
+        return expand_phrases({'kind': [plain]} | grammar | rules)
+    except OptionsError as error:
+        raise OptionsError(f'{where}: {error}') from error
+
+
+def _grammar(name: Any, where: str) -> dict[str, list[str]]:
+    """Return the rules of a grammar and, where it has none, those of the general one."""
+    grammars = _shipped('grammars.yaml')
+    if not isinstance(name, str) or name not in grammars:
+        raise OptionsError(f'{where}: grammar: {name!r:.60} is none of {", ".join(grammars)}')
+    return {**grammars[_GENERAL], **grammars[name]}
+
+
+def _words(words: Any, where: str) -> list[str]:
+    if where.endswith((f': {NAME}', f': {SECOND}')):
+        raise OptionsError(f'{where}: has a meaning of its own; choose another name')
+    if not isinstance(words, list) or not words:
+        raise OptionsError(f'{where}: expected a list of text, not {words!r:.60}')
+    for word in words:
+        if not isinstance(word, str) or not word.strip():
+            raise OptionsError(f'{where}: {word!r:.60} is no text (quote numbers and yes/no)')
+    return words
