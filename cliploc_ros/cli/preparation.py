@@ -31,7 +31,7 @@ from cliploc_ros.nodes.relocalizer import RelocalizerNode
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, clip_options_of, load_localizer
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.robot_state import RobotState
+from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.map_parameters import map_files
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
@@ -123,7 +123,7 @@ def answer(image_rgb: NDArray[np.uint8], detector: ObjectDetector | None,
     # what a request costs at most
     localized = localizer.localize(
         Frame(image, info, detections_to_msg(boxes, header), now, now),
-        replace(parameters, crops='all'), RobotState(np.eye(4)), times)
+        replace(parameters, crops='all'), KnownBefore(RobotState(np.eye(4))), times)
     stage_ms = {'detection': detection_ms} if detector is not None else {}
     return Request(stage_ms | times.ms, len(found), len(boxes),
                    localized.found.reason or 'accepted')

@@ -148,7 +148,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                 (health.fail if fault.is_certain else health.warn)(fault.text)
             keyframes = localizer.keyframes
             if keyframes is not None:
-                health.values |= {'keyframes': len(keyframes), 'keyframes file': keyframes.file,
+                health.values |= {'keyframes': len(keyframes.layer),
+                                  'keyframes file': keyframes.file,
                                   'keyframes hash': keyframes.file_hash}
             health.values |= localizer.cameras.values
             for wrong in localizer.cameras.faults:
