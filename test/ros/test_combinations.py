@@ -144,14 +144,18 @@ def test_a_refused_request_of_several_looks_is_refused_again_alike(cameras, tmp_
     equal(again, found.found)
 
 
-@pytest.mark.parametrize('probability', [0.95, 0.0])
-def test_where_a_prior_decides_the_record_says_so(probability, tmp_path):
+@pytest.mark.parametrize('x_m', [0.0, 30.0])
+def test_where_a_prior_decides_the_record_has_it(x_m, tmp_path):
     drive = Drive(1, 'prior', tmp_path)
-    drive.objects, drive.region = 4, replace(drive.region, probability=probability)
+    drive.region = replace(drive.region, mean=np.array([x_m, 0.0, 0.0]))
     found, _ = drive.localize()
-    _, again = drive.recorded()
-    assert (found.found.evidence.prior != 0.0) == (probability > 0.0)
+    case, again = drive.recorded()
+    assert (found.found.evidence.prior < 0.0) == (x_m > 0.0)
     equal(again, found.found)
+    query, = case.queries
+    without = Localizer(Relocalizer(MAP, case.options)).answer(replace(query, frames=(
+        replace(query.newest, region=None),)))
+    assert without.evidence != again.evidence
 
 
 @pytest.mark.parametrize(('cameras', 'known'), COMBINATIONS)
