@@ -152,6 +152,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                                   'keyframes file': keyframes.file,
                                   'keyframes hash': keyframes.file_hash}
             health.values |= localizer.cameras.values
+            health.values['wrong cameras'] = '; '.join(localizer.cameras.faults)
             for wrong in localizer.cameras.faults:
                 health.fail(f'{wrong}: check camera_info, and the pixels and corners of the boxes')
             if parameters.depth_transport != 'none':

@@ -34,6 +34,7 @@ from cliploc_ros.messages import (
     parse_class_map,
 )
 from cliploc_ros.ros import qos
+from cliploc_ros.ros.answer import Verdict
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.frame_localizer import (
     FrameLocalizer,
@@ -124,15 +125,18 @@ class Doctor(ManagedNode[RelocalizerParameters]):
         Of the relocalizer.
     topics : sequence of str
         Its remappings, NAME:=TOPIC.
+    wrong_cameras : str
+        What its looks have shown to be wrong with its cameras.
     """
 
-    def __init__(self, given: Sequence[Parameter], topics: Sequence[str]) -> None:
+    def __init__(self, given: Sequence[Parameter], topics: Sequence[str], wrong_cameras: str = ''
+                 ) -> None:
         rules = [word for rule in ('/diagnostics:=~/diagnostics', *topics)
                  for word in ('-r', rule)]
         super().__init__('doctor', RelocalizerParameters, DetectorParameters,
                          parameter_overrides=[one for one in given if one.name != 'autostart'],
                          cli_args=['--ros-args', *rules])
-        parameters = self.settings.values
+        parameters, self.wrong_cameras = self.settings.values, wrong_cameras
         self.robot = RobotStateSource(self)
         self.frames = frames_of(self, parameters, LINGER_S)
         self.handoff = HandOff(self, self.robot.odometry)
@@ -390,7 +394,9 @@ def _check_request(node: Doctor, parameters: RelocalizerParameters,
         report.judge('time', time_is_up(stages_ms) if is_slow else '',
                      f'{in_words(stages_ms)}; timeout_s {parameters.timeout_s:g}')
         found = localized.found
-        if found.accepted:
+        if found.accepted and node.wrong_cameras:
+            report.add('pose', State.REFUSED, f'the relocalizer refuses it: {node.wrong_cameras}')
+        elif found.accepted:
             report.add('pose', State.PASS,
                        f'accepted with confidence {found.confidence:.3f}; not handed over')
         else:
@@ -402,7 +408,7 @@ def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) 
 
     CliplocError: a parameter file cannot be read, or no node can have this name.
     """
-    name = whole_name(name)
+    name, wrong_cameras = whole_name(name), ''
     if files:
         given, topics = parameters_of_files(files, name), []
     else:
@@ -411,10 +417,14 @@ def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) 
         except NotRunningError as error:
             return report.add('relocalizer', State.FAIL, str(error))
         given, topics = running.parameters, running.topics
+        wrong_cameras = running.values.get('wrong cameras', '')
+        if any(running.values.get(one, '0') != '0' for one in (
+                Verdict.ACCEPTED, Verdict.WITHHELD)):  # it has no use for its last pose any more
+            given = [one for one in given if one.name != 'last_pose_file']
         # what an active one misses has lines of its own
         report.judge('relocalizer', running.problem, f'{running.name} is active')
     executor, ended = NodeExecutor(), threading.Event()
-    node = Doctor(given, topics)
+    node = Doctor(given, [*topics, f'~/prior:={name}/prior'], wrong_cameras)
     node.get_logger().set_level(LoggingSeverity.ERROR)
     executor.add_node(node)
 
