@@ -180,19 +180,9 @@ class FrameLocalizer:
         CliplocError: names what to fix in the frame or in the parameters.
         """
         times.begin('decoding')
-        localizer = self._localizer_for(parameters.options())
         query = self._instants.query(frame, parameters, known)
-        if self._keyframes is not None:
-            self._instants.note(self._keyframes.layer.camera_note(query.newest.camera))
-        times.begin('search')
-        found = localizer.answer(query, self._observer, deadline, times.begin)
-        for name in localizer.cameras.wrong_mounts:
-            self._instants.note(f'what {name} sees does not fit the other cameras: check its '
-                                'mount, camera_info and image')
-        if localizer.depth_scale.is_wrong:
-            self._instants.note(
-                f'depth is {localizer.depth_scale.ratio:.2f} times what boxes and map say, and '
-                'is used no more: check its unit, calibration and registration')
+        found = self.answer(query, parameters.options(), times, deadline)
+        localizer = self._localizer
         assert localizer.query is not None
         query, seen = localizer.query, localizer.query.newest
         if (found.accepted and found.map_from_camera is not None
@@ -210,6 +200,23 @@ class FrameLocalizer:
             found, landmark_map, SeenImage(query.images[-1], seen, layer), compared, is_cut,
             for_filter, (*frame.left_out, *(one.camera for one, _ in known.beside
                                             if one.camera not in names)), query)
+
+    def answer(self, query: Query, options: RelocalizerOptions, times: StageTimes,
+               deadline: float = math.inf) -> Relocalization:
+        """Answer a query with options as they are now; see localize."""
+        localizer = self._localizer_for(options)
+        if self._keyframes is not None:
+            self._instants.note(self._keyframes.layer.camera_note(query.newest.camera))
+        times.begin('search')
+        found = localizer.answer(query, self._observer, deadline, times.begin)
+        for name in localizer.cameras.wrong_mounts:
+            self._instants.note(f'what {name} sees does not fit the other cameras: check its '
+                                'mount, camera_info and image')
+        if localizer.depth_scale.is_wrong:
+            self._instants.note(
+                f'depth is {localizer.depth_scale.ratio:.2f} times what boxes and map say, and '
+                'is used no more: check its unit, calibration and registration')
+        return found
 
     def look(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
              frame_id: str, map_from_camera: NDArray[np.float64]) -> WatchReport:

@@ -12,7 +12,7 @@ import numpy as np
 
 from cliploc_ros.command import positive_int
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.datasets.observations import load_observations
@@ -247,9 +247,7 @@ def observation_of(recorded: PosedDetections, row: int, stamp_ns: int) -> Observ
     boxes = slice(recorded.frame_offsets[row], recorded.frame_offsets[row + 1])
     odom = None if recorded.odom_from_camera is None else recorded.odom_from_camera[row]
     return Observation(
-        recorded.camera_of(row), Detections(
-            recorded.bboxes_xyxy[boxes],
-            tuple(recorded.class_names[one] for one in recorded.classes[boxes]),
-            recorded.scores[boxes]), stamp_ns=stamp_ns, camera_name=recorded.name_of(row),
+        recorded.camera_of(row), recorded.detections_of(row), stamp_ns=stamp_ns,
+        camera_name=recorded.name_of(row),
         depths=None if recorded.depths is None else recorded.depths[boxes].astype(np.float64),
         odom_from_camera=None if odom is None or np.isnan(odom).any() else odom)
