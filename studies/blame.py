@@ -39,7 +39,7 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.offline.datasets.queries import Queries, load_queries
 from cliploc_ros.offline.evaluation.sensors import with_neighbours, with_vertical
-from cliploc_ros.offline.evaluation.trials import Query, make_queries
+from cliploc_ros.offline.evaluation.trials import PosedQuery, make_queries
 
 CAUSES = ('objects', 'map', 'candidates', 'search', 'choice')
 _MATCHINGS = {'hybrid': 'labels', 'class': 'classes'}
@@ -60,11 +60,11 @@ class Known(NamedTuple):
     """Queries, and the options that say what else is known."""
 
     name: str
-    queries: Sequence[Query]
+    queries: Sequence[PosedQuery]
     options: RelocalizerOptions
 
 
-def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query, limit_m: float
+def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: PosedQuery, limit_m: float
           ) -> Blame:
     """Return what makes a query fail.
 
