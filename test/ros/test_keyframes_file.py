@@ -35,12 +35,12 @@ def load(map_file, keyframes_file='auto'):
 
 
 def test_the_layer_next_to_the_map_or_a_named_one_is_read(room, tmp_path):
-    assert len(load(room)) == 1
+    assert len(load(room).layer) == 1
     moved = tmp_path / 'other.npz'
     (tmp_path / 'room.keyframes.npz').rename(moved)
     assert load(room) is None
-    assert len(load(room, moved)) == 1
-    assert len(load('', moved)) == 1
+    assert len(load(room, moved).layer) == 1
+    assert len(load('', moved).layer) == 1
 
 
 def test_no_layer_is_read_where_none_is_wanted(room):

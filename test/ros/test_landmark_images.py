@@ -28,7 +28,7 @@ from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import load_localizer
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.robot_state import RobotState
+from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
@@ -95,7 +95,7 @@ def frame():
 
 def finds(localizer, frame, values) -> bool:
     """Return whether the pose is accepted; it then has to be right."""
-    found = localizer.localize(frame, values, RobotState(np.eye(4)),
+    found = localizer.localize(frame, values, KnownBefore(RobotState(np.eye(4))),
                                StageTimes('waiting', 0.0)).found
     if found.accepted:
         truth = read_tum(ASSETS / 'sequence').pose_at(round(float(QUERY.timestamp) * NS_PER_S))
