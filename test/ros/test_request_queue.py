@@ -239,9 +239,11 @@ class LateTransforms:
 def test_a_late_transform_is_waited_for(node, camera, clients, wait, late_s):
     set_values(node, base_frame='base_link', timeout_s=4.0, tf_timeout_s=0.0)
     node.robot.transforms._buffer = LateTransforms(late_s)
-    node.localize = lambda frame: Answer(
-        Verdict.REFUSED, 'seen', received_at=frame.received_at,
-        state=node.robot.at(frame.image.header, node.settings.snapshot(), node.deadline))
+
+    def localize(frame):
+        node.robot.at(frame.image.header, node.settings.snapshot(), node.deadline)
+        return Answer(Verdict.REFUSED, 'seen', received_at=frame.received_at)
+    node.localize = localize
     begin = time.monotonic()
     node.deadline = begin + 4.0
     request = clients.submit(node.requests.answer)
