@@ -97,7 +97,7 @@ def main() -> int:
     collects.set_defaults(command=_collect)
     collects.add_argument('--sites', nargs='+', required=True, metavar='DIR[@METRES]',
                           help='RGB-D and TUM folders, the latter with the unit of their depth, '
-                               'and rooms of demo_world.make_keyframe_rooms')
+                               'and rooms of demo.world.make_keyframe_rooms')
     collects.add_argument('--model', required=True, help='weights of YOLO for real images')
     collects.add_argument('--blocks', type=positive_int, nargs='+', default=[], metavar='N',
                           help='map and ask blocks of N images in turn, too')

@@ -32,7 +32,6 @@ from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.core.search.scene import Prior
-from cliploc_ros.demo import ASSETS
 from cliploc_ros.files.storage import make_folder, write_file
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
@@ -44,6 +43,7 @@ from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.offline.recording.networks import MAX_DETECTIONS, RunNetworks
 from cliploc_ros.offline.recording.recorder import record_every_frame
+from demo import ASSETS
 from studies.keyframes.cases import (
     Case,
     Floats,

@@ -30,7 +30,7 @@ from studies.watch.recordings import (
 
 pytestmark = pytest.mark.full
 
-ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 IMAGES = 24
 
 
