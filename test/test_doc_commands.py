@@ -26,8 +26,7 @@ EXECUTABLES = {path.stem for path in (PROJECT / 'cliploc_ros/cli').glob('*.py')
 # Needs a robot, a person, or a sourced ROS: here only the arguments are checked.
 OF_ROS = {'bag', 'pkg', 'security', 'topic'}
 OTHER_PACKAGES = {'robot_localization', 'tf2_ros'}
-# A module for each subcommand.
-OF_STUDIES = ('studies.covariance.', 'studies.speed.')
+OF_STUDIES = ('studies.speed.',)
 MODULES = re.compile(r'(cliploc_ros|demo|studies)\.')
 
 

@@ -24,8 +24,9 @@ from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.files.storage import write_text
 from studies.keyframes.cases import cases
 from studies.keyframes.fit import GENUINE, POINTS, fit, left_out, make_rows, paste, report
-from studies.keyframes.judge import WAYS, draw, make_judge, table
+from studies.keyframes.judge import WAYS, confidences_by_way, make_judge, table
 from studies.keyframes.records import make_collect, read_places
+from studies.reports import draw_judged
 
 _FAMILIES = list(dict.fromkeys(name.partition(':')[0] for name in cases()))
 
@@ -75,7 +76,7 @@ def _judge(options: argparse.Namespace) -> int:
     if options.json:
         write_text(options.json, json.dumps([one._asdict() for one in found], indent=0))
     if options.figure:
-        draw(found, options.figure)
+        draw_judged(options.figure, '', confidences_by_way(found))
     return 0
 
 

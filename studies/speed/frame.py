@@ -45,7 +45,6 @@ from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_weights import import_ultralytics
 from cliploc_ros.offline.datasets.intrinsics import find_camera
 from demo import ASSETS
-from studies.speed.startup import write_random_checkpoint
 
 ENGINES = ('pytorch', 'openvino')
 STAGES = ('detection', 'CLIP', 'search', 'total')
@@ -130,7 +129,10 @@ def _weights(name: str, folder: Path) -> tuple[str, str, str]:
         resolve_clip_weights(ClipOptions(profile.clip_model, profile.clip_pretrained))
     except ModelError:
         clip = str(folder / f'{profile.clip_model}.pt')
-        write_random_checkpoint(profile.clip_model, Path(clip))
+        code = ('import sys, open_clip, torch; torch.manual_seed(0); '
+                'torch.save(open_clip.create_model(sys.argv[1]).state_dict(), sys.argv[2])')
+        subprocess.run([sys.executable, '-c', code, profile.clip_model, clip], check=True,
+                       stderr=subprocess.DEVNULL)
     kinds = {'detector': kept.exists(), 'CLIP': not clip}
     random = [what for what, is_real in kinds.items() if not is_real]
     encoder = json.dumps([profile.clip_model, profile.clip_pretrained, clip])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the tests notice faults: ``python -m studies.mutants --help``.
+"""Whether the tests notice faults: ``python test/mutants.py --help``.
 
 Faults are planted in lines drawn at random, one at a time and in memory: a comparison is turned, a
 constant changed, a term dropped, a sign flipped, a condition negated, two arguments exchanged, a
@@ -44,9 +44,11 @@ from typing import Any, NamedTuple, NoReturn
 import pytest
 from _pytest.runner import runtestprotocol
 
-from cliploc_ros.command import run_command
-
 PROJECT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(PROJECT))  # not the copy in install/
+
+from cliploc_ros.command import run_command  # noqa: E402
+
 PACKAGE = 'cliploc_ros'
 RECORDS = PROJECT / 'build' / 'mutants'
 _SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
@@ -623,7 +625,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def main() -> int:
     """Run the program; return its exit code."""
-    parser = argparse.ArgumentParser(prog='python -m studies.mutants', description=__doc__,
+    parser = argparse.ArgumentParser(prog='python test/mutants.py', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = parser.add_subparsers(required=True)
     part = parts.add_parser('record', help='note which lines tests run')
