@@ -20,15 +20,16 @@ from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.geometry.transforms import RIGHT_M
-from cliploc_ros.core.localizer import Localizer, recorded_crops
+from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.datasets.queries import load_queries
 from cliploc_ros.offline.evaluation.figures import within_ellipsoid
 from cliploc_ros.offline.evaluation.sensors import with_vertical
-from cliploc_ros.offline.evaluation.trials import Query, make_queries
+from cliploc_ros.offline.evaluation.trials import PosedQuery, make_queries
 from studies import wrong_sensors
 from studies.reports import errors_of, interval, table
 from studies.worlds.places import KINDS
@@ -36,7 +37,7 @@ from studies.worlds.world import make_drive
 
 _VERTICAL_DEG = 1.0
 #: What is wrong with all images, from nothing to much.
-CAMERAS: dict[str, Callable[[Sequence[Query]], Sequence[Query]]] = {
+CAMERAS: dict[str, Callable[[Sequence[PosedQuery]], Sequence[PosedQuery]]] = {
     'right': lambda some: some,
     'focal length x 1.03': lambda some: wrong_sensors.scaled_focal(some, 1.03),
     'focal length x .97': lambda some: wrong_sensors.scaled_focal(some, 0.97),
@@ -56,7 +57,7 @@ class Place(NamedTuple):
     """A map and queries in order."""
 
     landmark_map: LandmarkMap
-    queries: Sequence[Query]
+    queries: Sequence[PosedQuery]
     size: tuple[int, int]  #: Of the images [px]
 
 
@@ -69,8 +70,8 @@ class Answer(NamedTuple):
     is_called_wrong: bool  #: The camera, by then
 
 
-def answers(place: Place, change: Callable[[Sequence[Query]], Sequence[Query]], is_one: bool
-            ) -> Iterator[Answer]:
+def answers(place: Place, change: Callable[[Sequence[PosedQuery]], Sequence[PosedQuery]],
+            is_one: bool) -> Iterator[Answer]:
     """Yield the answers of one localizer, or of a new one for each query."""
     options = RelocalizerOptions(k=min(3, len(place.landmark_map)))
     relocalizer = Relocalizer(place.landmark_map, options)
@@ -78,13 +79,12 @@ def answers(place: Place, change: Callable[[Sequence[Query]], Sequence[Query]], 
     for query in change([_of_size(one, place.size) for one in place.queries]):
         if not is_one:
             localizer = Localizer(relocalizer)
-        found = localizer.localize(query.observation, None, crops=recorded_crops(
-            query.observation, options))
+        found = localizer.answer(Query((query.observation,), run=None))
         error_m, _, square = errors_of(found, query.map_from_camera)
         yield Answer(found.accepted, error_m, square, bool(localizer.cameras.faults))
 
 
-def _of_size(query: Query, size: tuple[int, int]) -> Query:
+def _of_size(query: PosedQuery, size: tuple[int, int]) -> PosedQuery:
     """Return a query with the size of its image, which query files do not hold."""
     camera = replace(query.observation.camera, width=size[0], height=size[1])
     return replace(query, observation=replace(query.observation, camera=camera))

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.verdict import refusal
 from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
-from cliploc_ros.core.localizer import Localizer, recorded_crops
+from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.offline.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.trials import PosedQuery
 from studies.acceptance.troubles import of_rows
 from studies.reports import interval
 
@@ -41,7 +42,7 @@ class Retries:
         return float(self.errors_m[np.argmax(self.accepted)]) if self.accepted.any() else np.nan
 
 
-def retry(landmark_map: LandmarkMap, queries: Sequence[Query], options: RelocalizerOptions,
+def retry(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], options: RelocalizerOptions,
           seed: int = 0) -> Iterator[Retries]:
     """Let a robot look 20 times at each query; each look misses some boxes and shifts others."""
     relocalizer, rng = Relocalizer(landmark_map, options), np.random.default_rng(seed)
@@ -51,7 +52,7 @@ def retry(landmark_map: LandmarkMap, queries: Sequence[Query], options: Relocali
         for number in range(LOOKS):
             look = replace(_flickering(query.observation, rng), odom_from_camera=np.eye(4),
                            stamp_ns=(number + 1) * _PERIOD_NS)
-            found = session.localize(look, crops=recorded_crops(look, options))
+            found = session.answer(Query((look,)))
             accepted.append(found.accepted)
             alone.append(found.evidence is not None and not refusal(
                 replace(found.evidence, earlier=()), options))
@@ -69,7 +70,7 @@ def _flickering(observation: Observation, rng: np.random.Generator) -> Observati
                    rows)
 
 
-def _error_m(pose: NDArray[np.float64] | None, query: Query) -> float:
+def _error_m(pose: NDArray[np.float64] | None, query: PosedQuery) -> float:
     return np.inf if pose is None else float(pose_error(pose, query.map_from_camera)[0])
 
 

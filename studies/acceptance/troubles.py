@@ -15,7 +15,7 @@ from cliploc_ros.core.localizer import by_classes
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.offline.evaluation.sensors import with_vertical
-from cliploc_ros.offline.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.trials import PosedQuery
 from studies import wrong_sensors
 from studies.acceptance.places import ALL, FIVE, LEVEL, ONE, VERTICAL, VERTICAL_DEG
 from studies.worlds.cameras import GROUP_SIZE
@@ -28,18 +28,18 @@ _MOVED_M = (0.3, 3.0)
 _SEEN_TWICE, _JITTER, _APART_M = 0.7, 0.02, 0.03
 _ELSEWHERE_M = np.array([1e3, 0.0, 0.0])
 
-World = tuple[LandmarkMap, Sequence[Query]]
+World = tuple[LandmarkMap, Sequence[PosedQuery]]
 #: A change of map and queries by a level, with a generator.
-Change = Callable[[LandmarkMap, Sequence[Query], float, np.random.Generator], World]
+Change = Callable[[LandmarkMap, Sequence[PosedQuery], float, np.random.Generator], World]
 
 
-def unchanged(landmark_map: LandmarkMap, queries: Sequence[Query], level: float,
+def unchanged(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], level: float,
               rng: np.random.Generator) -> World:
     """Change nothing."""
     return landmark_map, queries
 
 
-def exchange_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+def exchange_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
                        rng: np.random.Generator) -> World:
     """Exchange the places of a share of the landmarks; all of them make another place."""
     count = len(landmark_map)
@@ -49,7 +49,7 @@ def exchange_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], shar
     return replace(landmark_map, centers=centers), queries
 
 
-def move_objects(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+def move_objects(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
                  rng: np.random.Generator) -> World:
     """Move a share of the landmarks to other spots at their height, 0.3 to 3 m away."""
     count = len(landmark_map)
@@ -60,7 +60,7 @@ def move_objects(landmark_map: LandmarkMap, queries: Sequence[Query], share: flo
     return replace(landmark_map, centers=moved), queries
 
 
-def double_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], distance_m: float,
+def double_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], distance_m: float,
                      rng: np.random.Generator) -> World:
     """Add a second landmark of the same object next to each one, in random directions."""
     steps = rng.normal(size=landmark_map.centers.shape)
@@ -68,14 +68,14 @@ def double_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], distan
     return _with_copies(landmark_map, queries, steps)
 
 
-def add_equal_room(landmark_map: LandmarkMap, queries: Sequence[Query], gap_m: float,
+def add_equal_room(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], gap_m: float,
                    rng: np.random.Generator) -> World:
     """Add a room that equals the mapped one, beside it."""
     width = float(np.ptp(landmark_map.centers[:, 0]))
     return _with_copies(landmark_map, queries, np.array([width + gap_m, 0.0, 0.0]))
 
 
-def age_half(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+def age_half(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
              rng: np.random.Generator) -> World:
     """Let the map of one of two rooms side by side be out of date, for the queries in it.
 
@@ -94,13 +94,13 @@ def age_half(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
         [one for one in queries if (one.map_from_camera[0, 3] > middle) == is_right], kept))
 
 
-def add_aged_twin(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+def add_aged_twin(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
                   rng: np.random.Generator) -> World:
     """Add an equal room; then one of both changes, see age_half."""
     return age_half(*add_equal_room(landmark_map, queries, 2.0, rng), share, rng)
 
 
-def confuse_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], copies: float,
+def confuse_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], copies: float,
                       rng: np.random.Generator) -> World:
     """Add landmarks of other classes at each landmark, and boxes of these classes at most boxes.
 
@@ -138,7 +138,7 @@ def confuse_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], copie
              for one in _with_columns(queries, rows)])
 
 
-def unmapped_desk(landmark_map: LandmarkMap, queries: Sequence[Query], level: float,
+def unmapped_desk(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], level: float,
                   rng: np.random.Generator) -> World:
     """Let the robot stand at a desk that the map lacks: every pose is wrong. By classes."""
     desk = make_world('one desk', int(rng.integers(1 << 30)), groups=len(queries)).queries
@@ -153,7 +153,7 @@ def unmapped_desk(landmark_map: LandmarkMap, queries: Sequence[Query], level: fl
 def _distorted(change: Callable[[NDArray[np.float64], float, np.random.Generator],
                                 NDArray[np.float64]]) -> Change:
     """Return a change of the landmarks' places (L, 3), relative to their mean, by a level."""
-    def changed(landmark_map: LandmarkMap, queries: Sequence[Query], level: float,
+    def changed(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], level: float,
                 rng: np.random.Generator) -> World:
         middle = landmark_map.centers.mean(axis=0)
         return replace(landmark_map, centers=middle + change(
@@ -177,7 +177,7 @@ def _half_turned(offsets: NDArray[np.float64], angle_deg: float, rng: np.random.
     return turned
 
 
-def random_detections(landmark_map: LandmarkMap, queries: Sequence[Query], count: float,
+def random_detections(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], count: float,
                       rng: np.random.Generator) -> World:
     """Replace the boxes of each query by random ones, each like a random landmark."""
     def drawn(observation: Observation) -> Observation:
@@ -212,7 +212,7 @@ def _random_boxes(observation: Observation, count: int, rng: np.random.Generator
     return np.hstack([corners, corners + rng.uniform(*_BOX_SIDE_PX, (count, 2))])
 
 
-def _with_columns(queries: Sequence[Query], columns: NDArray[np.int64]) -> list[Query]:
+def _with_columns(queries: Sequence[PosedQuery], columns: NDArray[np.int64]) -> list[PosedQuery]:
     """Return queries with the similarities of some landmarks."""
     def chosen(observation: Observation) -> Observation:
         return observation if observation.similarities is None else replace(
@@ -223,8 +223,8 @@ def _with_columns(queries: Sequence[Query], columns: NDArray[np.int64]) -> list[
                     neighbours=tuple(map(chosen, one.neighbours))) for one in queries]
 
 
-def _with_copies(landmark_map: LandmarkMap, queries: Sequence[Query], steps: NDArray[np.float64]
-                 ) -> World:
+def _with_copies(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
+                 steps: NDArray[np.float64]) -> World:
     """Return a map with a copy of each landmark, steps (L, 3) or (3,) away."""
     rows = np.tile(np.arange(len(landmark_map)), 2)
     ids = (*landmark_map.landmark_ids, *(f'{one}_copy' for one in landmark_map.landmark_ids))
@@ -243,7 +243,7 @@ class Trouble(NamedTuple):
     in_order: bool = False  #: Whether it concerns a camera, so that several looks may tell
 
 
-def _of_sensor(change: Callable[[Sequence[Query], float], Sequence[Query]]) -> Change:
+def _of_sensor(change: Callable[[Sequence[PosedQuery], float], Sequence[PosedQuery]]) -> Change:
     return lambda landmark_map, queries, level, rng: (landmark_map, change(queries, level))
 
 
@@ -271,7 +271,7 @@ TROUBLES = {
     'odometry too long by a factor': Trouble(_of_sensor(wrong_sensors.scaled_odometry), (1.2, 0.8),
                                              (FIVE, ALL))}
 _BOTH = (ONE, VERTICAL)
-_OF_CAMERA: dict[str, tuple[Callable[[Sequence[Query], float], Sequence[Query]],
+_OF_CAMERA: dict[str, tuple[Callable[[Sequence[PosedQuery], float], Sequence[PosedQuery]],
                             tuple[float, ...]]] = {
     'boxes in pixels of a middle crop of [px]': (wrong_sensors.middle_crop, (300.0, 416.0)),
     'boxes scaled by': (wrong_sensors.scaled_boxes, (0.5, 1.5, 2.0)),
