@@ -18,11 +18,11 @@ import pytest
 PROJECT = Path(__file__).resolve().parents[1]
 MODULES = sorted((PROJECT / 'cliploc_ros').rglob('*.py'))
 SOURCES = [*MODULES, PROJECT / 'setup.py', *(
-    path for folder in ('demo_world', 'studies', 'test')
+    path for folder in ('demo', 'studies', 'test')
     for path in sorted((PROJECT / folder).rglob('*.py')))]
 SCRIPTS = [path for path in sorted((PROJECT / 'script').iterdir()) if path.is_file()]
 INTERFACES = sorted((PROJECT / 'cliploc_ros/offline/datasets/vision_msgs/msg').glob('*.msg'))
-EXECUTABLES = ['build_map', 'check_map', 'demo', 'detector', 'import_map', 'prepare',
+EXECUTABLES = ['build_map', 'check_map', 'detector', 'import_map', 'prepare',
                'relocalizer', 'replay', 'studio', 'tum_to_bag', 'wake_up']
 
 # As vision_msgs 4.1.1 of Jazzy has them, in this order.

@@ -19,8 +19,6 @@ from cliploc_ros.core.map.landmark_embeddings import (
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.demo import ASSETS
-from cliploc_ros.demo.truth import read_frames
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.offline.datasets.intrinsics import find_camera
@@ -32,6 +30,8 @@ from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
+from demo import ASSETS
+from demo.truth import read_frames
 
 HEADER = Header(frame_id='camera')
 FRAMES = list(read_frames(ASSETS / 'sequence', 0.5))
