@@ -71,7 +71,7 @@ class Places(NamedTuple):
     likeness: float
     unlabelled: float
     aged: float
-    rooms: float
+    labels: float
 
 
 class Prior(NamedTuple):
