@@ -52,8 +52,8 @@ def test_a_dead_worker_costs_time_only(cluster):
 
 
 def test_no_scheduler_and_no_workers():
-    with pytest.raises(WorkersError, match='no Dask scheduler answers at nonsense'):
+    with pytest.raises(WorkersError, match='at nonsense'):
         dict(run_tasks(Cube(), range(3), scheduler='nonsense'))
     with (local_cluster(workers=0) as empty,
-          pytest.raises(WorkersError, match='has no workers; start some with "dask worker tcp')):
+          pytest.raises(WorkersError, match='has no workers')):
         dict(run_tasks(Cube(), range(3), scheduler=empty.scheduler_address))

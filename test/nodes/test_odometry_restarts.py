@@ -97,8 +97,7 @@ def publishing(start_shared, tester, room_map):
     assert 'Traceback' not in process.output()
 
 
-@pytest.mark.parametrize(('rate_hz', 'gap_s'), [(5, 0.0), (5, 0.4), (20, 0.15), (20, 0.4)])
-@pytest.mark.parametrize('fills_twist', [True, False])
+@pytest.mark.parametrize(('rate_hz', 'gap_s', 'fills_twist'), [(5, 0.4, False), (20, 0.15, True)])
 def test_a_restart_ends_the_broadcast_until_the_next_pose(publishing, tester, rate_hz, gap_s,
                                                           fills_twist):
     wheels = Wheels(tester, rate_hz, fills_twist)

@@ -84,8 +84,7 @@ def test_the_map_is_read_anew_and_a_bad_one_changes_nothing(own_relocalizer, tes
     own_map.write_text(text.replace('frame_id: map', 'frame_id: hall'))
     answer = reload_map(tester)
     assert answer.success
-    assert re.fullmatch("loaded: 12 landmarks in frame 'hall', matching class, algorithm bf; map "
-                        '[0-9a-f]{12}', answer.message)
+    assert re.search("12 landmarks in frame 'hall'.* map [0-9a-f]{12}$", answer.message)
     assert tester.relocalize(make_frame()).success
     tester.wait(lambda: tester.poses, 'a pose')
     assert tester.poses[-1].header.frame_id == 'hall'

@@ -73,7 +73,7 @@ def test_what_cannot_be_recorded_says_why(own_relocalizer, tester, tmp_path):
     assert record(tester).success  # 0.9 MiB
     full = record(tester)
     assert not full.success
-    assert 'record_limit_mb is 1' in full.message
+    assert 'record_limit_mb' in full.message
     assert len(list(folder.iterdir())) == 1
     assert 'no fresh frame' in tester.answer(tester.ask()).message
     assert not record(tester).success

@@ -22,8 +22,7 @@ from cliploc_ros.ros.outputs.handoff import (
 @pytest.mark.clock
 def test_without_a_localizer_the_pose_is_withheld(robot):
     start = time.monotonic()
-    with pytest.raises(NoLocalizerError, match=r'^nobody subscribes /initialpose: start the '
-                       r'localizer \(AMCL\), or set require_localizer: false$'):
+    with pytest.raises(NoLocalizerError, match='/initialpose'):
         robot.hand_over()
     assert 1.0 < time.monotonic() - start < 5.0
     robot.localizer.subscribe()
@@ -107,14 +106,14 @@ def test_who_hears_the_pose_but_shows_none_is_no_localizer(robot):
     robot.localizer.subscribe()
     robot.handoff.open('amcl_pose')
     robot.meet()
-    with pytest.raises(NoLocalizerError, match='nobody publishes /amcl_pose'):
+    with pytest.raises(NoLocalizerError, match='/amcl_pose'):
         robot.hand_over()
     assert not robot.localizer.poses
     robot.handoff.close()
 
 
 @pytest.mark.parametrize(('timeout_s', 'named', 'times'), [
-    (3.2, '/amcl_pose shows nothing since', 3), (0.3, 'too little time is left', 0)])
+    (3.2, 'shows nothing', 3), (0.3, 'too little time', 0)])
 def test_the_pose_comes_again_until_time_is_up(silent, timeout_s, named, times):
     with pytest.raises(NoLocalizerError, match=named):
         silent.hand_over(timeout_s)

@@ -32,8 +32,8 @@ def test_paths_and_urls(prefix):
 
 
 @pytest.mark.parametrize(('url', 'message'), [
-    ('package://nowhere/office.yaml', "there is no package 'nowhere' here: install it"),
-    ('package://no such name!/office.yaml', 'there is no package'),
+    ('package://nowhere/office.yaml', "no package 'nowhere'"),
+    ('package://no such name!/office.yaml', 'no package'),
     ('package:///office.yaml', 'no package://PACKAGE/PATH'),
     ('package://my_maps', 'no package://PACKAGE/PATH'),
     ('package://my_maps/', 'no package://PACKAGE/PATH')])
