@@ -9,16 +9,6 @@ import pytest
 
 from cliploc_ros.cli.build_map import main
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.datasets.observations import load_observations, save_observations
-
-
-@pytest.fixture(scope='module')
-def observations(shared_data, tmp_path_factory):
-    """Every sixteenth frame of the office: enough for a map, and quick."""
-    whole = load_observations(shared_data / 'tum_fr3_office' / 'observations.npz')
-    path = tmp_path_factory.mktemp('office') / 'office.npz'
-    save_observations(path, whole.select_frames(range(0, len(whole), 16)))
-    return path
 
 
 @pytest.fixture

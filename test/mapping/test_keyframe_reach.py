@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene import CAMERA, make_room
+from scene import make_layer, make_room
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.cli.check_map import main
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, save_layer
+from cliploc_ros.core.keyframes.layer import layer_path, save_layer
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.offline.mapping.check.advice import give_advice
 from cliploc_ros.offline.mapping.check.checking import check_map
@@ -25,12 +25,7 @@ LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def layer_at(*poses):
-    count = len(poses)
-    return KeyframeLayer(
-        ROOM.frame_id, ROOM.landmark_ids, ROOM.centers.astype(np.float32), CAMERA, np.array(poses),
-        np.arange(count + 1) * 5, np.zeros((5 * count, 2), np.uint16),
-        np.ones((5 * count, 3), np.float32), np.ones((5 * count, 128), np.uint8),
-        np.zeros(5 * count, np.uint16), np.ones((1, 128), np.uint8))
+    return replace(make_layer(ROOM, len(poses), points=5), map_from_camera=np.array(poses))
 
 
 def view(x=0.0, degrees=0.0):

@@ -10,11 +10,9 @@ from scene import CAMERA, write_map
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
-from std_srvs.srv import Trigger
-from tester import RELIABLE, transform_of
+from tester import RELIABLE, ask_until, transform_of
 from vision_msgs.msg import Detection2DArray
 
-from cliploc_ros.cli.evaluate import main as evaluate
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.ros.conversions import detections_to_msg
 
@@ -81,15 +79,6 @@ def four_cameras(start, tester, surroundings_map, tmp_path):
             tester.destroy_publisher(publisher)
 
 
-def ask_until(ask, text, *given):
-    """Ask until an answer says something: on a busy machine a camera is late at times."""
-    for _ in range(30):
-        answer = ask(*given)
-        if text in answer.message:
-            return answer
-    raise AssertionError(f'{text!r} in {answer.message}')
-
-
 def test_four_cameras_see_enough_at_once(four_cameras, tester):
     process, ask = four_cameras
     while not ask_until(ask, ', 4 cameras;').success:
@@ -113,17 +102,13 @@ def test_the_doctor_looks_at_each_camera(four_cameras, start):
 
 
 def test_a_recorded_request_of_four_cameras_replays(four_cameras, tester, surroundings_map,
-                                                    tmp_path, capsys):
+                                                    tmp_path, replay):
     _, ask = four_cameras
     answer = ask_until(ask, ', 4 cameras;')
-    stored = tester.call(Trigger, '/relocalizer/record', Trigger.Request())
+    stored = tester.trigger('record')
     assert stored.success, stored.message
     (case,) = tmp_path.glob('cases/case_*')
-    assert evaluate(['--bag', str(case), '--map', str(surroundings_map)]) == 0
-    printed = capsys.readouterr().out
-    assert printed.endswith('the same verdict\n')
-    confidence = answer.message.partition('[confidence ')[2].partition(',')[0]
-    assert f'confidence {confidence}' in printed
+    replay(case, surroundings_map, answer)
 
 
 @pytest.mark.parametrize(('working', 'late_s'), [

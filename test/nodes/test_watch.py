@@ -10,7 +10,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from processes import wait_for
 from scene import make_room, write_map
 from std_msgs.msg import Bool, Header, String
-from std_srvs.srv import Trigger
 from tester import transform_of
 from watched import MOUNT, Robot, stamp
 
@@ -151,7 +150,7 @@ def test_a_map_of_another_frame_ends_the_verdict_of_the_one_before(watch, tester
     watched.until_state('localized')
     write_map(replace(make_room(), frame_id='elsewhere'), tmp_path / 'elsewhere.yaml')
     assert tester.set_parameter('map_file', str(tmp_path / 'elsewhere.yaml'))
-    assert tester.call(Trigger, 'relocalizer/reload_map', Trigger.Request()).success
+    assert tester.trigger('reload_map').success
     tester.wait(lambda: 'a map was loaded' in watched.values['watch reason'], 'the end')
     assert watched.states[-1] == 'uncertain'
     watched.until_reason("the localizer's pose is in frame 'map'")
