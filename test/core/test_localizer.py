@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
+from test_one_verdict import Says
 
 from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
-from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN
-from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
+from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.localizer import KeptInstant, Localizer, instants_to_fuse
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -261,21 +261,6 @@ def test_a_filter_learns_nothing_from_a_standing_camera_until_a_new_run():
     assert deviations[1] > 10.0
     alone = session.localize(replace(frame(3), odom_from_camera=None))
     np.testing.assert_array_equal(session.covariance_for_filter(alone), alone.covariance)
-
-
-class Says:
-    """A keyframe search with a known answer."""
-
-    deviation_per_metre = 0.01
-
-    def __init__(self, place):
-        self._place = place
-
-    def recognize(self, guesses, prior=NOTHING_KNOWN):
-        return Recognition((self._place,))
-
-    def coverage(self, map_from_camera):
-        return 1.0
 
 
 def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
