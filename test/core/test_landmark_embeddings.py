@@ -64,7 +64,7 @@ def test_a_map_finds_the_file_next_to_it(tmp_path, embeddings):
     save_landmark_embeddings(embeddings_path(map_path), embeddings)
     found = load_embeddings_of_map(map_path, ['added', 'mug_1'])
     assert found.is_known.tolist() == [False, True]
-    with pytest.raises(MapError, match=r'office\.embeddings\.npz.*another map'):
+    with pytest.raises(MapError, match='another map'):
         load_embeddings_of_map(map_path, ['chair_1'])
 
 

@@ -73,5 +73,5 @@ def test_what_has_no_end_is_not_read(tmp_path):
     pipe = tmp_path / 'pipe'
     os.mkfifo(pipe)
     for path in ('/dev/zero', pipe, tmp_path):
-        with pytest.raises(MapError, match=f'{path}: not a regular file'):
+        with pytest.raises(MapError, match='regular file'):
             LandmarkMap.from_file(path)

@@ -98,7 +98,7 @@ def test_image_embeddings_belong_to_one_map(tmp_path):
     write_map(path, room)
     assert load_embeddings_of_map(path, room.landmark_ids) is None
     embeddings_path(path).mkdir()
-    with pytest.raises(MapError, match=r'map\.embeddings\.npz: .*cannot be removed'):
+    with pytest.raises(MapError, match='cannot be removed'):
         write_map(path, room)
 
 
