@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.command import run_command
 from cliploc_ros.core.acceptance.confidence import tilt_handicaps, utilities
-from cliploc_ros.core.acceptance.support import ComparedFrame, Support, one_thing, support
+from cliploc_ros.core.acceptance.support import Support, compared_frame, support
 from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.verification import cameras_from_last, make_rig
@@ -39,7 +39,7 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.offline.datasets.queries import Queries, load_queries
 from cliploc_ros.offline.evaluation.sensors import with_neighbours, with_vertical
-from cliploc_ros.offline.evaluation.trials import Query, make_queries
+from cliploc_ros.offline.evaluation.trials import PosedQuery, make_queries
 
 CAUSES = ('objects', 'map', 'candidates', 'search', 'choice')
 _MATCHINGS = {'hybrid': 'labels', 'class': 'classes'}
@@ -60,11 +60,11 @@ class Known(NamedTuple):
     """Queries, and the options that say what else is known."""
 
     name: str
-    queries: Sequence[Query]
+    queries: Sequence[PosedQuery]
     options: RelocalizerOptions
 
 
-def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: Query, limit_m: float
+def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: PosedQuery, limit_m: float
           ) -> Blame:
     """Return what makes a query fail.
 
@@ -119,10 +119,9 @@ def _refined(frames: Sequence[SearchedFrame], map_from_camera: NDArray[np.float6
 def _support(landmark_map: LandmarkMap, frames: Sequence[SearchedFrame],
              pose: NDArray[np.float64], matches: Sequence[tuple[Match, ...]]) -> Support:
     """Return the support of a pose of the last frame."""
-    compared = [ComparedFrame(
-        one.observation.detections.bboxes_xyxy, one.observation.detections.class_ids,
-        one.observation.similarities, one.scene, one.observation.similarity_rows,
-        one_thing(one.observation.detections.bboxes_xyxy)) for one in frames]
+    compared = [compared_frame(
+        landmark_map, frame.observation.detections, frame.scene, frame.observation.similarities,
+        frame.observation.similarity_rows) for frame in frames]
     cameras = cameras_from_last([one.observation for one in frames])
     return support(landmark_map, compared, pose @ np.linalg.inv(cameras), matches)
 

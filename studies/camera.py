@@ -22,14 +22,15 @@ from tqdm import tqdm
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
-from cliploc_ros.core.localizer import Localizer, recorded_crops
+from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.datasets.queries import load_queries
 from cliploc_ros.offline.evaluation.sensors import with_vertical
-from cliploc_ros.offline.evaluation.trials import Query, make_queries
+from cliploc_ros.offline.evaluation.trials import PosedQuery, make_queries
 from studies import wrong_sensors
 from studies.reports import interval, table
 from studies.worlds.places import KINDS
@@ -38,7 +39,7 @@ from studies.worlds.world import make_drive
 _VERTICAL_DEG = 1.0
 _CHI2_95 = float(chi2.ppf(0.95, 6))
 #: What is wrong with all images, from nothing to much.
-CAMERAS: dict[str, Callable[[Sequence[Query]], Sequence[Query]]] = {
+CAMERAS: dict[str, Callable[[Sequence[PosedQuery]], Sequence[PosedQuery]]] = {
     'right': lambda some: some,
     'focal length x 1.03': lambda some: wrong_sensors.scaled_focal(some, 1.03),
     'focal length x .97': lambda some: wrong_sensors.scaled_focal(some, 0.97),
@@ -58,7 +59,7 @@ class Place(NamedTuple):
     """A map and queries in order."""
 
     landmark_map: LandmarkMap
-    queries: Sequence[Query]
+    queries: Sequence[PosedQuery]
     size: tuple[int, int]  #: Of the images [px]
 
 
@@ -71,8 +72,8 @@ class Answer(NamedTuple):
     is_called_wrong: bool  #: The camera, by then
 
 
-def answers(place: Place, change: Callable[[Sequence[Query]], Sequence[Query]], is_one: bool
-            ) -> Iterator[Answer]:
+def answers(place: Place, change: Callable[[Sequence[PosedQuery]], Sequence[PosedQuery]],
+            is_one: bool) -> Iterator[Answer]:
     """Yield the answers of one localizer, or of a new one for each query."""
     options = RelocalizerOptions(k=min(3, len(place.landmark_map)))
     relocalizer = Relocalizer(place.landmark_map, options)
@@ -80,8 +81,7 @@ def answers(place: Place, change: Callable[[Sequence[Query]], Sequence[Query]], 
     for query in change([_of_size(one, place.size) for one in place.queries]):
         if not is_one:
             localizer = Localizer(relocalizer)
-        found = localizer.localize(query.observation, None, crops=recorded_crops(
-            query.observation, options))
+        found = localizer.answer(Query((query.observation,), run=None))
         pose, error_m, square = found.map_from_camera, np.inf, np.inf
         if pose is not None and found.covariance is not None:
             error_m = pose_error(pose, query.map_from_camera)[0]
@@ -89,7 +89,7 @@ def answers(place: Place, change: Callable[[Sequence[Query]], Sequence[Query]], 
         yield Answer(found.accepted, error_m, square, bool(localizer.cameras.faults))
 
 
-def _of_size(query: Query, size: tuple[int, int]) -> Query:
+def _of_size(query: PosedQuery, size: tuple[int, int]) -> PosedQuery:
     """Return a query with the size of its image, which query files do not hold."""
     camera = replace(query.observation.camera, width=size[0], height=size[1])
     return replace(query, observation=replace(query.observation, camera=camera))

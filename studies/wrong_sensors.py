@@ -14,11 +14,11 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.offline.evaluation.sensors import turned
-from cliploc_ros.offline.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.trials import PosedQuery
 
 
-def with_mount_error(queries: Sequence[Query], groups: Sequence[int], noise_deg: float,
-                     seed: int = 0) -> tuple[Query, ...]:
+def with_mount_error(queries: Sequence[PosedQuery], groups: Sequence[int], noise_deg: float,
+                     seed: int = 0) -> tuple[PosedQuery, ...]:
     """Return queries with a known vertical, wrong by the same in all frames of a group.
 
     That is the error of a sensor, or of its mount.
@@ -40,8 +40,8 @@ def with_mount_error(queries: Sequence[Query], groups: Sequence[int], noise_deg:
     return tuple(found)
 
 
-def tilted_vertical(queries: Sequence[Query], angle_deg: float, seed: int = 0
-                    ) -> tuple[Query, ...]:
+def tilted_vertical(queries: Sequence[PosedQuery], angle_deg: float, seed: int = 0
+                    ) -> tuple[PosedQuery, ...]:
     """Return queries whose verticals are off by an angle, all frames of one in one direction."""
     found = []
     for query in queries:
@@ -54,24 +54,27 @@ def tilted_vertical(queries: Sequence[Query], angle_deg: float, seed: int = 0
     return tuple(found)
 
 
-def scaled_depth(queries: Sequence[Query], factor: float) -> tuple[Query, ...]:
+def scaled_depth(queries: Sequence[PosedQuery], factor: float) -> tuple[PosedQuery, ...]:
     """Return queries whose depths are too large by a factor: of a scale, or of a unit."""
     return _with_depths(queries, lambda depths, rng: factor * depths)
 
 
-def random_depth(queries: Sequence[Query], share: float, seed: int = 0) -> tuple[Query, ...]:
+def random_depth(queries: Sequence[PosedQuery], share: float, seed: int = 0
+                 ) -> tuple[PosedQuery, ...]:
     """Return queries in which a share of the depths are anything from .3 to 6 m."""
     return _with_depths(queries, lambda depths, rng: np.where(
         rng.random(len(depths)) < share, rng.uniform(0.3, 6.0, len(depths)), depths), seed)
 
 
-def missing_depth(queries: Sequence[Query], share: float, seed: int = 0) -> tuple[Query, ...]:
+def missing_depth(queries: Sequence[PosedQuery], share: float, seed: int = 0
+                  ) -> tuple[PosedQuery, ...]:
     """Return queries in which a share of the depths are not known."""
     return _with_depths(queries, lambda depths, rng: np.where(
         rng.random(len(depths)) < share, np.nan, depths), seed)
 
 
-def depth_elsewhere(queries: Sequence[Query], share: float, seed: int = 0) -> tuple[Query, ...]:
+def depth_elsewhere(queries: Sequence[PosedQuery], share: float, seed: int = 0
+                    ) -> tuple[PosedQuery, ...]:
     """Return queries with a share of depths of other boxes: the depth camera looks elsewhere."""
     known = [query.observation.depths for query in queries
              if query.observation.depths is not None]
@@ -80,9 +83,9 @@ def depth_elsewhere(queries: Sequence[Query], share: float, seed: int = 0) -> tu
         rng.random(len(depths)) < share, rng.choice(every, len(depths)), depths), seed)
 
 
-def _with_depths(queries: Sequence[Query], change: Callable[
+def _with_depths(queries: Sequence[PosedQuery], change: Callable[
         [NDArray[np.float64], np.random.Generator], NDArray[np.float64]], seed: int = 0
-        ) -> tuple[Query, ...]:
+        ) -> tuple[PosedQuery, ...]:
     """Return queries with other depths, where they have some."""
     found = []
     for query in queries:
@@ -94,7 +97,8 @@ def _with_depths(queries: Sequence[Query], change: Callable[
     return tuple(found)
 
 
-def wrong_mount(queries: Sequence[Query], angle_deg: float, seed: int = 0) -> tuple[Query, ...]:
+def wrong_mount(queries: Sequence[PosedQuery], angle_deg: float, seed: int = 0
+                ) -> tuple[PosedQuery, ...]:
     """Return queries of a camera that is turned in its mount by an angle, one way for each.
 
     The robot's tilt and odometry reach the camera through the mount, so both are wrong.
@@ -115,7 +119,7 @@ def wrong_mount(queries: Sequence[Query], angle_deg: float, seed: int = 0) -> tu
     return tuple(found)
 
 
-def scaled_odometry(queries: Sequence[Query], factor: float) -> tuple[Query, ...]:
+def scaled_odometry(queries: Sequence[PosedQuery], factor: float) -> tuple[PosedQuery, ...]:
     """Return queries whose odometry counts distances and turns too long by a factor."""
     found = []
     for query in queries:
@@ -134,7 +138,7 @@ def scaled_odometry(queries: Sequence[Query], factor: float) -> tuple[Query, ...
     return tuple(found)
 
 
-def middle_crop(queries: Sequence[Query], side_px: float) -> tuple[Query, ...]:
+def middle_crop(queries: Sequence[PosedQuery], side_px: float) -> tuple[PosedQuery, ...]:
     """Return queries with the boxes of a network that sees the middle square, in its pixels."""
     def change(boxes: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
         side = min(camera.width, camera.height)
@@ -144,17 +148,17 @@ def middle_crop(queries: Sequence[Query], side_px: float) -> tuple[Query, ...]:
     return _with_boxes(queries, change)
 
 
-def scaled_boxes(queries: Sequence[Query], factor: float) -> tuple[Query, ...]:
+def scaled_boxes(queries: Sequence[PosedQuery], factor: float) -> tuple[PosedQuery, ...]:
     """Return queries with boxes of an image of another size."""
     return _with_boxes(queries, lambda boxes, camera: factor * boxes)
 
 
-def shifted_boxes(queries: Sequence[Query], share: float) -> tuple[Query, ...]:
+def shifted_boxes(queries: Sequence[PosedQuery], share: float) -> tuple[PosedQuery, ...]:
     """Return queries with boxes shifted to the right by a share of the image's width."""
     return _with_boxes(queries, lambda boxes, camera: boxes + [share * camera.width, 0.0] * 2)
 
 
-def turned_boxes(queries: Sequence[Query], angle_deg: float) -> tuple[Query, ...]:
+def turned_boxes(queries: Sequence[PosedQuery], angle_deg: float) -> tuple[PosedQuery, ...]:
     """Return queries with the boxes of images turned by a multiple of 90 degrees."""
     def change(boxes: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
         width, height = camera.width, camera.height
@@ -167,7 +171,7 @@ def turned_boxes(queries: Sequence[Query], angle_deg: float) -> tuple[Query, ...
     return _with_boxes(queries, change)
 
 
-def mirrored_boxes(queries: Sequence[Query], level: float) -> tuple[Query, ...]:
+def mirrored_boxes(queries: Sequence[PosedQuery], level: float) -> tuple[PosedQuery, ...]:
     """Return queries with the boxes of images mirrored left to right (0) or top to bottom (1)."""
     def change(boxes: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
         left, top, right, bottom = boxes.T
@@ -189,13 +193,13 @@ CONVENTIONS: tuple[Callable[..., tuple[NDArray[np.float64], NDArray[np.float64]]
     lambda low, high, size: (low, low + high))
 
 
-def of_convention(queries: Sequence[Query], number: float) -> tuple[Query, ...]:
+def of_convention(queries: Sequence[PosedQuery], number: float) -> tuple[PosedQuery, ...]:
     """Return queries with boxes of another one of CONVENTIONS, taken for corners."""
     return _with_boxes(queries, lambda boxes, camera: np.hstack(CONVENTIONS[int(number)](
         boxes[:, :2], boxes[:, 2:], np.array([camera.width, camera.height]))))
 
 
-def fisheye_boxes(queries: Sequence[Query], level: float) -> tuple[Query, ...]:
+def fisheye_boxes(queries: Sequence[PosedQuery], level: float) -> tuple[PosedQuery, ...]:
     """Return queries with the boxes that an ideal fisheye sees, taken for a pinhole's."""
     def change(boxes: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
         middle, scale = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
@@ -214,33 +218,33 @@ def fisheye_boxes(queries: Sequence[Query], level: float) -> tuple[Query, ...]:
     return _with_boxes(queries, change)
 
 
-def scaled_camera(queries: Sequence[Query], factor: float) -> tuple[Query, ...]:
+def scaled_camera(queries: Sequence[PosedQuery], factor: float) -> tuple[PosedQuery, ...]:
     """Return queries with the intrinsics of an image of another size."""
     return _with_camera(queries, lambda camera: replace(
         camera, fx=factor * camera.fx, fy=factor * camera.fy, cx=factor * camera.cx,
         cy=factor * camera.cy))
 
 
-def scaled_focal(queries: Sequence[Query], factor: float) -> tuple[Query, ...]:
+def scaled_focal(queries: Sequence[PosedQuery], factor: float) -> tuple[PosedQuery, ...]:
     """Return queries with focal lengths that are wrong by a factor."""
     return _with_camera(queries, lambda camera: replace(camera, fx=factor * camera.fx,
                                                         fy=factor * camera.fy))
 
 
-def shifted_center(queries: Sequence[Query], share: float) -> tuple[Query, ...]:
+def shifted_center(queries: Sequence[PosedQuery], share: float) -> tuple[PosedQuery, ...]:
     """Return queries with a principal point that is off by a share of the width."""
     return _with_camera(queries, lambda camera: replace(camera,
                                                         cx=camera.cx + share * camera.width))
 
 
-def _with_camera(queries: Sequence[Query], change: Callable[[Camera], Camera]
-                 ) -> tuple[Query, ...]:
+def _with_camera(queries: Sequence[PosedQuery], change: Callable[[Camera], Camera]
+                 ) -> tuple[PosedQuery, ...]:
     return tuple(_of_all_frames(query, lambda one: replace(one, camera=change(one.camera)))
                  for query in queries)
 
 
-def _with_boxes(queries: Sequence[Query], change: Callable[
-        [NDArray[np.float64], Camera], NDArray[np.float64]]) -> tuple[Query, ...]:
+def _with_boxes(queries: Sequence[PosedQuery], change: Callable[
+        [NDArray[np.float64], Camera], NDArray[np.float64]]) -> tuple[PosedQuery, ...]:
     """Return queries with other boxes, all changed by one rule."""
     return tuple(_of_all_frames(query, lambda one: replace(one, detections=replace(
         one.detections, bboxes_xyxy=np.ascontiguousarray(change(
@@ -248,6 +252,6 @@ def _with_boxes(queries: Sequence[Query], change: Callable[
         for query in queries)
 
 
-def _of_all_frames(query: Query, change: Callable[[Observation], Observation]) -> Query:
+def _of_all_frames(query: PosedQuery, change: Callable[[Observation], Observation]) -> PosedQuery:
     return replace(query, observation=change(query.observation),
                    neighbours=tuple(map(change, query.neighbours)))

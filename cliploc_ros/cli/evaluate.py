@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from cliploc_ros.offline.datasets.frames import Frames
     from cliploc_ros.offline.datasets.queries import Queries
     from cliploc_ros.offline.evaluation.methods import Method
-    from cliploc_ros.offline.evaluation.trials import Query
+    from cliploc_ros.offline.evaluation.trials import PosedQuery
 
 EPILOG = f"""\
 methods: {', '.join(PAPER_METHODS)};
@@ -55,7 +55,7 @@ examples:
   evaluate --bag office --map office.yaml --methods class_bf auto --no-clip
   evaluate --queries office.npz --map office.yaml --methods auto --gravity --height-range 0.8 2.2
   evaluate --queries office.npz --map office.yaml --methods auto --fuse --odometry-noise 0.01 0.5
-  evaluate --bag case_20260101T120000.000_refused --map office.yaml
+  evaluate --bag case_20260101T120000.000_refused.npz --map office.yaml
       answers a request again that ~/record stored; exit code 1: another verdict
 """
 
@@ -74,7 +74,8 @@ def make_parser() -> argparse.ArgumentParser:
     sources = parser.add_mutually_exclusive_group(required=True)
     sources.add_argument('--queries', type=Path, metavar='NPZ',
                          help='recorded boxes and similarities')
-    sources.add_argument('--bag', type=Path, help='a rosbag2 recording with ground truth')
+    sources.add_argument('--bag', type=Path, help='a rosbag2 recording with ground truth; or a '
+                         'request that ~/record stored (npz), which is answered again')
     sources.add_argument('--tum', type=Path, metavar='DIR', help='a TUM RGB-D folder')
     add_folders(sources)
     parser.add_argument('--map', type=Path, nargs='+', required=True, metavar='YAML',
@@ -174,8 +175,6 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.core.map.joined_map import join_maps
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
-    from cliploc_ros.offline.datasets.bags import BagReader
-    from cliploc_ros.offline.datasets.cases import is_case
     from cliploc_ros.offline.evaluation.methods import parse_methods
     from cliploc_ros.offline.evaluation.recording import with_features
     from cliploc_ros.offline.evaluation.run import compare_methods
@@ -188,10 +187,7 @@ def evaluate(options: argparse.Namespace) -> int:
     check_folder_options(options)
     if options.level and folder_of(options) is None:
         raise OptionsError('--level is for folders of images only')
-    of_case = False
-    if options.bag is not None:  # or it has ground truth, and is no request alone
-        with BagReader(options.bag) as reader:
-            of_case = _truth(options) not in reader.topics and is_case(options.bag)
+    of_case = options.bag is not None and options.bag.suffix == '.npz'
     if options.queries is None and not of_case:
         find_topics(options, options.bag)
     landmark_map = join_maps([LandmarkMap.from_file(file) for file in options.map],
@@ -223,7 +219,7 @@ def evaluate(options: argparse.Namespace) -> int:
 
     noise_m, noise_deg = options.odometry_noise
 
-    def sensed(seed: int) -> 'tuple[Query, ...]':
+    def sensed(seed: int) -> 'tuple[PosedQuery, ...]':
         found = queries
         if options.gravity:
             found = with_vertical(found, options.gravity_noise_deg, seed)
@@ -243,7 +239,7 @@ def evaluate(options: argparse.Namespace) -> int:
     return 0
 
 
-def _notes_on_detector(queries: 'Sequence[Query]', landmark_map: 'LandmarkMap') -> list[str]:
+def _notes_on_detector(queries: 'Sequence[PosedQuery]', landmark_map: 'LandmarkMap') -> list[str]:
     """Return a note where no query can be answered by its objects."""
     from cliploc_ros.core.detector_check import DetectorCheck
 
@@ -313,23 +309,26 @@ def _truth(options: argparse.Namespace) -> str:
 
 def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
     """Answer a recorded request again; return 0 if the verdict is the same, else 1."""
+    from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+    from cliploc_ros.core.localizer import Localizer, repeat
+    from cliploc_ros.core.query import read_case
+    from cliploc_ros.core.relocalizer import Relocalizer
     from cliploc_ros.models.map_rows import load_encoder_for_map
     from cliploc_ros.models.observer import Observer
-    from cliploc_ros.offline.datasets.cases import read_case
-    from cliploc_ros.offline.evaluation.cases import options_of, parameters_of, replay_case
 
     case, observer = read_case(options.bag), None
-    if options_of(case).needs_similarities:
+    if case.options.needs_similarities:
         observer = Observer(*load_encoder_for_map(
             clip_options(options), landmark_map, [str(file) for file in options.map],
             options.landmark_embeddings))
     wanted = options.keyframes
-    if wanted is None and not parameters_of(case).get('keyframes_file', True):
+    if wanted is None and not case.report.get('parameters', {}).get('keyframes_file', True):
         wanted = False
     layer = read_layer(options.map[0], landmark_map, wanted) if len(options.map) == 1 else None
-    again = replay_case(case, landmark_map, observer, layer)
+    again = repeat(case, Localizer(Relocalizer(landmark_map, case.options),
+                                   None if layer is None else KeyframeLocalizer(layer)), observer)
     is_same = again.accepted == (case.report.get('found') == 'accepted')
-    print(f'{options.bag}: {len(case.frames)} frames, map {case.report.get("map_hash")}\n'
+    print(f'{options.bag}: {len(case.queries)} frames, map {case.report.get("map_hash")}\n'
           f'recorded: {case.report.get("message")}\n'
           f'again:    {"accepted" if again.accepted else f"refused: {again.reason}"}\n'
           f'{"the same verdict" if is_same else "another verdict"}', flush=True)

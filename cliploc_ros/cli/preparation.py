@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 from llvmlite.binding import get_host_cpu_name
 from numpy.typing import NDArray
-from sensor_msgs.msg import CameraInfo, Image
-from std_msgs.msg import Header
 
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.map.landmark_embeddings import embeddings_path
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.query import Query
 from cliploc_ros.demo import ASSETS
 from cliploc_ros.errors import ImageError, OptionsError
 from cliploc_ros.models.clip_towers import keep_text_tower
@@ -28,10 +28,7 @@ from cliploc_ros.models.openvino_networks import ConversionError
 from cliploc_ros.models.protocols import ObjectDetector
 from cliploc_ros.nodes.detector import DetectorNode
 from cliploc_ros.nodes.relocalizer import RelocalizerNode
-from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, clip_options_of, load_localizer
-from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.map_parameters import map_files
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
@@ -111,22 +108,14 @@ def answer(image_rgb: NDArray[np.uint8], detector: ObjectDetector | None,
     detection_ms = (time.monotonic() - start) * 1e3
     height, width = image_rgb.shape[:2]
     boxes = with_drawn_boxes(found, localizer.landmark_map, (width, height))
-    header = Header(frame_id='camera')
-    image = Image(header=header, width=width, height=height, encoding='rgb8', step=3 * width,
-                  data=image_rgb.tobytes())
     # The time does not depend on the lens: 53 degrees wide.
-    lens = [float(width), 0.0, width / 2, 0.0, float(width), height / 2, 0.0, 0.0, 1.0]
-    info = CameraInfo(header=header, width=width, height=height, k=lens,
-                      p=[*lens[:3], 0.0, *lens[3:6], 0.0, *lens[6:], 0.0])
-    now = time.monotonic()
-    times = StageTimes('waiting', now)
+    camera = Camera(width, height, width, width, width / 2, height / 2)
+    times = StageTimes('waiting', time.monotonic())
     # what a request costs at most
-    localized = localizer.localize(
-        Frame(image, info, detections_to_msg(boxes, header), now, now),
-        replace(parameters, crops='all'), RobotState(np.eye(4)), times)
+    answered = localizer.answer(Query((Observation(camera, boxes),), (image_rgb,), None),
+                                replace(parameters.options(), crops='all'), times)
     stage_ms = {'detection': detection_ms} if detector is not None else {}
-    return Request(stage_ms | times.ms, len(found), len(boxes),
-                   localized.found.reason or 'accepted')
+    return Request(stage_ms | times.ms, len(found), len(boxes), answered.reason or 'accepted')
 
 
 def with_drawn_boxes(found: Detections, landmark_map: LandmarkMap, size: tuple[int, int]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Localizing frame after frame of one moving camera: as the relocalizer node does.
+"""Answering query after query of one moving robot: all programs answer by this module.
 
 A localizer fuses each frame with the last few that odometry links to it, and accepts a pose only
 where the successive looks are sure of it on average.
@@ -18,9 +18,12 @@ each direction it ends up as certain as the better of both, never more. That is 
 (Gustafsson, "Statistical Sensor Fusion", 2010), seen from the sensor.
 """
 
-from collections.abc import Callable, Sequence
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from functools import partial
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,11 +41,16 @@ from cliploc_ros.core.geometry.transforms import (
     pose_difference,
     pose_error,
 )
-from cliploc_ros.core.keyframes.localization import ImageRecognizer
+from cliploc_ros.core.keyframes.localization import (
+    ImageRecognizer,
+    KeyframeLocalizer,
+    query_features,
+)
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.map.similarities import Similarities
+from cliploc_ros.core.map.similarities import CropSimilarities, Similarities
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.query import Case, Query
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer, TimeBudget
 from cliploc_ros.core.search.frame_search import SearchedFrame
@@ -59,7 +67,13 @@ _CONTRADICTION = float(chi2.ppf(0.99, 6))
 _LEAST_SHARE = 1e-4
 #: Crops between two searches. A search takes less time than one crop of most networks on a CPU.
 BATCH = 4
+# Time that a request needs after its last crops [s]: for a search, which may take most of a fifth
+# of the time that is left, and for the answer. Guesses.
+_SEARCHES, _MOST_SHARE, _ANSWER_S = 2.0, 0.2, 0.1
+# With less time left, the objects' answer stands: extracting features cannot be stopped.
+_LEAST_S = 0.5
 _NO_LOOKS = Looks()
+_NO_ROWS = np.empty(0, dtype=np.int64)
 
 
 class Known(NamedTuple):
@@ -113,6 +127,31 @@ def _carried(known: Known, odom_from_camera: NDArray[np.float64]) -> Known:
                  covariance + np.diag(np.repeat(_DRIFT ** 2 * np.array(ways), 3)))
 
 
+class ImageCrops(Protocol):
+    """The crops of one image."""
+
+    @property
+    def known(self) -> NDArray[np.int64]:
+        """Return the detections (m,) whose similarities cost nothing."""
+
+    def compare(self, rows: NDArray[np.int64]) -> Similarities:
+        """Return the similarities (m, L) of some detections (m,) and the labels."""
+
+
+class CropSource(Protocol):
+    """Compares crops of images with the labels of a map, see cliploc_ros.models.observer."""
+
+    def crops(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64],
+              known: Mapping[int, NDArray[np.float32]] | None = None) -> ImageCrops:
+        """Return the crops of an image (h, w, 3) at boxes (n, 4) [px].
+
+        `known` has embeddings by their row; by default those of earlier images.
+        """
+
+    def crops_within(self, left_s: float) -> int:
+        """Return how many crops there is time for [s]."""
+
+
 @dataclass(frozen=True)
 class Crops:
     """The crops of one frame, which a search compares with the labels as it needs them."""
@@ -120,7 +159,7 @@ class Crops:
     #: Takes the rows of m detections; returns their similarities (m, L)
     compare: Callable[[NDArray[np.int64]], Similarities]
     #: (m,): detections whose similarities cost nothing; the first search has them
-    known: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    known: NDArray[np.int64] = field(default_factory=_NO_ROWS.copy)
     room: Callable[[], int] = lambda: BATCH  #: Returns how many crops to compare next; 0 ends
 
 
@@ -232,51 +271,47 @@ class KeptInstant(NamedTuple):
 
 
 class Localizer:
-    """Localizes with each frame and those before it."""
+    """Answers each query with those before it.
 
-    def __init__(self, relocalizer: Relocalizer) -> None:
-        self._relocalizer = relocalizer
+    Parameters
+    ----------
+    keyframes : KeyframeLocalizer, optional
+        Of the keyframes of the map.
+    """
+
+    def __init__(self, relocalizer: Relocalizer, keyframes: KeyframeLocalizer | None = None
+                 ) -> None:
+        self._relocalizer, self._keyframes = relocalizer, keyframes
         self._instants: list[KeptInstant] = []
         self._looks = Looks()
         self._known: Known | None = None
-        self._run = -1
+        self._run: int | None = -1
         self._stamp_ns = 0
-        #: The newest frame that was localized, with the crops that it took.
-        self.observation: Observation | None = None
+        #: The newest query, with all that its answer depended on: with it the same answer comes
+        #: again.
+        self.query: Query | None = None
         #: Depth is not used any more once it is wrong.
         self.depth_scale = DepthScale()
         self.cameras = CameraCheck()
-        #: Before the newest frame: with it the same answer comes again.
-        self.cameras_before = CameraCheck()
 
-    def localize(self, observation: Observation, run: int | None = 0, limit: int = 1,
-                 length_s: float = 0.0, crops: Crops | None = None,
-                 recognizer: ImageRecognizer | None = None, others: Sequence[Observation] = ()
-                 ) -> Relocalization:
+    def answer(self, query: Query, crops: CropSource | None = None, deadline: float = math.inf,
+               begin_stage: Callable[[str], None] = lambda stage: None) -> Relocalization:
         """Localize with the frames of an instant and, where odometry places it, those before it.
 
         Odometry links all instants of one run. A new run or a stamp before the last one forgets
-        instants and looks. Looks persist until a pose is accepted, whatever `length_s`.
+        instants and looks. Looks persist until a pose is accepted, whatever the query's length.
 
         Parameters
         ----------
-        observation : Observation
-            Of the camera to localize. Without odom_from_camera it is localized alone, and the
-            localizer does not change.
-        run : int or None
-            Number of the run of odometry; None: this instant is linked to no other.
-        limit : int
-            The most instants to fuse, this one included; fewer where they have more frames than
-            can be fused.
-        length_s : float
-            Older instants are dropped [s].
-        crops : Crops, optional
-            Of this frame, compared until the pose is accepted.
-        recognizer : ImageRecognizer, optional
-            Of the keyframes, for the image of this frame.
-        others : sequence of Observation, optional
-            What other cameras see at this instant: with its stamp, a camera_name each, and
-            odom_from_camera in the same coordinate frame, such as the robot's.
+        query : Query
+            Its newest frame is localized. Without odom_from_camera or run it is localized alone,
+            and instants and looks do not change.
+        crops : CropSource, optional
+            Compares the crops that the query has no similarities of, until the pose is accepted.
+        deadline : float
+            No crops are compared and no keyframes matched then (monotonic clock) [s].
+        begin_stage : callable
+            Takes the name of a stage that begins: 'CLIP', 'keyframes', and 'search' after them.
 
         Raises
         ------
@@ -284,49 +319,145 @@ class Localizer:
             See Relocalizer.relocalize. The localizer drops this instant.
         """
         if self.depth_scale.is_wrong:
-            observation = replace(observation, depths=None)
-            others = [replace(one, depths=None) for one in others]
-        self.cameras_before = self.cameras.copied()
-        for one in (*others, observation):
+            query = replace(query, frames=tuple(replace(one, depths=None)
+                                                for one in query.frames))
+        if query.cameras is not None:
+            self.cameras = query.cameras.copied()
+        query = replace(query, cameras=self.cameras.copied(), by_keyframes=query.by_keyframes
+                        and deadline - time.monotonic() >= _LEAST_S)
+        others = [self.with_free_crops(query, row, crops) for row in range(len(query.frames) - 1)]
+        for one in query.frames:
             self.cameras.see(one)
-        found = self._localize(observation, run, limit, length_s, crops, recognizer, others)
+        found = self._localize(query, others, *self._crops(query, crops, deadline, begin_stage),
+                               self.recognizer(query, deadline, begin_stage))
         self.cameras.add(found.cameras)
         if found.accepted and found.depth is not None:
             self.depth_scale.add(found.depth)
         if others and found.accepted and found.frame_matches:
             # where nothing is accepted, the map may be out of date
-            seen, index = [*others, observation], self._relocalizer.landmark_map.classes
-            self.cameras.add_instant(seen, [int(index.are_own(index.classes_of(
-                one.detections.class_ids)).sum()) for one in seen], [
-                    len(one) for one in found.frame_matches[-len(seen):]])
+            index = self._relocalizer.landmark_map.classes
+            self.cameras.add_instant(query.frames, [int(index.are_own(index.classes_of(
+                one.detections.class_ids)).sum()) for one in query.frames], [
+                    len(one) for one in found.frame_matches[-len(query.frames):]])
         return found
 
-    def _localize(self, observation: Observation, run: int | None, limit: int, length_s: float,
-                  crops: Crops | None, recognizer: ImageRecognizer | None,
-                  others: Sequence[Observation]) -> Relocalization:
+    def recognizer(self, query: Query, deadline: float = math.inf,
+                   begin_stage: Callable[[str], None] = lambda stage: None
+                   ) -> ImageRecognizer | None:
+        """Return the keyframe search of the newest image; None without keyframes or image."""
+        if self._keyframes is None or not query.images or not query.by_keyframes:
+            return None
+        return ImageRecognizer(self._keyframes, partial(query_features, query.images[-1]),
+                               query.newest.camera, deadline, begin_stage)
+    def with_free_crops(self, query: Query, row: int, source: CropSource | None,
+                        begin_stage: Callable[[str], None] = lambda stage: None) -> Observation:
+        """Return a frame of a query with the crops that cost nothing, or that were compared.
+
+        The paper's algorithms compare all crops, however long that takes.
+        """
+        frame, options = query.frames[row], self._relocalizer.options
+        compares_all = not can_do_without_crops(options)
+        crops = self._crops_of(query, row, source, not compares_all, begin_stage)
+        if crops is None or not options.needs_similarities:
+            return frame
+        if compares_all:
+            every = np.arange(len(frame.detections))
+            return replace(frame, similarities=crops.compare(every), compared=None)
+        rows = crops.known if frame.compared is None else frame.compared
+        return replace(frame, similarities=crops.compare(rows), compared=rows)
+
+    def _crops(self, query: Query, source: CropSource | None, deadline: float,
+               begin_stage: Callable[[str], None]) -> tuple[Observation, Crops | None]:
+        """Return the newest frame, and the crops that its search compares as it needs them."""
+        newest, options, last = query.newest, self._relocalizer.options, len(query.frames) - 1
+        on_demand = options.crops == 'on_demand'
+        if not can_do_without_crops(options):
+            return self.with_free_crops(query, last, source, begin_stage), None
+        is_given = newest.similarities is not None
+        if is_given and not query.rooms and (newest.compared is not None or not on_demand):
+            return newest, None
+        crops = self._crops_of(query, last, source, on_demand, begin_stage)
+        if crops is None or (is_given and not query.rooms):
+            return newest, crops
+        if query.rooms:
+            assert newest.compared is not None
+            first, *others = query.rooms
+            rooms = iter(others)
+            return newest, replace(crops, known=newest.compared[:first],
+                                   room=lambda: next(rooms, BATCH))
+        assert source is not None
+        end = deadline if math.isinf(deadline) else deadline - _ANSWER_S - min(
+            _SEARCHES * options.time_budget_s, _MOST_SHARE * (deadline - time.monotonic()))
+
+        def room() -> int:
+            return source.crops_within(end - time.monotonic())
+        if on_demand:
+            return newest, replace(crops, room=lambda: min(BATCH, room()))
+        rows, count = informative_first(self._relocalizer.landmark_map, newest), 0
+        while count < len(rows) and (more := room()) > 0:
+            count += more
+            crops.compare(rows[:count])
+        return newest, replace(crops, known=rows[:count], room=lambda: 0)
+
+    def _crops_of(self, query: Query, row: int, source: CropSource | None, remembers: bool,
+                  begin_stage: Callable[[str], None]) -> Crops | None:
+        """Return the crops of a frame, recorded ones or those of its image; None without both."""
+        frame = query.frames[row]
+        given, rows = frame.similarities, frame.similarity_rows
+        if given is not None and (source is None or not query.images
+                                  or not isinstance(given, CropSimilarities)):
+            recorded = np.asarray(given)
+            return Crops(lambda wanted: recorded[rows[wanted]])
+        if source is None or not query.images:
+            return None
+        known: dict[int, NDArray[np.float32]] | None = None if remembers else {}
+        if isinstance(given, CropSimilarities):
+            known = {one: given.crops[its] for one, its in enumerate(rows.tolist()) if its >= 0}
+        of_image = source.crops(query.images[row], frame.detections.bboxes_xyxy, known)
+
+        def compare(wanted: NDArray[np.int64]) -> Similarities:
+            begin_stage('CLIP')
+            similarities = of_image.compare(wanted)
+            begin_stage('search')
+            return similarities
+        return Crops(compare, of_image.known)
+
+    def _localize(self, query: Query, others: Sequence[Observation], newest: Observation,
+                  crops: Crops | None, recognizer: ImageRecognizer | None) -> Relocalization:
+        """Search the newest frame beside the others, and keep what the answer depended on."""
         budget = self._relocalizer.begin(len(others) + 1, len(others) + 1) if others else None
         beside = [self._relocalizer.search(one, budget.search_end(number, len(others) + 1))
                   for number, one in enumerate(others, start=1)] if budget else []
-        if observation.odom_from_camera is None or run is None:
-            alone, found = localize_on_demand(self._relocalizer, beside, observation, crops,
-                                              recognizer=recognizer, budget=budget,
-                                              cameras=self.cameras)
-            self.observation = alone.observation
-            return found
-        if run != self._run or observation.stamp_ns < self._stamp_ns:
-            self._instants, self._looks, self._known = [], Looks(), None
-        self._run, self._stamp_ns = run, observation.stamp_ns
-        earlier, anchor = instants_to_fuse(self._instants, observation, limit, length_s)
-        while earlier and sum(len(one.searched) for one in earlier) + len(beside) >= MAX_FRAMES:
-            del earlier[0]
-        newest, found = localize_on_demand(
+        rooms: list[int] = []
+        if crops is not None:
+            rooms, room = [len(crops.known)], crops.room
+
+            def recorded_room() -> int:
+                rooms.append(max(0, room()))
+                return rooms[-1]
+            crops = replace(crops, room=recorded_room)
+        is_alone = newest.odom_from_camera is None or query.run is None
+        earlier, looks = list[KeptInstant](), _NO_LOOKS
+        if not is_alone:
+            if query.run != self._run or newest.stamp_ns < self._stamp_ns:
+                self._instants, self._looks, self._known = [], Looks(), None
+            self._run, self._stamp_ns = query.run, newest.stamp_ns
+            looks = self._looks
+            earlier, anchor = instants_to_fuse(self._instants, newest, query.limit,
+                                               query.length_s)
+            while earlier and sum(len(one.searched) for one in earlier) + len(beside) \
+                    >= MAX_FRAMES:
+                del earlier[0]
+        searched, found = localize_on_demand(
             self._relocalizer, [*(frame for one in earlier for frame in one.searched), *beside],
-            observation, crops, self._looks, recognizer, budget, self.cameras)
-        self._instants = [*earlier, KeptInstant((*beside, newest), anchor)]
-        self.observation = newest.observation
+            newest, crops, looks, recognizer, budget, self.cameras)
+        self.query = replace(query, frames=(*others, searched.observation), rooms=tuple(rooms))
+        if is_alone:
+            return found
+        self._instants = [*earlier, KeptInstant((*beside, searched), anchor)]
         if found.map_from_camera is not None and found.evidence is not None:
             self._looks = self._looks.with_look(Look(
-                replace(observation, similarities=None, compared=None), found.map_from_camera,
+                replace(newest, similarities=None, compared=None), found.map_from_camera,
                 found.evidence.with_right_camera.confidence, found.recognized), found.accepted)
         return found
 
@@ -336,13 +467,25 @@ class Localizer:
         To be called once for each result that such a filter gets. Without odometry it is that of
         the result.
         """
-        assert self.observation is not None
-        odom_from_camera = self.observation.odom_from_camera
-        if odom_from_camera is None or found.covariance is None or found.map_from_camera is None:
+        assert self.query is not None
+        odom_from_camera = self.query.newest.odom_from_camera
+        if (self.query.run is None or odom_from_camera is None or found.covariance is None
+                or found.map_from_camera is None):
             return found.covariance
         given, self._known = succeed(self._known, odom_from_camera, found.map_from_camera,
                                      found.covariance)
         return given
+
+
+def repeat(case: Case, localizer: Localizer, crops: CropSource | None = None) -> Relocalization:
+    """Answer a recorded request again, by a new localizer: on the same map the answer is equal.
+
+    `crops` are needed where the options compare crops with labels. CliplocError: the case does
+    not belong to the map, or is broken.
+    """
+    for query in case.queries:
+        found = localizer.answer(query, crops)
+    return found
 
 
 def instants_to_fuse(instants: Sequence[KeptInstant], observation: Observation, limit: int,

@@ -12,14 +12,10 @@ from numpy.typing import NDArray
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error, transform_from_pose
-from cliploc_ros.core.localizer import (
-    Localizer,
-    by_classes,
-    can_do_without_crops,
-    recorded_crops,
-)
+from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.demo.robot import WakeUp
@@ -171,10 +167,7 @@ class Reviewer:
     def _search(self, localizer: Localizer, first: Observation, others: Sequence[Observation]
                 ) -> Relocalization:
         """Return the pose of the first camera, as the relocalizer finds it."""
-        if can_do_without_crops(self._options):
-            others = [by_classes(one, len(self._relocalizer.landmark_map)) for one in others]
-        return localizer.localize(
-            first, run=None, crops=recorded_crops(first, self._options), others=others)
+        return localizer.answer(Query((*others, first), run=None))
 
     def _review(self, name: str, judged: Judged, image_rgb: NDArray[np.uint8],
                 observation: Observation, matches: tuple[Match, ...], repeated: bool) -> Review:

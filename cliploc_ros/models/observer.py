@@ -4,6 +4,7 @@
 
 import time
 from collections import deque
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import cv2
@@ -124,14 +125,15 @@ class Observer:
         crops = self._encoder.encode_crops(image_rgb, detections.bboxes_xyxy)
         return Observation(camera, detections, CropSimilarities(crops, self._labels), stamp_ns)
 
-    def crops(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
-              ) -> 'ObservedCrops':
+    def crops(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64],
+              known: Mapping[int, NDArray[np.float32]] | None = None) -> 'ObservedCrops':
         """Return the crops of an image (h, w, 3) uint8 at boxes (n, 4) [px].
 
-        Those that have not changed since an earlier image are encoded already.
+        `known` has embeddings (d,) by their row; by default those of crops that have not changed
+        since an earlier image.
         """
-        return ObservedCrops(self, image_rgb, bboxes_xyxy,
-                             self._memory.recall(image_rgb, bboxes_xyxy))
+        return ObservedCrops(self, image_rgb, bboxes_xyxy, self._memory.recall(
+            image_rgb, bboxes_xyxy) if known is None else known)
 
     def encode(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
                ) -> NDArray[np.float32]:
@@ -159,7 +161,7 @@ class ObservedCrops:
     """
 
     def __init__(self, observer: Observer, image_rgb: NDArray[np.uint8],
-                 bboxes_xyxy: NDArray[np.float64], known: dict[int, NDArray[np.float32]]
+                 bboxes_xyxy: NDArray[np.float64], known: Mapping[int, NDArray[np.float32]]
                  ) -> None:
         self._observer, self._image_rgb, self._bboxes_xyxy = observer, image_rgb, bboxes_xyxy
         self._known = dict(known)

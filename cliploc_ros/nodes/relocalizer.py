@@ -148,9 +148,11 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                 (health.fail if fault.is_certain else health.warn)(fault.text)
             keyframes = localizer.keyframes
             if keyframes is not None:
-                health.values |= {'keyframes': len(keyframes), 'keyframes file': keyframes.file,
+                health.values |= {'keyframes': len(keyframes.layer),
+                                  'keyframes file': keyframes.file,
                                   'keyframes hash': keyframes.file_hash}
             health.values |= localizer.cameras.values
+            health.values['wrong cameras'] = '; '.join(localizer.cameras.faults)
             for wrong in localizer.cameras.faults:
                 health.fail(f'{wrong}: check camera_info, and the pixels and corners of the boxes')
             if parameters.depth_transport != 'none':

@@ -15,10 +15,8 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from numpy.typing import NDArray
 from std_msgs.msg import Header
 
-from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.acceptance.verdict import RefusalKind
-from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.robot_state import RobotState
+from cliploc_ros.core.query import Query
 
 
 class Verdict(StrEnum):
@@ -43,12 +41,9 @@ class Answer:
     pose: PoseWithCovarianceStamped | None = None  #: None unless accepted
     #: When the image arrived (monotonic clock) [s]; -inf without one
     received_at: float = -math.inf
-    #: The robot's state at the stamp of the image; None without an image
-    state: RobotState | None = None
+    query: Query | None = None  #: With it the same answer comes again; None without an image
     #: Whether time was too short for all crops, which could have changed the verdict
     is_cut: bool = False
-    #: The frames of other cameras that were used, with the robot's state at each
-    beside: tuple[tuple[Frame, RobotState], ...] = ()
     stages_ms: Mapping[str, float] = field(default_factory=dict)  #: How long each stage took [ms]
     #: Of the map that was searched, see cliploc_ros.ros.map_parameters; empty without one
     map_hash: str = ''
@@ -59,12 +54,11 @@ class Answer:
     #: Where the robot's x axis points, or the camera looks, from the map's x axis to its y axis
     heading_deg: float = 0.0
     number: int = 0  #: From 1, in the order of the answers to requests; 0: to no request
-    cameras_before: CameraCheck | None = None  #: See Localized; None without an image
 
     @property
     def is_linked(self) -> bool:
         """Return whether odometry links the frame with those before and after it."""
-        return self.state is not None and self.state.place is not None
+        return self.query is not None and self.query.run is not None
 
     @property
     def message(self) -> str:

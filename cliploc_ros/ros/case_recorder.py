@@ -1,60 +1,46 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Keeps the frames of the last request, and stores them as a recording when that is asked for."""
+"""Keeps the queries of the last request, and stores them as a case when that is asked for."""
 
 import threading
 from collections import deque
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
 
-from rclpy.serialization import serialize_message
-from sensor_msgs.msg import CompressedImage, Image
-
-from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.query import CASE, Case, Query, case_arrays
 from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
-from cliploc_ros.messages import detections_from_msg
 from cliploc_ros.ros.answer import Answer, Verdict
-from cliploc_ros.ros.conversions import detections_to_msg, stamp_ns
-from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.robot_state import RobotState
 from cliploc_ros.ros.parameters import RelocalizerParameters
-
-if TYPE_CHECKING:
-    from cliploc_ros.offline.datasets.cases import Case, CaseFrame
 
 # As many frames as acceptance looks back to, see cliploc_ros.core.acceptance.looks.
 _MAX_FRAMES = 20
 _MAX_BYTES = 256 * 2**20
 _MIB = 2**20
+_LIBRARIES = ('cliploc_ros', 'numpy', 'scipy', 'numba')
 
 
 class NoCaseError(CliplocError):
     """There is nothing to record; the message says why."""
 
 
-class _Seen(NamedTuple):
-    frame: Frame
-    answer: Answer
-
-
 class CaseRecorder:
-    """The last frames that requests looked at, if it keeps any; older ones are forgotten."""
+    """The last answers to frames of requests, if it keeps any; older ones are forgotten."""
 
     def __init__(self, keeps: bool) -> None:
         self._keeps = keeps
         self._lock = threading.Lock()
-        self._seen: deque[_Seen] = deque(maxlen=_MAX_FRAMES)
+        self._seen: deque[Answer] = deque(maxlen=_MAX_FRAMES)
         self._last = Answer(Verdict.FAILED, 'no request yet')
 
-    def add(self, frame: Frame, answer: Answer) -> None:
-        """Keep a frame and what was found in it."""
+    def add(self, answer: Answer) -> None:
+        """Keep what was found in a frame."""
         if not self._keeps:
             return
         with self._lock:
-            self._seen.append(_Seen(frame, answer))
+            self._seen.append(answer)
             while sum(map(_bytes, self._seen)) > _MAX_BYTES \
                     and len(self._seen) > 1:
                 self._seen.popleft()
@@ -82,88 +68,47 @@ class CaseRecorder:
         if not parameters.record_folder:
             raise OptionsError('record_folder is empty: set it at the start, to a folder with '
                                'room for record_limit_mb')
-        try:
-            from cliploc_ros.offline.datasets.cases import Case, write_case
-        except ImportError as error:
-            raise OptionsError(f'recording needs rosbags ({error}): pip install rosbags'
-                               ) from error
-        seen, last = self._linked()
-        folder = _made_folder(parameters.record_folder)
-        found = seen[-1].answer
-        case = Case(tuple(frame for one in seen for frame in _case_frames(one)), {
-            'verdict': str(last.verdict), 'message': last.message, 'found': str(found.verdict),
-            'reason': found.detail, 'map_hash': found.map_hash, 'linked': found.is_linked,
-            'cameras_before': found.cameras_before.fields() if found.cameras_before else {},
-            'parameters': asdict(parameters), 'options': asdict(parameters.options())})
-        _check_room(folder, case, parameters.record_limit_mb)
+        queries, found, last = self._linked()
+        folder, versions = _made_folder(parameters.record_folder), {}
+        for name in _LIBRARIES:
+            with suppress(PackageNotFoundError):
+                versions[name] = version(name)
+        arrays = case_arrays(Case(queries, {
+            'verdict': last.verdict, 'message': last.message, 'found': found.verdict,
+            'reason': found.detail, 'map_hash': found.map_hash,
+            'parameters': asdict(parameters), 'options': asdict(parameters.options()),
+            'versions': versions}))
+        _check_room(folder, sum(one.nbytes for one in arrays.values()),
+                    parameters.record_limit_mb)
         now = datetime.now(UTC).strftime('%Y%m%dT%H%M%S.%f')[:-3]
-        path = folder / f'case_{now}_{last.verdict}'
-        write_case(path, case)
-        return f'{path}: {len(case.frames)} frames; {last.message}'
+        path = folder / f'case_{now}_{last.verdict}.npz'
+        CASE.write(path, arrays, compress=True)
+        return f'{path}: {len(queries)} frames; {last.message}'
 
-    def _linked(self) -> tuple[list[_Seen], Answer]:
-        """Return the frames that the last answer may rest on, the oldest first, and the answer.
+    def _linked(self) -> tuple[tuple[Query, ...], Answer, Answer]:
+        """Return the queries that the last answer may rest on, the oldest first, and answers.
 
-        Odometry links a frame to those before it. Without it a frame stands alone.
+        Odometry links a frame to those before it. Without it a frame stands alone. The answers
+        are that to the newest frame, and that to the request.
         """
         with self._lock:
             seen, last = list(self._seen), self._last
-        newest = next((place for place in reversed(range(len(seen)))
-                       if seen[place].frame.received_at == last.received_at), None)
-        if newest is None:
+        while seen and seen[-1].received_at != last.received_at:
+            seen.pop()
+        if not seen:
             raise NoCaseError(f'nothing to record: the last request saw no frame: {last.message}')
-        oldest = newest
-        while oldest > 0 and _run(seen[newest]) is not None \
-                and _run(seen[oldest - 1]) == _run(seen[newest]):
-            oldest -= 1
-        return seen[oldest:newest + 1], last
+        linked: list[Query] = []
+        for one in reversed(seen):
+            assert one.query is not None
+            if linked and (one.query.run is None or one.query.run != linked[0].run):
+                break
+            linked.insert(0, one.query)
+        return tuple(linked), seen[-1], last
 
 
-def _bytes(seen: _Seen) -> int:
+def _bytes(answer: Answer) -> int:
     """Return the memory of its images."""
-    return sum(len(image.data) for one in (seen.frame, *seen.frame.beside)
-               for image in (one.image, one.depth) if image is not None)
-
-
-def _run(seen: _Seen) -> int | None:
-    """Return the run of odometry that places a frame; None without one."""
-    state = seen.answer.state
-    return None if state is None or state.place is None else state.place.run
-
-
-def _case_frames(seen: _Seen) -> list['CaseFrame']:
-    """Return the frames of an instant, that of the pose last."""
-    return [*(replace(_case_frame(frame, state), is_beside=True)
-              for frame, state in seen.answer.beside), _case_frame(seen.frame, seen.answer.state)]
-
-
-def _case_frame(frame: Frame, state: RobotState | None) -> 'CaseFrame':
-    from cliploc_ros.offline.datasets.cases import CaseFrame
-
-    detections, odom_from_camera = frame.detections, None
-    if any(one.bbox.center.theta != 0.0 for one in detections.detections):
-        # only rclpy's reader understands turned boxes
-        detections = detections_to_msg(detections_from_msg(detections), detections.header)
-    if state is not None and state.place is not None:
-        odom_from_camera = state.place.odom_from_camera
-    elif state is not None and frame.camera:
-        odom_from_camera = invert_transform(state.camera_from_base)
-    return CaseFrame(
-        stamp_ns(frame.image.header.stamp), _type_of(frame.image),
-        image=bytes(serialize_message(frame.image)),
-        camera_info=bytes(serialize_message(frame.camera_info)),
-        detections=bytes(serialize_message(detections)),
-        up_in_camera=None if state is None else state.up_in_camera,
-        odom_from_camera=odom_from_camera, camera=frame.camera,
-        depth_type=_type_of(frame.depth) if frame.depth else '',
-        depth=bytes(serialize_message(frame.depth)) if frame.depth else b'',
-        depth_camera_info=bytes(serialize_message(frame.depth_camera_info))
-        if frame.depth_camera_info else b'',
-        camera_from_depth=None if state is None else state.camera_from_depth)
-
-
-def _type_of(image: Image | CompressedImage) -> str:
-    return f'sensor_msgs/msg/{type(image).__name__}'
+    return 0 if answer.query is None else sum(one.nbytes for one in answer.query.images)
 
 
 def _made_folder(name: str) -> Path:
@@ -177,10 +122,8 @@ def _made_folder(name: str) -> Path:
     return folder
 
 
-def _check_room(folder: Path, case: 'Case', limit_mb: int) -> None:
-    """Raise unless the case fits into what the recordings of the folder may take."""
-    size = sum(len(frame.image) + len(frame.camera_info) + len(frame.detections)
-               + len(frame.depth) for frame in case.frames)
+def _check_room(folder: Path, size: int, limit_mb: int) -> None:
+    """Raise unless a size [bytes] fits into what the recordings of the folder may take."""
     # The size of all files; some may be moved away meanwhile.
     used = 0
     for parent, _, names in folder.walk():

@@ -26,7 +26,6 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.errors import CliplocError, misspelt_classes
 from cliploc_ros.messages import (
     camera_from_msg,
-    depths_from_msg,
     detections_from_msg,
     faults_of_camera_info,
     faults_of_headers,
@@ -35,12 +34,12 @@ from cliploc_ros.messages import (
     parse_class_map,
 )
 from cliploc_ros.ros import qos
+from cliploc_ros.ros.answer import Verdict
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.frame_localizer import (
     FrameLocalizer,
     keyframes_path,
     load_localizer,
-    read_frame,
 )
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_faults import faults_of_axes
@@ -52,6 +51,7 @@ from cliploc_ros.ros.inputs.frame_source import (
     TimedImage,
     of_camera,
 )
+from cliploc_ros.ros.inputs.instants import frame_depths, read_frame
 from cliploc_ros.ros.inputs.rig import frames_of
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
@@ -125,15 +125,18 @@ class Doctor(ManagedNode[RelocalizerParameters]):
         Of the relocalizer.
     topics : sequence of str
         Its remappings, NAME:=TOPIC.
+    wrong_cameras : str
+        What its looks have shown to be wrong with its cameras.
     """
 
-    def __init__(self, given: Sequence[Parameter], topics: Sequence[str]) -> None:
+    def __init__(self, given: Sequence[Parameter], topics: Sequence[str], wrong_cameras: str = ''
+                 ) -> None:
         rules = [word for rule in ('/diagnostics:=~/diagnostics', *topics)
                  for word in ('-r', rule)]
         super().__init__('doctor', RelocalizerParameters, DetectorParameters,
                          parameter_overrides=[one for one in given if one.name != 'autostart'],
                          cli_args=['--ros-args', *rules])
-        parameters = self.settings.values
+        parameters, self.wrong_cameras = self.settings.values, wrong_cameras
         self.robot = RobotStateSource(self)
         self.frames = frames_of(self, parameters, LINGER_S)
         self.handoff = HandOff(self, self.robot.odometry)
@@ -233,7 +236,7 @@ def _check_map(node: Doctor, parameters: RelocalizerParameters, report: Report
         else:
             report.judge('keyframes', '' if keyframes is not None else
                          f'{file} is not used, see the error above: make it again with build_map',
-                         f'{len(keyframes or ())} of {file}')
+                         f'{len(keyframes.layer if keyframes else ())} of {file}')
         return localizer
     return None
 
@@ -362,10 +365,9 @@ def _check_depth(frame: Frame, state: RobotState, parameters: RelocalizerParamet
                           'or set depth_transport to none')
     with report.failing(what):
         _, camera, given = read_frame(frame, parameters)
-        boxes = given.usable(camera.width, camera.height, parameters.max_detections).bboxes_xyxy
-        depths_m = depths_from_msg(
-            frame.depth, frame.image.header.frame_id, camera, boxes,
-            frame.depth_camera_info, state.camera_from_depth)
+        boxes = given.usable(camera.width, camera.height, parameters.max_detections)
+        depths_m = frame_depths(frame, camera, boxes, state)
+        assert depths_m is not None
         known_m = depths_m[np.isfinite(depths_m)]
         if not len(known_m):
             return report.skip(what, f'none of {len(depths_m)} boxes has depth')
@@ -379,21 +381,22 @@ def _check_request(node: Doctor, parameters: RelocalizerParameters,
     if localizer is None or frame is None:
         return report.skip('time, pose', 'need a map and an image with detections')
     with report.failing('pose'):
-        deadline = time.monotonic() + parameters.tf_timeout_s
-        states = [(one, node.robot.at(one.image.header, parameters.of_camera(one.camera), deadline,
-                                      one.depth_frame)) for one in (frame, *frame.beside)]
+        known = node.robot.at_instant(frame, parameters, localizer.frame_ids, localizer.map_hash,
+                                      time.monotonic() + parameters.tf_timeout_s)
         if parameters.depth_transport != 'none':
-            for one, state in states:
+            for one, state in ((frame, known.state), *known.beside):
                 _check_depth(one, state, parameters, report)
         times = StageTimes('waiting', time.monotonic())
         localized = node.worker.run(partial(
-            localizer.localize, frame, parameters, states[0][1], times, math.inf, states[1:]))
+            localizer.localize, frame, parameters, known, times))
         stages_ms = {'detection': 1e3 * (frame.detected_at - frame.received_at), **times.ms}
         is_slow = sum(stages_ms.values()) > 1e3 * parameters.timeout_s
         report.judge('time', time_is_up(stages_ms) if is_slow else '',
                      f'{in_words(stages_ms)}; timeout_s {parameters.timeout_s:g}')
         found = localized.found
-        if found.accepted:
+        if found.accepted and node.wrong_cameras:
+            report.add('pose', State.REFUSED, f'the relocalizer refuses it: {node.wrong_cameras}')
+        elif found.accepted:
             report.add('pose', State.PASS,
                        f'accepted with confidence {found.confidence:.3f}; not handed over')
         else:
@@ -405,7 +408,7 @@ def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) 
 
     CliplocError: a parameter file cannot be read, or no node can have this name.
     """
-    name = whole_name(name)
+    name, wrong_cameras = whole_name(name), ''
     if files:
         given, topics = parameters_of_files(files, name), []
     else:
@@ -414,10 +417,14 @@ def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) 
         except NotRunningError as error:
             return report.add('relocalizer', State.FAIL, str(error))
         given, topics = running.parameters, running.topics
+        wrong_cameras = running.values.get('wrong cameras', '')
+        if any(running.values.get(one, '0') != '0' for one in (
+                Verdict.ACCEPTED, Verdict.WITHHELD)):  # it has no use for its last pose any more
+            given = [one for one in given if one.name != 'last_pose_file']
         # what an active one misses has lines of its own
         report.judge('relocalizer', running.problem, f'{running.name} is active')
     executor, ended = NodeExecutor(), threading.Event()
-    node = Doctor(given, topics)
+    node = Doctor(given, [*topics, f'~/prior:={name}/prior'], wrong_cameras)
     node.get_logger().set_level(LoggingSeverity.ERROR)
     executor.add_node(node)
 

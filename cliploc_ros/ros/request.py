@@ -128,12 +128,10 @@ class Pipeline:
         assert localizer is not None  # an active node has one
         image = frame.image.header
         self._jumps.check(image.stamp, frame.received_at)
-        state = self._robot.at(image, parameters.of_camera(frame.camera), deadline,
-                               frame.depth_frame)
-        beside = self._beside(frame, parameters, deadline)
-        region = self._robot.prior.region(image.stamp, parameters, state.camera_from_base,
-                                          localizer.frame_ids, localizer.map_hash)
-        localized = localizer.localize(frame, parameters, state, times, deadline, beside, region)
+        known = self._robot.at_instant(frame, parameters, localizer.frame_ids, localizer.map_hash,
+                                       deadline)
+        localized = localizer.localize(frame, parameters, known, times, deadline)
+        state = known.state
         stages_ms = times.ms
         self._node.stages.add(stages_ms)
         if faults := '; '.join(fault.text for fault in localizer.faults):
@@ -143,10 +141,9 @@ class Pipeline:
         header = Header(stamp=image.stamp, frame_id=localized.landmark_map.frame_id)
         found = localized.found
         answer = Answer(Verdict.REFUSED, f'{found.reason} {_summary(localized, stages_ms)}',
-                        None, frame.received_at, state, localized.is_cut, tuple(beside),
-                        stages_ms, localizer.map_hash, found.refusal_kind,
-                        header, _figures(localized, parameters),
-                        cameras_before=localized.cameras_before)
+                        None, frame.received_at, localized.query, localized.is_cut, stages_ms,
+                        localizer.map_hash, found.refusal_kind, header,
+                        _figures(localized, parameters))
         if found.accepted:
             answer = self._publish(header, localized, state, replace(
                 answer, verdict=Verdict.ACCEPTED, detail=_summary(localized, stages_ms)))
@@ -156,20 +153,6 @@ class Pipeline:
                 self._visualization.show_debug_image, image, localized.seen,
                 localized.landmark_map, found, answer.message))
         return answer
-
-    def _beside(self, frame: Frame, parameters: RelocalizerParameters, deadline: float
-                ) -> list[tuple[Frame, RobotState]]:
-        """Return the frames of other cameras whose mounts are known, with the robot's state."""
-        found = []
-        for one in frame.beside:
-            soon = min(deadline, time.monotonic() + parameters.tf_timeout_s)
-            try:
-                found.append((one, self._robot.at(
-                    one.image.header, parameters.of_camera(one.camera), soon, one.depth_frame)))
-            except NoTransformError as error:
-                self._node.get_logger().warning(f'localizing without {one.camera}: {error}',
-                                                throttle_duration_sec=_LOG_PERIOD_S)
-        return found
 
     def _use(self, localizer: FrameLocalizer) -> str:
         self.localizer = localizer
@@ -312,7 +295,7 @@ class Requests:
     def _look(self, frame: Frame, times: StageTimes, deadline: float) -> Answer:
         """Localize with a frame and keep it, in the worker's thread."""
         answer = self._pipeline.localize(frame, times, deadline)
-        self._cases.add(frame, answer)
+        self._cases.add(answer)
         return answer
 
     def _hand_over(self, answer: Answer, deadline: float) -> tuple[Answer, bool]:
@@ -336,7 +319,8 @@ def _summary(localized: Localized, stages_ms: Mapping[str, float]) -> str:
     keyframes = '' if found.source == 'objects' else f', pose by {found.source}'
     if found.recognized is not None:
         keyframes += f', {found.recognized.inliers} points of keyframes agree'
-    cameras = f', {localized.cameras} cameras' if localized.cameras > 1 else ''
+    count = len(localized.query.frames)
+    cameras = f', {count} cameras' if count > 1 else ''
     if localized.left_out:
         cameras += f', none of {", ".join(localized.left_out)}'
     depth = ''
@@ -364,7 +348,7 @@ def _figures(localized: Localized, parameters: RelocalizerParameters) -> dict[st
     needed = parameters.min_confidence if evidence is None else needed_confidence(
         evidence, parameters.options())
     return {'source': found.source if found.solved else '', 'frames': len(found.frame_matches),
-            'cameras': localized.cameras, 'confidence': f'{found.confidence:.6f}',
+            'cameras': len(localized.query.frames), 'confidence': f'{found.confidence:.6f}',
             'confidence needed': f'{needed:g}',
             'landmarks': 0 if evidence is None else evidence.inliers,
             'keyframe points': 0 if points is None else points.inliers}

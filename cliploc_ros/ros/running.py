@@ -114,6 +114,7 @@ class Running:
     problem: str  #: Why it is not active, and what to do; empty if it is
     parameters: list[Parameter]
     topics: list[str]  #: Its remappings, NAME:=TOPIC
+    values: dict[str, str]  #: Of its diagnostics
 
 
 def whole_name(name: str) -> str:
@@ -156,7 +157,7 @@ def ask(name: str, patience_s: float) -> Running:
             name, '' if status.values['state'] == 'active' else status.problem(),
             [Parameter.from_parameter_msg(ParameterMsg(name=one, value=value))
              for one, value in zip(names, got.result().values, strict=True)],
-            status.values.get('topics', '').split())
+            status.values.get('topics', '').split(), status.values)
     finally:
         node.destroy_node()
 

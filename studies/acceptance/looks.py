@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.verdict import refusal
 from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
-from cliploc_ros.core.localizer import Localizer, recorded_crops
+from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.offline.evaluation.sensors import with_neighbours
-from cliploc_ros.offline.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.trials import PosedQuery
 from studies.acceptance.places import (
     STEP_DEG,
     STEP_M,
@@ -54,7 +55,7 @@ class Retries:
         return float(self.errors_m[np.argmax(self.accepted)]) if self.accepted.any() else np.nan
 
 
-def retry(landmark_map: LandmarkMap, queries: Sequence[Query], options: RelocalizerOptions,
+def retry(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], options: RelocalizerOptions,
           seed: int = 0) -> Iterator[Retries]:
     """Let a robot look 20 times at each query; each look misses some boxes and shifts others."""
     relocalizer, rng = Relocalizer(landmark_map, options), np.random.default_rng(seed)
@@ -64,7 +65,7 @@ def retry(landmark_map: LandmarkMap, queries: Sequence[Query], options: Relocali
         for number in range(LOOKS):
             look = replace(_flickering(query.observation, rng), odom_from_camera=np.eye(4),
                            stamp_ns=(number + 1) * _PERIOD_NS)
-            found = session.localize(look, crops=recorded_crops(look, options))
+            found = session.answer(Query((look,)))
             accepted.append(found.accepted)
             alone.append(found.evidence is not None and not refusal(
                 replace(found.evidence, earlier=()), options))
@@ -82,7 +83,7 @@ def _flickering(observation: Observation, rng: np.random.Generator) -> Observati
                    rows)
 
 
-def _error_m(pose: NDArray[np.float64] | None, query: Query) -> float:
+def _error_m(pose: NDArray[np.float64] | None, query: PosedQuery) -> float:
     return np.inf if pose is None else float(pose_error(pose, query.map_from_camera)[0])
 
 
@@ -126,13 +127,15 @@ def grow(place: Place, options: RelocalizerOptions, seed: int, vertical: bool
         queries = with_mount_error(queries, place.groups, VERTICAL_DEG, seed)
     queries = with_neighbours(queries, place.groups, STEP_M, STEP_DEG, seed)
     landmark_map = place.landmark_map
-    relocalizer = Relocalizer(landmark_map, replace(options, k=min(options.k, len(landmark_map))))
+    relocalizer = Relocalizer(landmark_map, replace(
+        options, k=min(options.k, len(landmark_map)), crops='all'))
     for group in dict.fromkeys(place.groups):
         session = Localizer(relocalizer)
         answers: list[Answer] = []
         for query in sorted((one for one, its in zip(queries, place.groups, strict=True)
                              if its == group), key=lambda one: one.observation.stamp_ns):
-            found = session.localize(query.observation, 0, GROUP_SIZE, _WINDOW_S)
+            found = session.answer(Query((query.observation,), limit=GROUP_SIZE,
+                                         length_s=_WINDOW_S))
             answers.append(Answer(len(answers) + 1, found.confidence,
                                   _error_m(found.map_from_camera, query), found.accepted))
         yield answers

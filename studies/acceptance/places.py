@@ -12,13 +12,13 @@ import numpy as np
 
 from cliploc_ros.command import positive_int
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.queries import Queries, load_queries
 from cliploc_ros.offline.evaluation.sensors import simulate_depths, with_neighbours, with_vertical
-from cliploc_ros.offline.evaluation.trials import Query, make_queries
+from cliploc_ros.offline.evaluation.trials import PosedQuery, make_queries
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.units import NS_PER_S
@@ -46,7 +46,7 @@ class Place(NamedTuple):
     """
 
     landmark_map: LandmarkMap
-    frames: Sequence[Query]
+    frames: Sequence[PosedQuery]
     groups: Sequence[int]
     is_main: Sequence[bool]
     every_frame: bool = False
@@ -57,10 +57,11 @@ class Place(NamedTuple):
         has_groups = len(set(self.groups)) < len(self.groups)
         return MODES if has_groups else (ONE, VERTICAL, LEVEL)
 
-    def ask(self, mode: str, seed: int = SEED, vertical_deg: float = VERTICAL_DEG) -> list[Query]:
+    def ask(self, mode: str, seed: int = SEED, vertical_deg: float = VERTICAL_DEG
+            ) -> list[PosedQuery]:
         """Return the queries with what is known in a mode."""
         is_fused = mode in (FIVE, ALL)
-        queries: Sequence[Query] = self.frames
+        queries: Sequence[PosedQuery] = self.frames
         if is_fused and any(one.neighbours for one in queries):
             return []  # of several cameras, one instant
         if mode in (VERTICAL, LEVEL, ALL):
@@ -98,7 +99,7 @@ class Recording(NamedTuple):
         """Return the place."""
         landmark_map = LandmarkMap.from_file(self.landmark_map)
         found = load_queries(self.queries, landmark_map.landmark_ids)
-        queries: Sequence[Query] = make_queries(found, landmark_map, every_frame=True)
+        queries: Sequence[PosedQuery] = make_queries(found, landmark_map, every_frame=True)
         if not self.has_depth:
             queries = _without_depth(queries)
         elif all(one.depths is None for one in found.frames):
@@ -152,20 +153,21 @@ class Halved(NamedTuple):
             halves.reverse()
         landmark_map = build_map(recorded.select_frames(halves[0])).landmark_map
         asked = recorded.select_frames(halves[1])
-        queries = [Query(number, observation_of(asked, number, round(stamp_s * NS_PER_S)), pose)
-                   for number, (stamp_s, pose) in enumerate(zip(
+        queries = [PosedQuery(number, observation_of(asked, number, round(stamp_s * NS_PER_S)),
+                              pose) for number, (stamp_s, pose) in enumerate(zip(
                        asked.stamps_s, asked.map_from_camera, strict=True))]
         if not self.has_depth:
             queries = _without_depth(queries)
         return Place(landmark_map, queries, range(len(queries)), [True] * len(queries))
 
 
-def _without_depth(queries: Sequence[Query]) -> list[Query]:
+def _without_depth(queries: Sequence[PosedQuery]) -> list[PosedQuery]:
     return [replace(one, observation=replace(one.observation, depths=None)) for one in queries]
 
 
-def _with_simulated_depth(queries: Sequence[Query], recorded: Queries, landmark_map: LandmarkMap
-                          ) -> tuple[Query, ...]:
+def _with_simulated_depth(queries: Sequence[PosedQuery], recorded: Queries,
+                          landmark_map: LandmarkMap
+                          ) -> tuple[PosedQuery, ...]:
     """Return queries with depth of the landmarks that their boxes show."""
     rows = np.array([landmark_map.landmark_ids.index(one) if one in landmark_map.landmark_ids
                      else -1 for one in recorded.landmark_ids] + [-1])
@@ -245,9 +247,7 @@ def observation_of(recorded: PosedDetections, row: int, stamp_ns: int) -> Observ
     boxes = slice(recorded.frame_offsets[row], recorded.frame_offsets[row + 1])
     odom = None if recorded.odom_from_camera is None else recorded.odom_from_camera[row]
     return Observation(
-        recorded.camera_of(row), Detections(
-            recorded.bboxes_xyxy[boxes],
-            tuple(recorded.class_names[one] for one in recorded.classes[boxes]),
-            recorded.scores[boxes]), stamp_ns=stamp_ns, camera_name=recorded.name_of(row),
+        recorded.camera_of(row), recorded.detections_of(row), stamp_ns=stamp_ns,
+        camera_name=recorded.name_of(row),
         depths=None if recorded.depths is None else recorded.depths[boxes].astype(np.float64),
         odom_from_camera=None if odom is None or np.isnan(odom).any() else odom)

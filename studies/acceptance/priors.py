@@ -13,7 +13,7 @@ from cliploc_ros.core.acceptance.look_alikes import find_alike
 from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Region
-from cliploc_ros.offline.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.trials import PosedQuery
 from studies.acceptance.places import ALL, LEVEL, ONE
 from studies.acceptance.troubles import Trouble, World, unchanged
 
@@ -23,8 +23,8 @@ _PROBABILITY = 0.9
 _MODES = (ONE, LEVEL, ALL)
 
 
-def _told(landmark_map: LandmarkMap, query: Query, spot: NDArray[np.float64],
-          deviations: Sequence[float], rng: np.random.Generator) -> Query:
+def _told(landmark_map: LandmarkMap, query: PosedQuery, spot: NDArray[np.float64],
+          deviations: Sequence[float], rng: np.random.Generator) -> PosedQuery:
     """Return a query with a region around a spot (3,): x, y and yaw, with an error like that."""
     region = Region(landmark_map.frame_id, spot + rng.normal(size=3) * deviations,
                     np.diag(deviations) ** 2, _PROBABILITY)
@@ -36,7 +36,7 @@ def _spot_of(map_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([*body[:2, 3], np.arctan2(body[1, 0], body[0, 0])])
 
 
-def tell(landmark_map: LandmarkMap, queries: Sequence[Query], wrong: float,
+def tell(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], wrong: float,
          rng: np.random.Generator, deviations: Sequence[float]) -> World:
     """Tell each query where it is; a share of them is told another spot of the map."""
     low, high = landmark_map.centers[:, :2].min(axis=0), landmark_map.centers[:, :2].max(axis=0)
@@ -52,7 +52,7 @@ def tell(landmark_map: LandmarkMap, queries: Sequence[Query], wrong: float,
     return landmark_map, found
 
 
-def tell_twin(landmark_map: LandmarkMap, queries: Sequence[Query], wrong: float,
+def tell_twin(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], wrong: float,
               rng: np.random.Generator, deviations: Sequence[float] = ()) -> World:
     """Keep the queries whose place has a twin; each is told, where there are deviations, the twin.
 

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
-from cliploc_ros.core.localizer import Localizer, recorded_crops
+from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.offline.evaluation.figures import within_ellipsoid
 from cliploc_ros.offline.evaluation.methods import AUTO, Method
-from cliploc_ros.offline.evaluation.trials import Query, run_trial
+from cliploc_ros.offline.evaluation.trials import PosedQuery, run_trial
 from studies.acceptance.fit import best_recall
 from studies.acceptance.places import SEED, AnyPlace, Place
 from studies.acceptance.priors import PRIORS
@@ -99,13 +100,12 @@ def search(task: Task) -> list[Outcome]:
             for one in run_trial(landmark_map, Method(AUTO, options), 0, changed)]
 
 
-def _looks(landmark_map: LandmarkMap, options: RelocalizerOptions, queries: Sequence[Query],
+def _looks(landmark_map: LandmarkMap, options: RelocalizerOptions, queries: Sequence[PosedQuery],
            outcome: Callable[..., Outcome]) -> list[Outcome]:
     """Return the outcomes of one localizer that has all queries in order, without odometry."""
     localizer, found = Localizer(Relocalizer(landmark_map, options)), []
     for number, query in enumerate(queries):
-        result = localizer.localize(query.observation, None, crops=recorded_crops(
-            query.observation, options))
+        result = localizer.answer(Query((query.observation,), run=None))
         pose, error_m, error_deg, nees = result.map_from_camera, inf, inf, inf
         if pose is not None:
             error_m, error_deg = pose_error(pose, query.map_from_camera)

@@ -15,7 +15,7 @@ from cliploc_ros.core.localizer import by_classes
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.offline.evaluation.sensors import with_vertical
-from cliploc_ros.offline.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.trials import PosedQuery
 from studies import wrong_sensors
 from studies.acceptance.places import ALL, FIVE, LEVEL, ONE, VERTICAL, VERTICAL_DEG
 from studies.worlds.cameras import GROUP_SIZE
@@ -28,18 +28,18 @@ _MOVED_M = (0.3, 3.0)
 _SEEN_TWICE, _JITTER, _APART_M = 0.7, 0.02, 0.03
 _ELSEWHERE_M = np.array([1e3, 0.0, 0.0])
 
-World = tuple[LandmarkMap, Sequence[Query]]
+World = tuple[LandmarkMap, Sequence[PosedQuery]]
 #: A change of map and queries by a level, with a generator.
-Change = Callable[[LandmarkMap, Sequence[Query], float, np.random.Generator], World]
+Change = Callable[[LandmarkMap, Sequence[PosedQuery], float, np.random.Generator], World]
 
 
-def unchanged(landmark_map: LandmarkMap, queries: Sequence[Query], level: float,
+def unchanged(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], level: float,
               rng: np.random.Generator) -> World:
     """Change nothing."""
     return landmark_map, queries
 
 
-def remove_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+def remove_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
                      rng: np.random.Generator) -> World:
     """Remove a share of the landmarks from the map; their detections stay."""
     count = len(landmark_map)
@@ -47,7 +47,7 @@ def remove_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share:
     return landmark_map.select(kept.tolist()), _with_columns(queries, kept)
 
 
-def move_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], distance_m: float,
+def move_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], distance_m: float,
                    rng: np.random.Generator) -> World:
     """Move a third of the landmarks by a distance, in random directions."""
     steps = rng.normal(size=landmark_map.centers.shape)
@@ -56,7 +56,7 @@ def move_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], distance
     return replace(landmark_map, centers=landmark_map.centers + steps), queries
 
 
-def exchange_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+def exchange_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
                        rng: np.random.Generator) -> World:
     """Exchange the places of a share of the landmarks; all of them make another place."""
     count = len(landmark_map)
@@ -66,7 +66,7 @@ def exchange_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], shar
     return replace(landmark_map, centers=centers), queries
 
 
-def mislabel_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+def mislabel_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
                        rng: np.random.Generator) -> World:
     """Exchange labels and classes of a share of the landmarks."""
     count = len(landmark_map)
@@ -78,7 +78,7 @@ def mislabel_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], shar
                     details=described.details), _with_columns(queries, source))
 
 
-def move_objects(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+def move_objects(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
                  rng: np.random.Generator) -> World:
     """Move a share of the landmarks to other spots at their height, 0.3 to 3 m away."""
     count = len(landmark_map)
@@ -89,7 +89,7 @@ def move_objects(landmark_map: LandmarkMap, queries: Sequence[Query], share: flo
     return replace(landmark_map, centers=moved), queries
 
 
-def double_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], distance_m: float,
+def double_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], distance_m: float,
                      rng: np.random.Generator) -> World:
     """Add a second landmark of the same object next to each one, in random directions."""
     steps = rng.normal(size=landmark_map.centers.shape)
@@ -97,14 +97,14 @@ def double_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], distan
     return _with_copies(landmark_map, queries, steps)
 
 
-def add_equal_room(landmark_map: LandmarkMap, queries: Sequence[Query], gap_m: float,
+def add_equal_room(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], gap_m: float,
                    rng: np.random.Generator) -> World:
     """Add a room that equals the mapped one, beside it."""
     width = float(np.ptp(landmark_map.centers[:, 0]))
     return _with_copies(landmark_map, queries, np.array([width + gap_m, 0.0, 0.0]))
 
 
-def age_half(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+def age_half(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
              rng: np.random.Generator) -> World:
     """Let the map of one of two rooms side by side be out of date, for the queries in it.
 
@@ -123,13 +123,13 @@ def age_half(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
         [one for one in queries if (one.map_from_camera[0, 3] > middle) == is_right], kept))
 
 
-def add_aged_twin(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+def add_aged_twin(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
                   rng: np.random.Generator) -> World:
     """Add an equal room; then one of both changes, see age_half."""
     return age_half(*add_equal_room(landmark_map, queries, 2.0, rng), share, rng)
 
 
-def confuse_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], copies: float,
+def confuse_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], copies: float,
                       rng: np.random.Generator) -> World:
     """Add landmarks of other classes at each landmark, and boxes of these classes at most boxes.
 
@@ -167,7 +167,7 @@ def confuse_landmarks(landmark_map: LandmarkMap, queries: Sequence[Query], copie
              for one in _with_columns(queries, rows)])
 
 
-def unmapped_desk(landmark_map: LandmarkMap, queries: Sequence[Query], level: float,
+def unmapped_desk(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], level: float,
                   rng: np.random.Generator) -> World:
     """Let the robot stand at a desk that the map lacks: every pose is wrong. By classes."""
     desk = make_world('one desk', int(rng.integers(1 << 30)), groups=len(queries)).queries
@@ -182,7 +182,7 @@ def unmapped_desk(landmark_map: LandmarkMap, queries: Sequence[Query], level: fl
 def _distorted(change: Callable[[NDArray[np.float64], float, np.random.Generator],
                                 NDArray[np.float64]]) -> Change:
     """Return a change of the landmarks' places (L, 3), relative to their mean, by a level."""
-    def changed(landmark_map: LandmarkMap, queries: Sequence[Query], level: float,
+    def changed(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], level: float,
                 rng: np.random.Generator) -> World:
         middle = landmark_map.centers.mean(axis=0)
         return replace(landmark_map, centers=middle + change(
@@ -206,7 +206,7 @@ def _half_turned(offsets: NDArray[np.float64], angle_deg: float, rng: np.random.
     return turned
 
 
-def random_detections(landmark_map: LandmarkMap, queries: Sequence[Query], count: float,
+def random_detections(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], count: float,
                       rng: np.random.Generator) -> World:
     """Replace the boxes of each query by random ones, each like a random landmark."""
     def drawn(observation: Observation) -> Observation:
@@ -225,7 +225,7 @@ def random_detections(landmark_map: LandmarkMap, queries: Sequence[Query], count
                           for query in queries]
 
 
-def drop_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+def drop_detections(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
                     rng: np.random.Generator) -> World:
     """Drop a share of the boxes."""
     def thinned(observation: Observation) -> Observation:
@@ -235,7 +235,7 @@ def drop_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share: 
     return landmark_map, [replace(one, observation=thinned(one.observation)) for one in queries]
 
 
-def invent_detections(landmark_map: LandmarkMap, queries: Sequence[Query], share: float,
+def invent_detections(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
                       rng: np.random.Generator) -> World:
     """Add random boxes, a number for each true one, whose looks are permuted true ones."""
     def extended(observation: Observation) -> Observation:
@@ -271,7 +271,7 @@ def _random_boxes(observation: Observation, count: int, rng: np.random.Generator
     return np.hstack([corners, corners + rng.uniform(*_BOX_SIDE_PX, (count, 2))])
 
 
-def _with_columns(queries: Sequence[Query], columns: NDArray[np.int64]) -> list[Query]:
+def _with_columns(queries: Sequence[PosedQuery], columns: NDArray[np.int64]) -> list[PosedQuery]:
     """Return queries with the similarities of some landmarks."""
     def chosen(observation: Observation) -> Observation:
         return observation if observation.similarities is None else replace(
@@ -282,7 +282,8 @@ def _with_columns(queries: Sequence[Query], columns: NDArray[np.int64]) -> list[
                     neighbours=tuple(map(chosen, one.neighbours))) for one in queries]
 
 
-def _with_copies(landmark_map: LandmarkMap, queries: Sequence[Query], steps: NDArray[np.float64]
+def _with_copies(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
+                 steps: NDArray[np.float64]
                  ) -> World:
     """Return a map with a copy of each landmark, steps (L, 3) or (3,) away."""
     rows = np.tile(np.arange(len(landmark_map)), 2)
@@ -302,7 +303,7 @@ class Trouble(NamedTuple):
     in_order: bool = False  #: Whether it concerns a camera, so that several looks may tell
 
 
-def _of_sensor(change: Callable[[Sequence[Query], float], Sequence[Query]]) -> Change:
+def _of_sensor(change: Callable[[Sequence[PosedQuery], float], Sequence[PosedQuery]]) -> Change:
     return lambda landmark_map, queries, level, rng: (landmark_map, change(queries, level))
 
 
@@ -331,7 +332,7 @@ TROUBLES = {
     'odometry too long by a factor': Trouble(_of_sensor(wrong_sensors.scaled_odometry), (1.2, 0.8),
                                              (FIVE, ALL))}
 _BOTH = (ONE, VERTICAL)
-_OF_CAMERA: dict[str, tuple[Callable[[Sequence[Query], float], Sequence[Query]],
+_OF_CAMERA: dict[str, tuple[Callable[[Sequence[PosedQuery], float], Sequence[PosedQuery]],
                             tuple[float, ...]]] = {
     'boxes in pixels of a middle crop of [px]': (wrong_sensors.middle_crop, (300.0, 416.0)),
     'boxes scaled by': (wrong_sensors.scaled_boxes, (0.5, 1.5, 2.0)),

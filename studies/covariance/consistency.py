@@ -27,7 +27,7 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.datasets.queries import load_queries
 from cliploc_ros.offline.evaluation.sensors import with_neighbours
 from cliploc_ros.offline.evaluation.summary import wilson_interval
-from cliploc_ros.offline.evaluation.trials import Query, make_queries
+from cliploc_ros.offline.evaluation.trials import PosedQuery, make_queries
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_world
@@ -54,13 +54,13 @@ class Squares(NamedTuple):
                      for own, freedom in zip(self, (6, 3, 3), strict=True))
 
 
-def squares_of(landmark_map: LandmarkMap, queries: Sequence[Query], groups: Sequence[int],
+def squares_of(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], groups: Sequence[int],
                wanted: Sequence[int], seed: int = 0) -> Iterator[tuple[str, tuple[float, ...]]]:
     """Yield the mode and the three squares of each accepted, right pose.
 
     Parameters
     ----------
-    queries : sequence of Query
+    queries : sequence of PosedQuery
         All images.
     groups : sequence of int
         The group of each.

@@ -29,9 +29,10 @@ from cliploc_ros.core.geometry.transforms import (
 )
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.offline.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.trials import PosedQuery
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_walk
 
@@ -76,13 +77,13 @@ def walk_squares(kind: str, seed: int) -> NDArray[np.float64]:
     """
     world = make_walk(kind, seed, _IMAGES)
     session = Localizer(Relocalizer(world.landmark_map, RelocalizerOptions(
-        k=min(3, len(world.landmark_map)))))
+        k=min(3, len(world.landmark_map)), crops='all')))
     filters: list[Filter] = []
     squares = []
     odometry = _odometry(world.queries, np.random.default_rng([seed, 1]))
     for query, pose in zip(world.queries, odometry, strict=True):
-        found = session.localize(replace(query.observation, odom_from_camera=pose), 0, _FRAMES,
-                                 _WINDOW_S)
+        found = session.answer(Query((replace(query.observation, odom_from_camera=pose),),
+                                     limit=_FRAMES, length_s=_WINDOW_S))
         filters = [one.predicted(pose) for one in filters]
         if not found.accepted:
             continue
@@ -97,7 +98,8 @@ def walk_squares(kind: str, seed: int) -> NDArray[np.float64]:
     return np.array(squares).reshape(-1, len(COVARIANCES))
 
 
-def _odometry(queries: tuple[Query, ...], rng: np.random.Generator) -> list[NDArray[np.float64]]:
+def _odometry(queries: tuple[PosedQuery, ...], rng: np.random.Generator
+              ) -> list[NDArray[np.float64]]:
     """Return odom_from_camera (4, 4) of each image."""
     poses = [np.eye(4)]
     for before, after in pairwise(queries):

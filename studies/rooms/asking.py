@@ -21,7 +21,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import MappingError
-from cliploc_ros.offline.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.trials import PosedQuery
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from studies.blame import blame
@@ -125,7 +125,7 @@ def make_ask(folders: Sequence[str], options: RoomOptions, with_sift: bool
 
 
 def _ask_here(task: Task, room: Room, landmark_map: LandmarkMap, keyframes: KeyframeLocalizer,
-              sift: SiftMap | None, query: Query) -> Iterator[Outcome]:
+              sift: SiftMap | None, query: PosedQuery) -> Iterator[Outcome]:
     """Yield the answers to an image of the mapped room."""
     for way, known in product((OBJECTS, BOTH, KEYFRAMES), task.known):
         if known not in (NOTHING, VERTICAL) and (way == KEYFRAMES or not room.has_depth):
@@ -141,14 +141,14 @@ def _ask_here(task: Task, room: Room, landmark_map: LandmarkMap, keyframes: Keyf
 
 
 def _ask_elsewhere(task: Task, other: Room, landmark_map: LandmarkMap,
-                   keyframes: KeyframeLocalizer, query: Query) -> Iterator[Outcome]:
+                   keyframes: KeyframeLocalizer, query: PosedQuery) -> Iterator[Outcome]:
     """Yield the answers to an image of another room, all of which should be refusals."""
     for way, known in product((OBJECTS, KEYFRAMES, BOTH), task.known):
         if known == NOTHING or (known == VERTICAL and other.has_poses):
             yield _outcome(task, other.name, query, way, known, landmark_map, keyframes)
 
 
-def _outcome(task: Task, asked: str, query: Query, way: str, known: str,
+def _outcome(task: Task, asked: str, query: PosedQuery, way: str, known: str,
              landmark_map: LandmarkMap, keyframes: KeyframeLocalizer) -> Outcome:
     observation = known_of(query.observation, known)
     if way == KEYFRAMES:

@@ -32,7 +32,7 @@ from cliploc_ros.offline.datasets.frames import (
     folder_frames,
 )
 from cliploc_ros.offline.evaluation.sensors import with_vertical
-from cliploc_ros.offline.evaluation.trials import ImageFeatures, Query
+from cliploc_ros.offline.evaluation.trials import ImageFeatures, PosedQuery
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
 from cliploc_ros.units import NS_PER_S
@@ -95,9 +95,9 @@ class Room:
             frames, raws, self.options, f'{self.name}.robot'))
 
     @cached_property
-    def queries(self) -> tuple[Query, ...]:
+    def queries(self) -> tuple[PosedQuery, ...]:
         """Return all images as queries, with all that is known of them."""
-        plain = [Query(row, observation_of(self.detections, row, raw.stamp_ns),
+        plain = [PosedQuery(row, observation_of(self.detections, row, raw.stamp_ns),
                        self.detections.map_from_camera[row],
                        image=ImageFeatures(*self.features[row], 0.0))
                  for row, raw in enumerate(self.raws)]

@@ -25,7 +25,7 @@ from cliploc_ros.core.localizer import Crops, localize_on_demand
 from cliploc_ros.core.map.joined_map import join_maps
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
-from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization, in_its_map
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -186,9 +186,8 @@ def _queries(floor: int, seen: SeenFloor, labels: NDArray[np.float32], count: in
         true, pose = seen.true_landmarks[rows], detections.map_from_camera[frame]
         noise = _units(rng, len(true), labels.shape[1])
         crops = _unit(np.where(true[:, None] >= 0, labels[true], 0.0) + _NOISE * noise)
-        names = tuple(detections.class_names[number] for number in detections.classes[rows])
         found.append(Query(floor, pose, Observation(
-            CAMERA, Detections(detections.bboxes_xyxy[rows], names, detections.scores[rows]),
+            CAMERA, detections.detections_of(frame),
             up_in_camera=pose[2, :3] if gravity else None), crops, true))
     return found
 

@@ -25,7 +25,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.datasets.queries import load_queries
-from cliploc_ros.offline.evaluation.trials import Query, make_queries
+from cliploc_ros.offline.evaluation.trials import PosedQuery, make_queries
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_world
 
@@ -47,7 +47,7 @@ class Look(NamedTuple):
     ranks: NDArray[np.int64]  #: (m,): number of labels more similar than the landmark's
 
 
-def look(landmark_map: LandmarkMap, query: Query) -> Look:
+def look(landmark_map: LandmarkMap, query: PosedQuery) -> Look:
     """Compare the detections of an image with the map at the true pose."""
     observation = query.observation
     camera, boxes = observation.camera, observation.detections.bboxes_xyxy

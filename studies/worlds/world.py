@@ -14,7 +14,7 @@ from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.offline.evaluation.sensors import simulate_depths
-from cliploc_ros.offline.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.trials import PosedQuery
 from cliploc_ros.units import NS_PER_S
 from studies.worlds.appearance import Encoder
 from studies.worlds.cameras import (
@@ -46,7 +46,7 @@ class World:
     kind: str  #: One of KINDS
     landmark_map: LandmarkMap  #: With errors
     #: All images, five of each group in order of time. They know neither vertical nor odometry.
-    queries: tuple[Query, ...]
+    queries: tuple[PosedQuery, ...]
 
     @property
     def groups(self) -> tuple[int, ...]:
@@ -172,12 +172,12 @@ def _make_scene(kind: str, sigma_m: float | None, rng: np.random.Generator, dens
 def _seen(kind: str, scene: _Scene, camera: Camera, poses: NDArray[np.float64],
           rng: np.random.Generator) -> World:
     return World(kind, scene.found.landmark_map, tuple(
-        Query(number, _look(scene, camera, pose, number, rng), pose)
+        PosedQuery(number, _look(scene, camera, pose, number, rng), pose)
         for number, pose in enumerate(poses)))
 
 
-def _with_cameras(scene: _Scene, camera: Camera, query: Query, count: int,
-                  rng: np.random.Generator) -> Query:
+def _with_cameras(scene: _Scene, camera: Camera, query: PosedQuery, count: int,
+                  rng: np.random.Generator) -> PosedQuery:
     """Return a query with what the robot's other cameras see, whose mounts are a bit wrong."""
     others = []
     for row in range(1, count):

@@ -27,9 +27,10 @@ from cliploc_ros.core.geometry.transforms import invert_transform, make_transfor
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN
-from cliploc_ros.offline.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.trials import PosedQuery
 from studies import wrong_sensors
 
 ROOM = make_room()
@@ -57,7 +58,7 @@ def query(rng, noise_px=1.0, pose=None):
     boxes = boxes_at(pose)
     boxes = np.clip(boxes + rng.normal(0.0, noise_px, boxes.shape), 0.0, [*SIZE, *SIZE])
     rows = np.nonzero((boxes[:, 2:] - boxes[:, :2] > 8.0).all(axis=1))[0]
-    return Query(0, Observation(CAMERA, Detections(
+    return PosedQuery(0, Observation(CAMERA, Detections(
         boxes[rows], tuple(ROOM.class_ids[row] for row in rows), np.full(len(rows), 0.9))), pose)
 
 
@@ -73,7 +74,7 @@ def matches(boxes, map_from_camera):
 
 
 def localized(localizer, queries):
-    return [localizer.localize(one.observation, None) for one in queries]
+    return [localizer.answer(Query((one.observation,), run=None)) for one in queries]
 
 
 def test_the_derivatives_are_those_of_the_residuals(rng):
@@ -245,11 +246,10 @@ def test_with_what_was_known_before_the_same_answer_comes_again(focal, rng):
     localizer = Localizer(RELOCALIZER)
     queries = wrong_sensors.scaled_focal([query(rng) for _ in range(LOOKS)], focal)
     for one in queries:
-        found = localizer.localize(one.observation, None)
+        found = localizer.answer(Query((one.observation,), run=None))
         again = Localizer(RELOCALIZER)
-        again.cameras = CameraCheck.of_fields(json.loads(json.dumps(
-            localizer.cameras_before.fields())))
-        repeated = again.localize(one.observation, None)
+        repeated = again.answer(replace(localizer.query, cameras=CameraCheck.of_fields(json.loads(
+            json.dumps(localizer.query.cameras.fields())))))
         assert repeated.evidence == found.evidence
         assert repeated.refusal_kind == found.refusal_kind
     assert again.cameras.faults == localizer.cameras.faults

@@ -15,6 +15,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.evaluation.sensors import simulate_depths
@@ -125,10 +126,10 @@ def test_depth_of_a_wrong_scale_is_used_no_more(rng):
     for number in range(5):
         assert not localizer.depth_scale.is_wrong
         one = look(rng)
-        localizer.localize(replace(one, depths=1.5 * one.depths, stamp_ns=number))
+        localizer.answer(Query((replace(one, depths=1.5 * one.depths, stamp_ns=number),)))
     assert localizer.depth_scale.is_wrong
     assert localizer.depth_scale.ratio == pytest.approx(1.5, abs=0.1)
-    assert localizer.localize(look(rng)).depth is None
+    assert localizer.answer(Query((look(rng),))).depth is None
 
 
 def test_depth_is_off_by_eight_percent_at_most():

@@ -92,7 +92,7 @@ def test_a_turn_about_an_axis_that_all_objects_share_is_a_rival():
         [Observation(CAMERA, see_room(one, camera), up_in_camera=camera[2, :3])])
         for one in (on_axis, spread)]
     assert [one.accepted for one in found] == [False, True]
-    assert found[0].evidence.distinct < 0.7
+    assert found[0].evidence.distinct < 0.8
     assert found[1].evidence.distinct > 0.95
 
 
@@ -106,7 +106,9 @@ def shown(counts, likenesses, first=0):
 def test_labels_tell_places_apart_and_what_one_place_lacks_does_not():
     pose = shown([1] * 6, [2.0] * 6)
     assert lead_over_twin(pose, pose) == pytest.approx(0.0)
-    assert lead_over_twin(pose, shown([1] * 6, [0.0] * 6)) > 4.0
+    assert lead_over_twin(pose, shown([1] * 6, [0.0] * 6), is_room=False) > 4.0
+    # labels of two rooms that are alike err together
+    assert 2.0 < lead_over_twin(pose, shown([1] * 6, [0.0] * 6)) < 2.5
     # the twin lacks two of the objects: as much as one place of two that is out of date
     assert 0.0 < lead_over_twin(pose, shown([1] * 4, [2.0] * 4)) < 1.4
     # a pose elsewhere that explains one of them: each of the others counts as its label says

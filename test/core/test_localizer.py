@@ -3,19 +3,20 @@
 """Frame after frame of one camera: which frames are fused, and which looks have to agree."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
-from test_one_verdict import Says
 
 from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
-from cliploc_ros.core.keyframes.places import RecognizedPlace
+from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.localizer import KeptInstant, Localizer, instants_to_fuse
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 
 ROOM = make_room()
@@ -108,7 +109,7 @@ def session():
 
 def fused(session, observation, run=0):
     """The number of frames that a session fuses; each is searched with as many samples."""
-    found = session.localize(observation, run, limit=5, length_s=5.0)
+    found = session.answer(Query((observation,), run=run, limit=5, length_s=5.0))
     alone = RELOCALIZER.search(observation).progress.tried
     assert found.tried % alone == 0
     return found.tried // alone
@@ -117,7 +118,7 @@ def fused(session, observation, run=0):
 def test_a_session_finds_what_the_relocalizer_finds(session):
     observations = [frame(number, 4.0 * number) for number in range(3)]
     for one in observations:
-        found = session.localize(one, 0, 5, 5.0)
+        found = session.answer(Query((one,), limit=5, length_s=5.0))
     at_once = RELOCALIZER.relocalize(observations)
     np.testing.assert_array_equal(found.map_from_camera, at_once.map_from_camera)
     assert found.covariance == pytest.approx(at_once.covariance)
@@ -152,8 +153,8 @@ def test_a_frame_without_odometry_is_localized_alone(session):
 def drive(session, seconds, metres, run=0, objects=12):
     """Localize with a view that never changes, although odometry says that the robot drives."""
     seen = SEEN.select(np.arange(objects))
-    return session.localize(frame(seconds, metres=metres, detections=seen), run, limit=1,
-                            length_s=5.0)
+    return session.answer(Query((frame(seconds, metres=metres, detections=seen),), run=run,
+                                length_s=5.0))
 
 
 def test_a_pose_that_earlier_looks_contradict_is_refused(session):
@@ -253,24 +254,40 @@ def test_a_filter_learns_nothing_from_a_standing_camera_until_a_new_run():
     session = Localizer(RELOCALIZER)
     deviations = []
     for seconds, run in ((0, 0), (1, 0), (2, 1)):
-        found = session.localize(frame(seconds), run, 5, 5.0)
+        found = session.answer(Query((frame(seconds),), run=run, limit=5, length_s=5.0))
         assert found.accepted
         given = session.covariance_for_filter(found)
         deviations.append(np.sqrt(np.diag(given) / np.diag(found.covariance)).min())
     assert deviations[0] == deviations[2] == 1.0
     assert deviations[1] > 10.0
-    alone = session.localize(replace(frame(3), odom_from_camera=None))
+    alone = session.answer(Query((replace(frame(3), odom_from_camera=None),)))
     np.testing.assert_array_equal(session.covariance_for_filter(alone), alone.covariance)
 
 
-def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
-    session, fine = Localizer(RELOCALIZER), np.diag([1e-4] * 3 + [1e-5] * 3)
-    keyframes = Says(RecognizedPlace(MAP_FROM_CAMERA, fine, 0.5 * fine, 200, 0.9, 0.9,
-                                     pixels=np.array([[0.0, 0.0], [640.0, 480.0]])))
+class Says:
+    """Keyframes with a known answer to each image."""
 
-    def localize(seconds, run=0, detections=SEEN, recognizer=keyframes):
-        found = session.localize(frame(seconds, detections=detections), run, 5, 5.0,
-                                 recognizer=recognizer)
+    def __init__(self, place):
+        self._place = place
+        self.layer = SimpleNamespace(map_from_camera=np.empty((0, 4, 4)), deviation_per_metre=0.01)
+
+    def localize_features(self, *_):
+        return Recognition((self._place,))
+
+    def coverage(self, map_from_camera, camera):
+        return 1.0
+
+
+def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
+    fine = np.diag([1e-4] * 3 + [1e-5] * 3)
+    session = Localizer(RELOCALIZER, Says(RecognizedPlace(
+        MAP_FROM_CAMERA, fine, 0.5 * fine, 200, 0.9, 0.9,
+        pixels=np.array([[0.0, 0.0], [640.0, 480.0]]))))
+    image = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
+
+    def localize(seconds, run=0, detections=SEEN, by_keyframes=True):
+        found = session.answer(Query((frame(seconds, detections=detections),), (image,), run, 5,
+                                     5.0, by_keyframes))
         assert found.accepted
         return found
 
@@ -280,7 +297,7 @@ def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
     np.testing.assert_array_equal(given, fine)
     again = session.covariance_for_filter(localize(1))
     assert (np.diag(again) > 100.0 * np.diag(fine)).all(), 'nothing new'
-    objects = localize(2, recognizer=None)
+    objects = localize(2, by_keyframes=False)
     assert (np.diag(given) < np.diag(objects.covariance)).all()
     rough = session.covariance_for_filter(objects)
     assert (np.diag(rough) > 100.0 * np.diag(objects.covariance)).all(), 'objects tell less'

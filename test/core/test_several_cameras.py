@@ -15,6 +15,7 @@ from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 
 OPTIONS = RelocalizerOptions(matching='class', tilt_deviation_deg=0.0)
@@ -27,7 +28,7 @@ def test_together_they_see_enough(rng):
     for _ in range(12):
         *others, last = look(rng)
         alone = relocalizer.relocalize([last])
-        found = Localizer(relocalizer).localize(last, run=None, others=others)
+        found = Localizer(relocalizer).answer(Query((*others, last), run=None))
         accepted.append((alone.accepted, found.accepted))
         if found.accepted:
             assert pose_error(found.map_from_camera, MOUNTS[-1])[0] < 0.5
@@ -70,7 +71,7 @@ def test_instants_are_kept_and_replaced_as_a_whole(rng):
 
     def localize(number, pose):
         *others, last = look(rng, pose, stamp_ns=number)
-        found = localizer.localize(last, 0, 5, 60.0, others=others)
+        found = localizer.answer(Query((*others, last), limit=5, length_s=60.0))
         return found, [len(one.searched) for one in localizer._instants]
     assert localize(0, np.eye(4))[1] == [4]
     assert localize(1, np.eye(4))[1] == [4], 'a robot that stands replaces its instant'
@@ -90,7 +91,7 @@ def test_a_camera_that_contradicts_the_others_is_named(rng, turned_deg, objects,
     for number in range(8):
         assert not localizer.cameras.wrong_mounts or number >= 5
         *others, last = look(rng, objects=objects, mounts=mounts)
-        found = localizer.localize(last, run=None, others=others)
+        found = localizer.answer(Query((*others, last), run=None))
         assert found.accepted
         assert pose_error(found.map_from_camera, MOUNTS[-1])[0] < 0.3
     assert localizer.cameras.wrong_mounts == wrong
@@ -101,7 +102,7 @@ def test_a_covered_camera_has_no_wrong_mount(rng):
     for _ in range(8):
         covered, *others, last = look(rng)
         covered = replace(covered, detections=covered.detections.select(np.empty(0, np.int64)))
-        assert localizer.localize(last, run=None, others=[covered, *others]).accepted
+        assert localizer.answer(Query((covered, *others, last), run=None)).accepted
     assert localizer.cameras.wrong_mounts == []
 
 
@@ -111,5 +112,5 @@ def test_a_map_that_is_out_of_date_is_not_blamed_on_a_mount(rng):
     localizer = Localizer(Relocalizer(exchanged, OPTIONS))
     for _ in range(10):
         *others, last = look(rng, objects=5)
-        assert not localizer.localize(last, run=None, others=others).accepted
+        assert not localizer.answer(Query((*others, last), run=None)).accepted
     assert localizer.cameras.wrong_mounts == []

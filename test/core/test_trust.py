@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.confidence import Setting, confidences, none_right, utilities
-from cliploc_ros.core.acceptance.support import ComparedFrame, Support, one_thing, support
+from cliploc_ros.core.acceptance.support import Support, compared_frame, support
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, refusal
 from cliploc_ros.core.fit.covariance import pose_covariance
 from cliploc_ros.core.fit.finalists import Match
@@ -88,8 +88,7 @@ def compared(office_map, queries):
     similarities[1, 4] = 1.0
     scene = make_scene(camera.normalize_bboxes(boxes), office_map.centers, office_map.shapes,
                        np.ones((4, len(office_map)), dtype=bool), np.empty((0, 2), int), 0.2)
-    return ComparedFrame(boxes, detections.class_ids, similarities, scene, np.arange(len(boxes)),
-                         one_thing(boxes))
+    return compared_frame(office_map, detections, scene, similarities, np.arange(len(boxes)))
 
 
 @pytest.fixture

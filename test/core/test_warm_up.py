@@ -23,6 +23,7 @@ from cliploc_ros.core.kernels.compiled import KERNEL_FOLDERS
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.localizer import Localizer
+from cliploc_ros.core.query import Query
 from test_matching import make_world
 
 landmark_map, observation = make_world(60)
@@ -36,8 +37,8 @@ for method in sys.argv[3:]:
         session = Localizer(Relocalizer(landmark_map, options))
         for number in range(3):
             place = np.eye(4) + 0.1 * number * np.eye(4, k=3)
-            session.localize(replace(observation, up_in_camera=up, stamp_ns=number,
-                                     odom_from_camera=place), 0, 5, 5.0)
+            session.answer(Query((replace(observation, up_in_camera=up, stamp_ns=number,
+                                          odom_from_camera=place),), limit=5, length_s=5.0))
     print(method, KERNEL_FOLDERS.found + KERNEL_FOLDERS.missing - before)
 """
 

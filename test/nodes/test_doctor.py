@@ -8,11 +8,16 @@ import time
 
 import pytest
 import yaml
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from processes import wait_for
 from rclpy.qos import qos_profile_system_default
+from scene import write_map
 from std_msgs.msg import Header
+from test_prior_node import SEARCH, TWINS, at
 from tester import class_matching, make_frame
+
+from cliploc_ros.ros.qos import LATCHED
 
 LINE = re.compile('^(.{12}) (pass|fail|not checked|refused) +(.*)$', re.MULTILINE)
 WHOLE = {'parameters': 'valid', 'map': '12 landmarks', 'camera': '640 x 480 px',
@@ -141,6 +146,19 @@ def test_what_is_broken_fails_with_what_to_do(examine, robot, what, text, broken
     assert found[what][0] == 'fail' and text in found[what][1]
     failed = {one for one, (state, _) in found.items() if state == 'fail'}
     assert failed <= {what, *CONSEQUENCES.get(what, ())}
+
+
+def test_a_prior_decides_for_the_doctor_as_for_the_relocalizer(examine, tester, tmp_path):
+    """Of two rooms that look alike."""
+    write_map(TWINS, tmp_path / 'twins.yaml')
+    parameters = {'map_file': str(tmp_path / 'twins.yaml'), **SEARCH}
+    assert 'look alike' in examine(**parameters)[0]['pose'][1]
+    publisher = tester.create_publisher(PoseWithCovarianceStamped, 'relocalizer/prior', LATCHED)
+    publisher.publish(at(0.0))
+    assert 'accepted' in examine(**parameters)[0]['pose'][1]
+    publisher.publish(at(10.0))
+    assert examine(**parameters)[0]['pose'][0] == 'refused'
+    tester.destroy_publisher(publisher)
 
 
 #: Old images are from before all odometry.

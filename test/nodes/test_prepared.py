@@ -83,7 +83,7 @@ def test_prepare_shows_progress_and_costs(prepared, robot):
                  'need neither network nor compiler', f'carry {folder}'):
         assert text in output
     stages = [line.split()[0] for line in output.splitlines() if len(line.split()) == 3]
-    assert set(stages[-4:]) == {'detection', 'decoding', 'CLIP', 'search'}
+    assert set(stages[-3:]) == {'detection', 'CLIP', 'search'}
     for file in (*map(robot.with_name, WEIGHTS), Path(ASSETS) / 'map.yaml'):
         assert f'carry as well, for a parameter names it: {file}' in output
     assert len(list((folder / 'openvino').iterdir())) == 3

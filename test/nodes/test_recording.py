@@ -14,6 +14,7 @@ from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.offline.datasets.intrinsics import PRESETS
 from cliploc_ros.offline.datasets.tum import read_tum
@@ -45,8 +46,8 @@ def core_answers(office, detections):
     """What the core says of detections in turn, without any ROS."""
     localizer = Localizer(Relocalizer(LandmarkMap.from_file(office / 'map.yaml'),
                                       RelocalizerOptions(matching='class')))
-    return [localizer.localize(Observation(PRESETS['fr3'], one.usable(640, 480, 50)), None)
-            for one in detections]
+    return [localizer.answer(Query((Observation(
+        PRESETS['fr3'], one.usable(640, 480, 50)),), run=None)) for one in detections]
 
 
 def test_recorded_detections(shared_data, start, tester, tmp_path):

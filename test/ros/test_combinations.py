@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where features meet: cameras, what is known besides, and what asks, in one process."""
 
-import math
 import time
 from dataclasses import asdict, replace
 from itertools import product
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -18,17 +18,17 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.localizer import Localizer, repeat
 from cliploc_ros.core.observation import Region
+from cliploc_ros.core.query import read_case
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.watch import WatchState
-from cliploc_ros.offline.datasets.cases import read_case
-from cliploc_ros.offline.evaluation.cases import replay_case
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.case_recorder import CaseRecorder
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Keyframes
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.robot_state import CameraPlace, RobotState
+from cliploc_ros.ros.inputs.robot_state import CameraPlace, KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -53,7 +53,7 @@ class Drive:
         self.region = None if known not in ('prior', 'all') else Region(
             'map', np.zeros(3), np.diag([0.5, 0.5, ANY_YAW]) ** 2, 0.95)
         self.recorder = CaseRecorder(True)
-        self.cameras, self.rng = cameras, np.random.default_rng(3)
+        self.cameras, self.rng, self.objects = cameras, np.random.default_rng(3), 8
 
     def pixels(self):
         """Return an image (h, w) of some blobs, another one each time."""
@@ -64,7 +64,8 @@ class Drive:
         """Return the frames of an instant with their states, and the true pose of the first."""
         robot = make_transform(np.eye(3), np.array([0.0, 0.0, 0.05 * number]))
         frames = []
-        for name, mount, seen in zip(NAMES, MOUNTS, look(self.rng, robot, 8, noise_px=0.3),
+        for name, mount, seen in zip(NAMES, MOUNTS, look(self.rng, robot, self.objects,
+                                                           noise_px=0.3),
                                      strict=True):
             header = Header(frame_id=name, stamp=Time(sec=100 + number))
             frames.append((Frame(
@@ -86,35 +87,75 @@ class Drive:
     def localize(self, number=0):
         """Answer for an instant as the node does; return the result and the pose's error [m]."""
         ((frame, state), *beside), truth = self.see(number)
-        found = self.localizer.localize(frame, self.parameters, state, StageTimes(
-            'waiting', time.monotonic()), math.inf, beside, self.region)
-        assert found.found.accepted, found.found.reason
-        answer = Answer(Verdict.ACCEPTED, '', received_at=frame.received_at, state=state,
-                        beside=tuple(beside))
-        self.recorder.add(replace(frame, beside=tuple(one for one, _ in beside)), answer)
+        found = self.localizer.localize(frame, self.parameters, KnownBefore(
+            state, beside, self.region), StageTimes('waiting', time.monotonic()))
+        answer = Answer(Verdict.ACCEPTED if found.found.accepted else Verdict.REFUSED, '',
+                        received_at=frame.received_at, query=found.query)
+        self.recorder.add(answer)
         self.recorder.end(answer)
         return found, pose_error(found.found.map_from_camera, truth)[0]
+
+    def recorded(self):
+        """Store the request; return what another localizer answers to the file."""
+        self.recorder.store(self.parameters)
+        *_, path = sorted(Path(self.parameters.record_folder).iterdir())
+        case = read_case(path)
+        return case, repeat(case, Localizer(
+            Relocalizer(MAP, case.options),
+            KeyframeLocalizer(LAYER) if self.localizer.keyframes else None))
+
+
+def equal(one, other):
+    """Return whether two results are equal bit by bit, times aside."""
+    np.testing.assert_array_equal(one.map_from_camera, other.map_from_camera)
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+    assert (one.accepted, one.evidence, one.reason) == (other.accepted, other.evidence,
+                                                        other.reason)
 
 
 @pytest.mark.parametrize(('cameras', 'known'), COMBINATIONS)
 def test_a_request_is_answered_and_its_record_is_answered_alike(cameras, known, tmp_path):
     drive = Drive(cameras, known, tmp_path)
-    found, error_m = drive.localize()
-    assert error_m < 0.05
-    assert found.cameras == cameras
-    assert found.found.source == 'objects'
-    depths = found.seen.observation.depths
-    assert (depths is not None and np.isfinite(depths).sum() >= 6) == drive.has_depth
-    drive.recorder.store(drive.parameters)
-    case = read_case(next((tmp_path / 'cases').iterdir()))
+    for number in range(2):  # the second fuses the first, by odometry
+        found, error_m = drive.localize(number)
+        assert found.found.accepted and error_m < 0.05
+        assert found.found.source == 'objects'
+        assert len(found.query.frames) == cameras
+        depths = found.query.newest.depths
+        assert (depths is not None and np.isfinite(depths).sum() >= 6) == drive.has_depth
+    assert len(found.found.frame_matches) == 2 * cameras
+    case, again = drive.recorded()
     assert asdict(drive.parameters).items() >= case.report['parameters'].items()
-    again = replay_case(case, MAP, None, LAYER if drive.localizer.keyframes else None)
-    assert again.accepted
-    np.testing.assert_allclose(again.map_from_camera, found.found.map_from_camera, atol=1e-6)
-    if drive.region is None:  # what was known of the place before is not recorded
-        assert again.confidence == pytest.approx(found.found.confidence, abs=1e-9)
-    else:
-        assert again.confidence <= found.found.confidence + 1e-9
+    assert len(case.queries) == 2
+    equal(again, found.found)
+
+
+@pytest.mark.parametrize('cameras', [1, 4])
+def test_a_refused_request_of_several_looks_is_refused_again_alike(cameras, tmp_path):
+    """Looks that disagree, and what they said of the cameras, are in the record."""
+    drive = Drive(cameras, 'all', tmp_path)
+    drive.objects = 3
+    drive.parameters = replace(drive.parameters, min_confidence=1.0)
+    for number in range(4):
+        found, _ = drive.localize(10 * number)
+        assert not found.found.accepted
+    case, again = drive.recorded()
+    assert len(case.queries) == 4 and len(again.evidence.earlier) == 3
+    equal(again, found.found)
+
+
+@pytest.mark.parametrize('x_m', [0.0, 30.0])
+def test_where_a_prior_decides_the_record_has_it(x_m, tmp_path):
+    drive = Drive(1, 'prior', tmp_path)
+    drive.region = replace(drive.region, mean=np.array([x_m, 0.0, 0.0]))
+    found, _ = drive.localize()
+    case, again = drive.recorded()
+    assert (found.found.evidence.prior < 0.0) == (x_m > 0.0)
+    equal(again, found.found)
+    query, = case.queries
+    without = Localizer(Relocalizer(MAP, case.options)).answer(replace(query, frames=(
+        replace(query.newest, region=None),)))
+    assert without.evidence != again.evidence
 
 
 @pytest.mark.parametrize(('cameras', 'known'), COMBINATIONS)
@@ -123,7 +164,7 @@ def test_continuous_answers_tell_a_filter_only_what_is_new(cameras, known, tmp_p
     shares = []
     for number in range(4):
         found, error_m = drive.localize(number)
-        assert error_m < 0.05
+        assert found.found.accepted and error_m < 0.05
         shares.append(np.trace(found.found.covariance[:3, :3])
                       / np.trace(found.for_filter[:3, :3]))
     assert shares[0] == pytest.approx(1.0)

@@ -18,7 +18,7 @@ from cliploc_ros.errors import CameraError, MapError
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import load_localizer
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.robot_state import CameraPlace, RobotState
+from cliploc_ros.ros.inputs.robot_state import CameraPlace, KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -49,7 +49,8 @@ def localizer(make_node, values):
 
 
 def localize(localizer, frame, values, up_in_camera=None):
-    return localizer.localize(frame, values, RobotState(np.eye(4), up_in_camera), timer()).found
+    return localizer.localize(frame, values, KnownBefore(RobotState(np.eye(4), up_in_camera)),
+                              timer()).found
 
 
 def timer():
@@ -58,14 +59,14 @@ def timer():
 
 def test_the_observation_has_the_way_driven(localizer, values):
     state = RobotState(np.eye(4), place=CameraPlace(np.eye(4), 0, 2.5))
-    localized = localizer.localize(make_frame(), values, state, timer())
-    assert localized.seen.observation.odom_way_m == 2.5
+    localized = localizer.localize(make_frame(), values, KnownBefore(state), timer())
+    assert localized.query.newest.odom_way_m == 2.5
 
 
 def test_a_perfect_view_gives_the_true_pose(localizer, values):
     times = timer()
     found, landmark_map, view, compared, is_cut, for_filter, *_ = localizer.localize(
-        make_frame(), values, RobotState(np.eye(4)), times)
+        make_frame(), values, KnownBefore(RobotState(np.eye(4))), times)
     assert (compared, is_cut) == (0, False)
     np.testing.assert_array_equal(for_filter, found.covariance)
     assert view.image_rgb.shape == (CAMERA.height, CAMERA.width, 3)
@@ -113,9 +114,10 @@ def test_a_camera_of_another_run_of_odometry_is_left_out_and_named(localizer, va
     places = [RobotState(np.eye(4), place=CameraPlace(np.eye(4), run, 0.0)) for run in (1, 1, 2)]
     frames = [replace(make_frame(), camera=name) for name in ('front', 'left', 'back')]
     first = replace(frames[0], left_out=('right',))
-    found = localizer.localize(first, values, places[0], timer(),
-                               beside=list(zip(frames[1:], places[1:], strict=True)))
-    assert (found.cameras, found.left_out) == (2, ('right', 'back'))
+    found = localizer.localize(first, values, KnownBefore(places[0], list(zip(
+        frames[1:], places[1:], strict=True))), timer())
+    assert [one.camera_name for one in found.query.frames] == ['left', 'front']
+    assert found.left_out == ('right', 'back')
 
 
 def test_a_look_at_a_pose_in_another_frame_names_the_frames(localizer, values):
@@ -138,7 +140,7 @@ def test_depth_of_another_camera_is_registered(localizer, values, caplog):
     def depths(info, camera_from_depth):
         frame = replace(make_frame(), depth=depth, depth_camera_info=info)
         state = RobotState(np.eye(4), camera_from_depth=camera_from_depth)
-        return localizer.localize(frame, values, state, timer()).seen.observation.depths
+        return localizer.localize(frame, values, KnownBefore(state), timer()).query.newest.depths
     found = depths(info, left)
     known = np.isfinite(found)
     assert known.sum() >= 9  # the others are small

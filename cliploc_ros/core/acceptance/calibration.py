@@ -23,6 +23,7 @@ class Objects(NamedTuple):
     depth: float
     none_right: float
     map_size: float
+    least_size: float
     vertical: float
     knee: float
     slope: float
@@ -70,7 +71,7 @@ class Places(NamedTuple):
     likeness: float
     unlabelled: float
     aged: float
-    turned: float
+    rooms: float
 
 
 class Prior(NamedTuple):

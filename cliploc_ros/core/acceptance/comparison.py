@@ -357,8 +357,11 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
     rivals = contenders_of(joined, [places[row - 1] for row in others], [True] * len(others))
     leads = _leads_of_points(compared, poses[others], rooms[rows], recognizer)
     for number, (rival, row) in enumerate(zip(rivals, rows, strict=True)):
-        by_objects = lead_over_twin(best.support, rival.support, float(shares[row])) \
-            if row < len(twins) else CALIBRATION.places.turned * (best.odds - rival.odds)
+        # as much as if the search had met it, see confidences
+        by_objects = (1.0 + CALIBRATION.objects.slope) * (best.odds - rival.odds)
+        if row < len(twins):
+            by_objects = lead_over_twin(best.support, rival.support, float(shares[row]),
+                                        bool(rooms[row]))
         leads[number] += best.prior - rival.prior + by_objects
     chance = float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum()))
     return chance, place_of(joined.landmark_map, poses[others][int(np.argmin(leads))])

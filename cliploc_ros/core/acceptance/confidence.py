@@ -40,8 +40,11 @@ class Setting(NamedTuple):
 
     @property
     def map_size(self) -> float:
-        """Return the logarithm of the number of landmarks."""
-        return math.log(max(1, self.landmarks))
+        """Return the logarithm of the number of landmarks.
+
+        Boxes may show all things of the building: a small map lacks some that look like its own.
+        """
+        return math.log(max(CALIBRATION.objects.least_size, self.landmarks))
 
     @property
     def vertical(self) -> float:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.confidence import Setting, tilt_handicaps, utilities
 from cliploc_ros.core.acceptance.prior import region_odds
-from cliploc_ros.core.acceptance.support import ComparedFrame, Support, one_thing, support
+from cliploc_ros.core.acceptance.support import Support, compared_frame, support
 from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.verification import Rig, cameras_from_last, make_rig
@@ -119,13 +119,12 @@ def contenders_of(joined: JoinedFrames, finalists: Sequence[Finalist], upright: 
 def supports_of(joined: JoinedFrames, poses: NDArray[np.float64],
                 matches: Sequence[list[tuple[Match, ...]]]) -> list[Support]:
     """Return the support of each pose (m, 4, 4), from its matches in each frame."""
-    used = [one.observation if joined.options.needs_similarities
-            else replace(one.observation, similarities=None) for one in joined.frames]
-    compared = [ComparedFrame(
-        one.observation.detections.bboxes_xyxy, one.observation.detections.class_ids,
-        seen.similarities, one.scene, seen.similarity_rows,
-        one_thing(one.observation.detections.bboxes_xyxy))
-        for one, seen in zip(joined.frames, used, strict=True)]
+    compared = []
+    for frame in joined.frames:
+        seen = frame.observation if joined.options.needs_similarities \
+            else replace(frame.observation, similarities=None)
+        compared.append(compared_frame(joined.landmark_map, seen.detections, frame.scene,
+                                       seen.similarities, seen.similarity_rows))
     last_from_cameras = np.linalg.inv(joined.cameras)
     return [support(joined.landmark_map, compared, pose @ last_from_cameras, found)
             for pose, found in zip(poses, matches, strict=True)]

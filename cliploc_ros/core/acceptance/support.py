@@ -20,6 +20,7 @@ from cliploc_ros.core.map.similarities import (
     pair_similarities,
     sampled_spread,
 )
+from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.search.scene import Scene
 
 # Boxes whose IoU is below the first number show two things, above the second number one thing.
@@ -61,16 +62,41 @@ class Support:
 
 
 class ComparedFrame(NamedTuple):
-    """A frame to measure supports in."""
+    """A frame to measure supports in: what all poses share of its n detections."""
 
-    bboxes_xyxy: NDArray[np.float64]  #: (n, 4) [px]
-    class_ids: tuple[str, ...]  #: Class of each detection, n of them
+    scene: Scene
+    classes: NDArray[np.int64]  #: (n,): the map's number of each class
+    #: (n,): the logarithm of the number of things for each thing of this class
+    rarities: NDArray[np.float64]
+    #: (n,): whether the class is some landmark's own, not only what it is taken for
+    are_own: NDArray[np.bool_]
     similarities: Similarities | None  #: None where classes alone are matched
-    scene: Scene  #: Of the same detections
     #: (n,): row of similarities of each detection; -1 where its class alone is matched
     similarity_rows: NDArray[np.int64]
+    means: NDArray[np.float64]  #: (n,): of the similarities of each detection
+    deviations: NDArray[np.float64]  #: (n,): of the same
     #: (n, n): to what degree two boxes show one thing, 0 to 1, see one_thing
     same: NDArray[np.float64]
+
+
+def compared_frame(landmark_map: LandmarkMap, detections: Detections, scene: Scene,
+                   similarities: Similarities | None, similarity_rows: NDArray[np.int64]
+                   ) -> ComparedFrame:
+    """Return a frame to measure supports in; see ComparedFrame for the arguments."""
+    index = landmark_map.classes
+    classes = index.classes_of(detections.class_ids)
+    # a class that is rare in the map may be common in the place where the camera is
+    common = np.array([CALIBRATION.common.get(name, 0.0) for name in detections.class_ids])
+    rarities = -np.log(np.maximum(
+        np.maximum(index.sizes_of(classes), 1) / len(landmark_map), common))
+    means, deviations = np.zeros(len(classes)), np.ones(len(classes))
+    compared = similarity_rows >= 0
+    if similarities is not None and compared.any():
+        means[compared], deviations[compared] = sampled_spread(
+            similarities, similarity_rows[compared])
+    return ComparedFrame(scene, classes, rarities, index.are_own(classes), similarities,
+                         similarity_rows, means, np.maximum(deviations, 1e-6),
+                         one_thing(detections.bboxes_xyxy))
 
 
 def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
@@ -91,12 +117,12 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
         distinct = _each_object_once(found, landmark_map.objects)
         if distinct:
             seen = np.array([match.detection for match in distinct])
-            weights = 1.0 / frame.same[np.ix_(seen, seen)].sum(axis=1)
+            weights = 1.0 / frame.same[seen[:, None], seen].sum(axis=1)
             for match, row in zip(distinct, weights[:, None] * _contributions(
                     landmark_map, frame, map_from_camera, distinct), strict=True):
                 rows.setdefault(int(landmark_map.objects[match.landmark]), {})[
                     number, match.detection] = row
-        unexplained += _unexplained(landmark_map, frame, [match.detection for match in found])
+        unexplained += _unexplained(frame, [match.detection for match in found])
     if not rows:
         return Support()
     shown = {one: row / len(of_object) for of_object in rows.values()
@@ -107,15 +133,14 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
                    shown=shown)
 
 
-def _unexplained(landmark_map: LandmarkMap, frame: ComparedFrame, matched: list[int]) -> float:
+def _unexplained(frame: ComparedFrame, matched: list[int]) -> float:
     """Return the number of things of the map's classes that no match shows."""
     # A class that a landmark is only taken for does not count: a real person is not expected in a
     # map because a teddy bear sometimes looks like one.
-    index = landmark_map.classes
-    others = np.nonzero(index.are_own(index.classes_of(frame.class_ids)))[0]
-    others = others[~np.isin(others, matched)]
-    alone = 1.0 - frame.same[np.ix_(others, matched)].max(axis=1, initial=0.0)
-    return float((alone / frame.same[np.ix_(others, others)].sum(axis=1)).sum())
+    others = frame.are_own.copy()
+    others[matched] = False
+    alone = 1.0 - frame.same[others][:, matched].max(axis=1, initial=0.0)
+    return float((alone / frame.same[others][:, others].sum(axis=1)).sum())
 
 
 def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
@@ -127,23 +152,17 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
     rows, likenesses = frame.similarity_rows[detections], np.zeros(len(matches))
     compared = rows >= 0
     if frame.similarities is not None and compared.any():
-        means, deviations = sampled_spread(frame.similarities, rows[compared])
-        likenesses[compared] = (
-            pair_similarities(frame.similarities, rows[compared], landmarks[compared])
-            - means) / np.maximum(deviations, 1e-6)
-    index = landmark_map.classes
-    classes = index.classes_of(frame.class_ids)[detections]
-    # a class that is rare in the map may be common in the place where the camera is
-    common = np.array([CALIBRATION.common.get(frame.class_ids[row], 0.0) for row in detections])
+        likenesses[compared] = pair_similarities(
+            frame.similarities, rows[compared], landmarks[compared])
+        likenesses = (likenesses - frame.means[detections]) / frame.deviations[detections]
     # 0 if the class of a detection is none of its landmark
-    rarities = index.shares(landmarks, classes) * -np.log(np.maximum(
-        np.maximum(index.sizes_of(classes), 1) / len(landmark_map), common))
+    shares = landmark_map.classes.shares(landmarks, frame.classes[detections])
+    sigmas = landmark_map.position_sigmas[landmarks]
     return np.column_stack([
         np.ones(len(matches)), [match.iou for match in matches],
-        _misfits(frame.scene, map_from_camera, detections, landmarks,
-                 landmark_map.position_sigmas[landmarks]), likenesses, rarities, ~compared,
-        _depth_odds(frame.scene, map_from_camera, detections, landmarks,
-                    landmark_map.position_sigmas[landmarks])])
+        _misfits(frame.scene, map_from_camera, detections, landmarks, sigmas), likenesses,
+        shares * frame.rarities[detections], ~compared,
+        _depth_odds(frame.scene, map_from_camera, detections, landmarks, sigmas)])
 
 
 def _each_object_once(matches: Sequence[Match], objects: NDArray[np.int64]) -> list[Match]:

@@ -19,7 +19,7 @@ from cliploc_ros.files.storage import write_file
 from cliploc_ros.offline.evaluation.drawing import draw_map, spread_names
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
 from cliploc_ros.offline.evaluation.summary import Summary, find_best, wilson_interval
-from cliploc_ros.offline.evaluation.trials import Query, Result
+from cliploc_ros.offline.evaluation.trials import PosedQuery, Result
 
 # The colours of Okabe and Ito, which the colour-blind can distinguish: one for each matching, the
 # others for other methods. Line style and marker show the algorithm.
@@ -39,7 +39,7 @@ _JUDGED_COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E
 _MARKERS = 'osD^vP'
 
 
-def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
+def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
              results: Sequence[Result], summaries: Sequence[Summary],
              sweep: Mapping[str, Mapping[int, Summary]], observing_ms: Mapping[str, float]
              ) -> list[Path]:
@@ -282,7 +282,7 @@ def _time_by_stage(summaries: Sequence[Summary], observing_ms: Mapping[str, floa
     return figure
 
 
-def _top_view(landmark_map: LandmarkMap, queries: Sequence[Query], results: Sequence[Result],
+def _top_view(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], results: Sequence[Result],
               method: str) -> Figure:
     truth = {query.number: query.map_from_camera for query in queries}
     first = [one for one in results if one.trial == 0]

@@ -21,7 +21,7 @@ from cliploc_ros.models.map_rows import embed_map
 from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.datasets.observations import Recorded
 from cliploc_ros.offline.datasets.queries import Queries, QueryFrame
-from cliploc_ros.offline.evaluation.trials import ImageFeatures, Query
+from cliploc_ros.offline.evaluation.trials import ImageFeatures, PosedQuery
 from cliploc_ros.offline.recording.recorder import RecordingOptions, observation_file, record_once
 
 logger = logging.getLogger(__name__)
@@ -82,7 +82,7 @@ def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap,
                    tuple(frames))
 
 
-def with_features(queries: Sequence[Query], frames: Frames) -> tuple[Query, ...]:
+def with_features(queries: Sequence[PosedQuery], frames: Frames) -> tuple[PosedQuery, ...]:
     """Return queries with the features of their images; those without an image stay.
 
     The queries were recorded from these frames.

@@ -38,7 +38,7 @@ from cliploc_ros.offline.evaluation.summary import (
     summarize,
     table_rows,
 )
-from cliploc_ros.offline.evaluation.trials import Query, Result, run_trial
+from cliploc_ros.offline.evaluation.trials import PosedQuery, Result, run_trial
 from cliploc_ros.units import NS_PER_S
 
 # A stopped run loses at most this many queries of each core.
@@ -59,10 +59,11 @@ class _Part(NamedTuple):
     places: tuple[int, ...]
 
 
-def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: Sequence[Query],
+def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method],
+                queries: Sequence[PosedQuery],
                 *, trials: int, workers: int = 1, scheduler: str = '',
                 done: Sequence[Result] = (), layer: KeyframeLayer | None = None,
-                noisy: Sequence[Sequence[Query]] = (),
+                noisy: Sequence[Sequence[PosedQuery]] = (),
                 advance: Callable[[list[Result]], object] = lambda results: None) -> list[Result]:
     """Run methods on queries.
 
@@ -76,7 +77,7 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method], queries: S
         Results of an earlier run, which are not run again.
     layer : KeyframeLayer, optional
         Keyframes of the map, for methods that use them and queries with features.
-    noisy : sequence of sequence of Query, optional
+    noisy : sequence of sequence of PosedQuery, optional
         For each trial the same queries with other noise of simulated sensors.
     advance : callable, optional
         Called with the results of each finished part.
@@ -133,7 +134,7 @@ class _MakeSearch:
     """Makes the function that runs a part; holds what all parts share."""
 
     landmark_map: LandmarkMap
-    queries: Sequence[Sequence[Query]]  # of each trial, or of all of them
+    queries: Sequence[Sequence[PosedQuery]]  # of each trial, or of all of them
     layer: KeyframeLayer | None = None
 
     def __call__(self) -> Callable[[_Part], list[Result]]:
@@ -149,7 +150,7 @@ class _MakeSearch:
         return run
 
 
-def compare_methods(landmark_map: LandmarkMap, queries: Sequence[Query],
+def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
                     methods: Sequence[Method], out: Path, *, sweep: Sequence[int] = (),
                     resume: bool = False, figures: bool = True,
                     frames: Sequence[QueryFrame] = (), remarks: Sequence[str] = (),
@@ -236,8 +237,8 @@ def read_results(log: Log, run: Mapping[str, Any]) -> list[Result]:
     return done
 
 
-def describe(landmark_map: LandmarkMap, queries: Sequence[Query], methods: Sequence[Method],
-             trials: int, layer: KeyframeLayer | None, noisy: Sequence[Sequence[Query]]
+def describe(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], methods: Sequence[Method],
+             trials: int, layer: KeyframeLayer | None, noisy: Sequence[Sequence[PosedQuery]]
              ) -> dict[str, Any]:
     """Return what identifies a run, as JSON keeps it."""
     digest = hashlib.sha256()
@@ -268,7 +269,7 @@ def describe(landmark_map: LandmarkMap, queries: Sequence[Query], methods: Seque
     return run
 
 
-def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
+def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
           results: Sequence[Result], summaries: Sequence[Summary], methods: Sequence[Method],
           frames: Sequence[QueryFrame]) -> list[Path]:
     try:
@@ -292,7 +293,8 @@ def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[Query],
          if np.isfinite(times).any()})
 
 
-def write_trajectories(folder: Path, queries: Sequence[Query], results: Sequence[Result]) -> None:
+def write_trajectories(folder: Path, queries: Sequence[PosedQuery], results: Sequence[Result]
+                       ) -> None:
     """Write ground_truth.txt, METHOD.txt and METHOD.accepted.txt of each method's first trial."""
     make_folder(folder)
     write_text(folder / 'ground_truth.txt', _tum_text(

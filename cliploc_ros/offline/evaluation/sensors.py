@@ -21,15 +21,15 @@ from cliploc_ros.core.geometry.depth import (
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.offline.evaluation.trials import Query
+from cliploc_ros.offline.evaluation.trials import PosedQuery
 
 # Of the boxes of a kitchen, a tenth have no depth. The share of those whose depth is of something
 # else, and between which values that is [m], are guesses.
 _NO_DEPTH, _SOMETHING_ELSE, _ANY_DEPTH_M = 0.1, 0.05, (0.5, 5.0)
 
 
-def with_vertical(queries: Sequence[Query], noise_deg: float = 0.0, seed: int = 0
-                  ) -> tuple[Query, ...]:
+def with_vertical(queries: Sequence[PosedQuery], noise_deg: float = 0.0, seed: int = 0
+                  ) -> tuple[PosedQuery, ...]:
     """Return queries with a known vertical, as from an accelerometer.
 
     Parameters
@@ -59,13 +59,13 @@ def _same_vertical(one: Observation, other: Observation, up_in_other: NDArray[np
     return replace(one, up_in_camera=turn @ up_in_other)
 
 
-def with_neighbours(queries: Sequence[Query], groups: Sequence[int], noise_m: float = 0.0,
-                    noise_deg: float = 0.0, seed: int = 0) -> tuple[Query, ...]:
+def with_neighbours(queries: Sequence[PosedQuery], groups: Sequence[int], noise_m: float = 0.0,
+                    noise_deg: float = 0.0, seed: int = 0) -> tuple[PosedQuery, ...]:
     """Return queries with the other frames of their group, linked by odometry.
 
     Parameters
     ----------
-    queries : sequence of Query
+    queries : sequence of PosedQuery
         All frames.
     groups : sequence of int
         The group of each.
@@ -80,7 +80,7 @@ def with_neighbours(queries: Sequence[Query], groups: Sequence[int], noise_m: fl
     OptionsError
         No group has a second frame.
     """
-    found: dict[int, Query] = {}
+    found: dict[int, PosedQuery] = {}
     for group in dict.fromkeys(groups):
         frames = sorted((one for one, its in zip(queries, groups, strict=True) if its == group),
                         key=lambda one: one.observation.stamp_ns)
@@ -123,7 +123,7 @@ def simulate_depths(centers: NDArray[np.float64], shapes: NDArray[np.float64],
     return depths
 
 
-def _odometry(frames: Sequence[Query], noise_m: float, noise_deg: float,
+def _odometry(frames: Sequence[PosedQuery], noise_m: float, noise_deg: float,
               rng: np.random.Generator) -> list[NDArray[np.float64]]:
     """Return odom_from_camera (4, 4) of each frame, with a random error of each step."""
     poses = [np.eye(4)]

@@ -41,7 +41,7 @@ class ImageFeatures(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Query:
+class PosedQuery:
     """An observation to localize, and the true pose."""
 
     number: int  #: Number of the frame in its query file, from 0
@@ -94,7 +94,7 @@ class Result:
 
 
 def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool = False
-                 ) -> tuple[Query, ...]:
+                 ) -> tuple[PosedQuery, ...]:
     """Return the queries of a file, with similarities in the map's order.
 
     With `every_frame` the neighbouring frames are queries, too. DatasetError: the queries were
@@ -111,15 +111,15 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
     # the file does not hold the size of the image, and localizing does not use it
     camera = Camera(max(1, round(2 * cx)), max(1, round(2 * cy)), fx, fy, cx, cy)
     return tuple(
-        Query(number, Observation(
+        PosedQuery(number, Observation(
             camera, Detections(frame.bboxes_xyxy, frame.class_ids, frame.scores),
             np.ascontiguousarray(frame.similarities[:, columns], dtype=np.float32),
             frame.stamp_ns, depths=frame.depths), frame.map_from_camera)
         for number, frame in enumerate(queries.frames) if every_frame or frame.is_main)
 
 
-def join_cameras(queries: Mapping[str, Sequence[Query]], tolerance_s: float
-                 ) -> tuple[Query, ...]:
+def join_cameras(queries: Mapping[str, Sequence[PosedQuery]], tolerance_s: float
+                 ) -> tuple[PosedQuery, ...]:
     """Return the queries of the first camera, each with what the others saw at its instant.
 
     The true poses tell how the cameras are mounted. DatasetError: no other image is so near in
@@ -144,7 +144,7 @@ def join_cameras(queries: Mapping[str, Sequence[Query]], tolerance_s: float
     return tuple(found)
 
 
-def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Sequence[Query],
+def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Sequence[PosedQuery],
               keyframes: KeyframeLocalizer | None = None) -> list[Result]:
     """Run one trial of a method, numbered from 0, on some queries.
 
@@ -192,7 +192,7 @@ def _localize_on_demand(relocalizer: Relocalizer, observations: Sequence[Observa
     return found, compared / max(crops, 1)
 
 
-def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: Query,
+def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: PosedQuery,
            found: Relocalization, crops_share: float, keyframes_ms: float) -> Result:
     pose = found.map_from_camera
     error_m, error_deg = (None, None) if pose is None else pose_error(pose, query.map_from_camera)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import move_poses
+from cliploc_ros.core.observation import Detections
 
 # A focal length and a principal point that differ by less are of one camera that focuses.
 _SAME_CAMERA = 0.02
@@ -74,6 +75,12 @@ class PosedDetections:
     def camera_of(self, frame: int) -> Camera:
         """Return the camera of a frame."""
         return self.cameras[self.frame_cameras[frame]]
+
+    def detections_of(self, frame: int) -> Detections:
+        """Return the detections of a frame."""
+        rows = slice(*self.frame_offsets[frame:frame + 2])
+        return Detections(self.bboxes_xyxy[rows], tuple(
+            self.class_names[one] for one in self.classes[rows]), self.scores[rows])
 
     def name_of(self, frame: int) -> str:
         """Return the name of a frame's camera; '' where there is one without a name."""

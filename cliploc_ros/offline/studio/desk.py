@@ -302,15 +302,12 @@ class Desk:
         guess = [] if fit is None else outlines_of(
             {'': Landmark({'label': '', 'class_id': '', **shape_fields(fit.center, fit.basis)})},
             studio.camera, studio.map_from_camera)
-        detections = recording.detections
-        first = detections.frame_offsets[studio.view]
-        names = [detections.class_names[number] for number in detections.classes[
-            first:detections.frame_offsets[studio.view + 1]]]
+        seen = recording.detections.detections_of(studio.view)
         return {
             'view': studio.view, 'camera': studio.camera_name,
             'size': [studio.camera.width, studio.camera.height],
             'boxes': [[*box, name] for box, name in zip(
-                recording.boxes_in_view(studio.view).round(1).tolist(), names, strict=True)],
+                seen.bboxes_xyxy.round(1).tolist(), seen.class_ids, strict=True)],
             'outlines': [[one.landmark_id, *_axes_of(one)] for one in shown],
             'guess': [_axes_of(one) for one in guess[:1]],
             'guide': studio.new.guide(studio.view).round(1).tolist()}

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -30,7 +29,7 @@ from cliploc_ros.offline.mapping.check.landmark_faults import (
     find_map_overlaps,
     hear_witness,
 )
-from cliploc_ros.offline.mapping.check.relocalization import RecordedKeyframes
+from cliploc_ros.offline.mapping.check.relocalization import RecordedKeyframes, simulated
 from cliploc_ros.offline.mapping.evidence import widest_angle_deg
 from cliploc_ros.offline.mapping.fitting import Fit, fit_ellipsoid
 from cliploc_ros.offline.mapping.labelling import embed_landmarks
@@ -107,8 +106,7 @@ class Recording:
 
     def boxes_in_view(self, view: int) -> NDArray[np.float64]:
         """Return the detector's boxes (n, 4) in a view [px]."""
-        first, last = self.detections.frame_offsets[view:view + 2]
-        return self.detections.bboxes_xyxy[first:last]
+        return self.detections.detections_of(view).bboxes_xyxy
 
     def look_of(self, rows: NDArray[np.int64], encoder_key: str) -> Encoded | None:
         """Return the look that an encoder has of some boxes; None where it saw none of them."""
@@ -180,16 +178,10 @@ class Recording:
             shown[box_rows] = landmark
         answers = []
         for view in views:
-            rows = slice(*detections.frame_offsets[view:view + 2])
-            class_ids = tuple(detections.class_names[one] for one in detections.classes[rows])
-            boxes = detections.bboxes_xyxy[rows]
             # equal noise each time, so that only edits change the answer
-            similarities = labels.similarities(shown[rows], class_ids, boxes,
-                                               np.random.default_rng([0, view]))
-            result = relocalizer.relocalize([Observation(
-                detections.camera_of(view), Detections(boxes, class_ids, detections.scores[rows]),
-                similarities)], None if keyframes is None
-                else keyframes.recognizer(detections, view))
+            result = relocalizer.relocalize(
+                [simulated(detections, view, shown, labels, 0)],
+                None if keyframes is None else keyframes.recognizer(detections, view))
             if result.map_from_camera is None:
                 answers.append(ViewAnswer(view, 'refused', None, None, result))
                 continue

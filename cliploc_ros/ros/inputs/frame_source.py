@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -198,7 +198,19 @@ class FrameSource:
         StoppedError
             The source was closed; the message gives the reason.
         """
-        return next_of_any([self], after, deadline, linger_s)
+        def newest() -> Frame | None:
+            frame = self._newest
+            return frame if frame is not None and frame.received_at >= after else None
+        with self.changed:
+            self.want(deadline)
+            self.changed.wait_for(lambda: self.is_closed or newest() is not None,
+                                  max(0.0, deadline - time.monotonic()))
+            frame = newest()
+            why = '' if frame else self.why_none(after)
+            self.want_no_more(deadline, linger_s)  # which may forget both
+        if frame is None:
+            raise NoFrameError(f'no fresh frame within {deadline - after:.3g} s: {why}')
+        return frame
 
     def want(self, deadline: float) -> None:
         """Subscribe until a deadline (monotonic clock) [s]; want_no_more ends it.
@@ -257,11 +269,6 @@ class FrameSource:
     def awaits_detections(self, stamp_ns: int, tolerance_s: float) -> bool:
         """Return whether an image near a stamp waits for its detections; holds the condition."""
         return self._pairing.waits_near('image', stamp_ns, tolerance_s * NS_PER_S)
-
-    def newest_since(self, moment: float) -> Frame | None:
-        """Return the newest frame if its image arrived after a moment of the monotonic clock."""
-        newest = self._newest
-        return newest if newest is not None and newest.received_at >= moment else None
 
     def _subscribe(self) -> None:
         if len(self._subscriptions) == len(self._topics):
@@ -439,29 +446,6 @@ class FrameSource:
 
     def _resolved(self, name: str) -> str:
         return str(self._node.resolve_topic_name(self._topics[name]))
-
-
-def next_of_any(sources: Sequence[FrameSource], after: float, deadline: float,
-                linger_s: float | None = None) -> Frame:
-    """Return the first complete frame of some sources whose image arrived after a moment.
-
-    See FrameSource.next_frame. The sources share their condition.
-    """
-    def newest() -> Frame | None:
-        return next((frame for one in sources if (frame := one.newest_since(after))), None)
-    changed = sources[0].changed
-    with changed:
-        for one in sources:
-            one.want(deadline)
-        changed.wait_for(lambda: sources[0].is_closed or newest() is not None,
-                         max(0.0, deadline - time.monotonic()))
-        frame = newest()
-        why = '' if frame else '; '.join(one.why_none(after) for one in sources)
-        for one in sources:
-            one.want_no_more(deadline, linger_s)  # which may forget both
-        if frame is None:
-            raise NoFrameError(f'no fresh frame within {deadline - after:.3g} s: {why}')
-        return frame
 
 
 def of_camera(camera: str, topic: str) -> str:

@@ -14,7 +14,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from cliploc_ros.ros.conversions import stamp_ns
-from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, TimedImage, next_of_any
+from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError, TimedImage
 from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.worker import LatestOnly, Worker
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -83,8 +83,10 @@ class Rig:
             parameters.depth_transport, parameters.depth_tolerance_s, name, self._changed)
             for name in parameters.camera_names}
         self._pending: deque[_Instant] = deque()
+        self._passed: Mapping[str, Frame] = {}
         self._passed_ns = -_LATE_NS
-        if linger_s == math.inf:  # a camera that is silent completes no instant
+        self._is_continuous = linger_s == math.inf
+        if self._is_continuous:  # a camera that is silent completes no instant
             node.create_timer(_CHECK_PERIOD_S, self._pass_on, MutuallyExclusiveCallbackGroup(),
                               Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -119,7 +121,7 @@ class Rig:
             source.forget()
         with self._changed:
             self._pending.clear()
-            self._passed_ns = -_LATE_NS
+            self._passed, self._passed_ns = {}, -_LATE_NS
 
     def next_frame(self, after: float, deadline: float) -> Frame:
         """Return the first instant whose images arrived after a moment; see FrameSource."""
@@ -127,31 +129,22 @@ class Rig:
         with self._changed:  # subscribed until the last camera's frame is there
             for source in sources:
                 source.want(deadline)
-        try:
-            return self._next_instant(sources, after, deadline)
-        finally:
-            with self._changed:
-                for source in sources:
-                    if not source.is_closed:
-                        source.want_no_more(deadline)
-
-    def _next_instant(self, sources: list[FrameSource], after: float, deadline: float) -> Frame:
-        frame = next_of_any(sources, after, deadline)
-        begun_at = time.monotonic()
-        until = begun_at + _Instant(frame, len(sources)).until - frame.detected_at
-
-        def is_all(awaited: Callable[[FrameSource], bool]) -> bool:
-            return sources[0].is_closed or not any(
-                awaited(self._sources[name]) for name in self._instant(frame, after).left_out)
-        with self._changed:
-            self._changed.wait_for(
-                lambda: is_all(lambda source: True),
-                max(0.0, min(begun_at + _PATIENCE_S, deadline) - time.monotonic()))
-            self._changed.wait_for(
-                lambda: is_all(lambda source: source.awaits_detections(
-                    _stamp_ns(frame), self._tolerance_s)),
-                max(0.0, min(until, deadline) - time.monotonic()))
-            return self._instant(frame, after)
+            frame = None
+            while frame is None and not self.main.is_closed:
+                left_s = deadline - time.monotonic()
+                self._changed.wait(max(0.0, min(left_s, _CHECK_PERIOD_S)))
+                self._pass_on()
+                frame = self._fresh(self._passed, after)
+                if left_s <= 0.0:  # not all of them can come in time
+                    fresh = (self._fresh(one.frames, after) for one in reversed(self._pending))
+                    frame = frame or next(filter(None, fresh), None)
+                    break
+            why = '' if frame else '; '.join(one.why_none(after) for one in sources)
+            for source in sources:
+                source.want_no_more(deadline)  # which may forget both
+        if frame is None:
+            raise NoFrameError(f'no fresh frame within {deadline - after:.3g} s: {why}')
+        return frame
 
     def missing(self) -> list[str]:
         """Return for each input that nothing publishes a line that says what to do."""
@@ -170,9 +163,9 @@ class Rig:
             health.add(own, name)
 
     def _take(self, frame: Frame) -> None:
-        """Take in a frame of continuous mode, and pass on the instants that are complete."""
+        """Take in a frame, and pass on the instants that are complete."""
         with self._changed:
-            if 0 <= self._passed_ns - _stamp_ns(frame) < _LATE_NS:
+            if self._is_continuous and 0 <= self._passed_ns - _stamp_ns(frame) < _LATE_NS:
                 return
             if not any(one.take(frame, self._tolerance_s * NS_PER_S) for one in self._pending):
                 self._pending.append(_Instant(frame, len(self._sources)))
@@ -184,7 +177,8 @@ class Rig:
             while self._pending and (len(self._pending) > _MOST_PENDING
                                      or not self._may_grow(self._pending[0])):
                 instant = self._pending.popleft()
-                self._passed_ns = max(instant.stamps_ns)
+                self._passed, self._passed_ns = instant.frames, max(instant.stamps_ns)
+                self._changed.notify_all()
                 self._on_frame(self._joined(instant.frames))
 
     def _may_grow(self, instant: _Instant) -> bool:
@@ -194,19 +188,16 @@ class Rig:
             now < instant.image_until or source.awaits_detections(at_ns, self._tolerance_s)
             for name, source in self._sources.items() if name not in instant.frames)
 
+    def _fresh(self, frames: Mapping[str, Frame], after: float) -> Frame | None:
+        """Return the frames of an instant whose images arrived after a moment; None without."""
+        fresh = {name: one for name, one in frames.items() if one.received_at >= after}
+        return self._joined(fresh) if fresh else None
+
     def _joined(self, frames: Mapping[str, Frame]) -> Frame:
         """Return frames of one instant as the first camera's, with those of others beside it."""
         first, *others = (frames[name] for name in self._sources if name in frames)
         return replace(first, beside=tuple(others), left_out=tuple(
             name for name in self._sources if name not in frames))
-
-    def _instant(self, frame: Frame, after: float) -> Frame:
-        """Return the frames of the newest instant, as the first camera's and those beside it."""
-        found = {name: newest for name, source in self._sources.items()
-                 if (newest := source.newest_since(after)) is not None} or {frame.camera: frame}
-        last_ns = max(_stamp_ns(one) for one in found.values())
-        return self._joined({name: one for name, one in found.items()
-                             if last_ns - _stamp_ns(one) <= self._tolerance_s * NS_PER_S})
 
 
 def frames_of(node: Node, parameters: RelocalizerParameters, linger_s: float,

@@ -4,8 +4,10 @@
 
 import math
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -13,7 +15,9 @@ from numpy.typing import NDArray
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.observation import Region
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
+from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometrySource
 from cliploc_ros.ros.inputs.prior import PriorSource
 from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
@@ -50,6 +54,15 @@ class RobotState:
     place: CameraPlace | None = None
     #: (4, 4): the pose of a depth camera that is not registered; None where tf2 lacks it
     camera_from_depth: NDArray[np.float64] | None = None
+
+
+class KnownBefore(NamedTuple):
+    """What is known at an instant besides its messages."""
+
+    state: RobotState  #: At the stamp of the frame to localize
+    #: The frames of other cameras whose mounts are known, with the robot's state at each
+    beside: Sequence[tuple[Frame, RobotState]] = ()
+    region: Region | None = None  #: Where the robot probably is
 
 
 class RobotStateSource:
@@ -101,6 +114,23 @@ class RobotStateSource:
         patience_s = min(_DISCOVERY_S, max(0.0, deadline - time.monotonic()))
         return (self._node.settings.values.fuse_frames > 1
                 and self.odometry.covers_soon(stamp, patience_s))
+
+    def at_instant(self, frame: Frame, parameters: RelocalizerParameters,
+                   frame_ids: Sequence[str], map_hash: str, deadline: float = math.inf
+                   ) -> KnownBefore:
+        """Return what is known at the instant of a frame, given the maps; see at."""
+        header = frame.image.header
+        state = self.at(header, parameters.of_camera(frame.camera), deadline, frame.depth_frame)
+        beside = []
+        for one in frame.beside:
+            soon = min(deadline, time.monotonic() + parameters.tf_timeout_s)
+            try:
+                beside.append((one, self.at(one.image.header, parameters.of_camera(one.camera),
+                                            soon, one.depth_frame)))
+            except NoTransformError as error:
+                self._warn(f'localizing without {one.camera}: {error}')
+        return KnownBefore(state, beside, self.prior.region(
+            header.stamp, parameters, state.camera_from_base, frame_ids, map_hash))
 
     def at(self, image: Header, parameters: RelocalizerParameters, deadline: float = math.inf,
            depth_frame: str = '') -> RobotState:

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import (
@@ -24,7 +23,7 @@ from cliploc_ros.core.keyframes.localization import (
     query_features,
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.offline.mapping.check.landmark_faults import Witness
 from cliploc_ros.offline.mapping.evidence import REACH, best_ious, explained, is_expected
@@ -155,10 +154,9 @@ def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, vie
     is_clutter = best_ious(views, landmarks) < _CLUTTER_IOU
     clutter = []
     for frame in frames[own[frames]]:
-        rows = np.arange(*detections.frame_offsets[frame:frame + 2])
-        rows = rows[is_clutter[rows]]
-        clutter.append((detections.bboxes_xyxy[rows],
-                        tuple(detections.class_names[one] for one in detections.classes[rows])))
+        unknown = detections.detections_of(frame).select(np.nonzero(is_clutter[slice(
+            *detections.frame_offsets[frame:frame + 2])])[0])
+        clutter.append((unknown.bboxes_xyxy, unknown.class_ids))
     # the robust deviation of closed edges, in standard deviations
     rows = np.nonzero(witness.shown >= 0)[0]
     linear = linearize_boxes(views, rows, witness.shown[rows], landmarks)
@@ -210,6 +208,18 @@ class Trial:
             'error_m': self.error_m, 'reason': self.reason}
 
 
+def simulated(detections: PosedDetections, frame: int, shown: NDArray[np.int64],
+              labels: LabelModel, seed: int) -> Observation:
+    """Return what a recorded frame shows, with simulated similarities, equal ones each time.
+
+    shown (n,) has the landmark of each box of the recording, -1 for none.
+    """
+    found, rows = detections.detections_of(frame), slice(*detections.frame_offsets[
+        frame:frame + 2])
+    return Observation(detections.camera_of(frame), found, labels.similarities(
+        shown[rows], found.class_ids, found.bboxes_xyxy, np.random.default_rng([seed, frame])))
+
+
 def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
                   shown: NDArray[np.int64], folds: Sequence[Fold], options: CheckOptions,
                   tell: Tell, keyframes: RecordedKeyframes | None = None) -> list[Trial]:
@@ -236,28 +246,25 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
         if keyframes is not None and fold.training[taken_at].any():
             localizer = KeyframeLocalizer(keyframes.layer.select(fold.training[taken_at]))
         for frame in frames:
-            rows = slice(*detections.frame_offsets[frame:frame + 2])
-            rng = np.random.default_rng([options.random_seed, frame])
-            class_ids = tuple(detections.class_names[one] for one in detections.classes[rows])
-            boxes, seen = detections.bboxes_xyxy[rows], shown[rows]
+            observation = simulated(detections, frame, shown, labels, options.random_seed)
+            seen = shown[slice(*detections.frame_offsets[frame:frame + 2])]
             pose, stamp_s = detections.map_from_camera[frame], float(detections.stamps_s[frame])
             tell((len(trials) + 1) / len(chosen))
             known = int(np.isin(seen, fold.rows).sum())
             is_judged = known >= min(LANDMARKS_FOR_A_POSE, int((seen >= 0).sum()))
             if relocalizer is None:
-                trials.append(Trial('refused', pose[:3, 3], pose[:3, 2], len(boxes), 0, None,
+                trials.append(Trial('refused', pose[:3, 3], pose[:3, 2], len(seen), 0, None,
                                     None, 'the other parts show no landmark', stamp_s,
                                     is_judged=is_judged))
                 continue
-            similarities = labels.similarities(seen, class_ids, boxes, rng)[:, fold.rows]
-            camera = detections.camera_of(frame)
-            judge = partial(_try, relocalizer, camera, Detections(
-                boxes, class_ids, detections.scores[rows]), similarities, pose,
-                int((seen >= 0).sum()), options, stamp_s)
+            judge = partial(_try, relocalizer, replace(
+                observation, similarities=np.asarray(observation.similarities)[:, fold.rows]),
+                pose, int((seen >= 0).sum()), options, stamp_s)
             trial = replace(judge(), is_judged=is_judged)
             if (localizer is not None and keyframes is not None
                     and (image := keyframes.image_of(frame)) is not None):
-                both = judge(ImageRecognizer(localizer, query_features(image), camera))
+                both = judge(ImageRecognizer(localizer, query_features(image),
+                                             observation.camera))
                 trial = replace(both, by_objects=trial.verdict, is_judged=is_judged)
             trials.append(trial)
     return sorted(trials, key=lambda one: one.stamp_s or 0.0)
@@ -300,7 +307,7 @@ def each_pose(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np
         detections, shown = model.detect(pose, rng)
         similarities = labels.similarities(shown, detections.class_ids, detections.bboxes_xyxy,
                                            rng)
-        yield _try(relocalizer, model.camera, detections, similarities, pose,
+        yield _try(relocalizer, Observation(model.camera, detections, similarities), pose,
                    int((shown >= 0).sum()), options)
 
 
@@ -310,9 +317,7 @@ def try_observations(landmark_map: LandmarkMap, observations: Sequence[PosedObse
     relocalizer = _relocalizer(landmark_map, options)
     trials = []
     for number, (one, pose, stamp_s) in enumerate(observations, start=1):
-        assert one.similarities is not None
-        trials.append(_try(relocalizer, one.camera, one.detections, np.asarray(one.similarities),
-                           pose, len(one.detections), options, stamp_s))
+        trials.append(_try(relocalizer, one, pose, len(one.detections), options, stamp_s))
         tell(number / len(observations))
     return trials
 
@@ -342,19 +347,17 @@ def _relocalizer(landmark_map: LandmarkMap, options: CheckOptions) -> Relocalize
     return Relocalizer(landmark_map, replace(options.relocalizer, k=k))
 
 
-def _try(relocalizer: Relocalizer, camera: Camera, detections: Detections,
-         similarities: NDArray[np.float32], map_from_camera: NDArray[np.float64], landmarks: int,
-         options: CheckOptions, stamp_s: float | None = None,
+def _try(relocalizer: Relocalizer, observation: Observation, map_from_camera: NDArray[np.float64],
+         landmarks: int, options: CheckOptions, stamp_s: float | None = None,
          recognizer: ImageRecognizer | None = None) -> Trial:
     up = map_from_camera[2, :3] if options.use_vertical else None  # the map's z in the camera
-    result = relocalizer.relocalize([Observation(camera, detections, similarities,
-                                                 up_in_camera=up)], recognizer)
+    result = relocalizer.relocalize([replace(observation, up_in_camera=up)], recognizer)
     estimate, error_m = result.map_from_camera, None
     if estimate is not None:
         error_m = float(pose_error(estimate, map_from_camera)[0])
     verdict: Verdict = 'refused'
     if result.accepted and error_m is not None:
         verdict = 'misled' if error_m > options.wrong_m else 'accepted'
-    return Trial(verdict, map_from_camera[:3, 3], map_from_camera[:3, 2], len(detections),
-                 landmarks, None if estimate is None else estimate[:3, 3], error_m, result.reason,
-                 stamp_s)
+    return Trial(verdict, map_from_camera[:3, 3], map_from_camera[:3, 2],
+                 len(observation.detections), landmarks,
+                 None if estimate is None else estimate[:3, 3], error_m, result.reason, stamp_s)

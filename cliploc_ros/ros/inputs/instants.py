@@ -1,0 +1,151 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""From the messages of an instant to a query, and what is wrong with them."""
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.detector_check import DetectorCheck
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.camera_faults import Fault, check_faults
+from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.query import Query
+from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.errors import CliplocError
+from cliploc_ros.messages import (
+    camera_from_msg,
+    depths_from_msg,
+    detections_from_msg,
+    image_from_msg,
+    parse_class_map,
+)
+from cliploc_ros.ros.conversions import stamp_ns
+from cliploc_ros.ros.inputs.frame_faults import faults_of_axes, faults_of_frame
+from cliploc_ros.ros.inputs.frame_source import Frame
+from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
+from cliploc_ros.ros.parameters import RelocalizerParameters
+
+logger = logging.getLogger(__name__)
+
+
+class Instants:
+    """Makes queries of frames, and checks cameras and detector.
+
+    Parameters
+    ----------
+    by_class : bool
+        Whether the classes of detections are compared with those of the map.
+    """
+
+    def __init__(self, landmark_map: LandmarkMap, by_class: bool) -> None:
+        self._detector = DetectorCheck(landmark_map, by_class)
+        self._faults: dict[str, list[Fault]] = {}  # of the newest frame of each camera
+        self._notes: set[str] = set()
+
+    @property
+    def faults(self) -> list[Fault]:
+        """Return what is wrong with the newest frames, their cameras and their detector."""
+        return [*(fault._replace(text=f'{name}: {fault.text}' if name else fault.text)
+                  for name, faults in self._faults.copy().items() for fault in faults),
+                *(fault._replace(text=f'the detector: {fault.text}')
+                  for fault in self._detector.faults)]
+
+    def query(self, frame: Frame, parameters: RelocalizerParameters, known: KnownBefore) -> Query:
+        """Return the query of an instant, without cameras of another run of odometry.
+
+        CliplocError: names what to fix in the frame or in the parameters.
+        """
+        state, beside, region = known
+        # without odometry the robot itself is what links its cameras
+        run = _run_of(state)
+        by_odometry = run is not None or not (frame.camera and beside)
+        images, frames = zip(*(self._observed(one, parameters, its, by_odometry)
+                               for one, its in (*beside, (frame, state))
+                               if run == _run_of(its)), strict=True)
+        newest = replace(frames[-1], region=region)
+        return Query((*(replace(one, stamp_ns=newest.stamp_ns) for one in frames[:-1]), newest),
+                     images, run, parameters.fuse_frames, parameters.fuse_window_s)
+
+    def check_axes(self, frame: Frame, state: RobotState, map_from_camera: NDArray[np.float64]
+                   ) -> None:
+        """Raise CameraError where an accepted pose (4, 4) shows that a mount is a body's."""
+        with self._keeping(frame.camera):
+            check_faults(faults_of_axes(frame.image.header.frame_id, state.camera_from_base,
+                                        map_from_camera))
+
+    def explained(self, found: Relocalization) -> Relocalization:
+        """Return a result whose refusal also names what is wrong with the newest frames."""
+        if found.accepted:
+            return found
+        found = self._detector.explain(found)
+        texts = (fault.text for fault in self.faults if not fault.is_certain)
+        return replace(found, reason='; '.join([found.reason, *texts]))
+
+    def note(self, text: str) -> None:
+        """Log a warning once."""
+        if text and text not in self._notes:
+            self._notes.add(text)
+            logger.warning('%s', text)
+
+    def _observed(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
+                  by_odometry: bool) -> tuple[NDArray[np.uint8], Observation]:
+        """Return the image of a frame, and what was detected in it, without crops."""
+        with self._keeping(frame.camera):
+            image, camera, given = read_frame(frame, parameters)
+            faults = faults_of_frame(frame, camera, parameters, state)
+            check_faults(faults)
+        self._faults[frame.camera] = faults
+        detections = given.usable(camera.width, camera.height, parameters.max_detections)
+        self._detector.add(given, detections)
+        place, odom_from_camera = state.place, None
+        if not by_odometry:
+            odom_from_camera = invert_transform(state.camera_from_base)
+        elif place is not None:
+            odom_from_camera = place.odom_from_camera
+        depths = None
+        try:
+            depths = frame_depths(frame, camera, detections, state)
+        except CliplocError as error:
+            self.note(f'localizing without depth: {error}')
+        return image, Observation(
+            camera, detections, stamp_ns=stamp_ns(frame.image.header.stamp),
+            camera_name=frame.camera, up_in_camera=state.up_in_camera, depths=depths,
+            odom_from_camera=odom_from_camera, odom_way_m=0.0 if place is None else place.way_m)
+
+    @contextmanager
+    def _keeping(self, camera: str) -> Iterator[None]:
+        """Keep a CliplocError as a fault of a camera."""
+        try:
+            yield
+        except CliplocError as error:
+            self._faults[camera] = [Fault(str(error), True)]
+            raise
+
+
+def read_frame(frame: Frame, parameters: RelocalizerParameters
+               ) -> tuple[NDArray[np.uint8], Camera, Detections]:
+    """Return image, camera and all detections of a frame; CliplocError: one is invalid."""
+    image = image_from_msg(frame.image)
+    height, width = image.shape[:2]
+    camera = camera_from_msg(frame.camera_info, (width, height), parameters.rectified)
+    return image, camera, detections_from_msg(frame.detections,
+                                              parse_class_map(parameters.class_map))
+
+
+def frame_depths(frame: Frame, camera: Camera, detections: Detections, state: RobotState
+                 ) -> NDArray[np.float64] | None:
+    """Return the depth of each box (n,) [m]; None without depth. CliplocError: it is invalid."""
+    return None if frame.depth is None else depths_from_msg(
+        frame.depth, frame.image.header.frame_id, camera, detections.bboxes_xyxy,
+        frame.depth_camera_info, state.camera_from_depth)
+
+
+def _run_of(state: RobotState) -> int | None:
+    return None if state.place is None else state.place.run

@@ -1,0 +1,137 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A case of queries repeats its answer bit by bit from its file; broken files are named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+
+from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+from cliploc_ros.core.localizer import Localizer, repeat
+from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
+from cliploc_ros.core.observation import Observation, Region
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.query import CASE, Case, Query, case_arrays, read_case
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.models.observer import Observer
+
+ROOM = make_room()
+SEEN = see_room(ROOM)
+IMAGE = np.random.default_rng(0).integers(0, 255, (CAMERA.height, CAMERA.width, 3), np.uint8)
+LABELS = LabelEmbeddings.of(np.linalg.qr(np.random.default_rng(1).normal(
+    size=(16, 16)))[0][:len(ROOM)].astype(np.float32))
+
+
+class Encoder:
+    """Embeds crops by their mean colours, and counts them."""
+
+    def __init__(self):
+        self.count = 0
+
+    def encode_crops(self, image_rgb, bboxes_xyxy):
+        self.count += len(bboxes_xyxy)
+        found = [np.random.default_rng(int(image_rgb[int(top):, int(left):].sum())).normal(
+            size=16) for left, top, _, _ in np.maximum(bboxes_xyxy, 0.0)]
+        rows = np.array(found, dtype=np.float32).reshape(-1, 16)
+        return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def query(**changes):
+    return Query((replace(Observation(CAMERA, SEEN, stamp_ns=5, odom_from_camera=np.eye(4)),
+                          **changes),), (IMAGE,))
+
+
+def stored(queries, options, path):
+    CASE.write(path, case_arrays(Case(tuple(queries), {'options': vars(options)})), compress=True)
+    return read_case(path)
+
+
+def equal(one, other):
+    np.testing.assert_array_equal(one.map_from_camera, other.map_from_camera)
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+    assert (one.evidence, one.reason) == (other.evidence, other.reason)
+
+
+@pytest.mark.parametrize(('changes', 'count'), [
+    ({}, len(SEEN)), ({'min_confidence': 0.5}, 0), ({'crops': 'all'}, len(SEEN)),
+    ({'algorithm': 'prosac', 'iterations': 50}, len(SEEN)), ({'matching': 'class'}, 0)])
+def test_the_crops_that_were_compared_are_compared_again(changes, count, tmp_path):
+    options = RelocalizerOptions(**{'min_confidence': 1.0} | changes)
+    encoder = Encoder()
+    localizer = Localizer(Relocalizer(ROOM, options))
+    found = localizer.answer(query(), Observer(encoder, LABELS))
+    assert encoder.count == count
+    case = stored([localizer.query], options, tmp_path / 'case.npz')
+    encoder = Encoder()
+    again = repeat(case, Localizer(Relocalizer(ROOM, case.options)), Observer(encoder, LABELS))
+    assert encoder.count == 0, 'embeddings are stored'
+    equal(again, found)
+
+
+def test_crops_end_where_time_ended(tmp_path):
+    options = RelocalizerOptions(min_confidence=1.0)
+    localizer = Localizer(Relocalizer(ROOM, options))
+    observer = Observer(Encoder(), LABELS)
+    rooms = iter([2, 3])
+    observer.crops_within = lambda left_s: next(rooms, 0)
+    found = localizer.answer(query(), observer, 1e9)
+    assert localizer.query.rooms == (0, 2, 3, 0)
+    assert found.refusal_kind == 'not_all_crops' or len(localizer.query.newest.compared) == 5
+    equal(repeat(stored([localizer.query], options, tmp_path / 'case.npz'), Localizer(
+        Relocalizer(ROOM, options)), Observer(Encoder(), LABELS)), found)
+
+
+def test_another_map_has_labels_of_its_own(tmp_path):
+    """A case is answered with a part of its map, too."""
+    options = RelocalizerOptions(min_confidence=1.0, k=2)
+    localizer = Localizer(Relocalizer(ROOM, options))
+    localizer.answer(query(), Observer(Encoder(), LABELS))
+    case = stored([localizer.query], options, tmp_path / 'case.npz')
+    rows, encoder = list(range(8)), Encoder()
+    labels = LabelEmbeddings.of(np.asarray(LABELS)[rows])
+    again = repeat(case, Localizer(Relocalizer(ROOM.select(rows), options)),
+                   Observer(encoder, labels))
+    assert encoder.count == 0
+    assert pose_error(again.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
+
+
+def test_all_that_is_known_comes_back(tmp_path):
+    region = Region('map', np.array([0.1, 0.2, 0.3]), np.diag([1.0, 2.0, 3.0]), 0.7)
+    pose = make_transform(np.eye(3), np.array([0.1, 0.0, 1e-17]))
+    first = query(up_in_camera=np.array([0.0, -1.0, 0.0]), odom_from_camera=pose, odom_way_m=0.1,
+                  depths=np.where(np.arange(len(SEEN)) % 2, 1.0 / 3.0, np.nan), region=region,
+                  similarities=CropSimilarities(np.eye(12, 16, dtype=np.float32)[:2], LABELS),
+                  compared=np.array([3, 1]), camera_name='front')
+    first = replace(first, run=3, limit=5, length_s=2.5, by_keyframes=False, rooms=(1, 1, 0))
+    second = Query((Observation(CAMERA, SEEN.select(np.empty(0, np.int64))),), run=None)
+    case = stored([first, second], RelocalizerOptions(height_range_m=(0.5, 2.0)),
+                  tmp_path / 'case.npz')
+    assert case.options == RelocalizerOptions(height_range_m=(0.5, 2.0))
+    found, empty = case.queries
+    assert (found.run, found.limit, found.length_s, found.by_keyframes, found.rooms) == (
+        3, 5, 2.5, False, (1, 1, 0))
+    np.testing.assert_array_equal(found.images[0], IMAGE)
+    one, other = found.newest, first.newest
+    for name in ('up_in_camera', 'odom_from_camera', 'depths', 'compared'):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    np.testing.assert_array_equal(one.detections.bboxes_xyxy, SEEN.bboxes_xyxy)
+    np.testing.assert_array_equal(one.similarities.crops, other.similarities.crops)
+    np.testing.assert_array_equal(one.region.camera_from_body, region.camera_from_body)
+    assert (one.camera, one.camera_name, one.odom_way_m, one.region.probability) == (
+        CAMERA, 'front', 0.1, 0.7)
+    assert empty.run is None and empty.images == () and len(empty.newest.detections) == 0
+
+
+@pytest.mark.parametrize(('name', 'change'), [
+    ('about', lambda about: about[:-3]), ('about', lambda about: about[:0]),
+    ('images', lambda images: images[:-9]), ('images', lambda images: 0 * images),
+    ('image_offsets', lambda offsets: offsets[:1]), ('crop_offsets', lambda offsets: offsets[1:])])
+def test_a_broken_case_is_named(name, change, tmp_path):
+    arrays = dict(case_arrays(Case((query(),), {})))
+    arrays[name] = change(arrays[name])
+    np.savez(tmp_path / 'case.npz', **arrays)
+    with pytest.raises(DatasetError, match=r'case\.npz'):
+        read_case(tmp_path / 'case.npz')
