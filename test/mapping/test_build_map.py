@@ -142,20 +142,6 @@ def test_doubtful_input_is_noted():
     assert any("of the class 'cup'" in note for note in build_map(only).report.notes)
 
 
-def test_frames_without_boxes_do_no_harm():
-    table = make_table()
-    detections = see(table, walk_around())
-    away = see(table, [look_at(np.array([3.0, 0.0, 1.0]), (9.0, 0.0, 1.0))] * 3)
-    assert len(away.classes) == 0
-    joined = replace(
-        detections, map_from_camera=np.concatenate([detections.map_from_camera,
-                                                    away.map_from_camera]),
-        stamps_s=np.concatenate([detections.stamps_s, 100.0 + away.stamps_s]),
-        frame_offsets=np.concatenate([detections.frame_offsets,
-                                      np.repeat(detections.frame_offsets[-1], 3)]))
-    assert len(build_map(joined).landmark_map) == len(table)
-
-
 def test_boxes_cut_by_the_image_border_do_not_shrink_a_landmark():
     table = make_table(count=1)
     table = replace(table, semi_axes=np.array([[0.3, 0.3, 0.3]]))

@@ -29,16 +29,21 @@ def surroundings_map(tmp_path_factory):
     return path
 
 
-@pytest.fixture
-def four_cameras(start, tester, surroundings_map, tmp_path):
+@pytest.fixture(scope='module')
+def cases(tmp_path_factory):
+    return tmp_path_factory.mktemp('cases')
+
+
+@pytest.fixture(scope='module')
+def four_cameras(start_shared, tester, surroundings_map, cases):
     """Start a relocalizer; return it, and what asks while some cameras publish."""
     publishers = {name: {kind: tester.create_publisher(kind, f'{name}/{topic}', RELIABLE)
                          for kind, topic in ((CameraInfo, 'camera_info'), (Image, 'image'),
                                              (Detection2DArray, 'detections'))} for name in NAMES}
-    process = start('nodes.relocalizer', parameters={
+    process = start_shared('nodes.relocalizer', parameters={
         'map_file': surroundings_map, 'matching': 'class', 'base_frame': 'base_link',
         'tilt_deviation_deg': 0.0, 'time_budget_ms': 5000.0, 'cameras': list(NAMES),
-        'record_folder': tmp_path / 'cases',
+        'record_folder': cases,
         'base_from_camera': BASE_FROM_CAMERA})
     process.wait_for_output('ready after')
     tester.connect()
@@ -101,13 +106,13 @@ def test_the_doctor_looks_at_each_camera(four_cameras, start):
     assert {('detector', 'pass'), ('time', 'pass')} <= found
 
 
-def test_a_recorded_request_of_four_cameras_replays(four_cameras, tester, surroundings_map,
-                                                    tmp_path, replay):
+def test_a_recorded_request_of_four_cameras_replays(four_cameras, tester, surroundings_map, cases,
+                                                    replay):
     _, ask = four_cameras
     answer = ask_until(ask, ', 4 cameras;')
     stored = tester.trigger('record')
     assert stored.success, stored.message
-    (case,) = tmp_path.glob('cases/case_*')
+    (case,) = cases.glob('case_*')
     replay(case, surroundings_map, answer)
 
 
