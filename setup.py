@@ -12,7 +12,7 @@ PACKAGE = 'cliploc_ros'
 # programs share one name space: there they are named cliploc_evaluate and so on.
 COMMANDS = ('build_map', 'check_map', 'evaluate', 'import_map', 'studio', 'tum_to_bag')
 # These need ROS. Without it they would only print that, so a wheel has none of them.
-ROS_COMMANDS = ('demo', 'doctor', 'prepare', 'replay', 'wake_up')
+ROS_COMMANDS = ('doctor', 'prepare', 'replay', 'wake_up')
 NODES = ('detector', 'relocalizer')
 BUILDS_WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel'}.isdisjoint(sys.argv)
 
@@ -64,13 +64,6 @@ setup(
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
         f'{PACKAGE}.offline.datasets': ['vision_msgs/msg/*.msg'],
-        # By name: evaluate and build_map put files of their own beside a recording. A wheel has no
-        # command that shows the demo.
-        f'{PACKAGE}.demo': [] if BUILDS_WHEEL else [
-            'assets/clip.*', 'assets/NOTICE.txt', 'assets/map.yaml', 'assets/yolo.pt',
-            'assets/*/*.*', 'assets/*/rgb/*.jpg', 'assets/rig/*/*.*', 'assets/rig/*/rgb/*.jpg',
-            'assets/openvino/*/*.*',
-        ],
         f'{PACKAGE}.core.acceptance': ['calibration.yaml'],
         f'{PACKAGE}.offline.studio': ['web/studio.*'],
         f'{PACKAGE}.offline.vocabulary': ['*.yaml'],

@@ -18,13 +18,13 @@ of a box: there association allows a right pose. In several images an object cou
 import argparse
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from cliploc_ros.command import run_command
 from cliploc_ros.core.acceptance.confidence import tilt_handicaps, utilities
@@ -37,14 +37,12 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
-from cliploc_ros.offline.datasets.queries import Queries, load_queries
-from cliploc_ros.offline.evaluation.sensors import with_neighbours, with_vertical
-from cliploc_ros.offline.evaluation.trials import PosedQuery, make_queries
+from cliploc_ros.offline.evaluation.trials import PosedQuery
+from studies.acceptance.places import MODES, add_arguments, chosen_places
+from studies.reports import table
 
 CAUSES = ('objects', 'map', 'candidates', 'search', 'choice')
 _MATCHINGS = {'hybrid': 'labels', 'class': 'classes'}
-# Deviations of the simulated sensors, as in doc/results.md.
-_VERTICAL_NOISE_DEG, _ODOMETRY_NOISE = 1.0, (0.01, 0.5)
 _MANY = 5
 
 
@@ -54,14 +52,6 @@ class Blame(NamedTuple):
     cause: str  #: One of CAUSES; empty if the query does not fail
     #: Number of landmarks that are correspondence candidates of a box that shows them
     candidates: int
-
-
-class Known(NamedTuple):
-    """Queries, and the options that say what else is known."""
-
-    name: str
-    queries: Sequence[PosedQuery]
-    options: RelocalizerOptions
 
 
 def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: PosedQuery, limit_m: float
@@ -132,86 +122,34 @@ def _lead(its: Support, pose: NDArray[np.float64], options: RelocalizerOptions) 
     return float((utilities([its]) - handicap)[0])
 
 
-def count_causes(landmark_map: LandmarkMap, known: Known, limit_m: float) -> list[Blame]:
-    """Return what makes each query fail."""
-    options = replace(known.options, k=min(known.options.k, len(landmark_map)))
-    relocalizer = Relocalizer(landmark_map, options)
-    return [blame(landmark_map, relocalizer, query, limit_m) for query in known.queries]
-
-
-def with_sensors(queries: Queries, landmark_map: LandmarkMap, every_frame: bool, matching: str,
-                 heights_m: tuple[float, float]) -> Iterator[Known]:
-    """Yield the queries of a file with more and more sensors.
-
-    Parameters
-    ----------
-    every_frame : bool
-        Whether the neighbouring frames are queries, too.
-    matching : str
-        'hybrid', or 'class' for queries without similarities.
-    heights_m : tuple of float
-        Range of the camera's height where it is known.
-    """
-    frames = make_queries(queries, landmark_map, every_frame=True)
-    if matching == 'class':
-        frames = tuple(replace(one, observation=replace(one.observation, similarities=None))
-                       for one in frames)
-    asked = [frame.is_main or every_frame for frame in queries.frames]
-    groups = [frame.group for frame in queries.frames]
-    level = with_vertical(frames, _VERTICAL_NOISE_DEG)
-    plain = RelocalizerOptions(matching=matching)
-    high = replace(plain, height_range_m=heights_m)
-    several = len(set(groups)) < len(groups)
-    for name, found, options in (
-            ('one image', frames, plain), ('vertical', level, plain),
-            ('vertical, height', level, high), ('five images', frames, plain),
-            ('five, vertical, height', level, high)):
-        if name.startswith('five'):
-            if not several:
-                continue
-            found = with_neighbours(found, groups, *_ODOMETRY_NOISE)
-        yield Known(name, [one for one, is_asked in zip(found, asked, strict=True) if is_asked],
-                    options)
-
-
 def run(arguments: list[str]) -> int:
     """Print the table, as Markdown."""
     parser = argparse.ArgumentParser(prog='blame', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--queries', type=Path, required=True, nargs='+', metavar='NPZ',
-                        help='of the map; several seeds of simulated similarities add up')
-    parser.add_argument('--map', type=Path, required=True, metavar='YAML')
+    add_arguments(parser)
+    parser.set_defaults(frames='main')
     parser.add_argument('--matching', nargs='+', choices=_MATCHINGS, default=list(_MATCHINGS))
     parser.add_argument('--limit', type=float, default=0.5, metavar='M',
                         help='error of a right pose (%(default)s)')
-    parser.add_argument('--frames', choices=('main', 'all'), default='main')
-    parser.add_argument('--height-range', type=float, nargs=2, default=(0.8, 2.2),
-                        metavar=('LOW', 'HIGH'), help='of the camera, where it is known [m]')
     options = parser.parse_args(arguments)
-    landmark_map = LandmarkMap.from_file(options.map)
-    files = [load_queries(path, landmark_map.landmark_ids) for path in options.queries]
-    print(f'| by | known | queries | right within {options.limit:g} m | '
-          + ' | '.join(CAUSES) + f' | fail with {_MANY} candidates or more |')
-    print('|---|---|' + '---|' * (len(CAUSES) + 3))
-    for matching in options.matching:
-        low, high = options.height_range
-        by_mode = zip(*(with_sensors(file, landmark_map, options.frames == 'all', matching,
-                                     (low, high)) for file in files), strict=True)
-        for seeds in by_mode:
-            found = [one for known in seeds
-                     for one in count_causes(landmark_map, known, options.limit)]
-            counts = Counter(one.cause for one in found)
-            many = sum(bool(one.cause) and one.candidates >= _MANY for one in found)
-            print(f'| {_MATCHINGS[matching]} | {seeds[0].name} | {len(found)} | {counts[""]} | '
-                  + ' | '.join(str(counts[cause]) for cause in CAUSES) + f' | {many} |',
-                  flush=True)
+    places = [one.load() for one in chosen_places(options)]
+    rows = []
+    for matching, mode in product(options.matching, MODES):
+        found = []
+        for place in tqdm(places, f'{matching}, {mode}', disable=None):
+            relocalizer = Relocalizer(place.landmark_map, place.options(
+                mode, RelocalizerOptions(matching=matching)))
+            queries = place.ask(mode) if mode in place.modes else []
+            found += [blame(place.landmark_map, relocalizer, one, options.limit)
+                      for one in queries]
+        counts = Counter(one.cause for one in found)
+        rows.append([_MATCHINGS[matching], mode, len(found), *(
+            counts[cause] for cause in ('', *CAUSES)), sum(
+                bool(one.cause) and one.candidates >= _MANY for one in found)])
+    print(table(['by', 'known', 'queries', f'right within {options.limit:g} m', *CAUSES,
+                 f'fail with {_MANY} candidates or more'], rows))
     return 0
 
 
-def main() -> int:
-    """Run from the command line; return the exit code."""
-    return run_command(lambda: run(sys.argv[1:]))
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run_command(lambda: run(sys.argv[1:])))

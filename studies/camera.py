@@ -16,12 +16,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
-from cliploc_ros.core.fit.covariance import normalized_square
-from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
+from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
@@ -29,15 +27,15 @@ from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.datasets.queries import load_queries
+from cliploc_ros.offline.evaluation.figures import within_ellipsoid
 from cliploc_ros.offline.evaluation.sensors import with_vertical
 from cliploc_ros.offline.evaluation.trials import PosedQuery, make_queries
 from studies import wrong_sensors
-from studies.reports import interval, table
+from studies.reports import errors_of, interval, table
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_drive
 
 _VERTICAL_DEG = 1.0
-_CHI2_95 = float(chi2.ppf(0.95, 6))
 #: What is wrong with all images, from nothing to much.
 CAMERAS: dict[str, Callable[[Sequence[PosedQuery]], Sequence[PosedQuery]]] = {
     'right': lambda some: some,
@@ -82,10 +80,7 @@ def answers(place: Place, change: Callable[[Sequence[PosedQuery]], Sequence[Pose
         if not is_one:
             localizer = Localizer(relocalizer)
         found = localizer.answer(Query((query.observation,), run=None))
-        pose, error_m, square = found.map_from_camera, np.inf, np.inf
-        if pose is not None and found.covariance is not None:
-            error_m = pose_error(pose, query.map_from_camera)[0]
-            square = normalized_square(pose, found.covariance, query.map_from_camera)
+        error_m, _, square = errors_of(found, query.map_from_camera)
         yield Answer(found.accepted, error_m, square, bool(localizer.cameras.faults))
 
 
@@ -116,7 +111,8 @@ def row_of(name: str, way: str, runs: Sequence[Sequence[Answer]]) -> list[object
               for run in runs]
     alarms = [number for number in called if number]
     return [name, way, len(every), len(accepted), wrong, interval(wrong, len(every), 3),
-            f'{np.mean([one.square < _CHI2_95 for one in accepted]):.2f}' if accepted else '',
+            f'{within_ellipsoid(np.array([one.square for one in accepted])):.2f}'
+            if accepted else '',
             f'{len(alarms)} of {len(runs)}' if way == 'one' else '',
             f'{np.median(alarms):.0f}, {max(alarms)}' if alarms and way == 'one' else '']
 

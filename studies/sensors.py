@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors of real wheel odometry, IMUs and accelerometers: ``python -m studies.sensors``.
 
-Wheels are compared with the gyroscope (angle) and with GPS (distance), the orientation of an IMU
-with its acceleration over seconds, and an accelerometer with motion capture. The verticals are
+Wheels are compared with the gyroscope, the orientation of an IMU with its acceleration over
+seconds, and an accelerometer with motion capture. The verticals are
 those of the relocalizer's ``gravity: imu``.
 """
 
@@ -42,8 +42,6 @@ _LOST, _RATES_HZ = (0.0, 0.1), (5.0, 10.0, 25.0, 50.0)
 _TWISTS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
     'as it is': lambda twist: twist, 'empty': np.zeros_like}
 _LAGS_S = np.arange(-0.5, 0.51, 0.02)
-_EARTH_RADIUS_M = 6_371_000.0
-_CHORD_M = 20.0
 # A slower robot stands; the mean acceleration of so long before and after is that of gravity.
 _STANDS_M_S, _SLOW_NS = 0.01, 3 * NS_PER_S // 2
 # Between two instants of a vertical, and how many samples the node keeps.
@@ -54,15 +52,13 @@ _STATED_MOUNT = Rotation.from_matrix(np.diag([-1.0, -1.0, 1.0]))
 
 @dataclass(frozen=True)
 class Robot:
-    """A recording of a robot: n poses, m messages of an IMU, g fixes of GPS."""
+    """A recording of a robot: n poses, m messages of an IMU."""
 
     name: str
-    topics: dict[str, NDArray[np.float64]]  #: (., 2): stamps, and times of recording [s]
     poses: NDArray[np.float64]  #: (n, 8): stamp [s], position [m], quaternion x, y, z, w
     twists: NDArray[np.float64]  #: (n, 2, 3) [m/s], [rad/s]
     samples: tuple[Sample, ...]  #: m
     turn_rates: NDArray[np.float64]  #: (m, 3) of the gyroscope [rad/s]
-    fixes: NDArray[np.float64]  #: (g, 3): stamp [s], latitude and longitude [degrees]
 
     @property
     def yaws(self) -> NDArray[np.float64]:
@@ -81,14 +77,12 @@ class Robot:
 
 
 def read_robot(bag: Path) -> Robot:
-    """Read a bag of ROS 1 or 2 with one topic of odometry, one IMU and perhaps GPS."""
-    times: dict[str, list[tuple[float, float]]] = {}
-    poses, twists, samples, rates, fixes = [], [], list[Sample](), [], []
+    """Read a bag of ROS 1 or 2 with one topic of odometry and one IMU."""
+    poses, twists, samples, rates = [], [], list[Sample](), []
     with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-        for topic, received_ns, data in reader.messages():
+        for topic, _, data in reader.messages():
             msg: Any = reader.deserialize(data, topic.msgtype)
             at_s = msg.header.stamp.sec + msg.header.stamp.nanosec / NS_PER_S
-            times.setdefault(topic.topic, []).append((at_s, received_ns / NS_PER_S))
             if topic.msgtype.endswith('/Odometry'):
                 p, q = msg.pose.pose.position, msg.pose.pose.orientation
                 poses.append((at_s, p.x, p.y, p.z, q.x, q.y, q.z, q.w))
@@ -98,23 +92,7 @@ def read_robot(bag: Path) -> Robot:
                 w = msg.angular_velocity
                 samples.append(sample)
                 rates.append((w.x, w.y, w.z))
-            elif topic.msgtype.endswith('/NavSatFix'):
-                fixes.append((at_s, msg.latitude, msg.longitude))
-    return Robot(bag.stem, {name: np.array(one) for name, one in times.items()}, np.array(poses),
-                 np.array(twists), tuple(samples), np.array(rates), np.array(fixes).reshape(-1, 3))
-
-
-def topics_table(robots: Sequence[Robot]) -> str:
-    """Return the table of rates, gaps and delays."""
-    rows = []
-    for robot in robots:
-        for name, times in robot.topics.items():
-            steps, delays = np.diff(times[:, 0]), times[:, 1] - times[:, 0]
-            low, high = np.quantile(delays, [0.5, 0.99])
-            rows.append([robot.name, name, f'{1.0 / np.median(steps):.1f}', f'{steps.max():.3f}',
-                         f'{low * 1e3:.1f}, {high * 1e3:.1f}'])
-    return table(['bag', 'topic', 'rate [Hz]', 'longest gap [s]',
-                  'recorded after its stamp: median, 99 % [ms]'], rows)
+    return Robot(bag.stem, np.array(poses), np.array(twists), tuple(samples), np.array(rates))
 
 
 def restarts_table(robot: Robot, rates_hz: Sequence[float], tries: int = 4) -> str:
@@ -166,26 +144,6 @@ def angle_table(robot: Robot) -> str:
     return f'{robot.name}: wheels turn {scale:.2f} of the gyroscope, {lag_s:+.2f} s apart\n\n' \
         + table(['way [m]', 'pieces', 'error of the angle, rms [deg]', 'straight on', '95 %',
                  "rms in deviations of `build_map`'s odometry", 'of the looks'], rows)
-
-
-def distance_line(robot: Robot) -> str:
-    """Return how long wheels are beside GPS, on pieces with a chord of _CHORD_M."""
-    _, gyro = _gyro_yaw(robot)
-    middle = (gyro[1:] + gyro[:-1]) / 2
-    steps = np.diff(robot.ways)[:, None] * np.column_stack([np.cos(middle), np.sin(middle)])
-    track = np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-    at_s = robot.fixes[:, 0]
-    angles = np.radians(robot.fixes[:, 1:] - robot.fixes[0, 1:])
-    gps = _EARTH_RADIUS_M * angles * [1.0, np.cos(np.radians(robot.fixes[0, 1]))]
-    wheels = np.column_stack([np.interp(at_s, robot.poses[:, 0], one) for one in track.T])
-    ways = np.interp(at_s, robot.poses[:, 0], robot.ways)
-    first = np.searchsorted(ways, np.arange(0.0, ways[-1] - _CHORD_M, _CHORD_M / 2))
-    last = np.minimum(np.searchsorted(ways, ways[first] + _CHORD_M), len(ways) - 1)
-    by_gps, by_wheels = (np.linalg.norm(one[last] - one[first], axis=1) for one in (gps, wheels))
-    shares = (by_wheels / by_gps)[by_wheels > _CHORD_M / 2]
-    return (f'{robot.name}: {ways[-1]:.0f} m; wheels {np.median(shares):.3f} of GPS, '
-            f'{len(shares)} pieces of {_CHORD_M:g} m, quartiles '
-            f'{np.quantile(shares, 0.25):.3f} to {np.quantile(shares, 0.75):.3f}')
 
 
 def vertical_rows(robot: Robot) -> list[list[Any]]:
@@ -290,19 +248,15 @@ def run(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog='python -m studies.sensors', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--bags', type=Path, nargs='*', default=[], metavar='BAG',
-                        help='with odometry, an IMU with orientation, and perhaps GPS')
+                        help='with odometry and an IMU with orientation')
     parser.add_argument('--tum', type=Path, nargs='*', default=[], metavar='DIR',
                         help='TUM folders with accelerometer.txt')
     options = parser.parse_args(arguments)
     robots = [read_robot(bag) for bag in options.bags]
-    if robots:
-        print(topics_table(robots), '\n')
     for robot in robots:
         most_hz = 1.1 / np.median(np.diff(robot.poses[:, 0]))
         print(restarts_table(robot, [one for one in _RATES_HZ if one <= most_hz]), '\n')
         print(angle_table(robot), '\n')
-        if len(robot.fixes):
-            print(distance_line(robot), '\n')
     rows = [row for robot in robots for row in vertical_rows(robot)]
     rows += [row for folder in options.tum for row in accelerometer_rows(folder)]
     print(table(['vertical', 'instants', 'with a vertical', 'error, median [deg]', '68 %', '95 %',
@@ -310,10 +264,5 @@ def run(arguments: Sequence[str]) -> int:
     return 0
 
 
-def main() -> int:
-    """Run from the command line; return the exit code."""
-    return run_command(lambda: run(sys.argv[1:]))
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run_command(lambda: run(sys.argv[1:])))

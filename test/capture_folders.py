@@ -18,7 +18,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.offline.datasets.folders import FolderOptions, read_folder
 
-ASSETS = Path(__file__).resolve().parents[1] / 'cliploc_ros/demo/assets'
+ASSETS = Path(__file__).resolve().parents[1] / 'demo/assets'
 WALK = ASSETS / 'mapping'
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 # ARKit's and HoloLens's map from one with z up

@@ -15,7 +15,7 @@ from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.poses import mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum
 
-RIG = Path(__file__).resolve().parents[1] / 'cliploc_ros/demo/assets/rig'
+RIG = Path(__file__).resolve().parents[1] / 'demo/assets/rig'
 #: By camera: x y z qx qy qz qw on the robot, which is where the front camera is.
 MOUNTS = json.loads((RIG / 'mounts.json').read_text())
 TF = 'tf2_msgs/msg/TFMessage'

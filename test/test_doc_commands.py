@@ -26,9 +26,8 @@ EXECUTABLES = {path.stem for path in (PROJECT / 'cliploc_ros/cli').glob('*.py')
 # Needs a robot, a person, or a sourced ROS: here only the arguments are checked.
 OF_ROS = {'bag', 'pkg', 'security', 'topic'}
 OTHER_PACKAGES = {'robot_localization', 'tf2_ros'}
-# A module for each subcommand.
-OF_STUDIES = ('studies.covariance.', 'studies.speed.')
-MODULES = re.compile(r'(cliploc_ros|demo_world|studies)\.')
+OF_STUDIES = ('studies.speed.',)
+MODULES = re.compile(r'(cliploc_ros|demo|studies)\.')
 
 
 class _CaughtError(Exception):
@@ -42,7 +41,7 @@ class _CaughtError(Exception):
 @cache
 def parser_of(module: str) -> argparse.ArgumentParser:
     """Return the parser of a module that runs as a program, the one that it makes itself."""
-    if module.startswith('cliploc_ros.cli.'):
+    if module.startswith(('cliploc_ros.cli.', 'demo.__')):
         return importlib.import_module(module).make_parser()
 
     def caught(parser, *_):
@@ -69,7 +68,9 @@ def program_of(command: Command) -> tuple[str, list[str]]:
         if rest[1] + '.' in OF_STUDIES:
             return f'{rest[1]}.{rest[2]}', rest[3:]
         return rest[1], rest[2:]
-    name = re.sub('^(install/lib/cliploc_ros/|script/(?=demo$)|cliploc_(?!ros))', '', first)
+    elif first == 'script/demo':
+        return 'demo.__main__', rest
+    name = re.sub('^(install/lib/cliploc_ros/|cliploc_(?!ros))', '', first)
     if name in EXECUTABLES:
         return f'cliploc_ros.cli.{name}', rest
     return (f'cliploc_ros.nodes.{name}', rest) if name in NODES else ('', [])

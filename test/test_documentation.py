@@ -63,7 +63,7 @@ def test_links_lead_somewhere(path):
 def test_commands_run_what_there_is(path):
     """Programs of this package, and the tests that a figure comes from."""
     text = path.read_text()
-    for module in re.findall(r'python -m ((?:cliploc_ros|demo_world|studies)[\w.]*)', text):
+    for module in re.findall(r'python -m ((?:cliploc_ros|demo|studies)[\w.]*)', text):
         path = PROJECT / module.replace('.', '/')
         assert path.with_suffix('.py').is_file() or (path / '__main__.py').is_file(), module
     for test in re.findall(r'\b(test/[\w/]+\.py)', text):

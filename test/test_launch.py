@@ -113,7 +113,7 @@ def made(name: str, **given: str) -> list:
 
 @pytest.mark.needs('launch_ros')
 @pytest.mark.parametrize(('name', 'nodes'), [
-    ('relocalization.launch.py', 2), ('demo.launch.py', 0), ('wake_up.launch.py', 0)])
+    ('relocalization.launch.py', 2), ('wake_up.launch.py', 0)])
 def test_descriptions_are_made(name, nodes):
     assert len(made(name)) == nodes
 

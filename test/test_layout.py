@@ -43,7 +43,6 @@ LAYERS = (
     ('offline.replay',),
     ('offline.studio',),
     ('offline',),
-    ('demo',),
     ('cli',),
 )
 RANKS = {f'{ROOT}.{prefix}': rank for rank, prefixes in enumerate(LAYERS) for prefix in prefixes}

@@ -18,11 +18,11 @@ import pytest
 PROJECT = Path(__file__).resolve().parents[1]
 MODULES = sorted((PROJECT / 'cliploc_ros').rglob('*.py'))
 SOURCES = [*MODULES, PROJECT / 'setup.py', *(
-    path for folder in ('demo_world', 'studies', 'test')
+    path for folder in ('demo', 'studies', 'test')
     for path in sorted((PROJECT / folder).rglob('*.py')))]
 SCRIPTS = [path for path in sorted((PROJECT / 'script').iterdir()) if path.is_file()]
 INTERFACES = sorted((PROJECT / 'cliploc_ros/offline/datasets/vision_msgs/msg').glob('*.msg'))
-EXECUTABLES = ['build_map', 'check_map', 'demo', 'detector', 'import_map', 'prepare',
+EXECUTABLES = ['build_map', 'check_map', 'detector', 'import_map', 'prepare',
                'relocalizer', 'replay', 'studio', 'tum_to_bag', 'wake_up']
 # As vision_msgs 4.1.1 of Jazzy has it. The hash covers the other six messages as well.
 DETECTIONS_TYPE_HASH = 'RIHS01_214274120007f4a683866481336b70310268cfa107aebe9d594a6acf75bda968'

@@ -19,7 +19,6 @@ from cliploc_ros.core.map.landmark_embeddings import embeddings_path
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.query import Query
-from cliploc_ros.demo import ASSETS
 from cliploc_ros.errors import ImageError, OptionsError
 from cliploc_ros.models.clip_towers import keep_text_tower
 from cliploc_ros.models.clip_weights import resolve_clip_weights
@@ -61,17 +60,13 @@ def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bo
     Parameters
     ----------
     picture : Path or None
-        Picture for the request; None: one of the demo.
+        Picture for the request; None: a drawn one.
     cache_dir : Path or None
         The folder to carry; None: that of the parameters.
     has_detector : bool
         Whether the robot runs this package's detector.
     """
-    file = picture or min((ASSETS / 'sequence' / 'rgb').iterdir())
-    image_bgr = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image_bgr is None:
-        raise ImageError(f'{file} cannot be read as a picture: name a JPEG or PNG file')
-    image_rgb = np.ascontiguousarray(image_bgr[:, :, ::-1], dtype=np.uint8)
+    image_rgb = read_picture(picture)
     used: list[CommonParameters] = []
     detector = None
     if has_detector:
@@ -92,12 +87,27 @@ def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bo
                 keep_text_tower(resolve_clip_weights(clip), clip)
             except ConversionError as error:
                 print(f'    {error}: without PyTorch, a robot knows the labels of this map only')
-    with _step(f'{_REQUESTS} requests for {picture or "a picture of the demo"}'):
+    with _step(f'{_REQUESTS} requests for {picture or "a drawn picture"}'):
         requests = [answer(image_rgb, detector, localizer, parameters) for _ in range(_REQUESTS)]
     print(cost_table(requests), flush=True)
     print('ready: with these parameters, start and requests need neither network nor compiler')
     if cache_dir is not None:
         print('\n'.join(carrying(cache_dir, used)))
+
+
+def read_picture(picture: Path | None) -> NDArray[np.uint8]:
+    """Return a picture (h, w, 3) in RGB; without one, a drawn one of 640 x 480.
+
+    ImageError: the picture cannot be read.
+    """
+    if picture is None:
+        # Edges at all places, in which keyframes find as many features as they keep.
+        tiles = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+        return tiles.repeat(10, axis=0).repeat(10, axis=1)
+    image_bgr = cv2.imread(str(picture), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image_bgr is None:
+        raise ImageError(f'{picture} cannot be read as a picture: name a JPEG or PNG file')
+    return np.ascontiguousarray(image_bgr[:, :, ::-1], dtype=np.uint8)
 
 
 def answer(image_rgb: NDArray[np.uint8], detector: ObjectDetector | None,

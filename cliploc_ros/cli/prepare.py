@@ -42,7 +42,7 @@ def make_parser() -> argparse.ArgumentParser:
         help='parameter file of the nodes; repeat it as on their command line')
     parser.add_argument(
         '--image', type=Path, metavar='FILE',
-        help="picture of the robot's camera for the request (default: one of the demo)")
+        help="picture of the robot's camera for the request (default: a drawn one)")
     parser.add_argument(
         '--cache-dir', type=Path, metavar='DIR',
         help='keep everything in this folder, to copy it to a robot (default: where the '

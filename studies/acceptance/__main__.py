@@ -4,8 +4,8 @@
 
 ``judge`` localizes as robots do, ``recorded`` compares values of min_confidence, in the mapped
 place and in one whose objects have all exchanged places, where every pose is wrong. ``stress`` and
-``robustness`` change map, boxes or sensors, and the robot does not know. In ``retries`` a robot
-looks up to 20 times, in ``growth`` it fuses one to five images. ``fit`` fits the confidence.
+``families`` change map, boxes or sensors, and the robot does not know. ``priors`` tells the robot
+where it is. In ``retries`` it looks up to 20 times. ``fit`` fits the confidence.
 """
 
 import argparse
@@ -30,9 +30,6 @@ from cliploc_ros.offline.evaluation.run import RunError
 from studies.acceptance import fit
 from studies.acceptance.looks import (
     LOOKS,
-    MakeWalker,
-    growth_tables,
-    judged_after,
     retries_row,
     retry,
 )
@@ -43,12 +40,11 @@ from studies.acceptance.searches import (
     Task,
     acceptance_table,
     confidences_of,
-    draw_curves,
     false_table,
     make_search,
     tasks_of,
 )
-from studies.acceptance.troubles import BY_LABELS, CURVES, FAMILIES, TROUBLES, exchange_landmarks
+from studies.acceptance.troubles import BY_LABELS, FAMILIES, TROUBLES, exchange_landmarks
 from studies.reports import draw_judged, table
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
@@ -91,7 +87,7 @@ def _judge(options: argparse.Namespace) -> None:
     for by in (('place', 'mode'), ('mode',)):
         print(acceptance_table(found, by), end='\n\n')
     if options.out is not None:
-        draw_judged(options.out, 'confidence of the best pose', {
+        draw_judged(options.out / 'reliability.png', 'confidence of the best pose', {
             mode: (np.array([one.confidence for one in found if one.mode == mode]),
                    np.array([one.right for one in found if one.mode == mode])) for mode in MODES})
 
@@ -116,7 +112,7 @@ def _recorded(options: argparse.Namespace) -> None:
         make_folder(options.out)
         (options.out / 'outcomes.json').write_text(
             json.dumps([one._asdict() for one in (*here, *there)]))
-        draw_judged(options.out, 'poses that at least three objects support', {
+        draw_judged(options.out / 'reliability.png', 'poses that at least three objects support', {
             mode: confidences_of([one for one in here if one.mode == mode]) for mode in MODES})
 
 
@@ -164,14 +160,6 @@ def _priors(options: argparse.Namespace) -> None:
         print(acceptance_table(found, by), end='\n\n')
 
 
-def _robustness(options: argparse.Namespace) -> None:
-    tasks = tasks_of(chosen_places(options), RelocalizerOptions(matching=options.matching),
-                     [*CURVES], options.seed)
-    found: list[Outcome] = run_all(make_search, tasks, 'searches', options.workers)
-    print(acceptance_table(found, ('trouble', 'level')))
-    print(f'wrote {draw_curves(options.out or Path("robustness"), found)}')
-
-
 def _retries(options: argparse.Namespace) -> None:
     rows = []
     for one in chosen_places(options):
@@ -192,16 +180,6 @@ def _retries(options: argparse.Namespace) -> None:
                  'more than 1 m off'], rows))
 
 
-def _growth(options: argparse.Namespace) -> None:
-    make = MakeWalker(options.vertical, RelocalizerOptions(matching=options.matching))
-    groups = run_all(make, chosen_places(options), 'places', options.workers)
-    print(growth_tables(groups))
-    if options.out is not None:
-        draw_judged(options.out, 'after one to five images', {
-            f'{images} image{"s"[:images > 1]}': judged
-            for images, judged in judged_after(groups).items()})
-
-
 def _fit(options: argparse.Namespace) -> None:
     tasks = [Simulated(kind, seed, options.depth) for kind in KINDS
              for seed in range(options.worlds)]
@@ -212,7 +190,7 @@ def _fit(options: argparse.Namespace) -> None:
     if options.out is not None:
         plain = [one for one in searched if one.kind in fit.FITTED_KINDS
                  and not one.case.is_elsewhere]
-        draw_judged(options.out, 'simulated worlds, each kind left out of the fit', {
+        draw_judged(options.out / 'reliability.png', 'worlds, each kind left out of the fit', {
             mode: fit.judged([one for one in plain if one.mode == mode], calibrations)
             for mode in MODES})
     fitted = fit.fit([one.case for one in searched if one.kind in fit.FITTED_KINDS],
@@ -259,25 +237,17 @@ def run(arguments: Sequence[str] | None = None) -> int:
                           help='(by labels for changed maps, else by classes)')
     priors = add('priors', _priors, 'what regions known before add, right and wrong')
     add_arguments(priors, worlds=20, first_seed=1100)
-    robustness = add('robustness', _robustness, 'success and false accepts over growing troubles',
-                     'draw them')
-    add_arguments(robustness, ('room', 'office', 'shop'), first_seed=1000)
     retries = add('retries', _retries, f'{LOOKS} looks of a robot that does not move')
     add_arguments(retries, ('room', 'office', 'shop'), first_seed=1000)
     retries.set_defaults(frames='main')
-    growth = add('growth', _growth, 'confidence after one to five images',
-                 'draw the reliability')
-    add_arguments(growth, fit.FITTED_KINDS, worlds=20)
-    growth.add_argument('--vertical', action='store_true', help='known to 1 degree on each axis')
+    retries.add_argument('--seed', type=int, default=0, help='of the changes (%(default)s)')
     fits = add('fit', _fit, 'the fit of the confidence to simulated worlds',
                'draw a reliability diagram')
     fits.add_argument('--worlds', type=positive_int, default=24, metavar='N', help='of each kind')
     fits.add_argument('--depth', action='store_true', help='fit the coefficient of depth alone')
     fits.add_argument('--workers', type=positive_int, default=1, metavar='N')
-    for own in (judge, stress, priors, robustness, retries, growth):
+    for own in (judge, stress, priors, retries):
         own.add_argument('--matching', choices=fit.MATCHINGS, default='hybrid')
-    for own in (robustness, retries):
-        own.add_argument('--seed', type=int, default=0, help='of the changes (%(default)s)')
     options = parser.parse_args(arguments)
     options.command(options)
     return 0

@@ -116,7 +116,6 @@ class Simulated(NamedTuple):
     seed: int
     has_depth: bool = False
     cameras: int = 1
-    density: int = 1
 
     @property
     def name(self) -> str:
@@ -125,8 +124,7 @@ class Simulated(NamedTuple):
 
     def load(self) -> Place:
         """Return the place."""
-        world = make_world(self.kind, self.seed, has_depth=self.has_depth, cameras=self.cameras,
-                           density=self.density)
+        world = make_world(self.kind, self.seed, has_depth=self.has_depth, cameras=self.cameras)
         return Place(world.landmark_map, world.queries, world.groups,
                      [one.number % GROUP_SIZE == GROUP_SIZE - 1 for one in world.queries])
 
@@ -198,8 +196,6 @@ def add_arguments(parser: argparse.ArgumentParser, kinds: Sequence[str] = tuple(
                         help='of each box: that of the files, or else simulated')
     parser.add_argument('--cameras', type=positive_int, default=1, metavar='N',
                         help='of the robot in worlds, in modes of one image (%(default)s)')
-    parser.add_argument('--density', type=positive_int, default=1, metavar='N',
-                        help='things in worlds, for each one of a COCO class (%(default)s)')
     parser.add_argument('--frames', choices=('main', 'all'), default='all')
     parser.add_argument('--worlds', type=int, metavar='N',
                         help=f'simulated worlds of each kind ({worlds})')
@@ -233,8 +229,7 @@ def chosen_places(options: argparse.Namespace) -> list[AnyPlace]:
           for seed in range(_HALVINGS) for is_swapped in (False, True)),
         *(Recording(path, map_path, options.frames == 'all', has_depth=options.depth)
           for path, map_path in zip(options.queries, maps, strict=True)),
-        *(Simulated(kind, options.first_seed + number, options.depth, options.cameras,
-                    options.density)
+        *(Simulated(kind, options.first_seed + number, options.depth, options.cameras)
           for kind in options.kinds for number in range(worlds))]
     if not places:
         raise OptionsError('nothing to test: give --queries and --map, --observations, or '

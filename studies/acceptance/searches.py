@@ -5,17 +5,13 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from itertools import groupby
 from math import ceil, inf
-from pathlib import Path
-from textwrap import fill
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.fit.covariance import normalized_square
-from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
+from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
@@ -27,18 +23,14 @@ from cliploc_ros.offline.evaluation.trials import PosedQuery, run_trial
 from studies.acceptance.fit import best_recall
 from studies.acceptance.places import SEED, AnyPlace, Place
 from studies.acceptance.priors import PRIORS
-from studies.acceptance.troubles import CURVES, FAMILIES, TROUBLES
-from studies.reports import FAR_DEG, FAR_M, interval, table
+from studies.acceptance.troubles import FAMILIES, TROUBLES
+from studies.reports import FAR_DEG, FAR_M, SUCCESS_M, errors_of, grouped, interval, table
 
 #: More queries than any place has.
 MANY = 1_000_000
 #: Looks of one localizer before it can tell that its camera is wrong.
 EARLY_LOOKS = 5
-#: Errors below which a pose is a success [m].
-SUCCESS_M = 0.1, 0.25, 0.5, 1.0
-_PANEL_SIZE = 2.8, 2.8  # of one trouble in the figure [inch]
-_PANELS_A_ROW, _LABEL_WIDTH = 3, 22
-_CHANGES = TROUBLES | CURVES | PRIORS | FAMILIES
+_CHANGES = TROUBLES | PRIORS | FAMILIES
 
 
 class Task(NamedTuple):
@@ -106,13 +98,9 @@ def _looks(landmark_map: LandmarkMap, options: RelocalizerOptions, queries: Sequ
     localizer, found = Localizer(Relocalizer(landmark_map, options)), []
     for number, query in enumerate(queries):
         result = localizer.answer(Query((query.observation,), run=None))
-        pose, error_m, error_deg, nees = result.map_from_camera, inf, inf, inf
-        if pose is not None:
-            error_m, error_deg = pose_error(pose, query.map_from_camera)
-            if result.covariance is not None:
-                nees = normalized_square(pose, result.covariance, query.map_from_camera)
-        found.append(outcome(error_m < RIGHT_M, result.accepted, result.confidence, error_m,
-                             error_deg, nees, 'first five' if number < EARLY_LOOKS else 'later'))
+        errors = errors_of(result, query.map_from_camera)
+        found.append(outcome(errors[0] < RIGHT_M, result.accepted, result.confidence, *errors,
+                             'first five' if number < EARLY_LOOKS else 'later'))
     return found
 
 
@@ -168,11 +156,8 @@ def acceptance_table(outcomes: Sequence[Outcome], by: Sequence[str],
 
     columns = [f'{least:g}' for least in thresholds] + ['best'] if thresholds \
         else ['success', 'accepted, wrong (95 % of all); recall']
-    groups: dict[tuple[str, ...], list[Outcome]] = {}
-    for one in outcomes:
-        groups.setdefault(tuple(f'{getattr(one, name)}' for name in by), []).append(one)
     return table([*by, 'within 1 m', *columns],
-                 [[*key, *figures(some)] for key, some in groups.items()])
+                 [[*key, *figures(some)] for key, some in grouped(outcomes, by).items()])
 
 
 def false_table(outcomes: Sequence[Outcome], by: Sequence[str]) -> str:
@@ -181,11 +166,8 @@ def false_table(outcomes: Sequence[Outcome], by: Sequence[str]) -> str:
     With the 95 % intervals of their share of the accepted poses and of all requests, the accepted
     poses that are far off otherwise, and the share of those within their 95 % ellipsoid.
     """
-    groups: dict[tuple[Any, ...], list[Outcome]] = {}
-    for one in outcomes:
-        groups.setdefault(tuple(getattr(one, name) for name in by), []).append(one)
     rows = []
-    for key, some in groups.items():
+    for key, some in grouped(outcomes, by).items():
         accepted = [one for one in some if one.accepted]
         false = sum(not one.right for one in accepted)
         rows.append([*key, len(some), sum(one.right for one in some), len(accepted), false,
@@ -195,46 +177,3 @@ def false_table(outcomes: Sequence[Outcome], by: Sequence[str]) -> str:
                      if accepted else ''])
     return table([*by, 'n', 'within 1 m', 'accepted', 'false', '95 % of accepted', '95 % of n',
                   f'{FAR_M:g} m or {FAR_DEG:g} deg off', 'in 95 %'], rows)
-
-
-def draw_curves(folder: Path, outcomes: Sequence[Outcome]) -> Path:
-    """Draw success, accepted poses and false accepts over the levels, with 95 % intervals."""
-    # late, since tables need no matplotlib
-    from matplotlib.figure import Figure
-
-    from cliploc_ros.files.storage import make_folder
-    from cliploc_ros.offline.evaluation.figures import save_figure
-    from cliploc_ros.offline.evaluation.summary import wilson_interval
-
-    make_folder(folder)
-    curves = {name: list(some) for name, some in groupby(outcomes, lambda one: one.trouble)}
-    rows, columns = ceil(len(curves) / _PANELS_A_ROW), min(len(curves), _PANELS_A_ROW)
-    figure = Figure(figsize=(_PANEL_SIZE[0] * columns, _PANEL_SIZE[1] * rows),
-                    layout='constrained')
-    panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
-    for axes, (name, some) in zip(panels.flat, curves.items(), strict=False):
-        levels = {level: list(own) for level, own in groupby(some, lambda one: one.level)}
-        for label, color, marker, counts in (
-                ('within 1 m', '#0072B2', 'o', [sum(one.right for one in own)
-                                                for own in levels.values()]),
-                ('accepted', '#009E73', 's', [sum(one.accepted for one in own)
-                                              for own in levels.values()]),
-                ('false accepts', '#D55E00', 'X', [sum(one.accepted and not one.right
-                                                       for one in own)
-                                                   for own in levels.values()])):
-            totals = [len(own) for own in levels.values()]
-            intervals = np.array([wilson_interval(*one)
-                                  for one in zip(counts, totals, strict=True)])
-            axes.fill_between([*levels], *intervals.T, color=color, alpha=0.15, linewidth=0)
-            axes.plot([*levels], np.divide(counts, totals), color=color, marker=marker,
-                      markersize=5, linewidth=1.4, label=label)
-        axes.set_xlabel(fill(name, _LABEL_WIDTH))
-        axes.grid(alpha=0.3)
-        axes.set_axisbelow(True)
-    for axes in panels[:, 0]:
-        axes.set(ylabel='share of images', ylim=(-0.02, 1.02))
-    for axes in panels.flat[len(curves):]:
-        axes.remove()
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc='outside upper center', ncols=3,
-                  frameon=False, fontsize=9)
-    return save_figure(figure, folder / 'robustness.png')

@@ -39,23 +39,6 @@ def unchanged(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], level: f
     return landmark_map, queries
 
 
-def remove_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
-                     rng: np.random.Generator) -> World:
-    """Remove a share of the landmarks from the map; their detections stay."""
-    count = len(landmark_map)
-    kept = np.sort(rng.permutation(count)[:max(1, count - round(share * count))])
-    return landmark_map.select(kept.tolist()), _with_columns(queries, kept)
-
-
-def move_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], distance_m: float,
-                   rng: np.random.Generator) -> World:
-    """Move a third of the landmarks by a distance, in random directions."""
-    steps = rng.normal(size=landmark_map.centers.shape)
-    steps *= distance_m / np.linalg.norm(steps, axis=1, keepdims=True)
-    steps[rng.random(len(steps)) > 1 / 3] = 0.0
-    return replace(landmark_map, centers=landmark_map.centers + steps), queries
-
-
 def exchange_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
                        rng: np.random.Generator) -> World:
     """Exchange the places of a share of the landmarks; all of them make another place."""
@@ -64,18 +47,6 @@ def exchange_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
     centers = landmark_map.centers.copy()
     centers[chosen] = centers[np.roll(chosen, 1)]
     return replace(landmark_map, centers=centers), queries
-
-
-def mislabel_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
-                       rng: np.random.Generator) -> World:
-    """Exchange labels and classes of a share of the landmarks."""
-    count = len(landmark_map)
-    chosen = rng.permutation(count)[:round(share * count)]
-    source = np.arange(count)
-    source[chosen] = np.roll(chosen, 1)
-    described = landmark_map.select(source.tolist())
-    return (replace(landmark_map, labels=described.labels, class_ids=described.class_ids,
-                    details=described.details), _with_columns(queries, source))
 
 
 def move_objects(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
@@ -225,36 +196,6 @@ def random_detections(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], 
                           for query in queries]
 
 
-def drop_detections(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
-                    rng: np.random.Generator) -> World:
-    """Drop a share of the boxes."""
-    def thinned(observation: Observation) -> Observation:
-        rows = np.nonzero(rng.random(len(observation.detections)) >= share)[0]
-        return of_rows(observation, rows)
-
-    return landmark_map, [replace(one, observation=thinned(one.observation)) for one in queries]
-
-
-def invent_detections(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
-                      rng: np.random.Generator) -> World:
-    """Add random boxes, a number for each true one, whose looks are permuted true ones."""
-    def extended(observation: Observation) -> Observation:
-        true, similarities = observation.detections, np.asarray(observation.similarities)
-        count = int(rng.binomial(len(true), share)) if len(true) else 0
-        boxes = _random_boxes(observation, count, rng)
-        rows = rng.integers(len(true), size=count) if count else np.empty(0, dtype=np.int64)
-        looks = rng.permuted(similarities[rows], axis=1)
-        classes = tuple(true.class_ids[row] for row in rng.permutation(rows))
-        depths = observation.depths
-        return replace(
-            observation, similarities=np.ascontiguousarray(np.vstack([similarities, looks])),
-            depths=None if depths is None else np.append(depths, np.full(count, np.nan)),
-            detections=Detections(np.vstack([true.bboxes_xyxy, boxes]), true.class_ids + classes,
-                                  np.concatenate([true.scores, true.scores[rows]])))
-
-    return landmark_map, [replace(one, observation=extended(one.observation)) for one in queries]
-
-
 def of_rows(observation: Observation, rows: NDArray[np.int64]) -> Observation:
     """Return an observation with some of its boxes."""
     similarities, depths = observation.similarities, observation.depths
@@ -283,8 +224,7 @@ def _with_columns(queries: Sequence[PosedQuery], columns: NDArray[np.int64]) -> 
 
 
 def _with_copies(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
-                 steps: NDArray[np.float64]
-                 ) -> World:
+                 steps: NDArray[np.float64]) -> World:
     """Return a map with a copy of each landmark, steps (L, 3) or (3,) away."""
     rows = np.tile(np.arange(len(landmark_map)), 2)
     ids = (*landmark_map.landmark_ids, *(f'{one}_copy' for one in landmark_map.landmark_ids))
@@ -307,7 +247,6 @@ def _of_sensor(change: Callable[[Sequence[PosedQuery], float], Sequence[PosedQue
     return lambda landmark_map, queries, level, rng: (landmark_map, change(queries, level))
 
 
-_SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 #: What is wrong, and the robot does not know.
 TROUBLES = {
     'none': Trouble(unchanged, modes=(ONE, LEVEL, FIVE, ALL)),
@@ -374,13 +313,3 @@ FAMILIES = {
     'C half of the map turned by [degrees]': Trouble(_distorted(_half_turned), (10.0,), _BOTH)}
 #: Classes alone accept too little in these to tell.
 BY_LABELS = [name for name in FAMILIES if name.startswith('C')]
-#: What gets worse and worse, seen in one image.
-CURVES = {
-    'share of landmarks removed': Trouble(remove_landmarks, _SHARES, (ONE,)),
-    'a third of the landmarks moved by [m]': Trouble(
-        move_landmarks, (0.0, 0.1, 0.2, 0.3, 0.5, 1.0), (ONE,)),
-    'share of landmarks that exchange places': Trouble(
-        exchange_landmarks, (0.0, 0.2, 0.4, 0.6, 0.8, 1.0), (ONE,)),
-    'share of landmarks mislabelled': Trouble(mislabel_landmarks, _SHARES, (ONE,)),
-    'share of detections dropped': Trouble(drop_detections, _SHARES, (ONE,)),
-    'invented detections for each true one': Trouble(invent_detections, _SHARES, (ONE,))}

@@ -10,7 +10,6 @@ each room would accept by what the others fit.
 """
 
 import argparse
-import json
 import sys
 from functools import partial
 from itertools import product
@@ -21,18 +20,18 @@ from tqdm import tqdm
 from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.parallel import run_tasks
-from cliploc_ros.files.storage import write_text
 from studies.keyframes.cases import cases
 from studies.keyframes.fit import GENUINE, POINTS, fit, left_out, make_rows, paste, report
-from studies.keyframes.judge import WAYS, draw, make_judge, table
+from studies.keyframes.judge import WAYS, confidences_by_way, make_judge, table
 from studies.keyframes.records import make_collect, read_places
+from studies.reports import draw_judged
 
 _FAMILIES = list(dict.fromkeys(name.partition(':')[0] for name in cases()))
 
 
 def _collect(options: argparse.Namespace) -> int:
     places = tuple(one for site in options.sites
-                   for one in read_places(site, options.model, options.blocks))
+                   for one in read_places(site, options.model))
     if len({one.site for one in places}) < 2:
         raise OptionsError('--sites: images of other sites are needed: give two or more')
     chosen = [one for one in places if any(text in one.name for text in options.places)]
@@ -72,10 +71,8 @@ def _judge(options: argparse.Namespace) -> int:
     found.sort(key=lambda one: (order.index(one.case), one.place, one.number))
     for by in options.by or [['family'], ['case']]:
         print('\n'.join([*table(found, by), '']))
-    if options.json:
-        write_text(options.json, json.dumps([one._asdict() for one in found], indent=0))
     if options.figure:
-        draw(found, options.figure)
+        draw_judged(options.figure, '', confidences_by_way(found))
     return 0
 
 
@@ -97,10 +94,8 @@ def main() -> int:
     collects.set_defaults(command=_collect)
     collects.add_argument('--sites', nargs='+', required=True, metavar='DIR[@METRES]',
                           help='RGB-D and TUM folders, the latter with the unit of their depth, '
-                               'and rooms of demo_world.make_keyframe_rooms')
+                               'and rooms of demo.world.make_keyframe_rooms')
     collects.add_argument('--model', required=True, help='weights of YOLO for real images')
-    collects.add_argument('--blocks', type=positive_int, nargs='+', default=[], metavar='N',
-                          help='map and ask blocks of N images in turn, too')
     collects.add_argument('--queries', type=positive_int, default=24, metavar='N',
                           help='the most of each case but the plain one (%(default)s)')
     fits = commands.add_parser('fit', parents=[common], help='fit the verdict, and print numbers')
@@ -112,7 +107,6 @@ def main() -> int:
     judges.add_argument('--by', nargs='+', action='append',
                         choices=['site', 'place', 'family', 'case'],
                         help='what a line of a table is about (a table by family, one by case)')
-    judges.add_argument('--json', type=Path, metavar='FILE', help='write each outcome, too')
     judges.add_argument('--figure', type=Path, metavar='FILE.png',
                         help='draw the reliability of the confidence')
     options = parser.parse_args()

@@ -12,24 +12,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cliploc_ros.core.fit.covariance import normalized_square
-from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
+from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.offline.evaluation.figures import (
-    add_legend,
-    draw_reliability,
-    new_axes,
-    save_figure,
-    within_ellipsoid,
-)
-from cliploc_ros.offline.evaluation.summary import wilson_interval
+from cliploc_ros.offline.evaluation.figures import within_ellipsoid
 from studies.keyframes.records import Record, StoredCase, StoredRecognizer, localize
+from studies.reports import SUCCESS_M, Judged, errors_of, grouped, interval
 
 WAYS = ('objects', 'keyframes', 'both')
-_LIMITS_M = (0.1, 0.25, 0.5, 1.0)
 _NO_BOXES = Detections(np.empty((0, 4)), (), np.empty(0))
 
 
@@ -78,14 +70,11 @@ def make_judge(ways: Sequence[str] = WAYS) -> Callable[[Path], list[Outcome]]:
 
 
 def _outcome(case: StoredCase, record: Record, way: str, found: Relocalization) -> Outcome:
-    pose, nees = found.map_from_camera, np.inf
-    errors = tuple(np.inf if pose is None else pose_error(pose, truth)[0]
-                   for truth in record.truths) or (np.inf,)
-    if pose is not None and found.covariance is not None and record.truths:
-        nees = normalized_square(pose, found.covariance, record.truths[0])
+    errors = [errors_of(found, truth) for truth in record.truths] or [(np.inf,) * 3]
     return Outcome(
         case.place.partition('/')[0], case.place, case.name.partition(':')[0], case.name,
-        record.number, way, errors, found.accepted, float(found.confidence), float(nees),
+        record.number, way, tuple(error_m for error_m, *_ in errors), found.accepted,
+        float(found.confidence), float(errors[0][2]),
         '' if found.accepted else str(found.refusal_kind or way), found.reason, found.source)
 
 
@@ -110,22 +99,19 @@ def _figures(outcomes: Sequence[Outcome]) -> str:
     accepted = np.array([one.accepted for one in outcomes])
     nees = np.array([one.nees for one in outcomes])
     right, judged = errors < RIGHT_M, accepted & np.isfinite(nees)
-    shares = ' '.join(f'{np.mean(errors < limit):4.2f}' for limit in _LIMITS_M)
+    shares = ' '.join(f'{np.mean(errors < limit):4.2f}' for limit in SUCCESS_M)
     recall = f'{accepted[right].mean():.2f}' if right.any() else '-'
     inside = f'{within_ellipsoid(nees[judged]):.2f}' if judged.any() else '-'
     false = int((accepted & ~right).sum())
-    low, high = wilson_interval(false, len(errors))
     kinds = Counter(one.refusal for one in outcomes if one.refusal).most_common()
     return (f'{len(errors):7}  {shares}  {accepted.sum():8}  {recall:>6}  {inside:>7}  {false:5}  '
-            f'{low:.3f} to {high:.3f}  {", ".join(f"{count} {kind}" for kind, count in kinds)}')
+            f'{interval(false, len(errors), 3)}  '
+            + ', '.join(f'{count} {kind}' for kind, count in kinds))
 
 
-def draw(outcomes: Sequence[Outcome], path: Path) -> None:
-    """Draw the share of right poses over the confidence of each way."""
-    figure, axes = new_axes('confidence', f'share of poses within {RIGHT_M:g} m')
-    judged = {way: np.array([(one.confidence, one.errors_m[0] < RIGHT_M) for one in outcomes
-                             if one.way == way and one.confidence > 0.0]) for way in WAYS}
-    draw_reliability(axes, {way: (pairs[:, 0], pairs[:, 1] > 0.0)
-                            for way, pairs in judged.items() if len(pairs)})
-    add_legend(figure)
-    save_figure(figure, path)
+def confidences_by_way(outcomes: Sequence[Outcome]) -> dict[str, Judged]:
+    """Return the confidence above 0 of each way's answers, and if they are right."""
+    groups = grouped([one for one in outcomes if one.confidence > 0.0], ['way'])
+    return {way: (np.array([one.confidence for one in its]),
+                  np.array([one.errors_m[0] < RIGHT_M for one in its]))
+            for (way,), its in sorted(groups.items(), key=lambda group: WAYS.index(group[0][0]))}

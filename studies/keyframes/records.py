@@ -32,7 +32,6 @@ from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.core.search.scene import Prior
-from cliploc_ros.demo import ASSETS
 from cliploc_ros.files.storage import make_folder, write_file
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
@@ -44,6 +43,7 @@ from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.offline.recording.networks import MAX_DETECTIONS, RunNetworks
 from cliploc_ros.offline.recording.recorder import record_every_frame
+from demo import ASSETS
 from studies.keyframes.cases import (
     Case,
     Floats,
@@ -234,7 +234,7 @@ def _ask(number: int, case: Case, query: Query, landmark_map: LandmarkMap,
     return Record(number, tuple(looks), query.truths, options)
 
 
-def read_places(where: str, model: str, blocks: Sequence[int]) -> Iterator[Place]:
+def read_places(where: str, model: str) -> Iterator[Place]:
     """Yield the places of a site.
 
     Parameters
@@ -244,8 +244,6 @@ def read_places(where: str, model: str, blocks: Sequence[int]) -> Iterator[Place
         without depth; or an RGB-D folder. ``DIR@METRES`` gives a TUM folder's unit of depth.
     model : str
         Weights of YOLO for real images.
-    blocks : sequence of int
-        Besides the interleaved images and the halves, parts of that number of images in turn.
     """
     path, _, unit = where.partition('@')
     folder = Path(path)
@@ -262,9 +260,6 @@ def read_places(where: str, model: str, blocks: Sequence[int]) -> Iterator[Place
     rows = np.arange(len(raws))
     parts = {'interleaved': rows % 2 == 0, 'first half': rows < len(raws) // 2,
              'second half': rows >= len(raws) // 2}
-    for size in blocks:
-        parts |= {f'blocks of {size}, {which}': rows // size % 2 == rest
-                  for rest, which in enumerate(('even', 'odd'))}
     for part, is_mapped in parts.items():
         mapped, asked = (tuple(raws[row] for row in rows[chosen])
                          for chosen in (is_mapped, ~is_mapped))

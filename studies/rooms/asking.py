@@ -12,19 +12,18 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.localization import ImageRecognizer, KeyframeLocalizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.evaluation.trials import PosedQuery
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from studies.blame import blame
+from studies.reports import errors_of
 from studies.rooms.baseline import SiftMap
 from studies.rooms.rooms import ROBOT, Room, RoomOptions, known_of, read_room
 
@@ -158,12 +157,9 @@ def _outcome(task: Task, asked: str, query: PosedQuery, way: str, known: str,
     if way != OBJECTS and query.image is not None:
         recognizer = ImageRecognizer(keyframes, query.image.features, query.image.camera)
     found = relocalizer.relocalize([observation], recognizer)
-    pose, is_here = found.map_from_camera, asked == task.room
-    error_m, error_deg, nees = inf, inf, inf
-    if pose is not None and is_here:
-        error_m, error_deg = pose_error(pose, query.map_from_camera)
-        if found.covariance is not None:
-            nees = normalized_square(pose, found.covariance, query.map_from_camera)
+    is_here = asked == task.room
+    error_m, error_deg, nees = errors_of(found, query.map_from_camera) if is_here \
+        else (inf, inf, inf)
     cause = ''
     if way == OBJECTS and known == NOTHING and is_here and error_m > _FAILED_M:
         cause = blame(landmark_map, relocalizer, replace(query, observation=observation),
@@ -172,11 +168,8 @@ def _outcome(task: Task, asked: str, query: PosedQuery, way: str, known: str,
         task.room, task.kind, task.part, asked, query.number, way, known, float(error_m),
         float(error_deg), found.accepted, float(found.confidence), float(nees), found.source,
         found.reason, len(observation.detections), len(found.matches), cause,
-        _classes(landmark_map, found) if found.accepted else ())
-
-
-def _classes(landmark_map: LandmarkMap, found: Relocalization) -> tuple[str, ...]:
-    return tuple(landmark_map.class_ids[one.landmark] for one in found.matches)
+        tuple(landmark_map.class_ids[one.landmark] for one in found.matches)
+        if found.accepted else ())
 
 
 def tasks_of(room: Room, kinds: Sequence[str], images: int, elsewhere: int,

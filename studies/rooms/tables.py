@@ -11,7 +11,8 @@ import numpy as np
 
 from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.offline.evaluation.figures import within_ellipsoid
-from studies.reports import BINS, FAR_DEG, FAR_M, interval, table
+from studies import reports
+from studies.reports import BINS, FAR_DEG, FAR_M, SUCCESS_M, interval, table
 from studies.rooms.asking import (
     BOTH,
     KEYFRAMES,
@@ -25,7 +26,6 @@ from studies.rooms.asking import (
 )
 from studies.rooms.rooms import Room
 
-LIMITS_M = 0.1, 0.25, 0.5, 1.0
 # Numbers of boxes in an image, from and to.
 _BOXES = (0, 2), (3, 3), (4, 4), (5, 6), (7, 50)
 _MOST_CLASSES = 15
@@ -35,7 +35,7 @@ def tables(answers: Sequence[Answers], rooms: Sequence[Room]) -> str:
     """Return all tables, each under a heading."""
     outcomes = [one for answer in answers for one in answer.outcomes]
     here = [one for one in outcomes if one.is_here]
-    columns = ['room', 'split', 'by', 'known', 'images', *(f'{limit:g} m' for limit in LIMITS_M),
+    columns = ['room', 'split', 'by', 'known', 'images', *(f'{limit:g} m' for limit in SUCCESS_M),
                'accepted', 'false', f'{FAR_M:g} m or {FAR_DEG:g} deg off', 'recall', 'in 95 %']
     rows = [(*key, *success(its)) for key, its in grouped(here, 'room', 'kind', 'way', 'known')]
     failures = [f'{one.task.room}, {one.task.part}: not mapped: {one.failure}'
@@ -60,10 +60,7 @@ def tables(answers: Sequence[Answers], rooms: Sequence[Room]) -> str:
 def grouped(outcomes: Iterable[Outcome], *by: str
             ) -> list[tuple[tuple[str, ...], list[Outcome]]]:
     """Return outcomes in groups of equal fields: ways and what is known in their own order."""
-    order = [*WAYS, *KNOWN]
-    groups: dict[tuple[str, ...], list[Outcome]] = {}
-    for one in outcomes:
-        groups.setdefault(tuple(getattr(one, name) for name in by), []).append(one)
+    order, groups = [*WAYS, *KNOWN], reports.grouped(outcomes, by)
     # other names in the order in which they come first
     order += [name for key in groups for name in key if name not in order]
     return sorted(groups.items(), key=lambda pair: [order.index(name) for name in pair[0]])
@@ -75,7 +72,7 @@ def success(outcomes: Sequence[Outcome]) -> list[str]:
     accepted = np.array([one.accepted for one in outcomes])
     right = errors < RIGHT_M
     nees = np.array([one.nees for one in outcomes])[accepted & right]
-    cells = [str(len(outcomes)), *(f'{np.mean(errors < limit):.2f}' for limit in LIMITS_M)]
+    cells = [str(len(outcomes)), *(f'{np.mean(errors < limit):.2f}' for limit in SUCCESS_M)]
     if outcomes[0].way not in (OBJECTS, KEYFRAMES, BOTH):
         return [*cells, '', '', '', '', '']
     far = (errors > FAR_M) | (np.array([one.error_deg for one in outcomes]) > FAR_DEG)

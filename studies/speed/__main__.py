@@ -2,16 +2,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """How long things take, and what memory they need: ``python -m studies.speed --help``."""
 
+import argparse
 import sys
+from importlib import import_module
 
-from studies.commands import run_one_of
+from cliploc_ros.command import run_command
+
+STUDIES = {
+    'search': 'the search, beside a plain loop in the same run, and against the map',
+    'frame': 'a request by stage, for each profile, in PyTorch and OpenVINO',
+    'node_start': 'the start of the relocalizer',
+    'building': 'a building of many floors: verdicts and times'}
 
 if __name__ == '__main__':
-    sys.exit(run_one_of('studies.speed', {
-        'search': 'the search, beside a plain loop in the same run, and against the map',
-        'frame': 'a request by stage, for each profile, in PyTorch and OpenVINO',
-        'startup': 'the start of CLIP',
-        'node_start': 'the start of the relocalizer',
-        'building': 'a building of many floors: verdicts and times',
-        'floor': 'mapping a simulated floor of 5,000 objects in an hour',
-        'pose_errors': 'maps of disturbed poses'}))
+    parser = argparse.ArgumentParser(
+        prog='python -m studies.speed', formatter_class=argparse.RawDescriptionHelpFormatter,
+        description='Run a study; python -m studies.speed STUDY --help shows its options.',
+        epilog='\n'.join(f'{name:12} {summary}' for name, summary in STUDIES.items()))
+    parser.add_argument('study', choices=STUDIES)
+    study = parser.parse_args(sys.argv[1:2]).study
+    sys.argv[0] = f'python -m studies.speed {study}'  # argparse's name of the program
+    module = import_module(f'studies.speed.{study}')
+    sys.exit(run_command(lambda: module.run(sys.argv[2:])))

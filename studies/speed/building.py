@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.command import positive_int
 from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
-from cliploc_ros.core.localizer import Crops, localize_on_demand
+from cliploc_ros.core.localizer import localize_on_demand
 from cliploc_ros.core.map.joined_map import join_maps
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
@@ -33,10 +33,9 @@ from studies.speed.floors import CAMERA, SeenFloor, make_floor, see_floor
 from studies.worlds.things import CLASS_NAMES
 
 # Shares of class and noise in an embedding of 512 numbers: similarities to a label of the same
-# class and to the own label are 1.5 and 4 deviations above the others', as in
-# studies.speed.floor. Guesses.
+# class and to the own label are 1.5 and 4 deviations above the others'. Guesses.
 _OF_CLASS, _NOISE = 0.775, 5.6
-_LEAST_BOXES = 5
+_SIZE, _LEAST_BOXES = 512, 5
 _FRAMES = 400
 
 
@@ -68,7 +67,7 @@ def searched(maps: Sequence[LandmarkMap], labels: Sequence[NDArray[np.float32]],
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the benchmark; return the exit code."""
+    """Print success, false accepts, time and memory; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--floors', type=positive_int, default=20, help='(%(default)s)')
@@ -77,25 +76,9 @@ def run(arguments: Sequence[str]) -> int:
     parser.add_argument('--queries', type=positive_int, default=200, help='(%(default)s)')
     parser.add_argument('--alike', action='store_true',
                         help='all floors have the same objects and labels')
-    parser.add_argument('--gravity', action='store_true', help='the vertical is known')
-    parser.add_argument('--on-demand', action='store_true',
-                        help='crops on demand, as in the node: several searches a request')
-    parser.add_argument('--dimensions', type=positive_int, default=512,
-                        help='of an embedding (%(default)s)')
     parser.add_argument('--time-budget-ms', type=float, default=50.0,
                         help='of each search; inf: 10,000 samples end it (%(default)s)')
-    parser.add_argument('--processor-time', action='store_true',
-                        help='the budget is one of processor time, as on a machine with nothing '
-                        'else to do; for a busy machine')
     options = parser.parse_args(arguments)
-    if options.processor_time:
-        time.perf_counter = time.process_time
-    measure(options)
-    return 0
-
-
-def measure(options: argparse.Namespace) -> None:
-    """Print success, false accepts, time and memory."""
     maps, labels, queries = simulate(options)
     settings = RelocalizerOptions(time_budget_s=options.time_budget_ms / 1e3)
     start = time.perf_counter()
@@ -105,32 +88,32 @@ def measure(options: argparse.Namespace) -> None:
           f'{np.mean([len(one.crops) for one in queries]):.0f} boxes, top-1 within their floor '
           f'{_top1(labels, queries):.2f}; {options.time_budget_ms:g} ms a search', flush=True)
     everything.relocalizer.warm_up()
-    _localize(queries[0], everything, options)  # the first one touches all memory
+    _localize(queries[0], everything)  # the first one touches all memory
     print('searched             right  accepted  false accepts  median ms   95 %  processor ms')
-    show('its floor alone', options, [
+    show('its floor alone', [
         (one, searched(maps[one.floor:one.floor + 1], labels[one.floor:one.floor + 1], settings))
         for one in queries])
-    show('all floors', options, [(one, everything) for one in queries])
+    show('all floors', [(one, everything) for one in queries])
     if len(maps) > 2 and not options.alike:
         others = [searched(_without(maps, floor), _without(labels, floor), settings)
                   for floor in range(min(3, len(maps)))]
-        show('all but its floor', options, [(one, others[one.floor]) for one in queries
-                                            if one.floor < len(others)])
+        show('all but its floor', [(one, others[one.floor]) for one in queries
+                                   if one.floor < len(others)])
     print(f'peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB')
+    return 0
 
 
 def _without[T](some: Sequence[T], number: int) -> list[T]:
     return [*some[:number], *some[number + 1:]]
 
 
-def show(name: str, options: argparse.Namespace, requests: Sequence[tuple[Query, Searched]]
-         ) -> None:
+def show(name: str, requests: Sequence[tuple[Query, Searched]]) -> None:
     """Run requests, and print what became of them in a line."""
     right = accepted = false = 0
     wall_ms, processor_ms = [], []
     for query, where in requests:
         wall, processor = time.perf_counter(), time.process_time()
-        found = _localize(query, where, options)
+        found = _localize(query, where)
         wall_ms.append(1e3 * (time.perf_counter() - wall))
         processor_ms.append(1e3 * (time.process_time() - processor))
         found, part = in_its_map(found, where.landmark_map)
@@ -145,50 +128,43 @@ def show(name: str, options: argparse.Namespace, requests: Sequence[tuple[Query,
           f'{high:6.0f} {np.median(processor_ms):13.0f}', flush=True)
 
 
-def _localize(query: Query, where: Searched, options: argparse.Namespace) -> Relocalization:
-    def compare(rows: NDArray[np.int64]) -> CropSimilarities:
-        return CropSimilarities(query.crops[rows], where.labels)
-
-    observation = query.observation
-    if options.on_demand:
-        return localize_on_demand(where.relocalizer, (), observation, Crops(compare))[1]
-    observation = replace(observation, similarities=compare(np.arange(len(query.crops))))
-    return localize_on_demand(where.relocalizer, (), observation)[1]
+def _localize(query: Query, where: Searched) -> Relocalization:
+    return localize_on_demand(where.relocalizer, (), replace(
+        query.observation, similarities=CropSimilarities(query.crops, where.labels)))[1]
 
 
 def simulate(options: argparse.Namespace
              ) -> tuple[list[LandmarkMap], list[NDArray[np.float32]], list[Query]]:
     """Return the floors' maps, the embeddings of their labels, and the queries."""
-    rng, size = np.random.default_rng(0), options.dimensions
-    of_classes = dict(zip(CLASS_NAMES, _units(rng, len(CLASS_NAMES), size), strict=True))
+    rng = np.random.default_rng(0)
+    of_classes = dict(zip(CLASS_NAMES, _units(rng, len(CLASS_NAMES)), strict=True))
     maps, labels, queries = [], [], []
     for number in range(options.floors):
         seed = 0 if options.alike else number
         floor = make_floor(options.objects, seed)
         one = replace(floor.landmark_map, frame_id=f'floor_{number}')
-        own = _units(np.random.default_rng([1, seed]), len(one), size)
+        own = _units(np.random.default_rng([1, seed]), len(one))
         maps.append(one)
         labels.append(_unit(own + _OF_CLASS * np.array([of_classes[name]
                                                         for name in one.class_ids])))
         count = len(range(number, options.queries, options.floors))
         queries += _queries(number, see_floor(floor, _FRAMES, 1000 + number), labels[-1], count,
-                            rng, options.gravity)
+                            rng)
     return maps, labels, queries
 
 
 def _queries(floor: int, seen: SeenFloor, labels: NDArray[np.float32], count: int,
-             rng: np.random.Generator, gravity: bool) -> list[Query]:
+             rng: np.random.Generator) -> list[Query]:
     """Return some queries on one floor, spread over the way through it."""
     detections, found = seen.detections, []
     usable = np.nonzero(np.diff(detections.frame_offsets) >= _LEAST_BOXES)[0]
     for frame in usable[np.linspace(0, len(usable) - 1, count).astype(int)]:
         rows = slice(*detections.frame_offsets[frame:frame + 2])
         true, pose = seen.true_landmarks[rows], detections.map_from_camera[frame]
-        noise = _units(rng, len(true), labels.shape[1])
+        noise = _units(rng, len(true))
         crops = _unit(np.where(true[:, None] >= 0, labels[true], 0.0) + _NOISE * noise)
         found.append(Query(floor, pose, Observation(
-            CAMERA, detections.detections_of(frame),
-            up_in_camera=pose[2, :3] if gravity else None), crops, true))
+            CAMERA, detections.detections_of(frame)), crops, true))
     return found
 
 
@@ -200,8 +176,8 @@ def _top1(labels: Sequence[NDArray[np.float32]], queries: Sequence[Query]) -> fl
     return float(np.concatenate(hits)[np.concatenate(known)].mean())
 
 
-def _units(rng: np.random.Generator, count: int, size: int) -> NDArray[np.float32]:
-    return _unit(rng.standard_normal((count, size), dtype=np.float32))
+def _units(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+    return _unit(rng.standard_normal((count, _SIZE), dtype=np.float32))
 
 
 def _unit(rows: NDArray[Any]) -> NDArray[np.float32]:

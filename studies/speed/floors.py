@@ -11,14 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
-from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from studies.worlds.cameras import looking
 from studies.worlds.detector import hidden
 from studies.worlds.things import CLASS_NAMES, TYPICAL
 
@@ -123,17 +123,10 @@ def walk_floor(floor: Floor, frames: int) -> tuple[NDArray[np.float64], NDArray[
     headings = np.unwrap(np.tile(yaw, rooms))
     position = [np.interp(along, knots, stops[:, axis]) for axis in range(2)]
     height = 1.3 + 0.15 * np.sin(40.0 * along)
-    poses = np.array([_pose(np.array(where), heading) for *where, heading in zip(
+    poses = np.array([looking(np.array(where), heading, 0.2) for *where, heading in zip(
         *position, height, np.interp(along, knots, headings), strict=True)])
     inside = (along - room > 0.5 * _ENTERED) & (along - room < 0.5 * (_LEAVING + _LEFT))
     return poses, np.where(inside, 2 * room, 2 * room + 1)
-
-
-def _pose(position: NDArray[np.float64], yaw: float, pitch: float = 0.2) -> NDArray[np.float64]:
-    """Return map_from_camera of an upright camera that looks down by a pitch [rad]."""
-    forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
-    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
-    return make_transform(np.stack([right, np.cross(forward, right), forward], axis=1), position)
 
 
 def see_floor(floor: Floor, frames: int, seed: int = 0) -> SeenFloor:
@@ -181,42 +174,3 @@ def _see(true_map: LandmarkMap, pose: NDArray[np.float64], rows: NDArray[np.int6
     deviations = np.hypot(_NOISE_PX, _NOISE_SHARE * np.tile(extents[seen], 2))
     noisy = np.clip(clipped[seen] + deviations * rng.normal(size=deviations.shape), 0.0, size)
     return noisy, rows[seen]
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A built map next to the true one."""
-
-    #: True objects that enough frames show, those of them that were found, those that were not,
-    #: and landmarks that are no object or an object a second time
-    visible: int
-    found: int
-    missed: int
-    false: int
-    #: (found,): distances of the centres of what was found [m]
-    center_errors_m: NDArray[np.float64]
-
-
-def compare_maps(built: LandmarkMap, seen: SeenFloor, floor: Floor, min_frames: int = 10
-                 ) -> Comparison:
-    """Compare a built map with the truth.
-
-    A landmark and an object of one class belong together if they are nearest to each other and
-    nearer than the object's greatest semi-axis.
-    """
-    true_map = floor.landmark_map
-    counts = np.bincount(seen.true_landmarks[seen.true_landmarks >= 0],
-                         minlength=len(true_map.centers))
-    errors = np.full(len(true_map.centers), np.inf)
-    for name in set(built.class_ids) & set(true_map.class_ids):
-        ours = np.nonzero([one == name for one in built.class_ids])[0]
-        theirs = np.nonzero([one == name for one in true_map.class_ids])[0]
-        _, nearest = cKDTree(true_map.centers[theirs]).query(built.centers[ours])
-        distances, back = cKDTree(built.centers[ours]).query(true_map.centers[theirs])
-        mutual = nearest[back] == np.arange(len(theirs))
-        near = distances < true_map.semi_axes[theirs].max(axis=1)
-        errors[theirs] = np.where(mutual & near, distances, np.inf)
-    found, visible = np.isfinite(errors), counts >= min_frames
-    return Comparison(int(visible.sum()), int((found & visible).sum()),
-                      int((visible & ~found).sum()), len(built.centers) - int(found.sum()),
-                      errors[found])

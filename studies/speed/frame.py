@@ -44,13 +44,12 @@ from cliploc_ros.models.profiles import PROFILES, load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_weights import import_ultralytics
 from cliploc_ros.offline.datasets.intrinsics import find_camera
-from studies.speed.startup import write_random_checkpoint
+from demo import ASSETS
 
 ENGINES = ('pytorch', 'openvino')
 STAGES = ('detection', 'CLIP', 'search', 'total')
 # The node's default.
 _TIME_BUDGET_S = 0.05
-_ASSETS = Path(__file__).parents[1] / 'demo' / 'assets'
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -130,7 +129,10 @@ def _weights(name: str, folder: Path) -> tuple[str, str, str]:
         resolve_clip_weights(ClipOptions(profile.clip_model, profile.clip_pretrained))
     except ModelError:
         clip = str(folder / f'{profile.clip_model}.pt')
-        write_random_checkpoint(profile.clip_model, Path(clip))
+        code = ('import sys, open_clip, torch; torch.manual_seed(0); '
+                'torch.save(open_clip.create_model(sys.argv[1]).state_dict(), sys.argv[2])')
+        subprocess.run([sys.executable, '-c', code, profile.clip_model, clip], check=True,
+                       stderr=subprocess.DEVNULL)
     kinds = {'detector': kept.exists(), 'CLIP': not clip}
     random = [what for what, is_real in kinds.items() if not is_real]
     encoder = json.dumps([profile.clip_model, profile.clip_pretrained, clip])
@@ -159,7 +161,7 @@ def _serve(engine: str, yolo: str, clip: str, folder: str, *, crops: int, device
     import_ultralytics()
     image_rgb, observation = _demo_frame(crops, folder)
     bboxes_xyxy = observation.detections.bboxes_xyxy
-    relocalizer = Relocalizer(LandmarkMap.from_file(_ASSETS / 'map.yaml'),
+    relocalizer = Relocalizer(LandmarkMap.from_file(ASSETS / 'map.yaml'),
                               RelocalizerOptions(time_budget_s=_TIME_BUDGET_S))
     relocalizer.warm_up()
     free_memory()
@@ -184,18 +186,18 @@ def _serve(engine: str, yolo: str, clip: str, folder: str, *, crops: int, device
 
 def _demo_frame(crops: int, folder: str) -> tuple[NDArray[np.uint8], Observation]:
     """Return an image of the demo with enough boxes, and what the demo's networks say of it."""
-    detector = load_detector(DetectorOptions(str(_ASSETS / 'yolo.pt'), inference='pytorch'))
-    camera, _ = find_camera(None, _ASSETS / 'sequence')
-    for file in sorted((_ASSETS / 'sequence' / 'rgb').iterdir()):
+    detector = load_detector(DetectorOptions(str(ASSETS / 'yolo.pt'), inference='pytorch'))
+    camera, _ = find_camera(None, ASSETS / 'sequence')
+    for file in sorted((ASSETS / 'sequence' / 'rgb').iterdir()):
         pixels_bgr = cv2.imread(str(file))
         assert pixels_bgr is not None
         image_rgb = np.ascontiguousarray(pixels_bgr[..., ::-1], dtype=np.uint8)
         detections = detector.detect(image_rgb).usable(camera.width, camera.height, crops)
         if len(detections) == crops:
             break
-    clip = ClipOptions(str(_ASSETS / 'clip.json'), str(_ASSETS / 'clip.safetensors'),
+    clip = ClipOptions(str(ASSETS / 'clip.json'), str(ASSETS / 'clip.safetensors'),
                        inference='pytorch', cache_dir=folder)
-    landmark_map = LandmarkMap.from_file(_ASSETS / 'map.yaml')
+    landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
     observer = Observer(*load_encoder(clip, landmark_map.weighted_labels))
     return image_rgb, observer.observe(image_rgb, camera, detections, 0)
 

@@ -4,7 +4,7 @@
 
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from math import inf
 from pathlib import Path
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
-from cliploc_ros.core.map.culling import SortedLandmarks, make_groups
+from cliploc_ros.core.map.culling import make_groups
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import (
     CropSimilarities,
@@ -29,11 +29,10 @@ from cliploc_ros.core.search.candidates import match_frame
 from cliploc_ros.core.search.sampling import draw_ransac
 from cliploc_ros.core.search.scene import Scene
 from cliploc_ros.core.search.screening import set_up
-from cliploc_ros.core.search.strategies import Leaders, search_samples
+from cliploc_ros.core.search.strategies import Leaders, Progress, search_samples
 
 _CROPS, _DIMENSIONS, _K, _CLASSES = 12, 512, 3, 40
 _CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
-_REPETITIONS = 5
 
 
 def storey(count: int) -> tuple[LandmarkMap, Observation]:
@@ -73,17 +72,21 @@ def measure_maps(counts: Sequence[int]) -> None:
         start = time.perf_counter()
         landmark_map.prepare()
         sort_s = time.perf_counter() - start
-        knn_ms = 1e3 * _least_s(partial(nearest_landmarks, similarities, _K))
+        sorted_mb = sum(array.nbytes for array in landmark_map.sorted_landmarks) / 1e6
+        knn_ms = 1e3 * least_s(partial(nearest_landmarks, similarities, _K), 5)
         scene, _ = match_frame(landmark_map, observation, RelocalizerOptions())
-        samples = _mixed_samples(scene)
-        frame_ms = 1e3 * _least_s(partial(_frame, landmark_map, observation, scene))
-        sample_us = 1e6 / len(samples) * _least_s(partial(_drain, scene, samples))
+        # those of CLIP's candidates, whose mixture does not depend on the map's size
+        samples = draw_ransac(scene.pairs[:min(len(scene.pairs), _K * _CROPS)], 4_000,
+                              np.random.default_rng(0))
+        samples = samples[samples[:, 0] >= 0]
+        frame_ms = 1e3 * least_s(partial(_frame, landmark_map, observation, scene), 5)
+        sample_us = 1e6 / len(samples) * least_s(partial(_search, scene, samples), 5)
         relocalizer = Relocalizer(landmark_map, RelocalizerOptions())
         relocalizer.warm_up()
-        request_ms = 1e3 * _least_s(partial(relocalizer.relocalize, [observation]))
+        request_ms = 1e3 * least_s(partial(relocalizer.relocalize, [observation]), 5)
         first_us = first_us or sample_us
         print(f'  {count:9,d} {knn_ms:8.1f} {similarities.labels.unique.nbytes / 1e6:10.0f} '
-              f'{sort_s:7.2f} {_size_mb(landmark_map.sorted_landmarks):10.1f} '
+              f'{sort_s:7.2f} {sorted_mb:10.1f} '
               f'{frame_ms:9.2f} {sample_us:12.2f} {sample_us / first_us:6.2f} '
               f'{request_ms:11.1f} {_peak_mb():11.0f}', flush=True)
 
@@ -103,13 +106,6 @@ def measure_first_request() -> None:
           f'after a start of {ready_s:.1f} s')
 
 
-def _mixed_samples(scene: Scene) -> NDArray[np.int64]:
-    """Return samples of CLIP's candidates, whose mixture does not depend on the map's size."""
-    count = min(len(scene.pairs), _K * _CROPS)
-    samples = draw_ransac(scene.pairs[:count], 4_000, np.random.default_rng(0))
-    return samples[samples[:, 0] >= 0]
-
-
 def _frame(landmark_map: LandmarkMap, observation: Observation, scene: Scene) -> None:
     """Prepare the search of a frame: the tree of its classes' landmarks, and the bench."""
     make_groups(landmark_map.sorted_landmarks,
@@ -118,9 +114,16 @@ def _frame(landmark_map: LandmarkMap, observation: Observation, scene: Scene) ->
     set_up(scene)
 
 
-def _drain(scene: Scene, samples: NDArray[np.int64]) -> None:
-    for _ in search_samples(scene, samples, Leaders.none_yet()):
-        pass
+def _search(scene: Scene, samples: NDArray[np.int64]) -> None:
+    drain(search_samples(scene, samples, Leaders.none_yet()))
+
+
+def drain(search: Iterator[Progress]) -> int:
+    """Search to the end; return how many hypotheses were tried."""
+    tried = 0
+    for progress in search:
+        tried = progress.tried
+    return tried
 
 
 def _units(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
@@ -129,17 +132,14 @@ def _units(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
     return rows
 
 
-def _least_s(run: Callable[[], object]) -> float:
+def least_s(run: Callable[[], object], repetitions: int = 20) -> float:
+    """Return the least time [s] of some runs, the one least disturbed by other programs."""
     least = inf
-    for _ in range(_REPETITIONS):
+    for _ in range(repetitions):
         start = time.perf_counter()
         run()
         least = min(least, time.perf_counter() - start)
     return least
-
-
-def _size_mb(arrays: SortedLandmarks) -> float:
-    return sum(array.nbytes for array in arrays) / 1e6
 
 
 def _peak_mb() -> float:

@@ -17,6 +17,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from demo import ASSETS
+
 _PROJECT = Path(__file__).resolve().parents[2]
 _READY = 'landmarks in frame'
 # 'colcon build' finds no kernels, 'script/setup' finds kernels and no labels of the map.
@@ -48,10 +50,9 @@ def measure_starts(package: Path, matching: str) -> list[NodeStart]:
 
 def _start(package: Path, matching: str, kind: str, kernels: Path, cache: Path) -> NodeStart:
     """Start the relocalizer with kernels of one folder and label embeddings of another."""
-    assets = _PROJECT / 'cliploc_ros' / 'demo' / 'assets'
-    parameters = {'map_file': assets / 'map.yaml', 'matching': matching, 'device': 'cpu',
-                  'clip_model': assets / 'clip.json', 'cache_dir': cache,
-                  'clip_pretrained': assets / 'clip.safetensors'}
+    parameters = {'map_file': ASSETS / 'map.yaml', 'matching': matching, 'device': 'cpu',
+                  'clip_model': ASSETS / 'clip.json', 'cache_dir': cache,
+                  'clip_pretrained': ASSETS / 'clip.safetensors'}
     command = [sys.executable, '-m', 'cliploc_ros.nodes.relocalizer', '--ros-args']
     for name, value in parameters.items():
         command += ['-p', f'{name}:={value}']

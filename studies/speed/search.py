@@ -15,7 +15,6 @@ import argparse
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -41,9 +40,8 @@ from cliploc_ros.core.search.strategies import (
     search_progressively,
     search_samples,
 )
-from studies.speed.maps import measure_first_request, measure_maps
+from studies.speed.maps import drain, least_s, measure_first_request, measure_maps
 
-_REPETITIONS = 20
 _PLAIN_HYPOTHESES = 100
 _CHORDS = 32
 _K, _IOU_THRESHOLD = 3, 0.2
@@ -118,14 +116,14 @@ def _measure_hypotheses(scene: Scene) -> None:
     samples = samples[samples[:, 0] >= 0]
     bench = set_up(scene)
     solved = _verify_all(bench, samples)
-    whole_us = 1e6 * _least_s(lambda: _verify_all(bench, samples))
-    searched_us = 1e6 * _least_s(lambda: _drain(search_samples(scene, samples,
+    whole_us = 1e6 * least_s(lambda: _verify_all(bench, samples))
+    searched_us = 1e6 * least_s(lambda: drain(search_samples(scene, samples,
                                                                Leaders.none_yet())))
-    five_hundred_ms = 1e3 * _least_s(lambda: _drain(search_samples(scene, samples[:500],
+    five_hundred_ms = 1e3 * least_s(lambda: drain(search_samples(scene, samples[:500],
                                                                    Leaders.none_yet())))
     plain_us, plain_score = _plain(scene, samples[:_PLAIN_HYPOTHESES])
     leaders = Leaders.none_yet()
-    _drain(search_samples(scene, samples[:_PLAIN_HYPOTHESES], leaders))
+    drain(search_samples(scene, samples[:_PLAIN_HYPOTHESES], leaders))
     print(f'{len(scene.bearings)} boxes, {len(scene.potential.detections)} pairs, one core:\n'
           f'  {whole_us / solved:7.2f} us a hypothesis, P3P to whole verification\n'
           f'  {searched_us / len(samples):7.2f} us a sample, in a search\n'
@@ -155,7 +153,7 @@ def _measure_whole(name: str, scenes: list[Scene],
     for scene in scenes:
         run = partial(_search_once, search, scene)
         tried.append(run())
-        times_ms.append(1e3 * _least_s(run, 3))
+        times_ms.append(1e3 * least_s(run, 3))
     print(f'{name}, {len(scenes)} queries: {np.median(times_ms):.1f} ms (median), '
           f'{max(times_ms):.1f} ms (longest); {np.median(tried):.0f} and {max(tried)} '
           f'hypotheses; {1e3 * sum(times_ms) / max(sum(tried), 1):.2f} us each')
@@ -166,25 +164,7 @@ def _compatible(scene: Scene, leaders: Leaders) -> Iterator[Progress]:
 
 
 def _search_once(search: Callable[[Scene, Leaders], Iterator[Progress]], scene: Scene) -> int:
-    return _drain(search(scene, Leaders.none_yet()))
-
-
-def _drain(search: Iterator[Progress]) -> int:
-    """Search to the end; return how many hypotheses were tried."""
-    tried = 0
-    for progress in search:
-        tried = progress.tried
-    return tried
-
-
-def _least_s(run: Callable[[], object], repetitions: int = _REPETITIONS) -> float:
-    """Return the least time [s] of some runs, the one least disturbed by other programs."""
-    least = inf
-    for _ in range(repetitions):
-        start = time.perf_counter()
-        run()
-        least = min(least, time.perf_counter() - start)
-    return least
+    return drain(search(scene, Leaders.none_yet()))
 
 
 def _plain(scene: Scene, samples: NDArray[np.int64]) -> tuple[float, float]:

@@ -4,8 +4,8 @@
 
 A simulated localizer drifts along with the robot, gets displaced, or the robot is carried away.
 ``judge`` does so in simulated worlds, ``recorded`` with recorded boxes, ``mount`` with a camera
-that is turned on its robot. ``localizer`` judges recorded poses of a real one. ``cost`` measures
-time and memory. ``fit`` fits the evidence of looks.
+that is turned on its robot. ``localizer`` judges recorded poses of a real one. ``fit`` fits the
+evidence of looks.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from studies.watch import fit
 from studies.watch.judge import Alarm, Right, alarm_table, judge, right_table
 from studies.watch.localizers import Drive, recorded_drive, simulated_drive
 from studies.watch.recordings import watch_recording, write_watch
-from studies.watch.sensors import measure_cost, mount_table
+from studies.watch.sensors import mount_table
 from studies.worlds.places import KINDS
 
 # Frames of a recording at 30 Hz between two looks.
@@ -135,9 +135,6 @@ def run(arguments: Sequence[str] | None = None) -> int:
         options.kinds, range(options.first_seed, options.first_seed + options.worlds))),
         'the angle of a camera that is turned on its robot')
     add_worlds(mount, 10, 1000)
-    cost = add('cost', lambda options: print(measure_cost(options.looks)),
-               'processor time of a look, and memory over many')
-    cost.add_argument('--looks', type=positive_int, default=10_000, help='(%(default)s)')
     options = parser.parse_args(arguments)
     options.command(options)
     return 0

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, pose_error
@@ -22,7 +21,7 @@ from cliploc_ros.core.watch.watch import Watch, WatchState
 from cliploc_ros.files.storage import make_folder, write_text
 from cliploc_ros.offline.datasets.observations import Recorded
 from cliploc_ros.offline.datasets.poses import Poses
-from cliploc_ros.offline.evaluation.figures import add_legend, new_axes, save_figure
+from cliploc_ros.offline.evaluation.figures import add_legend, save_figure
 from cliploc_ros.units import NS_PER_S
 from studies.acceptance.places import observation_of
 
@@ -114,31 +113,18 @@ def times_to_alarm(looks: Sequence[WatchedLook]) -> list[dict[str, Any]]:
     return found
 
 
-def roc(looks: Sequence[WatchedLook]) -> NDArray[np.float64]:
-    """Return shares (k, 2) of right and of wrong poses below each probability, from 0, 0 on."""
-    known = [one for one in looks if one.is_right is not None]
-    chances = np.array([one.probability for one in known])
-    right = np.array([one.is_right for one in known], dtype=np.bool_)
-    if right.all() or not right.any():
-        return np.empty((0, 2))
-    limits = np.unique(chances)
-    shares = [[(chances[of] <= limit).mean() for of in (right, ~right)] for limit in limits]
-    return np.array([[0.0, 0.0], *shares])
-
-
 def summarize_watch(looks: Sequence[WatchedLook]) -> dict[str, Any]:
     """Return the figures of a watched recording; None where the truth does not tell."""
     hours = (looks[-1].stamp_s - looks[0].stamp_s) / 3600.0 if len(looks) > 1 else 0.0
-    alarms, curve = alarms_of(looks), roc(looks)
+    alarms = alarms_of(looks)
     false = sum(one.is_right is True for one in alarms)
     knows = any(one.is_right is not None for one in looks)
-    area = float(np.trapezoid(curve[:, 1], curve[:, 0])) if len(curve) else None
     return {
         'looks': len(looks), 'hours': hours, 'way_m': looks[-1].way_m if looks else 0.0,
         'states': {str(one): sum(look.state == one for look in looks) for one in WatchState},
         'alarms': len(alarms), 'false_alarms': false if knows else None,
         'false_alarms_per_hour': false / hours if knows and hours else None,
-        'area_under_roc': area, 'wrong_stretches': times_to_alarm(looks)}
+        'wrong_stretches': times_to_alarm(looks)}
 
 
 def write_watch(folder: Path, looks: Sequence[WatchedLook]) -> str:
@@ -149,8 +135,6 @@ def write_watch(folder: Path, looks: Sequence[WatchedLook]) -> str:
         {**summary, 'every_look': [asdict(one) for one in looks]}, indent=1))
     if looks:
         _draw_timeline(folder / 'watch_timeline.png', looks)
-        if len(curve := roc(looks)):
-            _draw_roc(folder / 'watch_roc.png', curve, summary['area_under_roc'])
     states = ', '.join(f'{name} {count}' for name, count in summary['states'].items())
     lines = [f'{len(looks)} looks in {60.0 * summary["hours"]:.1f} min and '
              f'{summary["way_m"]:.0f} m: {states}; {summary["alarms"]} alarms']
@@ -195,14 +179,4 @@ def _draw_timeline(path: Path, looks: Sequence[WatchedLook]) -> Path:
     for axes in (above, below):
         axes.grid(alpha=0.3)
     add_legend(figure)
-    return save_figure(figure, path)
-
-
-def _draw_roc(path: Path, shares: NDArray[np.float64], area: float) -> Path:
-    """Draw the shares (k, 2) of right and wrong poses below each probability; return the path."""
-    figure, axes = new_axes('share of right poses below', 'share of wrong poses below')
-    axes.plot([0, 1], [0, 1], color='#888888', linewidth=1.0)
-    axes.step(shares[:, 0], shares[:, 1], where='post', color=_PROBABILITY)
-    axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02),
-             title=f'each probability as a limit of alarms; area {area:.3f}')
     return save_figure(figure, path)

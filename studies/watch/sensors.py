@@ -1,21 +1,16 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The angle of a camera that is turned on its robot, and what the watch costs."""
+"""The angle of a camera that is turned on its robot."""
 
-import resource
-import time
 from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.units import NS_PER_S
 from studies.reports import table
 from studies.watch.judge import watch_of
-from studies.watch.localizers import LOOK_S, drifting, simulated_drive, turned_camera
+from studies.watch.localizers import drifting, simulated_drive, turned_camera
 
 _TURNS_DEG = (0.0, 2.0, 3.0, 5.0, 7.0, 10.0)
 # Looks that match three objects after which a turn is judged.
@@ -66,29 +61,3 @@ def _turn_after_looks(kind: str, seed: int, degrees: float
         return (True, float(np.linalg.norm(error)), float(np.linalg.norm(level)),
                 report.camera_turn.sigma_deg)
     return None
-
-
-def measure_cost(looks: int) -> str:
-    """Return a table of processor time and memory over some looks of one watch."""
-    drive = simulated_drive('office', 1000, 300)
-    watch, poses = watch_of(drive), drifting(drive.poses, np.random.default_rng(0))
-    image = np.random.default_rng(1).integers(0, 255, (480, 640, 3), dtype=np.uint8)
-    spent, memory = np.zeros(looks), list[float]()
-    for number in range(looks):
-        row = number % len(poses)
-        image[0, 0] = number % 256, number // 256 % 256, 0
-        seen = replace(drive.observations[row], stamp_ns=round(number * LOOK_S * NS_PER_S))
-        begin = time.process_time()
-        watch.look(seen, poses[row], image)
-        spent[number] = 1e3 * (time.process_time() - begin)
-        if number in (looks // 10, looks // 2, looks - 1):
-            memory.append(_resident_mb())
-    return table(['looks', 'processor time, median [ms]', '99 % [ms]', 'duty at .5 Hz',
-                  'memory of the process after a tenth [MB]', 'half [MB]', 'all [MB]'],
-                 [[looks, f'{np.median(spent):.1f}', f'{np.quantile(spent, 0.99):.1f}',
-                   f'{np.mean(spent) / 1e3 / LOOK_S:.2%}', *(f'{one:.1f}' for one in memory)]])
-
-
-def _resident_mb() -> float:
-    pages = int(Path('/proc/self/statm').read_text().split()[1])
-    return pages * resource.getpagesize() / 1e6

@@ -56,7 +56,7 @@ def make_groups(place: Place, objects: Objects, groups: int, rng: np.random.Gene
         drives = rng.random() < 0.5
         for number in range(GROUP_SIZE):
             roll, nod = np.radians(_ROLL_DEG) * rng.normal(size=2)
-            found[group, number] = _pose(np.array([*position, height]), yaw, pitch + nod, roll)
+            found[group, number] = looking(np.array([*position, height]), yaw, pitch + nod, roll)
             yaw += turn
             if drives:
                 step = _STEP_M * np.array([np.cos(yaw), np.sin(yaw)])
@@ -72,32 +72,10 @@ def _about(focus: NDArray[np.float64], height: float, rng: np.random.Generator
     for number in range(GROUP_SIZE):
         away = np.array([np.cos(angle), np.sin(angle)])
         off, nod, roll = np.radians([_AIM_DEG, _AIM_DEG, _ROLL_DEG]) * rng.normal(size=3)
-        found[number] = _pose(
+        found[number] = looking(
             np.array([*(focus[:2] + distance * away), height]), angle + np.pi + off,
             np.arctan2(height - focus[2], distance) + nod, roll)
         angle += step
-    return found
-
-
-def walk_through(place: Place, objects: Objects, images: int, rng: np.random.Generator
-                 ) -> NDArray[np.float64]:
-    """Return the poses map_from_camera (images, 4, 4) of a robot that stands, turns and drives.
-
-    It stands for the first quarter of the images, turns on the spot for the second, and then
-    drives along a curve.
-    """
-    height, pitch = rng.uniform(*_HEIGHT_M), np.radians(rng.uniform(*_PITCH_DEG))
-    position, yaw = _look(place, objects, rng)
-    turn = np.radians(rng.uniform(*_TURN_DEG)) * rng.choice((-1.0, 1.0))
-    found = np.empty((images, 4, 4))
-    for number in range(images):
-        roll, nod = np.radians(_ROLL_DEG) * rng.normal(size=2) if 4 * number >= images else (0, 0)
-        found[number] = _pose(np.array([*position, height]), yaw, pitch + nod, roll)
-        if 4 * number >= images:
-            yaw += turn
-        if 2 * number >= images:
-            step = _STEP_M * np.array([np.cos(yaw), np.sin(yaw)])
-            position = np.clip(position + step, 0.1, (place.width - 0.1, place.depth - 0.1))
     return found
 
 
@@ -114,7 +92,7 @@ def drive_about(place: Place, objects: Objects, images: int, rng: np.random.Gene
     found = np.empty((images, 4, 4))
     for number in range(images):
         roll, nod = np.radians(_DRIVE_ROLL_DEG) * rng.normal(size=2)
-        found[number] = _pose(np.array([*position, height]), yaw, pitch + nod, roll)
+        found[number] = looking(np.array([*position, height]), yaw, pitch + nod, roll)
         if not steps:
             offset = _free_spot(place, objects, rng) - position
             way, turn = float(np.hypot(*offset)), np.arctan2(offset[1], offset[0]) - yaw
@@ -153,7 +131,7 @@ def _free_spot(place: Place, objects: Objects, rng: np.random.Generator) -> NDAr
     return np.asarray(spots[free[0] if len(free) else int(np.argmax(gaps.min(axis=1)))])
 
 
-def _pose(position: NDArray[np.float64], yaw: float, pitch: float, roll: float
+def looking(position: NDArray[np.float64], yaw: float, pitch: float, roll: float = 0.0
           ) -> NDArray[np.float64]:
     """Return map_from_camera of a camera that looks down by a pitch and rolls [rad]."""
     forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])

@@ -19,8 +19,6 @@ from studies.worlds.things import (
     Thing,
 )
 
-# How far another thing is from one on each axis [m], and from which semi-axis on none is: guesses.
-_ASIDE_M, _LARGE_M = 0.4, 0.5
 # What detectors take a vase with flowers, or a part of it, for.
 _CONFUSED = ('book', 'vase', 'potted plant', 'bottle', 'cup', 'book', 'book', 'chair')
 
@@ -152,21 +150,6 @@ def one_desk(rng: np.random.Generator) -> Place:
     things = _desk(rng, 2.0, 2.0, rng.uniform(0.0, np.pi), rng.uniform(0.3, 0.9))
     things += _scattered(rng, FURNITURE, _some(rng, 0, 3), 4.0, 4.0)
     return Place(4.0, 4.0, things, (2.0, 2.0, 0.8))
-
-
-def denser(place: Place, density: int, rng: np.random.Generator) -> Place:
-    """Return a place with more things, of classes that COCO lacks: `density` times as many.
-
-    Each of them is about half a metre from one that is not large, at its height.
-    """
-    small = [one for one in place.things if max(TYPICAL[one.name][:3]) < _LARGE_M]
-    more = [one._replace(
-        name=f'{one.name}#{number}', x=float(np.clip(one.x + _ASIDE_M * rng.normal(), 0.0,
-                                                     place.width)),
-        y=float(np.clip(one.y + _ASIDE_M * rng.normal(), 0.0, place.depth)),
-        yaw=rng.uniform(0.0, np.pi), model=_new_model(rng))
-        for number in range(2, density + 1) for one in small]
-    return place._replace(things=[*place.things, *more])
 
 
 #: All kinds of places, by name.

@@ -47,8 +47,7 @@ _GROWTH = (0.75, 1.3)
 class Thing(NamedTuple):
     """One object: where its centre is [m], how it is turned [rad], and how it looks.
 
-    Things of one class and model look alike. 'cup#2' is of a class that COCO lacks, with the size
-    of a cup.
+    Things of one class and model look alike.
     """
 
     name: str
@@ -84,8 +83,8 @@ class Objects(NamedTuple):
 
 
 def rows_of(class_ids: Sequence[str]) -> list[int]:
-    """Return the rows in CLASS_NAMES of classes, or of those that they resemble."""
-    return [CLASS_NAMES.index(name.partition('#')[0]) for name in class_ids]
+    """Return the rows in CLASS_NAMES of classes."""
+    return [CLASS_NAMES.index(name) for name in class_ids]
 
 
 def make_objects(things: Sequence[Thing], rng: np.random.Generator) -> Objects:

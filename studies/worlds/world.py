@@ -22,10 +22,9 @@ from studies.worlds.cameras import (
     drive_about,
     make_camera,
     make_groups,
-    walk_through,
 )
 from studies.worlds.detector import Detector, detect
-from studies.worlds.places import KINDS, Place, denser
+from studies.worlds.places import KINDS, Place
 from studies.worlds.surveyor import MapErrors, Survey, survey
 from studies.worlds.things import Objects, make_objects
 
@@ -67,8 +66,8 @@ class _Scene(NamedTuple):
     depth_scale: float | None = None  #: Measured over true depth; None without depth
 
 
-def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = None,
-               has_depth: bool = False, cameras: int = 1, density: int = 1) -> World:
+def make_world(kind: str, seed: int, groups: int = 4, has_depth: bool = False,
+               cameras: int = 1) -> World:
     """Return a world; equal seeds give equal worlds.
 
     Parameters
@@ -77,17 +76,13 @@ def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = No
         One of KINDS.
     groups : int
         Places from which the robot looks, five images each.
-    sigma_m : float, optional
-        Standard deviation of the map's positions on each axis [m]; drawn by default.
     has_depth : bool
         Whether the camera measures depth; all else stays the same.
     cameras : int
         The robot has more cameras, in equal angles. They are neighbours of the first one's image.
-    density : int
-        Things over those of COCO's classes, see places.denser.
     """
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
-    place, scene = _make_scene(kind, sigma_m, rng, density)
+    place, scene = _make_scene(kind, rng)
     if has_depth:
         of_depth, = rng.spawn(1)
         scene = scene._replace(depth_scale=float(of_depth.normal(1.0, _DEPTH_SCALE)))
@@ -96,22 +91,6 @@ def make_world(kind: str, seed: int, groups: int = 4, sigma_m: float | None = No
     world = _seen(kind, scene, camera, poses, rng)
     return world if cameras == 1 else replace(world, queries=tuple(
         _with_cameras(scene, camera, query, cameras, rng.spawn(1)[0]) for query in world.queries))
-
-
-def make_walk(kind: str, seed: int, images: int) -> World:
-    """Return a world and the images of one walk through it, a second apart.
-
-    Parameters
-    ----------
-    kind : str
-        One of KINDS.
-    seed : int
-        Its objects and map are those of make_world.
-    """
-    rng = np.random.default_rng([seed, list(KINDS).index(kind)])
-    place, scene = _make_scene(kind, None, rng)
-    camera = make_camera(rng)
-    return _seen(kind, scene, camera, walk_through(place, scene.objects, images, rng), rng)
 
 
 @dataclass(frozen=True)
@@ -133,11 +112,13 @@ def make_drive(kind: str, seed: int, images: int, changed: float = 0.0) -> Drive
 
     Parameters
     ----------
-    kind, seed
-        See make_walk.
+    kind : str
+        One of KINDS.
+    seed : int
+        Its objects and map are those of make_world.
     """
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
-    place, scene = _make_scene(kind, None, rng)
+    place, scene = _make_scene(kind, rng)
     camera, (of_changes, of_looks) = make_camera(rng), rng.spawn(2)
     poses = drive_about(place, scene.objects, images, rng)
     count = len(scene.objects.class_ids)
@@ -153,16 +134,11 @@ def make_drive(kind: str, seed: int, images: int, changed: float = 0.0) -> Drive
                  (distances > _WRONG_M) | (found.objects != found.described))
 
 
-def _make_scene(kind: str, sigma_m: float | None, rng: np.random.Generator, density: int = 1
-                ) -> tuple[Place, _Scene]:
+def _make_scene(kind: str, rng: np.random.Generator) -> tuple[Place, _Scene]:
     place = KINDS[kind](rng)
-    if density > 1:
-        place = denser(place, density, rng)
     objects = make_objects(place.things, rng)
     encoder = Encoder.random(rng)
     errors = MapErrors.random(rng)
-    if sigma_m is not None:
-        errors = errors._replace(sigma_m=sigma_m)
     return place, _Scene(objects, objects.shapes, survey(objects, errors, rng),
                          Detector.random(objects, rng), encoder,
                          encoder.vectors(objects.class_ids, objects.models, rng),

@@ -10,9 +10,9 @@ from rig_bag import MOUNTS, RIG, write_rig_bag
 from cliploc_ros.cli.build_map import main as build_map
 from cliploc_ros.core.keyframes.layer import load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.demo.truth import read_objects
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.tum import read_tum
+from demo.truth import read_objects
 
 ASSETS = RIG.parent
 ALL = tuple(MOUNTS)

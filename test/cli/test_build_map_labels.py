@@ -15,7 +15,7 @@ from cliploc_ros.core.map.landmark_embeddings import load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets.observations import load_observations
 
-ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 CLIP = ('--clip-model', ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'clip.safetensors',
         '--device', 'cpu')
 # a short walk sees objects from one side

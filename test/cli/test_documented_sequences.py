@@ -20,11 +20,11 @@ from test_doc_commands import program_of
 from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.layer import layer_path
-from cliploc_ros.demo import ASSETS
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import BagWriter
 from cliploc_ros.offline.datasets.folders import read_sequence
 from cliploc_ros.offline.datasets.poses import mount_from_numbers
+from demo import ASSETS
 
 pytestmark = pytest.mark.full
 

@@ -14,7 +14,7 @@ from cliploc_ros.core.keyframes.layer import load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 
-ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 WALK = ['--tum', str(ASSETS / 'mapping')]
 
 

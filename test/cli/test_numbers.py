@@ -14,7 +14,8 @@ MAY_BE_INFINITE = {'--time-budget-ms', '--height-range'}
 
 
 def options_of(program):
-    parser = import_module(f'cliploc_ros.cli.{program}').make_parser()
+    module = 'demo.__main__' if program == 'demo' else f'cliploc_ros.cli.{program}'
+    parser = import_module(module).make_parser()
     return [action for action in parser._actions if action.option_strings and action.type]
 
 

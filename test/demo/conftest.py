@@ -22,6 +22,6 @@ def worlds(tmp_path_factory):
     """Two worlds of three images: one to train on, one held out."""
     folder = tmp_path_factory.mktemp('worlds')
     subprocess.run(
-        [sys.executable, '-m', 'demo_world.make_worlds', str(folder), '--count', '2',
+        [sys.executable, '-m', 'demo.world.make_worlds', str(folder), '--count', '2',
          '--frames', '3', '--seed', '40'], cwd=PROJECT, check=True, timeout=300)
     return folder

@@ -20,7 +20,7 @@ PROJECT = Path(__file__).resolve().parents[2]
 
 def compare(folder, *arguments):
     return subprocess.run(
-        [sys.executable, '-m', 'demo_world.compare', '--out', str(folder), *arguments],
+        [sys.executable, '-m', 'demo.world.compare', '--out', str(folder), *arguments],
         cwd=PROJECT, capture_output=True, text=True, timeout=900, check=False)
 
 

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo as a user runs it: the installed executable, to its end or to Ctrl-C."""
+"""The demo as a user runs it, to its end or to Ctrl-C."""
 
 import os
 import re
 import signal
 import subprocess
+import sys
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -22,22 +23,22 @@ PATIENCE_S = 300.0
 ROW = re.compile(r'^(\d+) .*?(accepted|refused) .*?\(?([0-9.]+) m [0-9.]+°', re.MULTILINE)
 
 
-def start(executables, *arguments):
-    return subprocess.Popen([executables / 'demo', *map(str, arguments)], text=True,
-                            stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+def start(*arguments):
+    return subprocess.Popen([sys.executable, '-m', 'demo', *map(str, arguments)], text=True,
+                            cwd=PROJECT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
-def run(executables, *arguments):
-    process = start(executables, *arguments)
+def run(*arguments):
+    process = start(*arguments)
     output, errors = process.communicate(timeout=PATIENCE_S)
     return process.returncode, output, errors
 
 
 @pytest.fixture(scope='module')
-def finished(executables, tmp_path_factory):
+def finished(tmp_path_factory):
     """Run the demo to its end; return the folder of its pictures and its output."""
     out = tmp_path_factory.mktemp('demo') / 'pictures'
-    code, output, errors = run(executables, '--out', out, '--rviz', '--wake-ups', WAKE_UPS)
+    code, output, errors = run('--out', out, '--rviz', '--wake-ups', WAKE_UPS)
     assert code == 0, errors
     return out, output
 
@@ -53,8 +54,8 @@ def test_poses_are_right_or_refused(finished):
 
 
 @pytest.mark.clock  # the request takes the cameras whose images come in time
-def test_four_cameras_need_not_turn(executables, tmp_path):
-    code, output, errors = run(executables, '--out', tmp_path, '--cameras', 4, '--wake-ups', 2)
+def test_four_cameras_need_not_turn(tmp_path):
+    code, output, errors = run('--out', tmp_path, '--cameras', 4, '--wake-ups', 2)
     assert code == 0, errors
     print(output)
     assert '2 wake-ups: 2 accepted, 0 refused, none wrong' in output
@@ -68,8 +69,8 @@ def test_four_cameras_need_not_turn(executables, tmp_path):
 
 
 @pytest.mark.clock  # a busy machine leaves looks out
-def test_a_kidnapped_robot_is_noticed_stops_and_gets_its_pose_back(executables, tmp_path):
-    code, output, errors = run(executables, '--out', tmp_path, '--kidnapped', '--method',
+def test_a_kidnapped_robot_is_noticed_stops_and_gets_its_pose_back(tmp_path):
+    code, output, errors = run('--out', tmp_path, '--kidnapped', '--method',
                                'class_auto')
     print(output)
     assert code == 0, errors
@@ -105,10 +106,10 @@ def test_the_page_shows_all_and_says_what_it_does_not(finished):
 
 
 @pytest.fixture(scope='module')
-def mapped(executables, tmp_path_factory):
+def mapped(tmp_path_factory):
     """Run the demo with a map of its own; return the folder of its pictures and its output."""
     out = tmp_path_factory.mktemp('demo') / 'mapped'
-    code, output, errors = run(executables, '--out', out, '--map', '--wake-ups', 1)
+    code, output, errors = run('--out', out, '--map', '--wake-ups', 1)
     assert code == 0, errors
     print('\n' + output)
     return out, output
@@ -144,8 +145,8 @@ def children(pid):
 @pytest.mark.full
 @pytest.mark.parametrize(('number', 'expected'), [
     (signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)])
-def test_no_process_outlives_it(executables, tmp_path, number, expected):
-    process = start(executables, '--out', tmp_path, '--rate', '0.5', '--method', 'class_ransac')
+def test_no_process_outlives_it(tmp_path, number, expected):
+    process = start('--out', tmp_path, '--rate', '0.5', '--method', 'class_ransac')
     for line in process.stdout:
         if line.startswith('both are ready'):
             break

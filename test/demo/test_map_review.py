@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.demo.map_review import (
+from cliploc_ros.offline.evaluation.summary import Summary
+from demo.map_review import (
     Sightings,
     console_lines,
     review_map,
     section,
 )
-from cliploc_ros.demo.truth import TrueObject
-from cliploc_ros.offline.evaluation.summary import Summary
+from demo.truth import TrueObject
 
 HOSTILE = '<script>alert("&")</script>'
 

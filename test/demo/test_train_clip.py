@@ -9,7 +9,7 @@ import torch
 
 from cliploc_ros.models.clip_encoder import load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions
-from demo_world import train_clip
+from demo.world import train_clip
 
 pytestmark = pytest.mark.full
 

@@ -9,8 +9,8 @@ import pytest
 
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_detector import YoloDetector
-from demo_world import train_detector
-from demo_world.appearance import CLASSES
+from demo.world import train_detector
+from demo.world.appearance import CLASSES
 
 pytestmark = pytest.mark.full
 

@@ -15,15 +15,15 @@ from cliploc_ros.core.geometry.ellipsoid import (
 )
 from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.demo import ASSETS
-from cliploc_ros.demo.truth import read_frames
 from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
-from demo_world.appearance import CLASSES
-from demo_world.recording import find_boxes, record, write_true_map
-from demo_world.renderer import Light, Renderer
-from demo_world.room import make_room
-from demo_world.trajectories import (
+from demo import ASSETS
+from demo.truth import read_frames
+from demo.world.appearance import CLASSES
+from demo.world.recording import find_boxes, record, write_true_map
+from demo.world.renderer import Light, Renderer
+from demo.world.room import make_room
+from demo.world.trajectories import (
     CAMERA,
     draw_views,
     query_walk,

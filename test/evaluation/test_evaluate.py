@@ -24,7 +24,7 @@ from cliploc_ros.offline.datasets.queries import load_queries
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
 
 PROJECT = Path(__file__).resolve().parents[2]
-ASSETS = PROJECT / 'cliploc_ros/demo/assets'
+ASSETS = PROJECT / 'demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
             '--clip-pretrained', ASSETS / 'clip.safetensors', '--map', ASSETS / 'map.yaml')
 FIGURES = ('success_over_threshold', 'success_over_iterations', 'best_iteration', 'top_view',

@@ -11,7 +11,7 @@ from rig_bag import write_rig_bag
 
 from cliploc_ros.cli.evaluate import main as evaluate
 
-ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
             '--clip-pretrained', ASSETS / 'clip.safetensors', '--map', ASSETS / 'map.yaml')
 CAMERAS = ('front', 'left', 'back')

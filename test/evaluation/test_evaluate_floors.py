@@ -12,7 +12,7 @@ import pytest
 from cliploc_ros.cli.evaluate import main
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.demo import ASSETS
+from demo import ASSETS
 
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
             '--clip-pretrained', ASSETS / 'clip.safetensors', '--methods', 'auto', '--trials', 1,

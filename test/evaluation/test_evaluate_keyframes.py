@@ -13,11 +13,11 @@ import pytest
 from cliploc_ros.cli.evaluate import main
 from cliploc_ros.core.keyframes.layer import layer_path, save_layer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.demo import ASSETS
 from cliploc_ros.offline.datasets.folders import tum_frames
 from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
+from demo import ASSETS
 
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
             '--clip-pretrained', ASSETS / 'clip.safetensors')

@@ -13,7 +13,6 @@ from cliploc_ros.core.map.landmark_embeddings import (
     save_landmark_embeddings,
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.demo import ASSETS
 from cliploc_ros.models.clip_encoder import embed_labels
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.protocols import DetectorOptions
@@ -22,6 +21,7 @@ from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.evaluation.recording import recorded_queries
 from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions
+from demo import ASSETS
 
 
 @pytest.fixture(scope='module')

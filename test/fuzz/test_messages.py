@@ -21,7 +21,7 @@ from scene import make_room, write_map
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros.frame_localizer import load_localizer
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.robot_state import RobotState
+from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -41,7 +41,7 @@ def localizer(values):
 def localize(localizer, values, image, info, found):
     frame = Frame(*(stamped(msg, 100) for msg in (image, info, found)), 0.0, 0.0)
     try:
-        return localizer.localize(frame, values, RobotState(np.eye(4)),
+        return localizer.localize(frame, values, KnownBefore(RobotState(np.eye(4))),
                                   StageTimes('waiting', 0.0)).found
     except CliplocError as error:
         assert str(error).strip()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from disturbed_poses import disturb, draw_errors
 from walk import CAMERA, CLASSES, look_at, make_table, nearest_errors, see, walk_around, without
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -16,7 +17,6 @@ from cliploc_ros.offline.make_map import find_labeller, make_map, update_map
 from cliploc_ros.offline.mapping.building import _windows, build_map
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.views import make_views, number_viewpoints, thin_out
-from studies.speed.pose_errors import disturb, draw_errors
 
 
 def test_every_landmark_is_found_where_it_is():

@@ -13,7 +13,7 @@ from cliploc_ros.cli import build_map
 from cliploc_ros.core.map.landmark_embeddings import load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.demo import ASSETS
+from demo import ASSETS
 
 ROOM = Path(__file__).parent / 'changed_room'
 CHANGES = json.loads((ROOM / 'changes.json').read_text())

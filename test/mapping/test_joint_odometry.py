@@ -7,6 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from disturbed_poses import (
+    aligned_offsets_m,
+    disturb,
+    draw_errors,
+    with_odometry,
+)
 from walk import look_at, make_table, see, walk_around
 
 from cliploc_ros.offline.mapping.building import build_map
@@ -15,12 +21,6 @@ from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
 from cliploc_ros.offline.mapping.odometry import link_frames
 from cliploc_ros.offline.mapping.options import MappingOptions, OdometryErrors, PoseErrors
 from cliploc_ros.offline.mapping.views import make_views
-from studies.speed.pose_errors import (
-    aligned_offsets_m,
-    disturb,
-    draw_errors,
-    with_odometry,
-)
 
 POSE_ERRORS = PoseErrors(0.05, 1.0, 3.0)
 NOISE = OdometryErrors(0.005, 0.2)

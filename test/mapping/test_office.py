@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from disturbed_poses import disturb, draw_errors, offsets_m
 
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.offline.datasets.observations import load_observations
@@ -19,7 +20,6 @@ from cliploc_ros.offline.mapping.evidence import explained_boxes
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.views import make_views
-from studies.speed.pose_errors import disturb, draw_errors, offsets_m
 
 
 @pytest.fixture(scope='module')

@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from disturbed_poses import aligned_offsets_m, disturb, draw_errors, offsets_m
 from scipy.spatial.transform import Rotation
 from walk import look_at, make_table, nearest_errors, see, walk_around
 
@@ -19,7 +20,6 @@ from cliploc_ros.offline.mapping.pose_noise import (
     significant_pose_errors,
 )
 from cliploc_ros.offline.mapping.views import Views, make_views
-from studies.speed.pose_errors import aligned_offsets_m, disturb, draw_errors, offsets_m
 
 ESTIMATING = MappingOptions(estimate_pose_errors=True)
 #: The camera is 3 cm and 2 degrees away from where the given poses have it.

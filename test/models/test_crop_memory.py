@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from cliploc_ros.demo.truth import read_frames
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.observer import CropMemory, Observer
+from demo.truth import read_frames
 
-ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 FRAMES = list(read_frames(ASSETS / 'sequence', 0.5))
 FRAME = max(FRAMES, key=lambda frame: len(frame.boxes))
 IMAGE = cv2.imread(str(FRAME.image))[..., ::-1].copy()

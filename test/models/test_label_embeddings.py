@@ -98,7 +98,7 @@ PHRASES = {'mug': ('a red mug', 'a blue mug with white dots'), 'box': ('a box',)
 
 @pytest.fixture
 def clip(tmp_path):
-    assets = PROJECT / 'cliploc_ros/demo/assets'
+    assets = PROJECT / 'demo/assets'
     return ClipOptions(model=str(assets / 'clip.json'), device='cpu', cache_dir=str(tmp_path),
                        pretrained=str(assets / 'clip.safetensors'))
 

@@ -28,7 +28,7 @@ from cliploc_ros.models.yolo_weights import load_yolo
 pytestmark = pytest.mark.full
 
 PROJECT = Path(__file__).resolve().parents[2]
-ASSETS = PROJECT / 'cliploc_ros/demo/assets'
+ASSETS = PROJECT / 'demo/assets'
 rng = np.random.default_rng(2)
 CORNERS = rng.uniform(0, 400, (12, 2))
 BBOXES = np.hstack([CORNERS, CORNERS + rng.uniform(5, 230, (12, 2))])

@@ -14,8 +14,8 @@ import open_clip
 import pytest
 from without_pytorch import hide_pytorch
 
-from cliploc_ros.demo import ASSETS
 from cliploc_ros.models.tokenizer import ClipTokenizer
+from demo import ASSETS
 
 pytestmark = pytest.mark.full
 
@@ -30,7 +30,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
-from cliploc_ros.demo import ASSETS
+from demo import ASSETS
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.map_rows import load_encoder_for_map
 from cliploc_ros.models.observer import Observer

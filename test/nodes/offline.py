@@ -19,8 +19,8 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from cliploc_ros.demo import ASSETS
 from cliploc_ros.offline.datasets.intrinsics import find_camera
+from demo import ASSETS
 
 SEQUENCE = ASSETS / 'sequence'
 

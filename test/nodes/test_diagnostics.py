@@ -89,7 +89,7 @@ def test_a_detector_of_other_classes_is_an_error(own_relocalizer, tester, status
 
 def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):
     detector = start('nodes.detector', parameters={
-        'model': PROJECT / 'cliploc_ros/demo/assets/yolo.pt', 'stale_after_s': 1.0})
+        'model': PROJECT / 'demo/assets/yolo.pt', 'stale_after_s': 1.0})
     detector.wait_for_output('ready after')
     values = status.wait(OK, 'active')
     assert values['listened to'] == 'False'

@@ -10,7 +10,7 @@ from tester import class_matching, make_frame
 
 pytestmark = pytest.mark.full
 
-ASSETS = PROJECT / 'cliploc_ros/demo/assets'
+ASSETS = PROJECT / 'demo/assets'
 
 
 def test_a_detector_that_is_killed_and_restarted_while_a_request_waits(start, tester, room_map):

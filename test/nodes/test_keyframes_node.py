@@ -19,7 +19,7 @@ from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 
-ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 ROOM = make_room()  # its objects are nowhere in the images
 # image 2 of the walk shows what these of the mapping walk do
 QUERY, LIKE_QUERY = 2, range(2, 10)

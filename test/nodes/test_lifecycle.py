@@ -15,7 +15,7 @@ from processes import PROJECT
 from scene import make_room, write_map
 from tester import class_matching, make_frame
 
-ASSETS = PROJECT / 'cliploc_ros/demo/assets'
+ASSETS = PROJECT / 'demo/assets'
 IDS = {'configure': Transition.TRANSITION_CONFIGURE, 'activate': Transition.TRANSITION_ACTIVATE,
        'deactivate': Transition.TRANSITION_DEACTIVATE, 'cleanup': Transition.TRANSITION_CLEANUP}
 SHUTDOWN_IDS = {'unconfigured': Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,

@@ -12,7 +12,7 @@ import pytest
 from processes import PROJECT
 from without_pytorch import hide_pytorch
 
-from cliploc_ros.demo import ASSETS
+from demo import ASSETS
 
 pytestmark = pytest.mark.full
 

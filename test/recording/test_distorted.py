@@ -16,14 +16,14 @@ from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.demo.truth import read_objects
 from cliploc_ros.offline.datasets.frames import RawFrame
 from cliploc_ros.offline.datasets.observations import load_recorded
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.views import make_views
 from cliploc_ros.offline.recording.networks import RunNetworks
+from demo.truth import read_objects
 
-ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--device', 'cpu')
 # That of the TUM sequences fr1.
 LENS = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, 'plumb_bob',

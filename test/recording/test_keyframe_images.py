@@ -21,7 +21,7 @@ from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 
-ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 WITH_IMAGES = LayerOptions(most_points=200, images=True)
 
 

@@ -28,7 +28,7 @@ from cliploc_ros.offline.recording.recorder import (
 )
 
 PROJECT = Path(__file__).resolve().parents[2]
-ASSETS = PROJECT / 'cliploc_ros/demo/assets'
+ASSETS = PROJECT / 'demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--device', 'cpu')
 CLIP = ('--clip-model', ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'clip.safetensors')
 # A short walk shows objects from one side: this test is about what the networks say.

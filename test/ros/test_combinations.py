@@ -28,6 +28,7 @@ from cliploc_ros.ros.case_recorder import CaseRecorder
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Keyframes
 from cliploc_ros.ros.inputs.frame_source import Frame
+from cliploc_ros.ros.inputs.instants import Instants
 from cliploc_ros.ros.inputs.robot_state import CameraPlace, KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -49,7 +50,7 @@ class Drive:
         keyframes = Keyframes(KeyframeLocalizer(LAYER)) if known in ('keyframes', 'all') else None
         self.localizer = FrameLocalizer(MAP, None, Relocalizer(MAP, options), options, 'cpu', '',
                                         keyframes)
-        self.has_depth = known in ('depth', 'all')
+        self.has_odometry, self.has_depth = True, known in ('depth', 'all')
         self.region = None if known not in ('prior', 'all') else Region(
             'map', np.zeros(3), np.diag([0.5, 0.5, ANY_YAW]) ** 2, 0.95)
         self.recorder = CaseRecorder(True)
@@ -81,7 +82,7 @@ class Drive:
                 if self.has_depth else None,
                 camera=name if self.cameras > 1 else ''),
                 RobotState(invert_transform(mount), place=CameraPlace(
-                    robot @ mount, 0, 0.05 * number))))
+                    robot @ mount, 0, 0.05 * number) if self.has_odometry else None)))
         return frames[:self.cameras], robot @ MOUNTS[0]
 
     def localize(self, number=0):
@@ -182,3 +183,17 @@ def test_the_watch_tells_a_right_pose_from_a_wrong_one(cameras, known, displaced
         pose[0, 3] += displaced_m
         report = drive.localizer.look(frame, drive.parameters, robot_state, 'map', pose)
     assert report.state is state
+
+
+def test_mounts_of_cameras_are_no_odometry(tmp_path):
+    """Without odometry a filter learns from each instant, and the watch knows of no standing."""
+    drive = Drive(4, 'nothing', tmp_path, 'continuous')
+    drive.has_odometry = False
+    for number in range(3):
+        found, error_m = drive.localize(number)
+        assert found.found.accepted and error_m < 0.05
+        assert len(found.query.frames) == 4 and found.query.run is None
+        np.testing.assert_array_equal(found.for_filter, found.found.covariance)
+    (frame, state), *_ = drive.see(0)[0]
+    assert Instants(MAP, True).query(
+        frame, drive.parameters, KnownBefore(state)).newest.odom_from_camera is None

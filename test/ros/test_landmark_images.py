@@ -19,8 +19,6 @@ from cliploc_ros.core.map.landmark_embeddings import (
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.demo import ASSETS
-from cliploc_ros.demo.truth import read_frames
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.offline.datasets.intrinsics import find_camera
@@ -28,10 +26,12 @@ from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import load_localizer
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.robot_state import RobotState
+from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
+from demo import ASSETS
+from demo.truth import read_frames
 
 HEADER = Header(frame_id='camera')
 FRAMES = list(read_frames(ASSETS / 'sequence', 0.5))
@@ -95,7 +95,7 @@ def frame():
 
 def finds(localizer, frame, values) -> bool:
     """Return whether the pose is accepted; it then has to be right."""
-    found = localizer.localize(frame, values, RobotState(np.eye(4)),
+    found = localizer.localize(frame, values, KnownBefore(RobotState(np.eye(4))),
                                StageTimes('waiting', 0.0)).found
     if found.accepted:
         truth = read_tum(ASSETS / 'sequence').pose_at(round(float(QUERY.timestamp) * NS_PER_S))

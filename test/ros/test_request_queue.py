@@ -9,7 +9,6 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import rclpy
 from builtin_interfaces.msg import Time
@@ -21,11 +20,12 @@ from std_msgs.msg import Header
 from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
+from cliploc_ros.core.query import Query
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.answer import Answer, Verdict
 from cliploc_ros.ros.case_recorder import CaseRecorder
 from cliploc_ros.ros.inputs.frame_source import FrameSource
-from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
+from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.outputs.handoff import HandOff
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -205,7 +205,7 @@ def test_more_images_are_no_remedy_where_nothing_is_detected(node, camera, clien
     node.robot.is_linked_soon = lambda stamp, deadline: True
     node.localize = lambda frame: Answer(
         Verdict.REFUSED, 'turn the camera', received_at=frame.received_at, kind=kind,
-        state=RobotState(np.eye(4), place=object()),
+        query=Query((), run=0),
         stages_ms={'image': 200.0, 'search': 1.0})
     request = clients.submit(node.requests.answer)
     shoot_until(camera, wait, request)
@@ -239,9 +239,11 @@ class LateTransforms:
 def test_a_late_transform_is_waited_for(node, camera, clients, wait, late_s):
     set_values(node, base_frame='base_link', timeout_s=4.0, tf_timeout_s=0.0)
     node.robot.transforms._buffer = LateTransforms(late_s)
-    node.localize = lambda frame: Answer(
-        Verdict.REFUSED, 'seen', received_at=frame.received_at,
-        state=node.robot.at(frame.image.header, node.settings.snapshot(), node.deadline))
+
+    def localize(frame):
+        node.robot.at(frame.image.header, node.settings.snapshot(), node.deadline)
+        return Answer(Verdict.REFUSED, 'seen', received_at=frame.received_at)
+    node.localize = localize
     begin = time.monotonic()
     node.deadline = begin + 4.0
     request = clients.submit(node.requests.answer)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cliploc_ros.demo import ASSETS
+from demo import ASSETS
 
 pytestmark = pytest.mark.full
 

@@ -10,7 +10,6 @@ from studies.watch.judge import KIDNAPPED, alarm_table, judge, right_table
 from studies.watch.localizers import (
     simulated_drive,
 )
-from studies.watch.sensors import measure_cost
 
 pytestmark = pytest.mark.full
 
@@ -23,9 +22,3 @@ def test_wrong_poses_are_noticed_and_right_ones_are_not_lost():
     assert np.mean(jumps) > 0.9
     assert '| room |' in right_table([right])
     assert '| all |' in alarm_table(alarms)
-
-
-def test_the_cost_of_a_look(record_property):
-    found = measure_cost(100)
-    record_property('figures', found)
-    assert '| 100 |' in found

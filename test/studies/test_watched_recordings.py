@@ -23,14 +23,13 @@ from studies.watch.__main__ import run
 from studies.watch.recordings import (
     WatchedLook,
     alarms_of,
-    roc,
     summarize_watch,
     write_watch,
 )
 
 pytestmark = pytest.mark.full
 
-ASSETS = Path(__file__).resolve().parents[2] / 'cliploc_ros/demo/assets'
+ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 IMAGES = 24
 
 
@@ -52,12 +51,6 @@ def test_figures_of_a_short_drive():
     assert found['wrong_stretches'] == [
         {'stamp_s': 8.0, 'seconds': 4.0, 'metres': 1.0, 'looks': 3}]
     assert found['states'] == {'localized': 3, 'uncertain': 1, 'lost': 3}
-    curve = roc(looks)
-    assert curve[0].tolist() == [0.0, 0.0]
-    assert curve[-1].tolist() == [1.0, 1.0]
-    assert found['area_under_roc'] == pytest.approx(
-        np.mean([[wrong < right for right in (0.9, 0.04, 0.3, 0.99)]
-                 for wrong in (0.95, 0.4, 0.01)]))
 
 
 def test_without_truth_nothing_is_false(tmp_path):
@@ -67,7 +60,6 @@ def test_without_truth_nothing_is_false(tmp_path):
     assert found['wrong_stretches'] == []
     assert 'false' not in write_watch(tmp_path, looks)
     assert (tmp_path / 'watch_timeline.png').exists()
-    assert not (tmp_path / 'watch_roc.png').exists()
     assert summarize_watch([])['looks'] == 0
 
 
@@ -119,8 +111,6 @@ def test_a_localizer_that_jumps_is_noticed(observations, tmp_path):
     assert found['false_alarms'] == 0
     stretch, = found['wrong_stretches']
     assert stretch['looks'] <= 5
-    assert found['area_under_roc'] > 0.95
-    for name in ('watch_timeline', 'watch_roc'):
-        assert (tmp_path / f'{name}.png').stat().st_size > 10_000
+    assert (tmp_path / 'watch_timeline.png').stat().st_size > 10_000
     assert 'localized' in {one['state'] for one in found['every_look'][2:7]}
     assert found['every_look'][-1]['error_m'] == pytest.approx(2.0, abs=0.1)

@@ -16,7 +16,7 @@ from cliploc_ros.offline.studio.images import open_images, views_of_folder
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.studio import Studio
 
-ASSETS = Path(__file__).parents[2] / 'cliploc_ros/demo/assets'
+ASSETS = Path(__file__).parents[2] / 'demo/assets'
 _ROOM = np.array([[0.0, 0.0, 0.4], [0.9, 0.2, 0.6], [0.3, 1.1, 0.5], [1.2, 1.3, 0.8],
                   [-0.5, 0.8, 0.3]])
 _CLASSES = ('cup', 'book', 'plant', 'cup', 'chair')

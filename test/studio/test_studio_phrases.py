@@ -11,13 +11,13 @@ from studio_map import ASSETS
 
 from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_landmark_embeddings
-from cliploc_ros.demo.truth import read_frames
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.offline.datasets.observations import save_observations
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.images import open_images, views_of_folder
+from demo.truth import read_frames
 
 WALK = ASSETS / 'mapping'
 CLIP = ('--clip-model', str(ASSETS / 'clip.json'),

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import quaternion_from_transform, transform_from_pose
+from cliploc_ros.core.geometry.transforms import quaternion_from_transform
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.offline.datasets.bags import typestore
 from cliploc_ros.units import NS_PER_S
@@ -93,15 +93,6 @@ def imu_message(stamp: int, frame_id: str, acceleration: NDArray[np.float64]) ->
         orientation_covariance=missing, angular_velocity=_make(vector, x=0.0, y=0.0, z=0.0),
         angular_velocity_covariance=missing, linear_acceleration=_make(vector, x=x, y=y, z=z),
         linear_acceleration_covariance=np.zeros(9))
-
-
-def map_from_camera_of(message: Any) -> NDArray[np.float64]:
-    """Read the pose (4, 4) of a geometry_msgs/PoseStamped."""
-    position, orientation = message.pose.position, message.pose.orientation
-    return transform_from_pose(
-        np.array([position.x, position.y, position.z]),
-        np.array([orientation.x, orientation.y, orientation.z, orientation.w]),
-    )
 
 
 def _make(msgtype: str, **fields: Any) -> Any:

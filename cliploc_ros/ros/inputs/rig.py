@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -83,7 +83,7 @@ class Rig:
             parameters.depth_transport, parameters.depth_tolerance_s, name, self._changed)
             for name in parameters.camera_names}
         self._pending: deque[_Instant] = deque()
-        self._passed: Mapping[str, Frame] = {}
+        self._passed: deque[Mapping[str, Frame]] = deque(maxlen=_MOST_PENDING)
         self._passed_ns = -_LATE_NS
         self._is_continuous = linger_s == math.inf
         if self._is_continuous:  # a camera that is silent completes no instant
@@ -121,7 +121,8 @@ class Rig:
             source.forget()
         with self._changed:
             self._pending.clear()
-            self._passed, self._passed_ns = {}, -_LATE_NS
+            self._passed.clear()
+            self._passed_ns = -_LATE_NS
 
     def next_frame(self, after: float, deadline: float) -> Frame:
         """Return the first instant whose images arrived after a moment; see FrameSource."""
@@ -129,16 +130,16 @@ class Rig:
         with self._changed:  # subscribed until the last camera's frame is there
             for source in sources:
                 source.want(deadline)
-            frame = None
-            while frame is None and not self.main.is_closed:
-                left_s = deadline - time.monotonic()
-                self._changed.wait(max(0.0, min(left_s, _CHECK_PERIOD_S)))
+            frame, left_s = None, deadline - time.monotonic()
+            # messages may be lost: the next instant may have all cameras
+            while left_s > 0.0 and not self.main.is_closed and (
+                    frame is None or (frame.left_out and time.monotonic()
+                                      < frame.received_at + _PATIENCE_S)):
+                self._changed.wait(min(left_s, _CHECK_PERIOD_S))
                 self._pass_on()
-                frame = self._fresh(self._passed, after)
-                if left_s <= 0.0:  # not all of them can come in time
-                    fresh = (self._fresh(one.frames, after) for one in reversed(self._pending))
-                    frame = frame or next(filter(None, fresh), None)
-                    break
+                frame, left_s = self._fullest(self._passed, after), deadline - time.monotonic()
+            if frame is None:  # the others of an instant cannot come in time
+                frame = self._fullest((one.frames for one in self._pending), after)
             why = '' if frame else '; '.join(one.why_none(after) for one in sources)
             for source in sources:
                 source.want_no_more(deadline)  # which may forget both
@@ -177,7 +178,8 @@ class Rig:
             while self._pending and (len(self._pending) > _MOST_PENDING
                                      or not self._may_grow(self._pending[0])):
                 instant = self._pending.popleft()
-                self._passed, self._passed_ns = instant.frames, max(instant.stamps_ns)
+                self._passed.append(instant.frames)
+                self._passed_ns = max(instant.stamps_ns)
                 self._changed.notify_all()
                 self._on_frame(self._joined(instant.frames))
 
@@ -188,10 +190,12 @@ class Rig:
             now < instant.image_until or source.awaits_detections(at_ns, self._tolerance_s)
             for name, source in self._sources.items() if name not in instant.frames)
 
-    def _fresh(self, frames: Mapping[str, Frame], after: float) -> Frame | None:
-        """Return the frames of an instant whose images arrived after a moment; None without."""
-        fresh = {name: one for name, one in frames.items() if one.received_at >= after}
-        return self._joined(fresh) if fresh else None
+    def _fullest(self, instants: Iterable[Mapping[str, Frame]], after: float) -> Frame | None:
+        """Return the instant of the most cameras whose images arrived after a moment, or None."""
+        fresh = ({name: one for name, one in frames.items() if one.received_at >= after}
+                 for frames in instants)
+        fullest = max(fresh, key=len, default={})
+        return self._joined(fullest) if fullest else None
 
     def _joined(self, frames: Mapping[str, Frame]) -> Frame:
         """Return frames of one instant as the first camera's, with those of others beside it."""

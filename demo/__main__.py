@@ -1,0 +1,84 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Let a robot wake up in a synthetic room: ``python -m demo``; offline, with shipped models."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from cliploc_ros.command import needs_ros, positive, positive_int, run_main
+from demo import ASSETS
+
+EPILOG = """\
+The demo plays a recording to the real detector and relocalizer, each in its own process. At each
+wake-up the robot stops, calls ~/relocalize, and goes on after the answer. At the end the demo
+writes a page of pictures to the folder of --out. With --map it first builds a map from a mapping
+walk and compares it with the room; the robot then wakes up in that map.
+"""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the demo; return the exit code."""
+    return run_main(make_parser(), demonstrate, args)
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='demo', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
+        description='Let a robot wake up in a synthetic room, and draw the results.')
+    parser.add_argument(
+        '--out', type=Path, default=Path('demo_out'), metavar='DIR',
+        help='folder for the pictures (default: ./%(default)s)')
+    parser.add_argument(
+        '--wake-ups', type=positive_int, default=10, metavar='N',
+        help='number of wake-ups along the recording (default: %(default)s)')
+    parser.add_argument(
+        '--rate', type=positive, default=8.0, metavar='X',
+        help='speed between wake-ups; 2 is twice as fast as recorded (default: %(default)g)')
+    parser.add_argument(
+        '--method', default='hybrid_auto', metavar='MATCHING_ALGORITHM',
+        help='a method of the paper, such as class_bf or clip_prosac (default: %(default)s)')
+    parser.add_argument(
+        '--assets', type=Path, default=ASSETS, metavar='DIR',
+        help='another world than the shipped one: sequence/ (a TUM folder), map.yaml, yolo.pt, '
+        'for --map mapping/, and except for class_* clip.json and clip.safetensors')
+    parser.add_argument(
+        '--map', action='store_true',
+        help="build the map from the assets' mapping walk (mapping/), and wake up in it")
+    parser.add_argument(
+        '--cameras', type=int, choices=(1, 4), default=1,
+        help='4: a robot that looks in four directions at once and does not turn (default: 1)')
+    parser.add_argument(
+        '--kidnapped', action='store_true',
+        help='carry a driving robot away: its watch notices, and it gets its pose back')
+    parser.add_argument(
+        '--rviz', action='store_true', help='show the topics in RViz, where it is installed')
+    return parser
+
+
+def demonstrate(options: argparse.Namespace) -> int:
+    """Run the demo as the command line says; return the exit code."""
+    with needs_ros('the demo'):
+        import rclpy  # noqa: F401
+    from demo.run import DemoOptions, run_demo
+
+    chosen = DemoOptions(assets=options.assets, out=options.out, wake_ups=options.wake_ups,
+                         rate=options.rate, method=options.method, rviz=options.rviz,
+                         has_rig=options.cameras > 1, is_watched=options.kidnapped)
+    if options.kidnapped:
+        from demo.kidnapped import run_kidnapped
+
+        run_kidnapped(chosen)
+    elif options.map:
+        from demo.map_demo import run_map_demo
+
+        run_map_demo(chosen)
+    else:
+        run_demo(chosen)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,280 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A robot that drives is carried away: the watch notices, it stops, and gets its pose back."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rclpy
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header, String
+from vision_msgs.msg import Detection2DArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import (
+    invert_transform,
+    pose_error,
+    quaternion_from_transform,
+    transform_from_pose,
+)
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.core.watch.watch import WatchState
+from cliploc_ros.messages import detections_from_msg
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.poses import slerp
+from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.ros import qos
+from cliploc_ros.ros.conversions import pose_to_msg, pose_with_covariance_msg, stamp_ns
+from cliploc_ros.ros.outputs.visualization import image_to_msg
+from demo.pictures import Moment, Step, draw_kidnapped
+from demo.processes import DemoError, own_ros_domain
+from demo.run import DemoOptions, nodes, prepare
+
+PICTURE = 'kidnapped.png'
+_SPEED_M_S, _TICK_S = 0.3, 0.05
+# A robot that stands takes images at this period, and the localizer shows its pose.
+_IMAGE_PERIOD_S, _POSE_PERIOD_S = 0.25, 0.25
+_PATIENCE_S = 60.0
+# It drives on for so many looks after it was found lost: nothing may happen then.
+_LOOKS_LOST = 2
+_STANDS_ON_S = 2.0
+_FRAME = 'camera'
+# Images of the walk that it drives back, and where on the other walk it is put down: 3 m away.
+_BEFORE, _AFTER = slice(14, 1, -1), slice(1, 14)
+
+
+@dataclass(frozen=True)
+class View:
+    """An image of the room, and where it was taken (4, 4)."""
+
+    file: Path
+    map_from_camera: NDArray[np.float64]
+
+
+class KidnappedRobot(Node):
+    """Publishes views, odometry and the pose of a localizer that follows odometry, as AMCL does.
+
+    ``check`` is called while time passes; it raises if a node has ended.
+    """
+
+    def __init__(self, camera: Camera, frame_id: str, check: Callable[[], None]) -> None:
+        super().__init__('robot')
+        self._camera, self._frame_id, self._check = camera, frame_id, check
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
+        self._image = self.create_publisher(Image, 'image', qos.POSE)
+        self._info = self.create_publisher(CameraInfo, 'camera_info', qos.POSE)
+        self._odom = self.create_publisher(Odometry, 'odom', qos.POSE)
+        self._shown = self.create_publisher(PoseWithCovarianceStamped, 'amcl_pose', qos.LATCHED)
+        self.create_subscription(PoseWithCovarianceStamped, 'initialpose', self._take, qos.POSE)
+        self.create_subscription(PoseWithCovarianceStamped, 'relocalizer/pose', self._on_pose,
+                                 qos.POSE)
+        self.create_subscription(String, 'relocalizer/localization_state', self._on_state,
+                                 qos.LATCHED)
+        self.create_subscription(Detection2DArray, 'detections', self._on_detections,
+                                 qos.DETECTIONS_OUT)
+        self._truth = self._odom_from_camera = self._map_from_odom = np.eye(4)
+        self._show_at = 0.0
+        self.began_at, self.looks, self.state = time.monotonic(), 0, ''
+        #: When it was found lost [s], and after how many looks; None until then.
+        self.lost: tuple[float, int] | None = None
+        #: Of poses, when they came [s].
+        self.relocalized_s: list[float] = []
+        self.delivered_s: list[float] = []
+        self.moments: list[Moment] = []
+        #: The newest view that was detected, and what.
+        self.seen: tuple[View, Detections] | None = None
+        self._views: dict[int, View] = {}
+
+    @property
+    def now_s(self) -> float:
+        """Return the time since the start [s]."""
+        return time.monotonic() - self.began_at
+
+    @property
+    def error_m(self) -> float:
+        """Return how far the localizer is from the truth [m]."""
+        return pose_error(self._map_from_odom @ self._odom_from_camera, self._truth)[0]
+
+    def put(self, view: View) -> None:
+        """Put the robot down at a view; neither odometry nor the localizer notices."""
+        self._truth = view.map_from_camera
+
+    def begin(self, view: View) -> None:
+        """Begin at a view that the localizer knows."""
+        self.put(view)
+        self._map_from_odom = view.map_from_camera
+
+    def drive(self, views: Sequence[View]) -> Iterator[None]:
+        """Drive through views from the first; yield after each of the others."""
+        for last, view in pairwise(views):
+            step = invert_transform(last.map_from_camera) @ view.map_from_camera
+            way_m = float(np.linalg.norm(step[:3, 3]))
+            ticks = max(1, round(way_m / _SPEED_M_S / _TICK_S))
+            begin = self._odom_from_camera
+            for tick in range(1, ticks + 1):
+                self._truth = _between(last.map_from_camera, view.map_from_camera, tick / ticks)
+                self._odom_from_camera = begin @ invert_transform(
+                    last.map_from_camera) @ self._truth
+                self._pass(view if tick == ticks else None)
+            yield
+
+    def stand(self, view: View, until: Callable[[], bool], what: str) -> None:
+        """Stand at a view until a condition holds. DemoError: it never does."""
+        end, image_at = self.now_s + _PATIENCE_S, 0.0
+        while not until():
+            if self.now_s > end:
+                raise DemoError(f'waited {_PATIENCE_S:g} s for {what}')
+            is_due = self.now_s >= image_at
+            if is_due:
+                image_at = self.now_s + _IMAGE_PERIOD_S
+            self._pass(view if is_due else None)
+
+    def _pass(self, view: View | None) -> None:
+        """Let a tick pass: tell odometry and pose, and take an image if there is a view."""
+        self._check()
+        end = time.monotonic() + _TICK_S
+        stamp = self.get_clock().now()
+        odometry = Odometry(header=Header(frame_id='odom', stamp=stamp.to_msg()),
+                            child_frame_id=_FRAME)
+        odometry.pose.pose = pose_to_msg(self._odom_from_camera)
+        self._odom.publish(odometry)
+        localized = self._map_from_odom @ self._odom_from_camera
+        if self.now_s >= self._show_at:
+            self._show_at = self.now_s + _POSE_PERIOD_S
+            self._shown.publish(pose_with_covariance_msg(
+                Header(frame_id=self._frame_id, stamp=stamp.to_msg()), localized,
+                0.01 * np.eye(6)))
+        if view is not None:
+            self._take_image(view, Header(frame_id=_FRAME, stamp=stamp.to_msg()))
+        self.moments.append(Moment(self.now_s, self._truth, localized, self.state))
+        while (left_s := end - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=left_s)
+
+    def _take_image(self, view: View, header: Header) -> None:
+        camera, pixels = self._camera, cv2.imread(str(view.file))
+        if pixels is None:
+            raise DemoError(f'{view.file} is no image: choose another folder with --assets')
+        self._views[stamp_ns(header.stamp)] = view
+        self._image.publish(image_to_msg(np.asarray(cv2.cvtColor(
+            pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8), header))
+        self._info.publish(CameraInfo(
+            header=header, width=camera.width, height=camera.height, k=camera.matrix.ravel(),
+            distortion_model='plumb_bob', d=[0.0] * 5,
+            p=np.c_[camera.matrix, np.zeros(3)].ravel()))
+
+    def _take(self, msg: PoseWithCovarianceStamped) -> None:
+        """Take a pose, as AMCL does at rest."""
+        self._map_from_odom = _pose_of(msg) @ invert_transform(self._odom_from_camera)
+        self._show_at = 0.0
+        self.delivered_s.append(self.now_s)
+
+    def _on_pose(self, msg: PoseWithCovarianceStamped) -> None:
+        self.relocalized_s.append(self.now_s)
+
+    def _on_state(self, msg: String) -> None:
+        if (self.state, msg.data) != (WatchState.LOST, WatchState.UNCERTAIN):
+            self.looks += 1  # else the watch has begun again, with the pose that was delivered
+        self.state = msg.data
+        if self.state == WatchState.LOST and self.lost is None:
+            self.lost = self.now_s, self.looks
+
+    def _on_detections(self, msg: Detection2DArray) -> None:
+        view = self._views.get(stamp_ns(msg.header.stamp))
+        if view is not None and self.state != WatchState.LOST:
+            self.seen = view, detections_from_msg(msg)
+
+
+def run_kidnapped(options: DemoOptions) -> list[Step]:
+    """Kidnap the robot, print what happens, and draw it; return the steps.
+
+    CliplocError: assets are missing, the nodes do not run, or the robot does not find itself.
+    """
+    prepare(options)
+    landmark_map = LandmarkMap.from_file(options.map_file)
+    walks = [read_tum(options.assets / name) for name in ('sequence', 'mapping')]
+    before, after = ([View(walk.image_paths[row], pose) for row in range(len(walk))[chosen]
+                      if (pose := walk.pose_at(walk.stamps_ns[row])) is not None]
+                     for walk, chosen in zip(walks, (_BEFORE, _AFTER), strict=True))
+    camera = find_camera(None, walks[0].folder)[0]
+    with own_ros_domain() as domain, nodes(options, domain) as check:
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            robot = KidnappedRobot(camera, landmark_map.frame_id, check)
+            steps = _kidnap(robot, before, after)
+            robot.destroy_node()
+        finally:
+            rclpy.try_shutdown()
+    picture = options.out / PICTURE
+    assert robot.seen is not None
+    view, detections = robot.seen
+    draw_kidnapped(view.file, camera, detections, landmark_map, robot.moments, steps, picture)
+    print(f'picture: {picture.resolve()}', flush=True)
+    return steps
+
+
+def _kidnap(robot: KidnappedRobot, before: Sequence[View], after: Sequence[View]) -> list[Step]:
+    """Let the robot drive, carry it away, and wait until its localizer is right again."""
+    steps: list[Step] = []
+    carried_s, first = 0.0, 0
+
+    def tell(text: str, at_s: float | None = None, looks: int | None = None) -> None:
+        step = Step(robot.now_s if at_s is None else at_s,
+                    robot.looks if looks is None else looks, text)
+        steps.append(step)
+        when = f'{step.time_s - carried_s:5.1f} s {step.looks - first:3d} looks' \
+            if carried_s else 'before'
+        print(f'{when:>17}: {text}', flush=True)
+
+    robot.begin(before[0])
+    for _ in robot.drive(before):
+        pass
+    robot.stand(before[-1], lambda: robot.state == WatchState.LOCALIZED, 'the watch to agree')
+    tell(f'the watch agrees with the localizer, {robot.error_m:.2f} m from the truth')
+    carried_s, first = robot.now_s, robot.looks
+    robot.put(after[0])
+    tell(f'carried by {robot.error_m:.2f} m; odometry and localizer do not notice')
+    way = robot.drive(after)
+    last = next((view for view, _ in zip(after[1:], way, strict=False)
+                 if robot.lost and robot.looks >= robot.lost[1] + _LOOKS_LOST), None)
+    if robot.lost is None or last is None:
+        raise DemoError('the watch did not notice before the way ended')
+    tell('noticed: lost; it drives on', *robot.lost)
+    stopped_s = robot.now_s
+    tell('it stops')
+    if robot.relocalized_s or robot.delivered_s:
+        raise DemoError('a pose came while the robot drove')
+    robot.stand(last, lambda: bool(robot.delivered_s), 'a pose to be delivered')
+    tell(f'relocalized, {robot.relocalized_s[0] - stopped_s:.1f} s after it stopped',
+         robot.relocalized_s[0])
+    tell(f'delivered: {robot.error_m:.2f} m from the truth', robot.delivered_s[0])
+    robot.stand(last, lambda: robot.state == WatchState.LOCALIZED, 'the watch to agree')
+    tell('the watch agrees again')
+    end_s = robot.now_s + _STANDS_ON_S
+    robot.stand(last, lambda: robot.now_s > end_s, 'the end')
+    return steps
+
+
+def _between(one: NDArray[np.float64], other: NDArray[np.float64], share: float
+             ) -> NDArray[np.float64]:
+    """Return a pose (4, 4) between two."""
+    quat = slerp(quaternion_from_transform(one), quaternion_from_transform(other), share)
+    place = one[:3, 3] + share * (other[:3, 3] - one[:3, 3])
+    return transform_from_pose(place, quat)
+
+
+def _pose_of(msg: PoseWithCovarianceStamped) -> NDArray[np.float64]:
+    p, q = msg.pose.pose.position, msg.pose.pose.orientation
+    return transform_from_pose(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))

@@ -1,0 +1,100 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The demo with a map of its own: build it from the mapping walk, judge it, wake up in it."""
+
+import json
+import subprocess
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.models.map_rows import embed_map
+from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.offline.datasets.folders import tum_frames
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.observations import load_recorded
+from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.offline.evaluation.methods import Method
+from cliploc_ros.offline.evaluation.recording import make_queries_of
+from cliploc_ros.offline.evaluation.run import run_methods
+from cliploc_ros.offline.evaluation.summary import Summary, summarize
+from cliploc_ros.offline.evaluation.trials import make_queries
+from cliploc_ros.offline.recording.networks import LoadNetworks
+from cliploc_ros.offline.recording.recorder import record_every_frame
+from demo.map_review import (
+    PICTURE,
+    console_lines,
+    count_sightings,
+    draw_map_review,
+    review_map,
+    section,
+    success_lines,
+)
+from demo.processes import DemoError, find_executable
+from demo.run import DemoOptions, WakeUpMap, prepare, run_demo
+from demo.truth import read_frames, read_objects
+
+
+def run_map_demo(options: DemoOptions) -> None:
+    """Build a map from the mapping walk, compare it with the room, and wake up in it.
+
+    CliplocError: assets are missing or invalid, the map cannot be built, or the nodes do not run.
+    """
+    if options.method.startswith('class'):
+        raise DemoError(f'--map compares labels, but --method {options.method} uses none: choose '
+                        'a hybrid_ or clip_ method')
+    prepare(options)
+    walk = options.assets / 'mapping'
+    if not walk.is_dir():
+        raise DemoError(f'{walk} is missing: choose another folder with --assets')
+    objects = read_objects(walk)
+    files = {name: options.out / f'built_map.{name}' for name in ('yaml', 'json', 'npz')}
+    _build(options, walk, files)
+    detections = load_recorded(files['npz']).detections
+    review = review_map(
+        LandmarkMap.from_file(files['yaml']), objects,
+        count_sightings(tuple(read_frames(walk)), detections),
+        json.loads(files['json'].read_text())['left_out'])
+    print('\n'.join(console_lines(review)), flush=True)
+    successes = _judge(options, files['yaml'])
+    print('\n' + '\n'.join(success_lines(successes)) + '\n', flush=True)
+    draw_map_review(review, detections.map_from_camera, options.out / PICTURE)
+    landmark_of = review.landmark_of
+    run_demo(replace(options, wake_up_map=WakeUpMap(
+        files['yaml'], lambda object_id: landmark_of.get(object_id, ''),
+        section(review, successes, len(detections)))))
+
+
+def _build(options: DemoOptions, walk: Path, files: Mapping[str, Path]) -> None:
+    """Write map, report and detections as a user does, with the installed executable."""
+    arguments = ['build_map', '--tum', walk, '--out', files['yaml'], '--report', files['json'],
+                 '--record-to', files['npz'], '--model', options.assets / 'yolo.pt',
+                 '--clip-model', options.assets / 'clip.json',
+                 '--clip-pretrained', options.assets / 'clip.safetensors']
+    print('$ ' + ' '.join(map(str, arguments)), flush=True)
+    done = subprocess.run([str(find_executable('build_map')), *map(str, arguments[1:])],
+                          check=False)
+    if done.returncode:
+        raise DemoError(f'build_map ended with exit code {done.returncode}; its message is above')
+
+
+def _judge(options: DemoOptions, built_map_file: Path) -> dict[str, Summary]:
+    """Return the success of one look at each image of the wake-ups, in the built and true map."""
+    clip = ClipOptions(model=str(options.assets / 'clip.json'),
+                       pretrained=str(options.assets / 'clip.safetensors'))
+    sequence = read_tum(options.assets / 'sequence')
+    print(f'localizing all {len(sequence)} images of the wake-ups in both maps', flush=True)
+    look = LoadNetworks(DetectorOptions(model=str(options.assets / 'yolo.pt')), clip)()
+    recorded = record_every_frame(
+        tum_frames(sequence, find_camera(None, sequence.folder)[0]), look)
+    method = Method(options.method, options.values.options())
+    summaries = {}
+    for name, file in (('built map', built_map_file), ('true map', options.assets / 'map.yaml')):
+        landmark_map = LandmarkMap.from_file(file)
+        queries = make_queries_of(recorded, landmark_map, embed_map(
+            clip, landmark_map, [str(file)], options.values.landmark_embeddings))
+        summaries[name], = summarize(run_methods(
+            landmark_map, [method], make_queries(queries, landmark_map), trials=1))
+    return summaries

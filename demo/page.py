@@ -1,0 +1,134 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Report the demo's wake-ups: a table on the terminal, and a page with the pictures."""
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from cliploc_ros.files.page import figure, first_screen, fold, page, table, tiles, verdict
+from cliploc_ros.files.storage import write_text
+from demo.review import WRONG_M, Judged, Review
+
+TOP_VIEW = 'top_view.png'
+#: Pattern of the wake-ups' pictures.
+PICTURES = 'wake_up_??.png'
+
+# Columns of the first screen.
+_BRIEF_COLUMNS = (0, 2, 4, 6, 7)
+# Heading and width on the terminal.
+_COLUMNS = (('', 3), ('image at', 8), ('answer', 8), ('score', 6), ('landmarks', 9),
+            ('x y z [m]', 18), ('error', 15), ('answer time', 11), ('stages', 0))
+_BRIEF = [_COLUMNS[column][0] for column in _BRIEF_COLUMNS]
+
+_SYNTHETIC = """\
+<p class="note"><b>This world is synthetic.</b> A program rendered room, objects and images;
+detector and CLIP are small networks trained on renders of other such rooms. Nodes, messages and
+search are those that run on a robot. So the page shows that the whole works, and <em>not</em> how
+well it recognizes real objects in real light. To find out, run the nodes on your own
+recordings.</p>"""
+
+_HOW = """\
+<p class="note">The two nodes sent boxes, hypotheses and figures of the table over ROS. The errors
+compare with the recording's ground truth, which the nodes never see. No topic carries the matches
+of boxes and landmarks. For the pictures the demo therefore repeats the search on the same
+detections with the same code, networks, options and seed, and compares its pose with the one from
+ROS ({repeated}).</p>"""
+
+_LIST = """\
+<p class="note">CLIP is the cosine similarity of crop and label, rank its place among all labels of
+the map, IoU the overlap of box and projected landmark. ✓ and ✗ compare a match with what the
+renderer drew there. A ✗ can also mean that the object was moved after mapping, or is not in the
+map.</p>"""
+
+
+def rig_section(cameras: Sequence[str], alone: int, count: int) -> str:
+    """Return what the page says of several cameras: how many are accepted with the first alone."""
+    return (f'<p class="note">The robot has {len(cameras)} cameras, {escape(", ".join(cameras))}, '
+            'and does not turn. Its pose is that of the first. With the first alone, '
+            f'{alone} of {count} wake-ups would be accepted.</p>')
+
+
+def picture_name(judged: Judged) -> str:
+    """Return the file name of a wake-up's picture."""
+    return PICTURES.replace('??', f'{judged.number:02d}')
+
+
+def console_header() -> str:
+    """Return the headings of the table."""
+    return _line([heading for heading, _ in _COLUMNS])
+
+
+def console_row(judged: Judged) -> str:
+    """Return a wake-up as a line of the table."""
+    return _line(_cells(judged))
+
+
+def summary(judged: Sequence[Judged]) -> str:
+    """Summarize all wake-ups in one line."""
+    accepted = [one for one in judged if one.wake_up.accepted]
+    wrong = sum(one.is_wrong for one in accepted)
+    errors = [one.error[0] for one in accepted if one.error is not None]
+    text = (f'{len(judged)} wake-ups: {len(accepted)} accepted, {len(judged) - len(accepted)} '
+            f'refused, {wrong or "none"} wrong by more than {WRONG_M:g} m')
+    if errors:
+        text += f'; error {np.median(errors):.3f} m (median), {max(errors):.3f} m at most'
+    return text + f'; answer time {np.median([one.wake_up.answer_s for one in judged]):.2f} s ' \
+        '(median)'
+
+
+def write_page(folder: Path, reviews: Sequence[Review], method: str, section: str = '') -> Path:
+    """Write the page that shows all pictures; return its file.
+
+    The section is HTML to put before the wake-ups.
+    """
+    judged = [review.judged for review in reviews]
+    accepted = [one for one in judged if one.wake_up.accepted]
+    wrong = sum(one.is_wrong for one in accepted)
+    errors = [one.error[0] for one in accepted if one.error is not None]
+    repeated = sum(review.repeated for review in reviews)
+    how = _HOW.format(repeated=f'equal in {repeated} of {len(reviews)} cases')
+    rows = [[(cell, cell) if cell in ('accepted', 'refused') else cell for cell in _cells(one)]
+            for one in judged]
+    pictures = [figure(picture_name(one), f'“{one.wake_up.message}”',
+                       f'wake-up {one.number}: {one.verdict}') for one in judged]
+    numbers = [(f'{len(accepted)} of {len(judged)}', 'wake-ups accepted', bool(accepted)),
+               (str(wrong), f'wrong by more than {WRONG_M:g} m', not wrong)]
+    if errors:
+        numbers.append((f'{100 * np.median(errors):.1f} cm', 'off the truth (median)', not wrong))
+    page_file = folder / 'index.html'
+    write_text(page_file, page(
+        'cliploc_ros: a robot wakes up', first_screen(
+            [verdict(f'{summary(judged)}.', not wrong), tiles(numbers), _SYNTHETIC,
+             '<h2>Wake-ups</h2>', table(_BRIEF, ([row[column] for column in _BRIEF_COLUMNS]
+                                                 for row in rows))],
+            [figure(TOP_VIEW, 'The map from above. A line joins each estimate to its ground '
+                    'truth. Refused poses were not published.', 'map with the estimated poses')]),
+        section,
+        fold(f'All figures; method {method}', table([name for name, _ in _COLUMNS], rows)),
+        # several cameras have pictures without a list of matches
+        fold('How to read the pictures', how, '' if any(one.beside for one in reviews)
+             else _LIST), *pictures))
+    return page_file
+
+
+def _cells(judged: Judged) -> list[str]:
+    """Return a wake-up's cells; the error of a refused pose is in brackets."""
+    wake_up = judged.wake_up
+    position = error = '–'
+    if wake_up.accepted and judged.pose is not None:
+        position = ' '.join(f'{value:.2f}' for value in judged.pose[:3, 3])
+    if judged.error is not None:
+        error = f'{judged.error[0]:.3f} m {judged.error[1]:.1f}°'
+        error = error if wake_up.accepted else f'({error})'
+    stages = ', '.join(f'{stage} {ms} ms' for stage, ms in wake_up.stage_ms.items())
+    return [str(judged.number), f'{judged.time_s:.1f} s',
+            'accepted' if wake_up.accepted else 'refused', f'{wake_up.score:.2f}',
+            str(wake_up.landmarks), position, error, f'{wake_up.answer_s:.2f} s', stages]
+
+
+def _line(cells: Sequence[str]) -> str:
+    return '  '.join(cell.ljust(width) for cell, (_, width) in zip(cells, _COLUMNS, strict=True)
+                     ).rstrip()

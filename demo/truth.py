@@ -1,0 +1,98 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Read what each image of a synthetic room shows, as its generator recorded it."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from cliploc_ros.errors import DatasetError
+
+#: A detector need not find a box that shows less of its object than this share.
+LEAST_VISIBILITY = 0.3
+_SAME_OBJECT_IOU = 0.5
+
+
+@dataclass(frozen=True)
+class TrueObject:
+    """An object of the room, and the ellipsoid around it [m]."""
+
+    object_id: str
+    class_id: str
+    label: str
+    center: npt.NDArray[np.float64]
+    semi_axes: npt.NDArray[np.float64]
+    orientation: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TrueBox:
+    """The box around the visible part of an object [px], and what the object is."""
+
+    object_id: str
+    class_id: str
+    label: str
+    bbox_xyxy: npt.NDArray[np.float64]
+    visibility: float
+    in_map: bool
+
+
+@dataclass(frozen=True)
+class TrueFrame:
+    """An image of a world and the boxes in it."""
+
+    image: Path
+    timestamp: str
+    boxes: tuple[TrueBox, ...]
+
+
+def read_objects(world: Path) -> tuple[TrueObject, ...]:
+    """Return the objects of a world, whether they are in its map or not.
+
+    DatasetError: truth.json is missing or lacks them.
+    """
+    file = world / 'truth.json'
+    try:
+        objects = tuple(TrueObject(item['id'], item['class_id'], item['label'], *(
+            np.array(item[name], dtype=float) for name in ('center', 'semi_axes', 'orientation')))
+            for item in json.loads(file.read_text())['objects'])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f'{file}: the objects of the room cannot be read ({error!r}); make it '
+                           'with python -m demo.world.make_demo_world') from error
+    if not objects:
+        raise DatasetError(f'{file}: the room has no objects')
+    return objects
+
+
+def read_frames(world: Path, least_visibility: float = LEAST_VISIBILITY) -> Iterator[TrueFrame]:
+    """Yield the images of a world with the boxes that show enough of their object."""
+    truth = json.loads((world / 'truth.json').read_text())
+    objects = {item['id']: item for item in truth['objects']}
+    for frame in truth['frames']:
+        yield TrueFrame(world / 'rgb' / f'{frame["timestamp"]}.jpg', frame['timestamp'], tuple(
+            TrueBox(seen['object'], objects[seen['object']]['class_id'],
+                    objects[seen['object']]['label'], np.array(seen['bbox_xyxy']),
+                    seen['visibility'], objects[seen['object']]['in_map'])
+            for seen in frame['boxes'] if seen['visibility'] >= least_visibility))
+
+
+def true_ids(bboxes_xyxy: npt.NDArray[np.float64], true_boxes: Sequence[TrueBox]
+             ) -> tuple[str, ...]:
+    """Return the object whose visible part fills each box (n, 4), or ''."""
+    ids = []
+    for bbox in bboxes_xyxy:
+        ious = [_box_iou(bbox, true.bbox_xyxy) for true in true_boxes]
+        best = int(np.argmax(ious)) if ious else -1
+        ids.append(true_boxes[best].object_id if ious and ious[best] > _SAME_OBJECT_IOU else '')
+    return tuple(ids)
+
+
+def _box_iou(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64]) -> float:
+    sides = np.minimum(first[2:], second[2:]) - np.maximum(first[:2], second[:2])
+    shared = float(np.prod(np.maximum(sides, 0.0)))
+    return shared / float(np.prod(first[2:] - first[:2]) + np.prod(second[2:] - second[:2])
+                          - shared)

@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Compare the paper's methods in the demo's world: ``python -m demo.world.compare --out DIR``.
+
+This scores the small networks on the demo's walk, which they were not trained on, records their
+output once, and runs the paper's ten methods on the recording.
+"""
+
+import argparse
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.command import run_command
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.files.storage import make_folder
+from cliploc_ros.models.clip_encoder import load_encoder
+from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.yolo_weights import import_ultralytics
+from cliploc_ros.offline.datasets.folders import tum_frames
+from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.queries import Queries, QueryFrame, save_queries
+from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.offline.evaluation.methods import parse_methods
+from cliploc_ros.offline.evaluation.recording import make_queries_of
+from cliploc_ros.offline.evaluation.run import compare_methods
+from cliploc_ros.offline.evaluation.trials import make_queries
+from cliploc_ros.offline.recording.networks import RunNetworks
+from cliploc_ros.offline.recording.recorder import record_every_frame
+from demo import ASSETS
+from demo.truth import TrueFrame, read_frames
+from demo.world import train_detector
+
+
+def record(sequence: Path, landmark_map: LandmarkMap, cache_dir: Path) -> Queries:
+    """Run the shipped detector and CLIP on the images of a world, against a map."""
+    detector = load_detector(DetectorOptions(model=str(ASSETS / 'yolo.pt')))
+    clip = ClipOptions(model=str(ASSETS / 'clip.json'), cache_dir=str(cache_dir),
+                       pretrained=str(ASSETS / 'clip.safetensors'))
+    encoder, labels = load_encoder(clip, landmark_map.weighted_labels)
+    frames = tum_frames(read_tum(sequence), find_camera(None, sequence)[0])
+    recorded = record_every_frame(frames, RunNetworks(detector.detect, encoder))
+    return make_queries_of(recorded, landmark_map, labels)
+
+
+def score_detector(sequence: Path) -> float:
+    """Return the mAP50 of the shipped detector on a world's images."""
+    with tempfile.TemporaryDirectory(prefix='cliploc_ros_score_') as name:
+        data = train_detector.write_dataset({'train': [sequence], 'val': [sequence]},
+                                            Path(name) / 'data')
+        model = import_ultralytics().YOLO(ASSETS / 'yolo.pt')
+        return float(train_detector.score(model, data, Path(name)).box.map50)
+
+
+def score_clip(frames: Sequence[QueryFrame], truth: Sequence[TrueFrame],
+               landmark_ids: Sequence[str]) -> tuple[float, float, int]:
+    """Return CLIP's top-1 and top-3 accuracy, and the number of detected objects.
+
+    An object counts if it is in the map and a detection overlaps its true box by an IoU of more
+    than .5.
+    """
+    ranks = []
+    for frame, true_frame in zip(frames, truth, strict=True):
+        for box in true_frame.boxes:
+            overlaps = _overlaps(box.bbox_xyxy, frame.bboxes_xyxy)
+            if box.object_id in landmark_ids and overlaps.max(initial=0.0) > 0.5:
+                similarities = frame.similarities[int(np.argmax(overlaps))]
+                own = similarities[landmark_ids.index(box.object_id)]
+                ranks.append(int((similarities > own).sum()))
+    counted, number = np.array(ranks), max(len(ranks), 1)
+    return int((counted < 1).sum()) / number, int((counted < 3).sum()) / number, len(ranks)
+
+
+def _overlaps(bbox: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the IoU (n,) of a box (4,) with others (n, 4)."""
+    def area(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.clip(boxes[..., 2:] - boxes[..., :2], 0, None).prod(-1))
+
+    shared = area(np.concatenate([np.maximum(bbox[:2], others[:, :2]),
+                                  np.minimum(bbox[2:], others[:, 2:])], axis=1))
+    return np.asarray(shared / (area(bbox) + area(others) - shared))
+
+
+def run(arguments: list[str]) -> int:
+    """Score the networks, record, compare."""
+    parser = argparse.ArgumentParser(prog='compare', description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--out', type=Path, default=Path('demo_compare'), metavar='DIR')
+    parser.add_argument('--trials', type=int, default=5, help='number of seeds (%(default)s)')
+    parser.add_argument('--iterations', type=int, default=500, help="the paper's %(default)s")
+    parser.add_argument('--budget', type=float, default=2.0, metavar='S',
+                        help='time limit of a search [s] (%(default)s), which some exhaustive '
+                        'searches reach')
+    parser.add_argument('--workers', type=int, default=len(os.sched_getaffinity(0)))
+    options = parser.parse_args(arguments)
+    make_folder(options.out)
+    landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
+    with tempfile.TemporaryDirectory(prefix='cliploc_ros_compare_') as cache:
+        queries = record(ASSETS / 'sequence', landmark_map, Path(cache))
+    save_queries(options.out / 'queries.npz', queries)
+    first, third, count = score_clip(tuple(queries), list(read_frames(ASSETS / 'sequence')),
+                                     landmark_map.landmark_ids)
+    print(f'detector: mAP50 {score_detector(ASSETS / "sequence"):.3f}; CLIP: top-1 {first:.3f}, '
+          f'top-3 {third:.3f} of {count} detected objects, {len(landmark_map)} labels\n')
+    paper = RelocalizerOptions(iterations=options.iterations, time_budget_s=options.budget)
+    compare_methods(landmark_map, make_queries(queries, landmark_map),
+                    parse_methods(['all', 'auto'], paper, len(landmark_map)), options.out,
+                    trials=options.trials, workers=options.workers, resume=True,
+                    frames=queries.frames)
+    return 0
+
+
+def main() -> int:
+    """Run from the command line; return the exit code."""
+    return run_command(lambda: run(sys.argv[1:]))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

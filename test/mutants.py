@@ -1,0 +1,649 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the tests notice faults: ``python test/mutants.py --help``.
+
+Faults are planted in lines drawn at random, one at a time and in memory: a comparison is turned, a
+constant changed, a term dropped, a sign flipped, a condition negated, two arguments exchanged, a
+call left out, or None returned. The tests that run the line have to fail, the quick ones first.
+
+``record`` runs tests once and stores the lines that each of them runs, and its time. A line that
+runs at import has the tests of the lines that use its name. Nobody sees the lines of compiled
+kernels. So ``record --plain`` runs tests with kernels that are not compiled, which are slow and
+divide otherwise than compiled ones; it leaves out tests that then fail or take too long. A fault
+in a kernel meets those tests, and as plain Python.
+
+A fault that a test notices which fails without it, too, does not count: the test is left out.
+"""
+
+import argparse
+import ast
+import copy
+import gc
+import os
+import pickle
+import random
+import re
+import selectors
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from functools import cache
+from importlib.machinery import SourceFileLoader
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+from types import CodeType, FunctionType
+from typing import Any, NamedTuple, NoReturn
+
+import pytest
+from _pytest.runner import runtestprotocol
+
+PROJECT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(PROJECT))  # not the copy in install/
+
+from cliploc_ros.command import run_command  # noqa: E402
+
+PACKAGE = 'cliploc_ros'
+RECORDS = PROJECT / 'build' / 'mutants'
+_SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
+    ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.And: ast.Or,
+    ast.Or: ast.And, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd}
+_QUIET = ('-q', '-x', '-p', 'no:cacheprovider', '-p', 'no:rerunfailures', '-p', 'no:xdist')
+# Calls whose arguments may be exchanged, or whose exchange no type checker lets pass.
+_ALIKE = re.compile(r'(^|\.)(max|min|maximum|minimum|hypot|logaddexp|isinstance|cast)$')
+_LOGS = re.compile(r'(self\._?)?([\w.]+\.get_)?log(ger)?(\(\))?\.(debug|info|warning|error)\(')
+# A test with a fault may take so much longer [s], and a fault may cost this time in all.
+_PATIENCE_S, _MOST_S = 60.0, 20.0
+
+
+class Record(NamedTuple):
+    """What a test ran."""
+
+    seconds: float  #: Of processor time, of this process
+    lines: frozenset[tuple[str, int]]  #: File, relative to the project, and line
+
+
+class Mutant(NamedTuple):
+    """A fault in a line."""
+
+    file: str
+    line: int
+    number: int  #: Of the faults of this file
+    what: str
+    lines: tuple[int, ...]  #: Those of its statement; a test that runs one of them runs it
+    names: tuple[str, ...]  #: Where it runs at import: names that it defines
+    function: tuple[str, int] | None  #: Name and first line of the outermost function around it
+    is_compiled: bool  #: Whether numba compiles it
+
+
+class Outcome(NamedTuple):
+    """What the tests made of a fault."""
+
+    mutant: Mutant
+    tests: int  #: How many tests could notice it
+    killer: str = ''  #: The test that noticed it, or 'time' where they did not end
+
+
+# ---- faults -------------------------------------------------------------------------------------
+
+def mutants_of(file: str) -> list[Mutant]:
+    """Return all faults of a file of the project."""
+    tree = ast.parse((PROJECT / file).read_text())
+    return [site.as_mutant(file, number) for number, site in enumerate(_sites(tree))]
+
+
+def planted(mutant: Mutant) -> tuple[CodeType, str]:
+    """Return the code of a module with a fault, and its changed line."""
+    tree = ast.parse((PROJECT / mutant.file).read_text())
+    site = _sites(tree)[mutant.number]
+    site.put()
+    return (compile(ast.fix_missing_locations(tree), str(PROJECT / mutant.file), 'exec'),
+            ast.unparse(site.statement).splitlines()[0])
+
+
+class _Site(NamedTuple):
+    """A place of a tree, and what a fault puts there."""
+
+    parent: ast.AST
+    field: str
+    row: int | None
+    node: Any
+    what: str
+    new: ast.AST
+    statement: ast.stmt
+    function: ast.FunctionDef | None  #: The outermost one around it
+
+    def put(self) -> None:
+        """Plant the fault."""
+        new = ast.copy_location(self.new, self.node)
+        if self.row is None:
+            setattr(self.parent, self.field, new)
+        else:
+            getattr(self.parent, self.field)[self.row] = new
+
+    def as_mutant(self, file: str, number: int) -> Mutant:
+        one = self.statement
+        body = getattr(one, 'body', None)  # of a compound statement the head alone counts
+        last = body[0].lineno - 1 if body else one.end_lineno or one.lineno
+        names: tuple[str, ...] = ()
+        if self.function is None:
+            names = (one.name,) if isinstance(one, ast.FunctionDef) else tuple(
+                node.id for node in ast.walk(one)
+                if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store))
+        decorators = self.function.decorator_list if self.function else []
+        return Mutant(
+            file, self.node.lineno, number, self.what,
+            tuple(range(one.lineno, max(one.lineno, last) + 1)), names,
+            None if self.function is None else (self.function.name, min(
+                [self.function.lineno, *(each.lineno for each in decorators)])),
+            any(isinstance(each, ast.Name) and each.id == 'compiled' for each in decorators))
+
+
+def _sites(tree: ast.Module) -> list[_Site]:
+    return list(_walk(tree, None, None))
+
+
+def _walk(parent: ast.AST, statement: ast.stmt | None, function: ast.FunctionDef | None
+          ) -> Iterator[_Site]:
+    """Yield the sites below a node. Annotations, messages, logs and documents have none."""
+    for field, value in ast.iter_fields(parent):
+        if field in ('annotation', 'returns', 'decorator_list', 'type_params', 'type_comment'):
+            continue
+        around = function
+        if function is None and field == 'body' and isinstance(parent, ast.FunctionDef):
+            around = parent
+        for index, node in enumerate(value if isinstance(value, list) else [value]):
+            if not isinstance(node, ast.AST) or isinstance(
+                    node, (ast.JoinedStr, ast.Raise, ast.Assert, ast.Import, ast.ImportFrom)):
+                continue
+            if isinstance(node, ast.Expr) and (isinstance(node.value, ast.Constant)
+                                               or _LOGS.match(ast.unparse(node))):
+                continue
+            within = node if isinstance(node, ast.stmt) else statement
+            for what, new in _changes(node, parent, field):
+                assert within is not None
+                yield _Site(parent, field, index if isinstance(value, list) else None, node, what,
+                            new, within, around)
+            yield from _walk(node, within, around)
+
+
+def _changes(node: ast.AST, parent: ast.AST, field: str) -> Iterator[tuple[str, ast.AST]]:
+    """Yield what a fault makes of a node."""
+    if field == 'test' and isinstance(parent, (ast.If, ast.While, ast.IfExp)):
+        yield 'condition negated', ast.UnaryOp(ast.Not(), copy.deepcopy(node))  # type: ignore
+    yield from _changes_of_statement(node)
+    match node:
+        case ast.Compare(ops=[op]) if type(op) in _SWAPPED and field != 'test':
+            yield 'comparison turned', _with(node, ops=[_SWAPPED[type(op)]()])
+        case ast.BinOp(left=left, op=op, right=right):
+            if type(op) in _SWAPPED:
+                yield 'operation exchanged', _with(node, op=_SWAPPED[type(op)]())
+                yield 'second term dropped', left
+            if isinstance(op, ast.MatMult):
+                yield 'factors exchanged', _with(node, left=right, right=left)
+        case ast.BoolOp(op=op, values=values):
+            yield 'and, or exchanged', _with(node, op=_SWAPPED[type(op)]())
+            yield 'last condition dropped', (
+                values[0] if len(values) == 2 else _with(node, values=values[:-1]))
+        case ast.UnaryOp(op=ast.USub() | ast.Not() | ast.Invert(), operand=operand):
+            yield 'sign or not dropped', operand
+        case ast.Constant(value=bool() as value):
+            yield f'{value} exchanged', ast.Constant(not value)
+        case ast.Constant(value=int() as value):
+            yield f'{value} is {value + 1}', ast.Constant(value + 1)
+        case ast.Constant(value=float() as value):
+            yield f'{value} is {1.3 * value or 1.0:g}', ast.Constant(1.3 * value or 1.0)
+        case ast.Call(args=[first, second, *others], func=function) if not any(
+                isinstance(one, ast.Starred) for one in node.args) and not _ALIKE.search(
+                ast.unparse(function)):
+            yield 'arguments exchanged', _with(node, args=[second, first, *others])
+
+
+def _changes_of_statement(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
+    match node:
+        case ast.Return(value=ast.expr() as value) if not (
+                isinstance(value, ast.Constant) and value.value is None):
+            yield 'None returned', ast.Return(ast.Constant(None))
+        case ast.Expr(value=ast.Call()) | ast.AugAssign():
+            yield 'statement left out', ast.Pass()
+        case ast.Continue():
+            yield 'break', ast.Break()
+        case ast.Break():
+            yield 'continue', ast.Continue()
+
+
+def _with(node: ast.AST, **fields: Any) -> ast.AST:
+    changed = copy.copy(node)
+    for name, value in fields.items():
+        setattr(changed, name, value)
+    return changed
+
+
+def draw(folders: Sequence[str], count: int, seed: int) -> list[Mutant]:
+    """Return faults in lines of some folders of the package, drawn at random: one a line."""
+    by_line = defaultdict(list)
+    for folder in folders:
+        for path in sorted((PROJECT / PACKAGE / folder).rglob('*.py')):
+            for mutant in mutants_of(str(path.relative_to(PROJECT))):
+                by_line[mutant.file, mutant.line].append(mutant)
+    rng = random.Random(seed)
+    lines = rng.sample(sorted(by_line), min(count, len(by_line)))
+    return [rng.choice(by_line[line]) for line in lines]
+
+
+# ---- the lines of tests -------------------------------------------------------------------------
+
+class Recorder:
+    """A plugin of pytest that notes which lines of the package each test runs.
+
+    The lines of a fixture that several tests share count for each of them.
+    """
+
+    def __init__(self, most_s: float) -> None:
+        self.records: dict[str, Record] = {}
+        self._most_s = most_s
+        self._lines: set[tuple[str, int]] = set()
+        self._of_fixtures: dict[str, set[tuple[str, int]]] = defaultdict(set)
+        self._failed = False
+        monitoring = sys.monitoring
+        monitoring.use_tool_id(monitoring.PROFILER_ID, 'mutants')
+        monitoring.register_callback(monitoring.PROFILER_ID, monitoring.events.LINE, self._run)
+        monitoring.set_events(monitoring.PROFILER_ID, monitoring.events.LINE)
+
+    def _run(self, code: CodeType, line: int) -> object:
+        if code.co_filename.startswith(f'{PROJECT}/{PACKAGE}/'):
+            self._lines.add((code.co_filename.removeprefix(f'{PROJECT}/'), line))
+        return sys.monitoring.DISABLE
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef: Any) -> Iterator[None]:
+        """Note the lines of a shared fixture."""
+        if fixturedef.scope == 'function':
+            return (yield)
+        before, self._lines = self._lines, set()
+        sys.monitoring.restart_events()
+        try:
+            return (yield)
+        finally:
+            self._of_fixtures[fixturedef.argname] |= self._lines
+            self._lines |= before
+            sys.monitoring.restart_events()
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: Any) -> Iterator[None]:
+        """Note the lines of a test that passes."""
+        self._lines, self._failed, start = set(), False, time.process_time()
+        sys.monitoring.restart_events()
+        if self._most_s:
+            signal.signal(signal.SIGVTALRM, _end_test)
+            signal.setitimer(signal.ITIMER_VIRTUAL, self._most_s)
+        result = yield
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+        if not self._failed:
+            shared = (self._of_fixtures.get(name, set()) for name in item.fixturenames)
+            self.records[item.nodeid] = Record(time.process_time() - start,
+                                               frozenset(self._lines.union(*shared)))
+        return result
+
+    def pytest_sessionfinish(self) -> None:
+        """Note no more lines."""
+        sys.monitoring.free_tool_id(sys.monitoring.PROFILER_ID)
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """Note a failure."""
+        self._failed |= not report.passed
+
+
+def _end_test(*_: object) -> None:
+    raise TimeoutError('the test takes too long')
+
+
+def _plain_kernels() -> None:
+    """Leave kernels as they are written, before anything imports them."""
+    from cliploc_ros.core.kernels import compiled
+
+    compiled.compiled = lambda function: function  # type: ignore[assignment]
+
+
+def record(arguments: argparse.Namespace) -> int:
+    """Run tests, and add what they ran to the records."""
+    if arguments.plain:
+        _plain_kernels()
+    recorder = Recorder(arguments.plain)
+    code = pytest.main([*_QUIET[:1], *_QUIET[2:], *arguments.tests], [recorder])
+    kind = 'plain' if arguments.plain else 'compiled'
+    _write(kind, _read(kind) | recorder.records)
+    print(f'{len(recorder.records)} tests, {len(_read(kind))} in all, kernels {kind}')
+    return int(code) if not arguments.plain else 0
+
+
+def _read(kind: str) -> dict[str, Record]:
+    file = RECORDS / f'{kind}.pickle'
+    return pickle.loads(file.read_bytes()) if file.exists() else {}
+
+
+def _write(kind: str, value: object) -> None:
+    RECORDS.mkdir(parents=True, exist_ok=True)
+    (RECORDS / f'{kind}.pickle').write_bytes(pickle.dumps(value))
+
+
+# ---- tests against faults -----------------------------------------------------------------------
+
+class Tests:
+    """The recorded tests, by the lines that they run."""
+
+    def __init__(self, kind: str) -> None:
+        self.records = _read(kind)
+        self._of_line: dict[tuple[str, int], set[str]] = defaultdict(set)
+        for name, one in self.records.items():
+            for line in one.lines:
+                self._of_line[line].add(name)
+
+    def of(self, mutant: Mutant) -> list[str]:
+        """Return the tests that can notice a fault, as time allows.
+
+        The files whose tests run the fewest lines come first: they say most about each.
+        """
+        lines = [(mutant.file, line) for line in mutant.lines]
+        if mutant.names:
+            word = re.compile(rf'\b({"|".join(mutant.names)})\b')
+            lines = [(file, number) for file, text in _sources() for number, line in text
+                     if word.search(line)]
+        found = set[str]().union(*(self._of_line.get(line, set()) for line in lines))
+        by_file = defaultdict(list)
+        for name in found:
+            by_file[name.split('::')[0]].append(name)
+        files = sorted(by_file.values(), key=lambda names: median(
+            len(self.records[name].lines) for name in names))
+        chosen: list[str] = []
+        left = _MOST_S
+        for name in (name for names in files for name in sorted(names, key=self.seconds)):
+            left -= self.seconds(name) + 0.01
+            if left > 0.0 or not chosen:
+                chosen.append(name)
+        return chosen
+
+    def seconds(self, name: str) -> float:
+        """Return how long a test takes."""
+        return self.records[name].seconds
+
+    def leave_out(self, name: str) -> None:
+        """Forget a test that fails without a fault."""
+        for line in self.records[name].lines:
+            self._of_line[line].discard(name)
+
+
+@cache
+def _sources() -> list[tuple[str, list[tuple[int, str]]]]:
+    return [(str(path.relative_to(PROJECT)), list(enumerate(path.read_text().splitlines(), 1)))
+            for path in sorted((PROJECT / PACKAGE).rglob('*.py'))]
+
+
+class Judge:
+    """Tries faults, each in a child of this process.
+
+    Faults in functions meet tests that are collected already: as a plugin of pytest, this takes
+    the place of the loop over the tests. A fault in a line that runs at import meets a new pytest.
+    """
+
+    def __init__(self, mutants: Sequence[Mutant], tests: Tests, workers: int) -> None:
+        self.outcomes: list[Outcome] = []
+        self._waiting: list[tuple[Mutant, str]] = [(one, '') for one in reversed(mutants)]
+        self._tests, self._workers = tests, workers
+        self._is_sound: dict[str, bool] = {}
+        self._items: dict[str, Any] = {}
+        self._functions: dict[tuple[str, str, int], list[FunctionType]] = defaultdict(list)
+
+    def pytest_runtestloop(self, session: Any) -> bool:
+        """Run tests against faults instead of running them once."""
+        self._items = {item.nodeid: item for item in session.items}
+        for one in gc.get_objects():
+            if isinstance(one, FunctionType):
+                code = one.__code__
+                self._functions[code.co_filename, code.co_name, code.co_firstlineno].append(one)
+        gc.freeze()  # children share what they do not change
+        self.run()
+        return True
+
+    def run(self) -> None:
+        """Try all faults."""
+        with selectors.DefaultSelector() as running:
+            while self._waiting or running.get_map():
+                while self._waiting and len(running.get_map()) < self._workers:
+                    self._begin(running)
+                ready = {key.fd for key, _ in running.select(1.0)}
+                for key in list(running.get_map().values()):
+                    is_late = time.monotonic() > key.data.ends_at
+                    if key.fd in ready or is_late:
+                        running.unregister(key.fd)
+                        os.close(key.fd)
+                        self._take(key.data, _finish(key.data, is_late and key.fd not in ready))
+
+    def _begin(self, running: selectors.BaseSelector) -> None:
+        mutant, alone = self._waiting.pop()
+        names = [alone] if alone else self._tests.of(mutant)
+        if self._items:
+            names = [name for name in names if name in self._items]
+        if not names:
+            self.outcomes.append(Outcome(mutant, 0))
+            return
+        folder = Path(tempfile.mkdtemp(prefix='mutant-'))
+        allowed = _PATIENCE_S + 4.0 * sum(self._tests.seconds(name) for name in names)
+        pid = os.fork()
+        if not pid:
+            _be_child(folder, lambda: self._try(None if alone else mutant, names, folder))
+        running.register(os.pidfd_open(pid), selectors.EVENT_READ, _Job(
+            mutant, names, bool(alone), folder, pid, time.monotonic() + allowed))
+
+    def _try(self, mutant: Mutant | None, names: list[str], folder: Path) -> int:
+        """Run tests in this process, a child; return whether one fails."""
+        if not self._items:
+            if mutant is not None:
+                _plant_at_import(mutant)
+            return int(pytest.main([*_QUIET, '--basetemp', str(folder / 'tmp'), *names],
+                                   [_Failures(folder / 'failed')]))
+        if mutant is not None:
+            self._plant(mutant)
+        items = [self._items[name] for name in names]
+        items[0].config._tmp_path_factory._basetemp = folder / 'tmp'
+        (folder / 'tmp').mkdir()
+        for item, following in pairwise([*items, None]):
+            if any(one.failed for one in runtestprotocol(item, log=False, nextitem=following)):
+                (folder / 'failed').write_text(item.nodeid)
+                return 1
+        return 0
+
+    def _plant(self, mutant: Mutant) -> None:
+        """Give a function the code with a fault."""
+        assert mutant.function is not None
+        faulty = next(one for one in _codes_of(planted(mutant)[0])
+                      if (one.co_name, one.co_firstlineno) == mutant.function)
+        for function in self._functions[str(PROJECT / mutant.file), *mutant.function]:
+            function.__code__ = faulty
+
+    def _take(self, job: '_Job', killer: str) -> None:
+        if job.is_check:
+            self._is_sound[job.names[0]] = not killer
+            if killer:
+                self._tests.leave_out(job.names[0])
+            self._waiting.append((job.mutant, ''))
+        elif killer in self._tests.records and killer not in self._is_sound:
+            self._waiting.append((job.mutant, killer))
+        else:
+            self.outcomes.append(Outcome(job.mutant, len(job.names), killer))
+            if len(self.outcomes) % 10 == 0:
+                print(f'{len(self.outcomes)} tried', file=sys.stderr, flush=True)
+
+
+class _Job(NamedTuple):
+    mutant: Mutant
+    names: list[str]
+    is_check: bool  #: Without the fault
+    folder: Path
+    pid: int
+    ends_at: float
+
+
+def _be_child(folder: Path, work: Callable[[], int]) -> NoReturn:
+    code = 2
+    try:
+        os.setpgid(0, 0)
+        with (folder / 'log').open('w') as log:
+            os.dup2(log.fileno(), 1)
+            os.dup2(log.fileno(), 2)
+        code = work()
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(code)
+
+
+def _finish(job: _Job, is_late: bool) -> str:
+    """End a job; return the test that failed, 'time', an exit code, or ''."""
+    if is_late:
+        os.kill(job.pid, signal.SIGKILL)
+    status = os.waitstatus_to_exitcode(os.waitpid(job.pid, 0)[1])
+    with suppress(ProcessLookupError):  # what its tests started
+        os.killpg(job.pid, signal.SIGKILL)
+    failed = job.folder / 'failed'
+    killer = 'time' if is_late else failed.read_text() if failed.exists() else ''
+    shutil.rmtree(job.folder, ignore_errors=True)
+    return killer or (f'exit code {status}' if status else '')
+
+
+class _Failures:
+    """A plugin of pytest that writes the first test that fails."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        if report.failed and not self._file.exists():
+            self._file.write_text(report.nodeid)
+
+    def pytest_collectreport(self, report: Any) -> None:
+        self.pytest_runtest_logreport(report)
+
+
+def _plant_at_import(mutant: Mutant) -> None:
+    """Give a module that is not imported yet the code with a fault."""
+    code, name = planted(mutant)[0], mutant.file.removesuffix('.py').removesuffix('/__init__')
+    get_code = SourceFileLoader.get_code
+
+    def get(self: SourceFileLoader, fullname: str) -> CodeType | None:
+        return code if fullname == name.replace('/', '.') else get_code(self, fullname)
+    SourceFileLoader.get_code = get  # type: ignore[method-assign,assignment]
+
+
+def _codes_of(code: CodeType) -> Iterator[CodeType]:
+    yield code
+    for one in code.co_consts:
+        if isinstance(one, CodeType):
+            yield from _codes_of(one)
+
+
+def judge(mutants: Sequence[Mutant], workers: int) -> list[Outcome]:
+    """Return the outcome of each fault. Kernels are judged in a process of their own."""
+    kernels = [one for one in mutants if one.is_compiled]
+    others = [one for one in mutants if not one.is_compiled]
+    outcomes = []
+    if kernels:
+        pid = os.fork()
+        if not pid:
+            _be_child(RECORDS, lambda: _judge_kernels(kernels, workers))
+        os.waitpid(pid, 0)
+        outcomes += pickle.loads((RECORDS / 'kernels.pickle').read_bytes())
+    import hypothesis, numba, scipy.optimize, scipy.spatial, scipy.stats, yaml  # noqa: E401,F401,I001
+
+    tests = Tests('compiled')
+    at_import = Judge([one for one in others if one.function is None], tests, workers)
+    at_import.run()
+    return outcomes + at_import.outcomes + _judge_functions(
+        [one for one in others if one.function is not None], tests, workers)
+
+
+def _judge_kernels(mutants: Sequence[Mutant], workers: int) -> int:
+    _plain_kernels()
+    _write('kernels', _judge_functions(mutants, Tests('plain'), workers))
+    return 0
+
+
+def _judge_functions(mutants: Sequence[Mutant], tests: Tests, workers: int) -> list[Outcome]:
+    judge, files = Judge(mutants, tests, workers), {
+        name.split('::')[0] for one in mutants for name in tests.of(one)}
+    if files:
+        pytest.main([*_QUIET, '-s', *sorted(files)], [judge])
+    return judge.outcomes + [Outcome(one, 0) for one in mutants if not files]
+
+
+# ---- the report ---------------------------------------------------------------------------------
+
+def report(outcomes: Sequence[Outcome]) -> str:
+    """Return a table by folder, and the faults that no test noticed."""
+    counts: dict[str, Counter[str]] = defaultdict(Counter)
+    for one in outcomes:
+        kind = 'killed' if one.killer else 'survived' if one.tests else 'not run'
+        folder = str(Path(one.mutant.file).parent.relative_to(PACKAGE))
+        for row in (folder, f'{folder.split("/")[0]}, all',
+                    'kernels' if one.mutant.is_compiled else 'Python', 'all'):
+            counts[row][kind] += 1
+    text = f'{"folder":28}{"killed":>8}{"survived":>10}{"not run":>9}{"share":>7}\n'
+    for row in sorted(counts):
+        killed, survived, not_run = (counts[row][kind]
+                                     for kind in ('killed', 'survived', 'not run'))
+        text += (f'{row:28}{killed:8}{survived:10}{not_run:9}'
+                 f'{killed / counts[row].total():7.2f}\n')
+    text += '\nno test noticed (tests that run the line):\n'
+    for one in sorted(outcomes):
+        if not one.killer:
+            text += (f'{one.mutant.file}:{one.mutant.line}: {one.mutant.what} ({one.tests}): '
+                     f'{planted(one.mutant)[1]}\n')
+    return text
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Plant faults; print the table."""
+    mutants = draw(arguments.folders, arguments.count, arguments.seed)
+    if arguments.only:
+        mutants = [one for one in mutants if arguments.only in f'{one.file}:{one.line}']
+    start = time.monotonic()
+    outcomes = judge(mutants, arguments.workers)
+    _write('outcomes', outcomes)
+    text = report(outcomes) + f'\n{len(outcomes)} faults in {time.monotonic() - start:.0f} s'
+    (RECORDS / 'report.txt').write_text(text)
+    print(text)
+    return 0
+
+
+def main() -> int:
+    """Run the program; return its exit code."""
+    parser = argparse.ArgumentParser(prog='python test/mutants.py', description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parts = parser.add_subparsers(required=True)
+    part = parts.add_parser('record', help='note which lines tests run')
+    part.add_argument('tests', nargs=argparse.REMAINDER,
+                      help='arguments of pytest, such as test/core')
+    part.add_argument('--plain', type=float, default=0.0, metavar='S',
+                      help='kernels are not compiled; tests that take longer are left out')
+    part.set_defaults(run=record)
+    part = parts.add_parser('run', help='plant faults')
+    part.add_argument('folders', nargs='+', help='of the package, such as core ros/inputs')
+    part.add_argument('--seed', type=int, default=0)
+    part.add_argument('--count', type=int, default=300)
+    part.add_argument('--workers', type=int, default=2)
+    part.add_argument('--only', default='', help='faults in FILE or FILE:LINE alone')
+    part.set_defaults(run=run)
+    arguments = parser.parse_args()
+    return run_command(lambda: int(arguments.run(arguments)))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
