@@ -21,7 +21,7 @@ from cliploc_ros.offline.mapping.landmarks import classes_of
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.systematic import MountCorrection
-from cliploc_ros.offline.mapping.update.renewal import UpdateReport
+from cliploc_ros.offline.mapping.update.updating import UpdateReport
 from cliploc_ros.offline.mapping.update.updating import update_map as update_landmarks
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.offline.vocabulary.phrase_embeddings import phrases_of_classes
