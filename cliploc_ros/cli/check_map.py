@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
-from cliploc_ros.cli.sources import add_topic_options
+from cliploc_ros.cli.options import add_topic_options
 from cliploc_ros.command import (
     SEEDS,
     StageBar,

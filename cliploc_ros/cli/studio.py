@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import read_layer
-from cliploc_ros.cli.sources import add_topic_options, find_topics
+from cliploc_ros.cli.options import add_topic_options
+from cliploc_ros.cli.sources import find_topics
 from cliploc_ros.command import run_main, within
 from cliploc_ros.errors import OptionsError
 
