@@ -53,12 +53,12 @@ def test_folders_without_poses_or_images(shots, tmp_path):
     (tmp_path / 'scan.r3d').touch()
     refuses(tmp_path / 'scan.r3d', 'no known layout: .*; unpack it')
     (tmp_path / 'photos/metadata.yaml').touch()
-    refuses(tmp_path / 'photos', 'it is a recording: give --bag')
+    refuses(tmp_path / 'photos', 'it is a recording: give it as `bag`')
     refuses(tmp_path / 'photos', 'no COLMAP model here', FolderOptions(layout='colmap'))
     folder = write_colmap(tmp_path / 'scan', shots)
     shutil.move(folder / 'images', tmp_path / 'moved')
     refuses(folder, 'none of 4 images is there, such as .*; give the folder of the images with '
-                    '--images')
+                    '`images`')
     found = read_folder(folder, FolderOptions(scale=1.0, images=tmp_path / 'moved'))
     assert found.count == 4
     (tmp_path / 'moved/walk' / shots[0].path.name).unlink()
@@ -68,7 +68,7 @@ def test_folders_without_poses_or_images(shots, tmp_path):
 
 def test_the_unit_must_be_known(shots, tmp_path):
     refuses(write_colmap(tmp_path / 'c', shots), 'COLMAP model does not know its unit: give '
-            '--scale METRES of a unit', FolderOptions())
+            '`scale` of a unit', FolderOptions())
     refuses(tmp_path / 'c', 'no images with a pose are named z.jpg; there are ',
             FolderOptions(known_distance=('z.jpg', shots[1].path.name, 1.0)))
     name = shots[0].path.name

@@ -128,5 +128,5 @@ def test_a_deadly_task_is_given_up_alone(caplog):
 
 def test_without_dask(monkeypatch):
     monkeypatch.setitem(sys.modules, 'distributed', None)  # as where it is not installed
-    with pytest.raises(OptionsError, match='--scheduler needs Dask: pip install distributed'):
+    with pytest.raises(OptionsError, match='`scheduler` needs Dask: pip install distributed'):
         results(Square(), scheduler='tcp://127.0.0.1:9')

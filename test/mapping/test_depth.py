@@ -55,7 +55,7 @@ def test_depth_in_another_unit_is_refused(scale, factor):
     table = make_table()
     boxes = see(table, walk_around(frames=30))
     with pytest.raises(MappingError, match=rf'measured depth is {factor}.* times .*wrong unit.*'
-                       '--depth-unit'):
+                       '`depth_unit`'):
         build_map(measure_depth(boxes, table, scale=scale))
 
 

@@ -221,7 +221,7 @@ def test_a_map_is_updated_from_several_cameras():
 
 
 def test_one_mount_is_corrected_at_a_time():
-    with pytest.raises(MappingError, match=r'the mounts of 2 cameras .* --cameras NAME alone'):
+    with pytest.raises(MappingError, match=r'the mounts of 2 cameras .* of that camera alone'):
         build_map(drive('front', 'left')[0], MappingOptions(refine_mount=True))
 
 

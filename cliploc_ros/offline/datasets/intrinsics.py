@@ -50,7 +50,7 @@ def find_camera(choice: str | None, folder: Path) -> tuple[Camera, str]:
     match = _SEQUENCE_NAME.search(folder.resolve().name)
     if match is None:
         raise DatasetError(f'{folder}: the name of the folder contains no TUM camera; give '
-                           '--intrinsics fr1, fr2, fr3 or a camera.json')
+                           '`intrinsics` fr1, fr2, fr3 or a camera.json')
     return PRESETS[f'fr{match[1]}'], f"preset fr{match[1]}, from the folder's name"
 
 

@@ -158,7 +158,7 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     options = options or MappingOptions()
     if options.refine_mount and len(detections.cameras) > 1:
         raise MappingError(f'the mounts of {len(detections.cameras)} cameras cannot be corrected '
-                           'together; correct each with a map of --cameras NAME alone')
+                           'together; correct each with a map of that camera alone')
     tell = progress or (lambda stage, share: None)
     given = make_views(detections, options)
     notes = check_input(detections, given, options)

@@ -124,7 +124,7 @@ class UpdateReport:
                             ('doubtful', self.doubtful), ('new', self.new)):
             rows += [f'{name}: {one.line()}' for one in found[:_ROWS_SHOWN]]
             if len(found) > _ROWS_SHOWN:
-                rows.append(f'{name}: and {len(found) - _ROWS_SHOWN} more, see --report')
+                rows.append(f'{name}: and {len(found) - _ROWS_SHOWN} more, see the report')
         return rows + left_out_lines(self.left_out)
 
 
@@ -211,7 +211,7 @@ def _check_belongs(judged: Judgement, well_share: float) -> None:
         raise MappingError(
             f'the recording does not belong to this map: of {in_view} landmarks in view, {there} '
             f'are where the map says, and {well_share:.0%} of their boxes fit; check the map, the '
-            'coordinate frame of the poses and the detector, give --pose-noise if the poses have '
+            'coordinate frame of the poses and the detector, give `pose_noise` if the poses have '
             'errors, or build a new map')
 
 
