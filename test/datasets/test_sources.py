@@ -23,7 +23,6 @@ from cliploc_ros.offline.datasets.bag_frames import (
 )
 from cliploc_ros.offline.datasets.bag_poses import (
     find_poses,
-    pose_sources,
     poses_of_tf,
     poses_of_topic,
 )
@@ -183,7 +182,6 @@ def test_odometry_and_covariance_with_a_mount(tmp_path):
     np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.05, 0.3, 0.5], atol=1e-9)
     frame, = bag_frames(bag, BagTopics(), poses_of_topic('/odom', 200 * MS)).read()
     np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.1, 0.0, 0.0], atol=1e-9)
-    assert sorted(pose_sources(bag)) == ['/amcl_pose', '/odom']
 
 
 def tf_messages(*, static=True, parent='odom'):
