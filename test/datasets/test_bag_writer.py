@@ -14,6 +14,7 @@ from cliploc_ros.errors import DatasetError
 from cliploc_ros.messages import detections_from_msg
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import LATCHED_QOS, RELIABLE_QOS, BagReader, BagWriter
+from cliploc_ros.ros.conversions import pose_from_msg
 
 STAMP_NS = 1341847980722988001
 CAMERA = Camera(64, 48, 53.5, 53.9, 32.0, 24.7, 'plumb_bob', (0.1, -0.2, 0.001, 0.002, 0.3))
@@ -57,7 +58,7 @@ def test_messages_come_back(tmp_path, storage):
     np.testing.assert_array_equal(again.scores, detections.scores)
     assert again.class_ids == detections.class_ids
     assert pose.header.frame_id == 'world'
-    np.testing.assert_allclose(bag_messages.map_from_camera_of(pose), map_from_camera, atol=1e-15)
+    np.testing.assert_allclose(pose_from_msg(pose.pose), map_from_camera, atol=1e-15)
 
 
 def test_metadata_is_as_jazzy_reads_it(tmp_path, storage):

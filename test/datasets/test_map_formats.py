@@ -1,0 +1,210 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Maps of other systems: what is read, what is left out, and what is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from foreign_maps import (
+    dual_quadric,
+    goreloc_file,
+    goreloc_object,
+    msgloc_node,
+    msgloc_text,
+    oaslam_files,
+    oaslam_text,
+    table_text,
+    varint,
+)
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.map_file import write_map
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.map_formats.given_map import (
+    COCO,
+    GivenMap,
+    place,
+    read_class_names,
+)
+from cliploc_ros.offline.datasets.map_formats.msgloc import read_msgloc
+from cliploc_ros.offline.datasets.map_formats.quadric_maps import read_goreloc, read_oaslam
+from cliploc_ros.offline.datasets.map_formats.table import read_table
+
+HERE = ('map', 1.0, np.eye(4))
+CUP = COCO.index('cup')
+SPHERE = dual_quadric([1, 2, 3], [0.1, 0.2, 0.3], [0, 0, 0, 1])
+
+
+@pytest.fixture
+def true_map():
+    rng = np.random.default_rng(5)
+    names = ('cup', 'book', 'chair', 'cup')
+    return LandmarkMap('map', ('a', 'b', 'c', 'd'), ('a red cup', 'b', 'c', 'd'), names,
+                       rng.uniform(-3, 3, (4, 3)), rng.uniform(0.03, 0.6, (4, 3)),
+                       Rotation.random(4, random_state=5).as_quat())
+
+
+def write(path, content):
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def shapes(landmark_map):
+    axes = (Rotation.from_quat(landmark_map.quats_xyzw).as_matrix()
+            * landmark_map.semi_axes[:, None, :])
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def import_all(given: GivenMap, placement=HERE):
+    return place(given, 'a test', *placement)
+
+
+def check_equal(imported, true_map):
+    assert imported.left_out == ()
+    found = imported.landmark_map
+    assert found.class_ids == true_map.class_ids
+    np.testing.assert_allclose(found.centers, true_map.centers, atol=1e-5)
+    np.testing.assert_allclose(shapes(found), shapes(true_map), atol=1e-5)
+    assert {one.source for one in found.details} == {'a test'}
+
+
+def test_goreloc(true_map, tmp_path):
+    path = write(tmp_path / 'm.objects', goreloc_file(true_map))
+    imported = import_all(read_goreloc(path, COCO))
+    check_equal(imported, true_map)
+    assert imported.landmark_map.landmark_ids == ('cup_0', 'book_1', 'chair_2', 'cup_3')
+    assert imported.landmark_map.details[0].class_weights == (('cup', 0.75), ('vase', 0.25))
+
+
+def test_what_the_file_does_not_know_of_its_errors_is_given(true_map, tmp_path):
+    given = read_goreloc(write(tmp_path / 'm.objects', goreloc_file(true_map)), COCO)
+    first = given.landmarks[0]
+    given.landmarks[0] = first._replace(details=replace(first.details, position_sigma=0.2))
+    scale = 0.5
+    known, *others = place(given, 'a test', 'map', scale, np.eye(4),
+                           (0.05, 1.0)).landmark_map.details
+    assert (known.position_sigma, known.shared_sigma) == (0.1, None)
+    assert {(one.position_sigma, one.shared_sigma, one.shared_sigma_deg)
+            for one in others} == {(0.05, 0.05, 1.0)}
+
+
+def test_oaslam_text(true_map, tmp_path):
+    imported = import_all(read_oaslam(write(tmp_path / 'm.txt', oaslam_text(true_map)), COCO))
+    check_equal(imported, true_map)
+    assert 'has no metric scale' in imported.notes[0]
+
+
+def test_oaslam_saved_map(true_map, tmp_path):
+    objects, tracks = oaslam_files(true_map)
+    path = write(tmp_path / 'map_m.mapobjects', objects)
+    with pytest.raises(DatasetError, match='objecttracks'):
+        read_oaslam(path, COCO)
+    write(tmp_path / 'map_m.objecttracks', tracks)
+    imported = import_all(read_oaslam(path, COCO))
+    check_equal(imported, true_map)
+    assert [one.support for one in imported.landmark_map.details] == [4] * 4
+
+
+def test_msgloc(true_map, tmp_path):
+    """Quaternions are w, x, y, z, signs of radii mean nothing, and shares are not likelihoods."""
+    imported = import_all(read_msgloc(write(tmp_path / 'm.json', msgloc_text(true_map)), COCO))
+    check_equal(imported, true_map)
+    assert imported.landmark_map.details[1].class_weights == (('book', 0.75), ('vase', 0.25))
+    (note,) = imported.notes
+    assert note.startswith('4 landmarks')
+
+
+@pytest.mark.parametrize('encoding', [
+    'utf-8-sig', 'utf-16'])
+def test_table_of_a_spreadsheet(tmp_path, encoding):
+    """Semicolons, decimal commas, a byte order mark, another order, empty rows and cells."""
+    text = ('class_id;c;b;a;z;y;x;label;colour;support\r\n'
+            'cup;0,1;0,2;0,3;1,5;-2;3;Tasse, groß;rot;7\r\n'
+            ';;;;;;;;;\r\n'
+            '"book";0.1;0.1;0.1;0;0;0;;;;\r\n')
+    given = read_table(write(tmp_path / 'm.csv', text.encode(encoding)))
+    found = import_all(given).landmark_map
+    assert found.labels == ('Tasse, groß', 'book')
+    assert found.landmark_ids == ('cup_1', 'book_2')
+    assert found.centers[0].tolist() == [3.0, -2.0, 1.5]
+    assert found.semi_axes[0].tolist() == [0.3, 0.2, 0.1]
+    assert found.quats_xyzw[0].tolist() == [0.0, 0.0, 0.0, 1.0]
+    assert [one.support for one in found.details] == [7, None]
+    assert [note.endswith(' colour') for note in given.notes] == [True]
+
+
+def test_scale_and_transform(true_map, tmp_path):
+    turn = Rotation.from_euler('xyz', [0.3, -1.0, 2.0])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn.as_matrix(), [5.0, 6.0, 7.0]
+    path = write(tmp_path / 'm.csv', table_text(true_map))
+    found = import_all(read_table(path), ('world', 2.0, pose)).landmark_map
+    assert found.frame_id == 'world'
+    np.testing.assert_allclose(
+        found.centers, turn.apply(2.0 * true_map.centers) + pose[:3, 3], atol=1e-9)
+    matrix = turn.as_matrix()
+    np.testing.assert_allclose(shapes(found), 4.0 * matrix @ shapes(true_map) @ matrix.T,
+                               atol=1e-9)
+
+
+def test_what_no_map_can_hold_is_left_out_with_the_reason(tmp_path):
+    flat = np.diag([0.04, 0.04, 0.0, -1.0])
+    lopsided = SPHERE.copy()
+    lopsided[0, 1] += 1.0
+    path = write(tmp_path / 'm.objects', b''.join(
+        goreloc_object(row, quadric, votes) for row, (quadric, votes) in enumerate([
+            (SPHERE, [(CUP, 1)]), (np.diag([0.04, -0.04, 0.01, -1.0]), [(CUP, 1)]),
+            (flat, [(CUP, 1)]), (np.diag([.1, .1, .1, 0.0]), [(CUP, 1)]),
+            (SPHERE * np.nan, [(CUP, 1)]), (SPHERE.ravel()[:9], [(CUP, 1)]), (SPHERE, []),
+            (lopsided, [(CUP, 1)]), (dual_quadric([0, 0, 0], [200, 1, 1], [0, 0, 0, 1]),
+                                     [(CUP, 1)])]))
+        + goreloc_object(0, SPHERE, [(CUP, 3)]))
+    imported = import_all(read_goreloc(path, COCO))
+    assert imported.landmark_map.landmark_ids == ('cup_0',)
+    reasons = dict(imported.left_out)
+    for name, reason in {
+            'object 1': 'no ellipsoid: squared semi-axes -0.04', 'object 2': 'no ellipsoid',
+            'object 3': 'no finite centre', 'object 4': 'not finite',
+            'object 5': 'has 9 numbers, not 16', 'object 6': '0 categories',
+            'object 7': 'not symmetric', 'cup_8': 'semi-axes are 1 1 200 m',
+            'cup_0': 'its id occurs before'}.items():
+        assert reason in reasons[name]
+
+
+@pytest.mark.parametrize(('read', 'content', 'message'), [
+    (read_msgloc, b'{"nodes": [', 'is no JSON'), (read_msgloc, b'[' * 100_000, 'is no JSON'),
+    (read_msgloc, json.dumps({'nodes': [msgloc_node(0, [0] * 3, [1] * 3, [0, 0, 0, 1],
+                                                    baseline_label={'812.0': [1.0]})]}).encode(),
+     '812.* --class-names'),
+    (read_goreloc, goreloc_object(0, SPHERE, [(CUP, 1)])[:-1],
+     r'byte \d+'),
+    (read_goreloc, b'\xff' * 11, 'more than 10 bytes'),
+    (read_goreloc, b'\x0a' + varint(2**60), f'{2**60} bytes'),
+    (read_goreloc, b'41 39 0.5', 'NAME.objects'),
+    (read_oaslam, b'1 41 0.1 0.2', 'line 1: expected')])
+def test_broken_files_are_refused(tmp_path, read, content, message):
+    path = write(tmp_path / 'broken', content)
+    with pytest.raises(DatasetError, match=message) as error:
+        read(path, COCO)
+    assert str(error.value).startswith(str(path)) or '812' in message
+
+
+def test_a_map_of_msgloc_as_published(shared_data, tmp_path):
+    samples = shared_data / 'import_samples'
+    names = read_class_names(samples / 'msgloc_coco.txt')
+    imported = import_all(read_msgloc(samples / 'msgloc_walk_yolo_coco_map.json', names))
+    found = imported.landmark_map
+    print(f'MSG-Loc sample: {len(found)} landmarks, {len(imported.left_out)} left out, '
+          f'{sum(one.class_weights is not None for one in found.details)} of several classes')
+    assert len(found) == 116 and len(imported.left_out) == 16
+    assert all('semi-axes are' in one.reason for one in imported.left_out)
+    row = found.landmark_ids.index('wine_glass_0')
+    np.testing.assert_allclose(found.centers[row], [2.07811, 0.40396, -0.48006], atol=1e-5)
+    np.testing.assert_allclose(found.quats_xyzw[row], [-.48684, .39502, -.52906, .57188],
+                               atol=1e-5)
+    write_map(tmp_path / 'm.yaml', found)
+    assert LandmarkMap.from_file(tmp_path / 'm.yaml').details[row].class_weights == (
+        ('wine glass', 0.9916), ('cup', 0.0084))

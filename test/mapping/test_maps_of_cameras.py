@@ -1,0 +1,255 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Maps from several cameras of one robot, on a simulated drive in a room whose objects are known.
+
+The cameras differ in resolution, lens and place on the robot, and their images interleave.
+"""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from walk import CAMERA, CLASSES, nearest_errors, see_rows
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.errors import DatasetError, MappingError
+from cliploc_ros.offline.datasets.observations import load_observations, save_observations
+from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.mapping.check.checking import check_map
+from cliploc_ros.offline.mapping.check.relocalization import sample_frames
+from cliploc_ros.offline.mapping.joint import pose_errors
+from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions, PoseErrors
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.update.updating import update_map
+from cliploc_ros.offline.mapping.views import make_views, thin_out
+
+#: By name: the camera, and where it looks [deg].
+RIG = {'front': (CAMERA, 0.0), 'left': (Camera(320, 240, 200.0, 200.0, 160.0, 120.0), 90.0),
+       'back': (Camera(800, 600, 450.0, 460.0, 380.0, 310.0), 180.0), 'right': (CAMERA, 270.0)}
+_LEVER_M, _STEP_S = 0.3, 0.5
+ERRORS = PoseErrors(0.05, 1.5, 3.0)
+OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def mount_of(name):
+    turn = Rotation.from_euler('z', RIG[name][1], degrees=True).as_matrix()
+    return make_transform(turn @ OPTICAL, turn @ [_LEVER_M, 0.0, 0.0] + [0.0, 0.0, 1.0])
+
+
+def room(count=20):
+    """Objects all around."""
+    rng = np.random.default_rng(0)
+    angles = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    centers = np.c_[2.6 * np.cos(angles), 2.6 * np.sin(angles), rng.uniform(0.6, 1.4, count)]
+    names = tuple(CLASSES[row % 3] for row in range(count))
+    return LandmarkMap('map', tuple(f'thing_{row}' for row in range(count)), names, names,
+                       centers, rng.uniform(0.1, 0.2, (count, 3)),
+                       Rotation.identity(count).as_quat())
+
+
+ROOM = room()
+
+
+def robot_at(stamps_s):
+    """Return poses of a robot that drives a circle and turns faster than that."""
+    poses = np.tile(np.eye(4), (len(stamps_s), 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler('z', 0.45 * stamps_s[:, None]).as_matrix()
+    poses[:, 0, 3] = 1.2 * np.cos(0.15 * stamps_s)
+    poses[:, 1, 3] = 1.2 * np.sin(0.15 * stamps_s)
+    return poses
+
+
+def drive(*names, noise_px=2.0, move=lambda stamps_s, poses: poses, seconds=50.0, delay_s=0.03):
+    """Return what cameras see, and their true poses; move returns the given poses of the robot."""
+    seen, true, stamps = [], [], []
+    for number, name in enumerate(names):
+        stamps.append(np.arange(0.0, seconds, _STEP_S) + number * delay_s)
+        true.append(robot_at(stamps[-1]) @ mount_of(name))
+        camera = RIG[name][0]
+        seen.append(see_rows(ROOM, true[-1], noise_px * camera.fx / 500.0, seed=number,
+                             camera=camera)[0])
+    joined = {key: np.concatenate([getattr(one, key) for one in seen])
+              for key in ('bboxes_xyxy', 'classes', 'scores')}
+    given = [move(*pair) @ mount_of(name) for *pair, name in zip(
+        stamps, map(robot_at, stamps), names, strict=True)]
+    counts = np.concatenate([np.diff(one.frame_offsets) for one in seen])
+    rows = np.repeat(np.arange(len(names)), list(map(len, seen)))
+    stamps, true = np.concatenate(stamps), np.concatenate(true)
+    order = np.argsort(stamps, kind='stable')
+    return PosedDetections(
+        tuple(RIG[name][0] for name in names), np.concatenate(given), stamps,
+        np.cumsum([0, *counts]), class_names=CLASSES, camera_rows=rows, camera_names=names,
+        **joined).select_frames(order), true[order]
+
+
+def wandering(seed):
+    """Return a function that moves a robot by errors that it shares over seconds."""
+    rng, times = np.random.default_rng(seed), np.arange(-1.0, 60.0, 0.05)
+    errors, kept = rng.normal(size=(len(times), 6)), float(np.exp(-0.05 / ERRORS.correlation_s))
+    for row in range(1, len(errors)):
+        errors[row] = kept * errors[row - 1] + np.sqrt(1.0 - kept ** 2) * errors[row]
+
+    def move(stamps_s, poses):
+        now = np.stack([np.interp(stamps_s, times, column) for column in errors.T], axis=1)
+        now *= ERRORS.sigmas
+        moved = poses.copy()
+        moved[:, :3, :3] = Rotation.from_rotvec(now[:, 3:]).as_matrix() @ poses[:, :3, :3]
+        moved[:, :3, 3] += now[:, :3]
+        return moved
+    return move
+
+
+def test_four_cameras_are_nearer_the_truth_than_one():
+    one, four = (build_map(drive(*names)[0]) for names in (('front',), tuple(RIG)))
+    errors = [nearest_errors(built.landmark_map, ROOM) for built in (one, four)]
+    print(f'\nmean error: one camera {1e3 * errors[0].mean():.1f} mm, four '
+          f'{1e3 * errors[1].mean():.1f} mm')
+    assert len(four.landmark_map) == len(ROOM)
+    assert errors[1].max() < 0.01
+    assert errors[1].mean() < 0.7 * errors[0].mean()
+
+
+@pytest.mark.parametrize('odometry', [False, True])
+def test_cameras_share_the_errors_of_the_robot(odometry):
+    def left(names, seed):
+        detections, true = drive(*names, move=wandering(seed))
+        if odometry:
+            detections = replace(detections, odom_from_camera=true)
+        built = build_map(detections, MappingOptions(pose_errors=ERRORS))
+        assert len(built.landmark_map) == len(ROOM)
+        offsets = built.map_from_camera[:, :3, 3] - true[:, :3, 3]
+        return offsets.std(axis=0).mean(), built
+    one, four = (np.mean([left(names, seed)[0] for seed in (0, 1)])
+                 for names in (('front',), tuple(RIG)))
+    built = left(tuple(RIG), 0)[1]
+    print(f'\nposes off by: one camera {1e3 * one:.0f} mm, four {1e3 * four:.0f} mm')
+    assert four < (1.0 if odometry else 0.6) * one
+    if odometry:
+        assert any(' 399 of 399 ' in one for one in built.report.notes)
+
+
+def test_a_rig_stays_rigid():
+    detections, true = drive(*RIG, move=wandering(0), delay_s=0.0)
+    built = build_map(detections, MappingOptions(pose_errors=ERRORS))
+    refined, given = (np.linalg.norm(np.diff(poses[:, :3, 3].reshape(-1, 4, 3), axis=1), axis=2)
+                      for poses in (built.map_from_camera, true))
+    print(f'\ndistances of cameras off by {1e3 * np.abs(refined - given).mean():.2f} mm')
+    assert np.abs(refined - given).mean() < 2e-3
+
+
+def test_a_turn_of_the_robot_is_one_error_of_all_cameras():
+    """The levers take the shift out that a turn of the robot gives each camera."""
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.02]).as_matrix()
+
+    def move(stamps_s, poses):
+        moved = poses.copy()
+        front = poses @ mount_of('front')  # about the first camera
+        moved[:, :3, :3] = turn @ poses[:, :3, :3]
+        moved[:, :3, 3] = front[:, :3, 3] + np.einsum(
+            'ij,fj->fi', turn, poses[:, :3, 3] - front[:, :3, 3])
+        return moved
+    given, present = (make_views(drive(*RIG, move=one)[0], MappingOptions())
+                      for one in (move, lambda stamps_s, poses: poses))
+    np.testing.assert_allclose(np.linalg.norm(given.levers[given.cameras == 2], axis=1),
+                               2.0 * _LEVER_M, atol=2e-3)
+    np.testing.assert_allclose(pose_errors(given, present),
+                               np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -0.02], (400, 1)), atol=2e-4)
+
+
+def test_viewpoints_and_samples_are_those_of_each_camera():
+    standing = drive(*RIG, seconds=10.0, move=lambda stamps_s, poses: poses[:1].repeat(
+        len(poses), axis=0))[0]
+    views = make_views(standing, MappingOptions())
+    assert sorted(np.bincount(views.viewpoints).tolist()) == [20] * 4
+    assert np.bincount(views.cameras[thin_out(views, 3)]).tolist() == [3] * 4
+    with pytest.raises(MappingError, match='move it around'):
+        build_map(standing.select_frames(standing.every(40)))
+    moving = drive(*RIG)[0]
+    for frames in (moving.every(4), sample_frames(moving, 100)):  # four cameras, each fourth frame
+        assert np.bincount(moving.frame_cameras[frames]).tolist() == [25] * 4
+    assert not any('jump' in note for note in build_map(moving).report.notes)
+
+
+def test_depth_of_each_camera_has_its_own_scale():
+    detections, true = drive('front', 'left')
+    depths = np.full(len(detections.classes), np.nan, dtype=np.float32)
+    for row, frame in enumerate(detections.frames):
+        # of the object whose box it is
+        offsets = ROOM.centers - true[frame, :3, 3]
+        ahead = offsets @ true[frame, :3, :3]
+        box, camera = detections.bboxes_xyxy[row], detections.camera_of(frame)
+        pixels = ahead[:, :2] / ahead[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        near = np.linalg.norm(pixels - 0.5 * (box[:2] + box[2:]), axis=1) + 1e6 * (ahead[:, 2] < 0)
+        depths[row] = ahead[near.argmin(), 2] - 0.6 * ROOM.semi_axes[near.argmin()].mean()
+    right = build_map(replace(detections, depths=depths)).report.notes
+    assert not right
+    is_left = detections.frame_cameras[detections.frames] == 1
+    long = build_map(replace(detections, depths=np.where(is_left, 1.2 * depths, depths)))
+    note, = long.report.notes
+    assert ' of left is 1.2' in note
+    with pytest.raises(MappingError, match=' of left is 1e'):
+        build_map(replace(detections, depths=np.where(is_left, 1000.0 * depths, depths)))
+
+
+def test_the_check_names_the_camera_that_is_off():
+    """Its boxes are those of a camera with another focal length."""
+    detections = drive(*RIG)[0]
+    cameras = list(detections.cameras)
+    cameras[1] = replace(cameras[1], fx=1.05 * cameras[1].fx, fy=1.05 * cameras[1].fy)
+    options = CheckOptions(relocalizer=RelocalizerOptions(iterations=300), frames=16,
+                           max_positions=4, headings=4, spacing_m=2.0)
+    right = check_map(ROOM, detections, options=options)
+    assert any('front' in one for one in right.notes)
+    assert len(right.recording.trials) == len(right.recording.simulated) == 16
+    assert not any(one.is_significant for one in right.recording.corrections)
+    wrong = check_map(ROOM, replace(detections, cameras=tuple(cameras)), options=options)
+    advice, = (line for line in wrong.advice if line.startswith('calibrate the camera'))
+    assert re.search('fx of left by -[45]', advice)
+    assert not any(f' of {name}' in advice for name in ('front', 'back', 'right'))
+
+
+def test_a_map_is_updated_from_several_cameras():
+    now = replace(ROOM, centers=ROOM.centers + np.where(
+        np.arange(len(ROOM))[:, None] == 3, [0.0, 0.0, 1.0], 0.0))
+    updated = update_map(now, drive(*RIG)[0], MappingOptions(pose_errors=ERRORS))
+    assert nearest_errors(updated.landmark_map, ROOM).max() < 0.05
+    assert [one.landmark_id for one in updated.report.moved] == ['thing_3']
+
+
+def test_one_mount_is_corrected_at_a_time():
+    with pytest.raises(MappingError, match='--cameras NAME'):
+        build_map(drive('front', 'left')[0], MappingOptions(refine_mount=True))
+
+
+def test_the_file_keeps_the_camera_of_each_frame(tmp_path):
+    detections = drive('front', 'left', seconds=5.0)[0]
+    save_observations(tmp_path / 'two.npz', detections)
+    again = load_observations(tmp_path / 'two.npz')
+    assert (again.cameras, again.camera_names) == (detections.cameras, ('front', 'left'))
+    assert (again.frame_cameras == detections.frame_cameras).all()
+    # a file without names is of one camera, as before
+    save_observations(tmp_path / 'one.npz', replace(
+        detections, cameras=detections.cameras[:1], camera_rows=None, camera_names=('',)))
+    with np.load(tmp_path / 'one.npz') as arrays:
+        assert not any(name.startswith('camera') for name in arrays)
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'camera_rows': np.full(20, 2)}, 'in row 0'),
+    ({'camera_rows': np.zeros(20, dtype=int)}, "'left'"),
+    ({'camera_names': np.array(['front', 'front'])}, 'repeats an id'),
+
+    ({'camera_intrinsics': np.zeros((2, 4))}, 'fx')])
+def test_a_file_that_contradicts_itself_is_refused(tmp_path, change, message):
+    path = tmp_path / 'two.npz'
+    save_observations(path, drive('front', 'left', seconds=5.0)[0])
+    with np.load(path) as arrays:
+        wrong = {**arrays, **change}
+    np.savez(path, **{name: array for name, array in wrong.items() if array is not None})
+    with pytest.raises(DatasetError, match=message):
+        load_observations(path)

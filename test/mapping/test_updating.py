@@ -1,0 +1,394 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Updates of a map from a simulated walk whose objects are known to have moved, or not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from walk import CLASSES, join_maps, look_at, moved, see, see_rows, walk_around, without
+
+from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.offline.mapping.update.updating import update_map
+
+ENCODER = 'test:0'
+POSES = walk_around(frames=60, turn_deg=320.0, radius=2.6)
+
+
+def make_things(count=20, seed=5) -> LandmarkMap:
+    """Ellipsoids of three classes on a grid of 50 cm, each of its own size."""
+    rng = np.random.default_rng(seed)
+    places = np.array([(0.5 * x - 1.0, 0.5 * y - 0.75) for x in range(5) for y in range(4)])
+    centers = np.c_[places[:count] + rng.uniform(-0.06, 0.06, (count, 2)), np.full(count, 0.8)]
+    names = tuple(CLASSES[row % 3] for row in range(count))
+    quats = Rotation.from_euler('z', rng.uniform(0, np.pi, (count, 1))).as_quat()
+    details = tuple(LandmarkDetails(position_sigma=0.02, support=50, seen_ratio=0.8,
+                                    baseline_deg=90.0, last_seen=1.0, source='test')
+                    for _ in range(count))
+    return LandmarkMap('map', tuple(f'thing_{row}' for row in range(count)),
+                       tuple(f'thing number {row}' for row in range(count)), names, centers,
+                       rng.uniform(0.06, 0.12, (count, 3)), quats, details)
+
+
+def ids(landmarks):
+    return {one.landmark_id for one in landmarks}
+
+
+def test_nothing_changed():
+    things = make_things()
+    updated = update_map(things, see(things, POSES, noise_px=2.0, missed=0.3))
+    report = updated.report
+    assert len(report.confirmed) == len(things)
+    assert report.moved == report.missing == report.new == report.not_observed == ()
+    assert updated.landmark_map.landmark_ids == things.landmark_ids
+    assert updated.landmark_map.labels == things.labels
+    assert np.linalg.norm(updated.landmark_map.centers - things.centers, axis=1).max() < 0.02
+    assert report.offset_m < 0.01
+    assert report.lines()[0].startswith('20 confirmed')
+
+
+def test_each_change_is_reported_and_nothing_else():
+    things = make_things()
+    old = without(things, 5, 17)  # these two are new
+    later = without(moved(things, {12: (1.6, 0.1, 0.8)}), 7, 10)
+    updated = update_map(old, see(later, POSES, noise_px=2.0, missed=0.2))
+    report = updated.report
+    assert ids(report.moved) == {'thing_12'}
+    assert ids(report.missing) == {'thing_7', 'thing_10'}
+    assert len(report.new) == 2
+    assert len(report.confirmed) == len(old) - 3
+    (one,) = report.moved
+    assert one.center == pytest.approx((1.6, 0.1, 0.8), abs=0.03)
+    assert one.distance_m == pytest.approx(np.linalg.norm(
+        np.array([1.6, 0.1, 0.8]) - things.centers[12]), abs=0.03)
+    assert all('seen in 0' in one.evidence for one in report.missing)
+    for row in (5, 17):
+        assert min(np.linalg.norm(np.array(one.center) - things.centers[row])
+                   for one in report.new) < 0.03
+    found = updated.landmark_map
+    assert 'thing_7' not in found.landmark_ids
+    assert found.labels[found.landmark_ids.index('thing_12')] == 'thing number 12'
+    assert set(found.landmark_ids[updated.first_new:]) == ids(report.new)
+    assert set(np.unique(updated.shown)) <= set(range(-1, len(found)))
+    assert len(set(found.landmark_ids)) == len(found) == len(later)
+    assert report.as_dict()['missing'][0]['last_seen'] == 1.0
+
+
+def test_what_is_kept_of_a_landmark():
+    things = make_things()
+    details = list(things.details)
+    details[4] = LandmarkDetails(labels=(('a thing', 0.7), ('a cup', 0.3)), source='a person',
+                                 class_weights=((things.class_ids[4], 0.9), ('vase', 0.1)))
+    old = replace(things, details=tuple(details),
+                  labels=(*things.labels[:4], 'named by a person', *things.labels[5:]))
+    found = update_map(old, see(things, POSES, noise_px=2.0)).landmark_map
+    assert found.labels[4] == 'named by a person'
+    kept = found.details[4]
+    assert (kept.labels, kept.class_weights, kept.source) == (
+        details[4].labels, details[4].class_weights, 'a person')
+    # no position_sigma: a person placed it
+    assert kept.position_sigma is None
+    np.testing.assert_array_equal(found.centers[4], old.centers[4])
+    assert kept.support > 40
+    assert found.details[5].support > 50 + 40
+    assert found.details[5].last_seen == pytest.approx(0.2 * (len(POSES) - 1))
+    assert 0.8 < found.details[5].seen_ratio <= 1.0
+
+
+def test_the_better_position_wins():
+    """A landmark is fitted again if the recording knows it better; else it stays where it is."""
+    things = make_things()
+    rng = np.random.default_rng(0)
+    wrong = things.centers + rng.normal(scale=0.03, size=things.centers.shape)
+    sigmas = [0.05] * 10 + [0.002] * 10
+    old = replace(things, centers=wrong, details=tuple(
+        replace(one, position_sigma=sigma)
+        for one, sigma in zip(things.details, sigmas, strict=True)))
+    updated = update_map(old, see(things, POSES, noise_px=2.0))
+    assert len(updated.report.confirmed) == len(things)
+    found = updated.landmark_map
+    errors = np.linalg.norm(found.centers - things.centers, axis=1)
+    before = np.linalg.norm(wrong - things.centers, axis=1)
+    assert errors[:10].mean() < 0.4 * before[:10].mean()
+    assert all(one.position_sigma < 0.02 for one in found.details[:10])
+    kept = (found.centers[10:] == wrong[10:]).all(axis=1)
+    assert kept.sum() >= 5  # the others differ by so much that they were nudged
+
+
+def test_what_a_new_object_hides_is_not_missing():
+    things = make_things()
+    hidden = 8
+    poses = np.array([look_at(np.array([things.centers[hidden, 0] + x, -3.0, 1.0]))
+                      for x in np.linspace(-0.8, 0.8, 30)])
+    later = without(things, hidden)
+    screen = replace(things.select([hidden]), landmark_ids=('screen',), class_ids=('book',),
+                     centers=things.centers[[hidden]] - (0.0, 0.35, 0.0),
+                     semi_axes=np.array([[0.3, 0.05, 0.3]]), quats_xyzw=np.array([[0, 0, 0, 1.0]]))
+    both = join_maps(later, screen)
+    assert 'thing_8' in ids(update_map(things, see(later, poses)).report.missing)
+    report = update_map(things, see(both, poses)).report
+    assert 'thing_8' in ids(report.not_observed)
+    assert len(report.new) == 1
+
+
+def test_what_was_not_in_view_stays_as_it_is():
+    things = make_things()
+    far = replace(things, centers=things.centers + np.array([0.0, 40.0, 0.0]))
+    updated = update_map(join_maps(things, far), see(things, POSES, missed=0.2))
+    assert ids(updated.report.not_observed) == {f'{name}_b' for name in far.landmark_ids}
+    np.testing.assert_array_equal(updated.landmark_map.centers[20:], far.centers)
+    assert updated.landmark_map.details[20:] == far.details
+
+
+def test_what_a_wall_hides_is_not_missing():
+    """No landmark beside it or behind it is seen: a wall may be in front."""
+    things = make_things()
+    old = moved(things, {row: things.centers[row] + (0.0, 3.0, 0.0) for row in range(16, 20)})
+    poses = np.array([look_at(np.array([x, -2.2, 1.1]), (0.0, 0.0, 0.8))
+                      for x in np.linspace(-1.0, 1.0, 40)])
+    report = update_map(old, see(without(old, 16, 17, 18, 19), poses)).report
+    assert {f'thing_{row}' for row in range(16, 20)} <= ids(report.not_observed)
+    assert report.missing == ()
+
+
+def test_one_missed_look_and_a_class_that_the_detector_never_finds_are_no_proof():
+    things = make_things()
+    old = replace(things, class_ids=('teapot', *things.class_ids[1:]))
+    looks = np.array([look_at(np.array([2.4 * np.cos(a), 2.4 * np.sin(a), 1.4]))
+                      for a in np.linspace(0.0, 1.2, 6)])
+    few = update_map(things, see(without(things, 7), looks[:4])).report
+    assert 'thing_7' in ids(few.not_observed)
+    many = update_map(old, see(without(things, 0, 7), POSES)).report
+    assert ids(many.missing) == {'thing_7'} and ids(many.not_observed) == {'thing_0'}
+    assert any('teapot' in note for note in many.notes)
+
+
+def test_an_offset_of_the_coordinate_frame_is_corrected_and_noted():
+    things = make_things()
+    later = moved(things, {12: (1.6, 0.1, 0.8)})
+    offset = make_transform(Rotation.from_euler('z', 2.0, degrees=True).as_matrix(),
+                            np.array([0.06, -0.04, 0.01]))
+    detections = see(later, POSES, noise_px=2.0).with_poses(offset @ POSES)
+    updated = update_map(things, detections)
+    assert ids(updated.report.moved) == {'thing_12'}
+    assert updated.report.missing == updated.report.new == ()
+    assert updated.report.offset_m == pytest.approx(0.073, abs=0.02)
+    assert updated.report.offset_deg == pytest.approx(2.0, abs=0.3)
+    assert any('off the map' in one for one in updated.report.notes)
+    assert np.linalg.norm(updated.landmark_map.centers[12] - (1.6, 0.1, 0.8)) < 0.03
+    assert np.abs(updated.map_from_camera[:, :3, 3] - POSES[:, :3, 3]).max() < 0.03
+
+
+def test_noisy_poses_with_gaps_are_refined_against_the_map():
+    """As the relocalizer gives them: each on its own, and not in every frame."""
+    things, rng = make_things(), np.random.default_rng(2)
+    later = without(moved(things, {12: (1.6, 0.1, 0.8)}), 6)
+    wrong = POSES.copy()
+    turns = Rotation.from_rotvec(rng.normal(scale=np.radians(1.0), size=(len(POSES), 3)))
+    wrong[:, :3, :3] = turns.as_matrix() @ POSES[:, :3, :3]
+    wrong[:, :3, 3] += rng.normal(scale=0.05, size=(len(POSES), 3))
+    kept = np.sort(rng.choice(len(POSES), 40, replace=False))
+    detections = see(later, POSES, noise_px=2.0).with_poses(wrong).select_frames(kept)
+    with pytest.raises(MappingError, match='--pose-noise'):
+        update_map(things, detections)
+    joint = update_map(things, detections,
+                       MappingOptions(pose_errors=PoseErrors(0.05, 1.0, 0.0)))
+    assert ids(joint.report.missing) == {'thing_6'}
+    assert ids(joint.report.moved) == {'thing_12'}
+    assert joint.report.new == ()
+
+    def error_m(poses):
+        return np.median(np.linalg.norm(poses[:, :3, 3] - POSES[kept, :3, 3], axis=1))
+
+    assert error_m(joint.map_from_camera) < 0.3 * error_m(wrong[kept])
+    assert joint.report.pose_change_m > 0.03
+
+
+def unit_rows(count, size=24, seed=0):
+    rows = np.random.default_rng(seed).normal(size=(count, size))
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def embeddings_of(landmark_ids, looks):
+    return LandmarkEmbeddings(ENCODER, landmark_ids, looks.astype(np.float16),
+                              np.empty((0, looks.shape[1]), np.float16),
+                              np.zeros(len(looks) + 1, dtype=np.int64))
+
+
+def seen_with_looks(later, looks):
+    """Return what is seen of things, with embeddings near the look of each thing."""
+    detections, truth = see_rows(later, POSES, noise_px=1.0)
+    rows = looks[truth] + np.random.default_rng(0).normal(scale=0.1, size=(len(truth),
+                                                                           looks.shape[1]))
+    return replace(detections, encoder_key=ENCODER, embeddings=(
+        rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float16))
+
+
+@pytest.mark.parametrize('alike', [False, True])
+def test_two_objects_that_exchanged_places(alike):
+    """Looks tell it, unless the two are identical."""
+    things = make_things(12)
+    first, second = 1, 7  # of one class
+    equal = things.semi_axes.copy()
+    equal[second] = equal[first]
+    things = replace(things, semi_axes=equal)
+    looks = unit_rows(len(things))
+    if alike:
+        looks[second] = looks[first]
+    later = moved(things, {first: things.centers[second], second: things.centers[first]})
+    updated = update_map(things, seen_with_looks(later, looks),
+                         embeddings=embeddings_of(things.landmark_ids, looks))
+    report = updated.report
+    assert ids(report.moved) == (set() if alike else {'thing_1', 'thing_7'})
+    assert report.missing == report.new == ()
+    if not alike:
+        assert all('another look' in one.evidence for one in report.moved)
+        np.testing.assert_allclose(updated.landmark_map.centers[first], things.centers[second],
+                                   atol=0.03)
+    assert updated.embeddings.landmark_ids == updated.landmark_map.landmark_ids
+
+
+def test_looks_tell_a_moved_object_from_a_new_one():
+    things = make_things(12)
+    later = moved(things, {4: (1.7, 0.0, 0.8)})
+    looks = unit_rows(len(things) + 1)
+    same = update_map(things, seen_with_looks(later, looks),
+                      embeddings=embeddings_of(things.landmark_ids, looks[:-1]))
+    assert ids(same.report.moved) == {'thing_4'}
+    other_looks = looks.copy()
+    other_looks[4] = looks[-1]
+    other = update_map(things, seen_with_looks(later, other_looks),
+                       embeddings=embeddings_of(things.landmark_ids, looks[:-1]))
+    assert other.report.moved == ()
+    assert ids(other.report.missing) == {'thing_4'}
+    assert len(other.report.new) == 1
+    row = other.first_new
+    assert other.embeddings.means[row] @ looks[-1] > 0.9
+    assert other.embeddings.means[0] @ looks[0] > 0.99
+
+
+def test_an_object_that_could_be_either_of_two_says_so():
+    things = make_things(12)
+    alike = things.semi_axes.copy()
+    alike[7] = alike[1]
+    things = replace(things, semi_axes=alike)
+    later = without(moved(things, {1: (1.7, 0.0, 0.8)}), 7)
+    report = update_map(things, see(later, POSES)).report
+    (one,) = report.moved
+    (gone,) = report.missing
+    assert {one.landmark_id, gone.landmark_id} == {'thing_1', 'thing_7'}
+    assert one.rivals == (gone.landmark_id,)
+    assert 'they look alike' in one.line()
+
+
+def test_new_ids_are_unused():
+    things = make_things(12)
+    old = without(replace(things, landmark_ids=('book_1', 'cup_1', *things.landmark_ids[2:])), 3)
+    updated = update_map(old, see(things, POSES))
+    (one,) = updated.report.new
+    assert one.class_id == 'book'
+    assert one.landmark_id == 'book_2'
+
+
+@pytest.mark.parametrize('details', [
+    (),
+    LandmarkDetails(),
+    LandmarkDetails(position_sigma=0.0, support=0, seen_ratio=0.0, baseline_deg=0.0),
+    LandmarkDetails(position_sigma=1e6, support=10**9, seen_ratio=1.0, last_seen=1e300),
+    LandmarkDetails(seen_ratio=40.0, class_weights=(('dragon', 1.0), ('cup', 1e-9))),
+])
+def test_odd_fields_of_a_map_do_no_harm(details):
+    things = make_things(12)
+    old = replace(things, details=details and (details,) * len(things))
+    updated = update_map(old, see(without(things, 5), POSES, noise_px=1.0))
+    assert ids(updated.report.missing) <= {'thing_5'}
+    assert len(updated.report.confirmed) >= 10
+    assert np.isfinite(updated.landmark_map.centers).all()
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    (lambda one: one.select_frames([3]), 'took 1 viewpoints'),
+    (lambda one: one.select_boxes(np.zeros(len(one.classes), dtype=np.bool_)),
+     'have no detections'),
+    (lambda one: replace(one, class_names=('a', 'b', 'c')), 'does not belong'),
+    (lambda one: one.with_poses(one.map_from_camera[::-1].copy()), 'does not belong'),
+])
+def test_useless_recordings_say_what_to_correct(change, message):
+    with pytest.raises(MappingError, match=message):
+        update_map(make_things(), change(see(make_things(), POSES)))
+
+
+def test_a_lost_landmark_beside_a_like_one_comes_back():
+    """Its neighbour of the same class overlaps many of its boxes, and must not keep them."""
+    things = make_things(12)
+    pair = moved(replace(things, semi_axes=np.full_like(things.semi_axes, 0.12)),
+                 {3: things.centers[0] + (0.26, 0.0, 0.0)})
+    updated = update_map(without(pair, 3), see(pair, POSES, noise_px=2.0, missed=0.3))
+    assert updated.report.moved == updated.report.missing == ()
+    (one,) = updated.report.new
+    assert one.center == pytest.approx(pair.centers[3], abs=0.03)
+    assert len(updated.report.confirmed) == len(pair) - 1
+
+
+def test_a_displaced_landmark_that_is_hard_to_see_comes_back_and_leaves_no_ghost():
+    """Its low seen_ratio alone does not prove that it has gone from where the map has it."""
+    things = make_things(12)
+    details = tuple(replace(one, seen_ratio=ratio) for one, ratio in zip(
+        things.details, np.linspace(0.1, 0.9, 12), strict=True))
+    things = replace(things, details=details)
+    wrong = moved(things, {0: things.centers[0] + (0.27, 0.25, 0.0)})
+    report = update_map(wrong, see(things, POSES, noise_px=2.0, missed=0.4)).report
+    (one,) = report.moved
+    assert one.landmark_id == 'thing_0'
+    assert one.center == pytest.approx(things.centers[0], abs=0.03)
+    assert report.new == report.missing == ()
+
+
+def test_a_landmark_that_is_never_seen_is_named():
+    things = make_things(12)
+    details = tuple(replace(one, seen_ratio=ratio) for one, ratio in zip(
+        things.details, np.tile([0.1, 0.9], 6), strict=True))
+    updated = update_map(replace(things, details=details),
+                         see(without(things, 0), POSES, missed=0.4))
+    (one,) = updated.report.doubtful
+    assert one.landmark_id == 'thing_0'
+    assert 'seen in 0: it stays' in one.evidence
+    assert any(line.startswith('doubtful: thing_0') for line in updated.report.lines())
+    assert updated.landmark_map.details[0].seen_ratio < 0.1
+
+
+def test_what_is_left_out_has_its_reason():
+    things = make_things(12)
+    later = join_maps(things, replace(things.select([0]), centers=np.array([[1.9, 0.0, 0.8]])))
+    poses = np.array([look_at(np.array([-2.6, y, 1.1])) for y in np.linspace(-0.3, 0.3, 30)])
+    report = update_map(things, see(later, poses, noise_px=1.0)).report
+    assert report.new == ()
+    (one,) = [one for one in report.left_out if np.hypot(one.center[0] - 1.9, one.center[1]) < 0.6]
+    assert one.support >= 20
+    assert one.reason.startswith('seen from one side')
+    assert any(one.reason in line for line in report.lines())
+
+
+@pytest.mark.parametrize(('sigma_m', 'noise'), [(0.02, (0.0, 0.0)), (0.05, (0.0, 0.0)),
+                                                (0.05, (0.05, 1.0))])
+def test_an_exact_map_hardly_moves_and_errors_of_poses_are_estimated(sigma_m, noise):
+    things, rng = make_things(), np.random.default_rng(0)
+    old = replace(things, details=tuple(replace(one, position_sigma=sigma_m)
+                                        for one in things.details))
+    poses = POSES.copy()
+    poses[:, :3, 3] += rng.normal(scale=noise[0], size=(len(POSES), 3))
+    poses[:, :3, :3] = Rotation.from_rotvec(rng.normal(
+        scale=np.radians(noise[1]), size=(len(POSES), 3))).as_matrix() @ poses[:, :3, :3]
+    updated = update_map(old, see(things, POSES, noise_px=2.0, missed=0.3).with_poses(poses),
+                         MappingOptions(estimate_pose_errors=True))
+    ways = np.linalg.norm(updated.landmark_map.centers - things.centers, axis=1)
+    assert np.median(ways) < 0.01
+    assert (updated.report.pose_change_m > 0.04) == (noise[0] > 0.0)
+    assert any('estimated from' in one for one in updated.report.notes) == (
+        noise[0] > 0.0)

@@ -44,7 +44,7 @@ class Evidence(NamedTuple):
 
     def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> 'Evidence':
         """Return the evidence for some of the landmarks."""
-        return Evidence(*(column[rows] for column in self))
+        return self._replace(**{name: column[rows] for name, column in self._asdict().items()})
 
     def details(self, row: int, given: LandmarkDetails) -> LandmarkDetails:
         """Return the details of a landmark in a map with this evidence in place of the given."""
