@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.depth_image import depths_of_points
+from cliploc_ros.core.depth_image import DepthImage, points_in_color
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.features import extract, match, unit_rows
@@ -20,7 +20,6 @@ from cliploc_ros.core.keyframes.layer import (
     PIXEL_SCALE,
     TRIANGULATED,
     KeyframeLayer,
-    learn_words,
     nearest_words,
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -42,6 +41,12 @@ _NEIGHBOURS = 8
 _LEAST_M, _MOST_M, _MOST_COS = 0.05, 2.0, np.cos(np.radians(40.0))
 #: The points of a room or hall are this far [m].
 _DEPTHS_M = (0.2, 40.0)
+# Number of words. 1,024 find the keyframes of the kitchen as well as comparing all descriptors.
+_WORDS = 1024
+# Descriptors that the words are learned from, and steps of k-means.
+_MOST_LEARNED, _STEPS = 50_000, 8
+# Pixels beside a pixel; one that is further away by this share belongs to another surface.
+_BESIDE, _EDGE = np.ones((3, 3), dtype=np.uint8), 0.1
 
 
 @dataclass(frozen=True)
@@ -276,3 +281,54 @@ def _agrees(points: NDArray[np.float64], bearings: NDArray[np.float64],
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float64]
+                     ) -> NDArray[np.float32]:
+    """Return the depth of what single pixels show.
+
+    Parameters
+    ----------
+    camera : Camera
+        Of the colour image.
+    pixels : ndarray (n, 2)
+        In the colour image, distorted [px].
+
+    Returns
+    -------
+    ndarray (n,) float32
+        Along z of the colour camera [m]: the nearest surface within a pixel of each; NaN where
+        nothing was measured, and at edges, where a neighbour is much further away.
+    """
+    height, width = depth.depths_m.shape
+    seen, values = points_in_color(depth, camera, 1)
+    places = np.round(seen * [[width / camera.width], [height / camera.height]]).astype(np.int64)
+    inside = ((places >= 0) & (places < [[width], [height]])).all(axis=0)
+    near = np.full((height, width), np.inf, dtype=np.float32)
+    np.minimum.at(near, (places[1, inside], places[0, inside]), values[inside])
+    nearest = cv2.erode(near, _BESIDE)
+    furthest = cv2.dilate(np.where(np.isfinite(near), near, 0.0), _BESIDE)
+    rows = np.round(pixels * (width / camera.width, height / camera.height)).astype(np.int64)
+    rows = np.clip(rows, 0, (width - 1, height - 1))
+    found, other = nearest[rows[:, 1], rows[:, 0]], furthest[rows[:, 1], rows[:, 0]]
+    with np.errstate(invalid='ignore'):
+        return np.where(np.isfinite(found) & (other - found <= _EDGE * found), found,
+                        np.float32(np.nan))
+
+
+def learn_words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the vocabulary (W, 128) of some descriptors (n, 128), by k-means.
+
+    The start is every n-th descriptor, so equal layers have equal words.
+    """
+    step = max(1, len(descriptors) // _MOST_LEARNED)
+    learned = unit_rows(descriptors[::step])
+    count = min(_WORDS, len(learned))
+    means = learned[np.linspace(0, len(learned) - 1, count).astype(np.int64)]
+    for _ in range(_STEPS):
+        words = nearest_words(learned, means)
+        order = np.argsort(words, kind='stable')
+        found, starts = np.unique(words[order], return_index=True)
+        sums = np.add.reduceat(learned[order], starts, axis=0)
+        means[found] = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
+    return np.asarray(np.clip(np.round(means * 512.0), 0, 255), dtype=np.uint8)
