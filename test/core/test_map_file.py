@@ -17,7 +17,7 @@ from cliploc_ros.core.map.landmark_embeddings import (
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.core.map.parameter_file import parse_written, read_parameter_file
+from cliploc_ros.core.map.parameter_file import parse_written_map, read_parameter_file
 from cliploc_ros.errors import MapError
 
 CUP = {'class_id': 'cup', 'center': [1.0, 2.0, 3.0], 'semi_axes': [0.1, 0.2, 0.3],
@@ -143,7 +143,7 @@ def equal(one, other):
 def test_what_was_written_is_read_as_yaml_reads_it(tmp_path, details, label):
     path, room = tmp_path / 'map.yaml', make_room()
     write_map(path, replace(room, details=details, labels=(label, *room.labels[1:])), ['h\u00f6'])
-    assert parse_written(path.read_text(encoding='utf-8')) is not None
+    assert parse_written_map(path.read_text(encoding='utf-8')) is not None
     assert equal(LandmarkMap.from_file(path), by_yaml(path))
 
 

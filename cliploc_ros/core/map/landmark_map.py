@@ -30,7 +30,12 @@ from cliploc_ros.core.map.landmark_details import (
     read_details,
 )
 from cliploc_ros.core.map.pairs import LandmarkPairs, make_pairs
-from cliploc_ros.core.map.parameter_file import parse_parameters, parse_written, read_text
+from cliploc_ros.core.map.parameter_file import (
+    WrittenMap,
+    parse_parameters,
+    parse_written_map,
+    read_text,
+)
 from cliploc_ros.errors import MapError, did_you_mean
 
 _UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
@@ -230,7 +235,9 @@ class LandmarkMap:
             Names the file, the landmark and the field to correct.
         """
         text = read_text(path)
-        tree = parse_written(text) or parse_parameters(text, path)
+        if (written := parse_written_map(text)) is not None and _is_valid(written):
+            return LandmarkMap(*written._replace(quats_xyzw=_unit(written.quats_xyzw)))
+        tree = parse_parameters(text, path)
         found = [node['ros__parameters']['map'] for node in tree.values()
                  if isinstance(node, dict) and isinstance(node.get('ros__parameters'), dict)
                  and 'map' in node['ros__parameters']]
@@ -256,11 +263,27 @@ class LandmarkMap:
         rows = [_landmark(landmark_id, fields, source)
                 for landmark_id, fields in landmarks.items()]
         labels, class_ids, centers, semi_axes, quats, details = zip(*rows, strict=True)
-        quats_xyzw = np.array(quats)
         return LandmarkMap(frame_id, tuple(map(str, landmarks)), labels, class_ids,
-                           np.array(centers), np.array(semi_axes),
-                           quats_xyzw / np.linalg.norm(quats_xyzw, axis=1, keepdims=True),
+                           np.array(centers), np.array(semi_axes), _unit(np.array(quats)),
                            details if any(one != LandmarkDetails() for one in details) else ())
+
+
+def _unit(quats_xyzw: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(quats_xyzw / np.linalg.norm(quats_xyzw, axis=1, keepdims=True))
+
+
+def _is_valid(written: WrittenMap) -> bool:
+    """Return whether from_mapping would accept a map that is finite and has unique ids."""
+    low, high = _SEMI_AXIS_RANGE_M
+    norms = np.linalg.norm(written.quats_xyzw, axis=1)
+    texts = ((written.frame_id,), written.labels, written.class_ids)
+    return bool(
+        ((written.semi_axes >= low) & (written.semi_axes <= high)).all()
+        and np.abs(written.centers).max() <= _MAX_COORDINATE_M
+        and np.abs(norms - 1.0).max() <= _MAX_QUATERNION_NORM_ERROR
+        and not any('.' in one for one in written.landmark_ids)
+        and all(len(one) <= _MAX_TEXT_LENGTH and not one.isspace() and one
+                for column in texts for one in set(column)))
 
 
 def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:

@@ -6,22 +6,25 @@ The tree is built from the parser's events, without recursion and without instan
 Size and depth are limited, so a hostile file ends in an error and not in a crash.
 
 PyYAML makes an object of each mark of the file: 100,000 landmarks take it 10 to 30 s. Files of
-build_map, import_map and the studio have lines of one kind, so a regular expression turns them
-into JSON, which is read several times faster. It accepts a small part of YAML only, in which it
-agrees with the parser. Any other file, a hand-written or invalid one among them, gives None, and
-the parser reads it and names what is wrong.
+build_map, import_map and the studio repeat one layout, so a regular expression for one landmark
+reads them ten times faster. It accepts a small part of YAML only, in which it agrees with the
+parser. Any other file, a hand-written or invalid one among them, gives None, and the parser reads
+it and names what is wrong.
 """
 
 import json
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from stat import S_ISREG
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
 
-from cliploc_ros.core.map.landmark_details import OPTIONAL_FIELDS
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.errors import MapError
 
 MAX_FILE_BYTES = 256 * 1024 * 1024
@@ -33,18 +36,20 @@ _QUOTED_STYLES = ('"', "'", '|', '>')
 # Longer text is no measured number; 300 digits would overflow a float.
 _MAX_NUMBER_LENGTH = 40
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
-# A line of what write_map writes: a key, and text, a number, or a list of these, in the part of
-# YAML that is JSON. Halves of a pair of code units are not in it; a key of YAML has at most 1024
-# characters.
+# Quoted text whose escapes mean the same in JSON and in YAML; halves of a pair of code units do
+# not. A key of YAML has at most 1024 characters.
 _ESCAPE = r'\\(?:["\\nrtbf]|u(?!d[89a-f])[0-9a-f]{4})'
 _TEXT = rf'"(?:[ !#-\[\]-~]|{_ESCAPE})*+"'
-_VALUE = rf'(?:{_TEXT}|-?(?:0|[1-9]\d{{0,14}})(?:\.\d{{1,9}})?(?=[\n,\]]))'
-_LINE = re.compile(
-    rf'((?:  ){{0,8}}+)("(?:[ !#-\[\]-~]|{_ESCAPE}){{1,150}}+"|/\*\*|ros__parameters|map|frame_id'
-    r'|landmarks|label|class_id|center|semi_axes|orientation|text|weight'
-    rf'|{"|".join(OPTIONAL_FIELDS)}):'
-    rf'(?: ({_VALUE}|\[{_VALUE}(?:, {_VALUE})*+\]))?\n')
-_COMMENTS = re.compile(r'(?:#[ -~\u00a0-\ud7ff]*\n)*+')
+_KEY = rf'"(?:[ !#-\[\]-~]|{_ESCAPE}){{1,150}}+"'
+_FLOAT = r'(?:0|[1-9]\d{0,14})\.\d{1,9}'
+_SIGNED = rf'-?{_FLOAT}'
+_HEAD = re.compile(
+    r'(?:#[ -~\u00a0-\ud7ff]*\n)*+/\*\*:\n  ros__parameters:\n    map:\n'
+    rf'      frame_id: ({_TEXT})\n'
+    r'      landmarks:\n')
+_INDENT = ' ' * 10
+# Groups of _LANDMARK before those of the details.
+_PLAIN = 6
 
 
 def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -153,30 +158,93 @@ def _scalar(event: yaml.ScalarEvent) -> Any:
         text.lower(), text)
 
 
-def parse_written(text: str) -> dict[str, Any] | None:
-    """Return the tree of a file's text; None if it has another layout than write_map's."""
-    comments = _COMMENTS.match(text)
-    assert comments is not None
-    parts, depth, is_open, end = list[str](), -1, True, comments.end()
-    for found in _LINE.finditer(text, end):
-        indent, key, value = found.groups()
-        steps = len(indent) // 2 - depth
-        if found.start() != end or steps > 1 or (steps == 1) != is_open:
-            return None
-        parts += ['{' if is_open else '}' * -steps + ',',
-                  key if key[0] == '"' else f'"{key}"', ':', value or '']
-        depth, is_open, end = depth + steps, value is None, found.end()
-    if end != len(text) or is_open:
-        return None
-    try:
-        return dict(json.loads(''.join(parts) + '}' * (depth + 1), object_pairs_hook=_unique))
-    except ValueError:
-        return None
+def _row(count: int) -> str:
+    return rf'\[({_SIGNED}{rf", {_SIGNED}" * (count - 1)})\]'
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return a mapping; ValueError: a key is repeated."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise ValueError('a key is repeated')
-    return found
+_LANDMARK = re.compile(''.join([
+    rf'        ({_KEY}):\n', rf'{_INDENT}label: ({_TEXT})\n', rf'{_INDENT}class_id: ({_TEXT})\n',
+    rf'{_INDENT}center: {_row(3)}\n', rf'{_INDENT}semi_axes: {_row(3)}\n',
+    rf'{_INDENT}orientation: {_row(4)}\n',
+    rf'(?:{_INDENT}labels:\n{_INDENT}  text: \[({_TEXT}(?:, {_TEXT})*+)\]\n',
+    rf'{_INDENT}  weight: \[({_FLOAT}(?:, {_FLOAT})*+)\]\n)?+',
+    rf'(?:{_INDENT}class_weights:\n((?:{_INDENT}  {_KEY}: {_FLOAT}\n)++))?+',
+    rf'(?:{_INDENT}support: ((?:0|[1-9]\d{{0,14}}))\n)?+',
+    *(rf'(?:{_INDENT}{name}: ({_FLOAT})\n)?+'
+      for name in ('position_sigma', 'shared_sigma', 'shared_sigma_deg', 'seen_ratio',
+                   'baseline_deg', 'last_seen')),
+    rf'(?:{_INDENT}source: ({_TEXT})\n)?+']))
+
+
+class WrittenMap(NamedTuple):
+    """The fields of LandmarkMap in their order, not yet validated."""
+
+    frame_id: str
+    landmark_ids: tuple[str, ...]
+    labels: tuple[str, ...]
+    class_ids: tuple[str, ...]
+    centers: NDArray[np.float64]
+    semi_axes: NDArray[np.float64]
+    quats_xyzw: NDArray[np.float64]
+    details: tuple[LandmarkDetails, ...]
+
+
+def parse_written_map(text: str) -> WrittenMap | None:
+    """Return the map of a file's text; None if it has another layout than write_map's.
+
+    Ids are unique, numbers finite, weights above 0.
+    """
+    head = _HEAD.match(text)
+    if head is None:
+        return None
+    rows, end = [], head.end()
+    while (found := _LANDMARK.match(text, end)) is not None:
+        rows.append(found.groups())
+        end = found.end()
+    if end != len(text) or not rows:
+        return None
+    columns = list(zip(*rows, strict=True))
+    ids, labels, class_ids = (tuple(_values(column)) for column in columns[:3])
+    details = _details(columns[_PLAIN:], len(rows))
+    if len(set(ids)) < len(ids) or details is None:
+        return None
+    centers, semi_axes, quats_xyzw = (
+        np.array(_values(column), dtype=np.float64).reshape(len(rows), -1)
+        for column in columns[3:_PLAIN])
+    return WrittenMap(json.loads(head[1]), ids, labels, class_ids, centers, semi_axes, quats_xyzw,
+                      details)
+
+
+def _values(texts: Iterable[str]) -> list[Any]:
+    """Return the values of JSON texts, lists joined."""
+    return list(json.loads(f'[{",".join(texts)}]'))
+
+
+def _details(columns: list[tuple[Any, ...]], count: int) -> tuple[LandmarkDetails, ...] | None:
+    """Return the optional fields of each landmark, empty if none has any; None for the parser."""
+    if not any(map(any, columns)):
+        return ()
+    texts, weights, classes, *numbers, sources = columns
+    phrases, heavy = _values(_lists(texts)), _values(_lists(weights))
+    shares = _values('null' if one is None else f'{{{one[:-1]}}}'.replace('\n', ',')
+                     for one in classes)
+    names = _values(one or 'null' for one in sources)
+    if (any(one and len(one) != len(its) for one, its in zip(phrases, heavy, strict=True))
+            # a class that is repeated
+            or any(one and len(its) < one.count('\n')
+                   for one, its in zip(classes, shares, strict=True))):
+        return None
+    labels, likely = ([pairs and tuple(pairs) for pairs in column] for column in (
+        [one and zip(one, its, strict=True) for one, its in zip(phrases, heavy, strict=True)],
+        [one and one.items() for one in shares]))
+    if not (all(text.strip() and weight > 0.0 for column in (labels, likely)
+                for pairs in column if pairs for text, weight in pairs)
+            and all(one is None or one.strip() for one in names)):
+        return None
+    support, *others = ([None if one is None else kind(one) for one in column]
+                        for kind, column in zip((int, *[float] * 6), numbers, strict=True))
+    return tuple(map(LandmarkDetails, labels, likely, *others[:3], support, *others[3:], names))
+
+
+def _lists(texts: Iterable[str | None]) -> Iterable[str]:
+    return ('null' if one is None else f'[{one}]' for one in texts)
