@@ -121,13 +121,13 @@ def _add_thresholds(parser: argparse.ArgumentParser) -> None:
 def check(options: argparse.Namespace) -> int:
     """Check as the command line asks; return the exit code."""
     # Late, so that --help is fast.
-    from cliploc_ros.core.geometry.tilt import tilt_note
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
     from cliploc_ros.offline.evaluation.map_check.page import PAGE, summary_lines, write_report
     from cliploc_ros.offline.evaluation.map_check.pictures import draw_pictures
     from cliploc_ros.offline.evaluation.map_check.views import ViewPainter
     from cliploc_ros.offline.mapping.check.checking import check_map
+    from cliploc_ros.offline.mapping.tilt import tilt_note
 
     begin = time.monotonic()
     landmark_map = LandmarkMap.from_file(options.map)

@@ -33,6 +33,7 @@ from scipy.stats import chi2
 from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.acceptance.looks import Look, Looks
+from cliploc_ros.core.fit.covariance import moved_pose
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import (
     SAME_VIEW,
@@ -110,10 +111,8 @@ def succeed(known: Known | None, odom_from_camera: NDArray[np.float64],
     given = np.asarray((axes / information) @ axes.T)
     gain = np.linalg.solve(prior + given, prior).T
     step, after = gain @ innovation, prior - gain @ prior
-    pose = before.map_from_camera.copy()
-    pose[:3, 3] += step[:3]
-    pose[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
-    return given, Known(odom_from_camera, pose, (after + after.T) / 2)
+    return given, Known(odom_from_camera, moved_pose(before.map_from_camera, step),
+                        (after + after.T) / 2)
 
 
 def _carried(known: Known, odom_from_camera: NDArray[np.float64]) -> Known:
@@ -349,6 +348,7 @@ class Localizer:
             return None
         return ImageRecognizer(self._keyframes, partial(query_features, query.images[-1]),
                                query.newest.camera, deadline, begin_stage)
+
     def with_free_crops(self, query: Query, row: int, source: CropSource | None,
                         begin_stage: Callable[[str], None] = lambda stage: None) -> Observation:
         """Return a frame of a query with the crops that cost nothing, or that were compared.
