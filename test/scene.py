@@ -15,9 +15,10 @@ from cliploc_ros.core.geometry.ellipsoid import (
 )
 from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
 from cliploc_ros.core.keyframes.features import DIMENSIONS, unit_rows
-from cliploc_ros.core.keyframes.layer import KeyframeLayer, learn_words, nearest_words
+from cliploc_ros.core.keyframes.layer import KeyframeLayer, nearest_words
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
+from cliploc_ros.offline.recording.keyframe_layer import learn_words
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 MAP_FROM_CAMERA = transform_from_pose(np.array([0.3, -0.2, -0.5]),

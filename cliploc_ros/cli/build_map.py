@@ -241,8 +241,8 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
     """Return detections in the map, and the scale and rotation (3, 3) that moved them there."""
     import numpy as np
 
-    from cliploc_ros.core.geometry.tilt import NO_VERTICAL, find_tilt, tilt_note
     from cliploc_ros.offline.make_map import scale_of_objects
+    from cliploc_ros.offline.mapping.tilt import NO_VERTICAL, find_tilt, tilt_note
 
     scale, rotation = 1.0, np.eye(3)
     if folder_of(options) is None:  # whoever reads a folder levels it

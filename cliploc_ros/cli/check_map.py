@@ -119,7 +119,6 @@ def _add_thresholds(parser: argparse.ArgumentParser) -> None:
 def check(options: argparse.Namespace) -> int:
     """Check as the command line asks; return the exit code."""
     # Late, so that --help is fast.
-    from cliploc_ros.core.geometry.tilt import tilt_note
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
     from cliploc_ros.offline.datasets.queries import load_queries
@@ -129,6 +128,7 @@ def check(options: argparse.Namespace) -> int:
     from cliploc_ros.offline.evaluation.trials import make_queries
     from cliploc_ros.offline.mapping.check.checking import check_map
     from cliploc_ros.offline.mapping.check.relocalization import PosedObservation
+    from cliploc_ros.offline.mapping.tilt import tilt_note
 
     begin = time.monotonic()
     landmark_map = LandmarkMap.from_file(options.map)

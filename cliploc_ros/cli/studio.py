@@ -84,7 +84,7 @@ def make_parser() -> argparse.ArgumentParser:
 def serve(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C; return the exit code."""
     # Late, so that --help is fast.
-    from cliploc_ros.core.geometry.tilt import tilt_note
+    from cliploc_ros.offline.mapping.tilt import tilt_note
     from cliploc_ros.offline.studio.page import serve_studio
 
     studio = open_studio(options)

@@ -8,7 +8,6 @@ So a box gets one robust value, from its inner half, and the spread of the value
 
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,9 +20,6 @@ MILLIMETRE, TUM_UNIT = 1e-3, 1 / 5000
 _INNER_SHARE = 0.5
 _LEAST_VALUES = 12
 _LEAST_SHARE = 0.1
-# A neighbouring pixel that is further away by this share belongs to another surface.
-_EDGE = 0.1
-_NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
 # Every second pixel in each direction is enough for a median.
 _STEP = 2
 #: Rooms and halls: the typical depth of a recording lies between these [m].
@@ -116,54 +112,6 @@ def depths_of_boxes(depth: DepthImage, camera: Camera, bboxes_xyxy: NDArray[np.f
             low, depths[row], high = np.percentile(inside, [16, 50, 84])
             spreads[row] = 0.5 * (high - low)
     return depths, spreads
-
-
-def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float64]
-                     ) -> NDArray[np.float32]:
-    """Return the depth of what single pixels show.
-
-    Parameters
-    ----------
-    camera : Camera
-        Of the colour image.
-    pixels : ndarray (n, 2)
-        In the colour image, distorted [px].
-
-    Returns
-    -------
-    ndarray (n,) float32
-        Along z of the colour camera [m]: the nearest surface within a pixel of each; NaN where
-        nothing was measured, and at edges, where a neighbour is much further away.
-    """
-    height, width = depth.depths_m.shape
-    seen, values = points_in_color(depth, camera, 1)
-    places = np.round(seen * [[width / camera.width], [height / camera.height]]).astype(np.int64)
-    inside = ((places >= 0) & (places < [[width], [height]])).all(axis=0)
-    near = np.full((height, width), np.inf, dtype=np.float32)
-    np.minimum.at(near, (places[1, inside], places[0, inside]), values[inside])
-    nearest = cv2.erode(near, _NEIGHBOURS)
-    furthest = cv2.dilate(np.where(np.isfinite(near), near, 0.0), _NEIGHBOURS)
-    rows = np.round(pixels * (width / camera.width, height / camera.height)).astype(np.int64)
-    rows = np.clip(rows, 0, (width - 1, height - 1))
-    found, other = nearest[rows[:, 1], rows[:, 0]], furthest[rows[:, 1], rows[:, 0]]
-    with np.errstate(invalid='ignore'):
-        return np.where(np.isfinite(found) & (other - found <= _EDGE * found), found,
-                        np.float32(np.nan))
-
-
-def check_depth_unit(depths_m: NDArray[np.float32], where: str) -> None:
-    """Refuse depths of boxes that no camera in a room or hall measures.
-
-    DatasetError: the median is implausible; says how to give the unit.
-    """
-    known = depths_m[np.isfinite(depths_m)]
-    if len(known) == 0:
-        return
-    median, (least, greatest) = float(np.median(known)), PLAUSIBLE_DEPTH_M
-    if not least < median < greatest:
-        raise DatasetError(
-            f'{where}: the median depth of the boxes is {median:.4g} m, expected {least} to '
-            f'{greatest:.0f} m: wrong unit? give --depth-unit (0.001 for mm, 0.0002 for TUM)')
 
 
 def points_in_color(depth: DepthImage, camera: Camera, step: int

@@ -276,6 +276,7 @@ class Localizer:
             return None
         return ImageRecognizer(self._keyframes, partial(query_features, query.images[-1]),
                                query.newest.camera, deadline, begin_stage)
+
     def with_free_crops(self, query: Query, row: int, source: CropSource | None,
                         begin_stage: Callable[[str], None] = lambda stage: None) -> Observation:
         """Return a frame of a query with the crops that cost nothing, or that were compared.

@@ -89,11 +89,14 @@ def case_arrays(case: Case) -> Arrays:
     for query in case.queries:
         images += [cv2.imencode('.png', cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].ravel()
                    for image in query.images]
-        crops += [_crops_of(one.similarities) for one in query.frames
-                  if one.similarities is not None]
+        # embeddings, or where these are unknown, similarities
+        crops += [one.similarities.crops if isinstance(one.similarities, CropSimilarities)
+                  else one.similarities for one in query.frames if one.similarities is not None]
     about = {'report': case.report, 'queries': [_fields_of(query) for query in case.queries]}
     return {
-        'about': np.frombuffer(json.dumps(about, default=_plain).encode(), dtype=np.uint8),
+        # arrays and numbers of NumPy as JSON has them
+        'about': np.frombuffer(json.dumps(about, default=lambda value: value.tolist()).encode(),
+                               dtype=np.uint8),
         'image_offsets': np.cumsum([0, *map(len, images)]),
         'images': np.concatenate([np.empty(0, np.uint8), *images]),
         'crop_offsets': np.cumsum([0, *map(len, crops)]),
@@ -118,16 +121,6 @@ def read_case(path: Path) -> Case:
 
 def _parts(arrays: Arrays, name: str) -> Iterator[NDArray[Any]]:
     return (arrays[f'{name}s'][first:last] for first, last in pairwise(arrays[f'{name}_offsets']))
-
-
-def _crops_of(similarities: Similarities) -> NDArray[np.float32]:
-    """Return the embeddings of crops, or where these are unknown, their similarities."""
-    return similarities.crops if isinstance(similarities, CropSimilarities) else similarities
-
-
-def _plain(value: Any) -> Any:
-    """Return an array or a number of NumPy as JSON has it."""
-    return value.tolist()
 
 
 def _fields_of(query: Query) -> dict[str, Any]:

@@ -56,11 +56,6 @@ class TimeBudget:
     total_s: float  #: Infinite for no limit
     frames: int  #: Number of frames that are localized together
 
-    @staticmethod
-    def begin(total_s: float, frames: int) -> 'TimeBudget':
-        """Return a budget that starts now."""
-        return TimeBudget(time.perf_counter(), total_s, frames)
-
     def search_end(self, number: int = 1, count: int = 1) -> float:
         """Return when the search of a frame ends: the number-th of count frames to search."""
         return self.start + self._time_s(_SEARCH_SHARE, _EARLIER_SEARCH_S) * number / count
@@ -93,19 +88,11 @@ class Relocalizer:
     def __init__(self, landmark_map: LandmarkMap, options: RelocalizerOptions) -> None:
         if options.needs_similarities:
             check_k(options.k, len(landmark_map))
-        self._map = landmark_map
+        #: The map
+        self.landmark_map = landmark_map
         landmark_map.prepare()
-        self._options = options
-
-    @property
-    def landmark_map(self) -> LandmarkMap:
-        """Return the map."""
-        return self._map
-
-    @property
-    def options(self) -> RelocalizerOptions:
-        """Return the options."""
-        return self._options
+        #: The options
+        self.options = options
 
     def warm_up(self) -> None:
         """Compile the kernels, or read them from disk, before the first request needs them."""
@@ -137,11 +124,11 @@ class Relocalizer:
 
         What several cameras see at one instant has the time of each.
         """
-        return TimeBudget.begin(cameras * self._options.time_budget_s, frames)
+        return TimeBudget(time.perf_counter(), cameras * self.options.time_budget_s, frames)
 
     def search(self, observation: Observation, deadline: float = math.inf) -> SearchedFrame:
         """Search one frame, until a deadline of time.perf_counter [s]."""
-        return search_frame(self._map, observation, self._options, deadline)
+        return search_frame(self.landmark_map, observation, self.options, deadline)
 
     def locate(self, frames: Sequence[SearchedFrame], budget: TimeBudget | None = None,
                looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None,
@@ -153,7 +140,7 @@ class Relocalizer:
         of the cameras counts, by default nothing. Raises OptionsError, see relocalize.
         """
         budget = budget or self.begin(len(frames))
-        joined = join_frames(self._map, self._options, frames)
+        joined = join_frames(self.landmark_map, self.options, frames)
         met = self._meet(joined, budget)
         depth = check_depth(joined.rig, met[0].finalist) if met else None
         if depth is not None and not depth.is_passed:
@@ -165,13 +152,13 @@ class Relocalizer:
         pose, covariance = pose_of(joined, compared)
         evidence = evidence_of(joined, compared, covariance, looks, recognizer)
         seen: list[CameraLook] = []
-        if compared.by_boxes is not None and self._options.refine:
+        if compared.by_boxes is not None and self.options.refine:
             # an uncertain position may be the camera's fault
-            if refusal(replace(evidence, near=1.0), self._options) is None:
+            if refusal(replace(evidence, near=1.0), self.options) is None:
                 seen = looks_of(joined, compared.by_boxes.finalist)
             camera, fault = (cameras or CameraCheck()).judge(seen, covariance)
             evidence = replace(evidence, camera=camera, camera_fault=fault)
-        refused = refusal(evidence, self._options)
+        refused = refusal(evidence, self.options)
         shown = compared.by_objects or compared.contenders[0]
         return Relocalization(
             accepted=refused is None, reason=refused.reason if refused else '',
@@ -186,7 +173,7 @@ class Relocalizer:
     def _meet(self, joined: JoinedFrames, budget: TimeBudget) -> list[Contender]:
         """Return the best poses that the search met, see search_contenders."""
         return search_contenders(joined, *find_with_rivals(
-            joined.frames, joined.rig, self._options.refine, budget.refinement_end))
+            joined.frames, joined.rig, self.options.refine, budget.refinement_end))
 
 
 def _hypotheses(pose: NDArray[np.float64], compared: Comparison, evidence: Evidence

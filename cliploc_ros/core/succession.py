@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from cliploc_ros.core.fit.covariance import moved_pose
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     move_covariance,
@@ -67,10 +68,8 @@ def succeed(known: FilterState | None, odom_from_camera: NDArray[np.float64],
     given = np.asarray((axes / information) @ axes.T)
     gain = np.linalg.solve(prior + given, prior).T
     step, after = gain @ innovation, prior - gain @ prior
-    pose = before.map_from_camera.copy()
-    pose[:3, 3] += step[:3]
-    pose[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
-    return given, FilterState(odom_from_camera, pose, (after + after.T) / 2)
+    return given, FilterState(odom_from_camera, moved_pose(before.map_from_camera, step),
+                              (after + after.T) / 2)
 
 
 def _carried(known: FilterState, odom_from_camera: NDArray[np.float64]) -> FilterState:

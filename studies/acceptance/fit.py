@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration, Objects
+from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration, Terms
 from cliploc_ros.core.acceptance.confidence import Setting, confidences, none_right, utilities
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, pose_error
@@ -169,7 +169,8 @@ def fit(cases: Sequence[Case], only: str = '') -> Calibration:
         fitted = float((solved.x / scale)[_TERMS.index(only)])
         return CALIBRATION._replace(objects=CALIBRATION.objects._replace(**{only: fitted}))
     return _levelled(cases, CALIBRATION._replace(
-        objects=Objects(*map(float, [*solved.x / scale, 0.0, 0.0]))))
+        objects=Terms(zip(CALIBRATION.objects, map(float, [*solved.x / scale, 0.0, 0.0]),
+                          strict=True))))
 
 
 class _Arrays(NamedTuple):

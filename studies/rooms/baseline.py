@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.depth_image import depths_of_points
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.offline.datasets.frames import PosedImage
+from cliploc_ros.offline.recording.keyframe_layer import depths_of_points
 
 _MOST_FEATURES, _RATIO = 2000, 0.8
 # Nearest features vote for images; those with most votes are matched one by one.

@@ -18,8 +18,8 @@ from cliploc_ros.core.keyframes.features import (
     unit_rows,
 )
 from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, find_pose, free_focal
-from cliploc_ros.core.keyframes.triangulation import PosedFeatures, triangulate
 from cliploc_ros.core.search.scene import Prior
+from cliploc_ros.offline.recording.keyframe_layer import PosedFeatures, triangulate
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
 

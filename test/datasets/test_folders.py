@@ -9,7 +9,6 @@ import pytest
 from cliploc_ros.core.depth_image import (
     DepthCamera,
     DepthImage,
-    check_depth_unit,
     depth_from_counts,
     depths_of_boxes,
 )
@@ -18,6 +17,7 @@ from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.folders import FolderOptions, rgbd_frames
 from cliploc_ros.offline.datasets.frames import DepthFormat
+from cliploc_ros.offline.recording.recorder import check_depth_unit
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
 NO_OPTIONS = FolderOptions()

@@ -9,13 +9,13 @@ import pytest
 from capture_folders import FLIP, shots_of, write_colmap, write_nerf
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.tilt import find_vertical
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.captures import placing
 from cliploc_ros.offline.datasets.captures.capture import StampedPoses
 from cliploc_ros.offline.datasets.captures.placing import AXES, check_axes
 from cliploc_ros.offline.datasets.folders import FolderOptions, find_layout, read_folder
+from cliploc_ros.offline.mapping.tilt import find_vertical
 
 pytestmark = pytest.mark.needs('pycolmap')
 STORED = {'opencv': lambda pose: pose, 'opengl': lambda pose: pose @ FLIP,

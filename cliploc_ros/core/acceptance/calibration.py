@@ -1,179 +1,50 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers that decide whether a pose is accepted: calibration.yaml, a tuple a section."""
+"""The numbers that decide whether a pose is accepted: calibration.yaml."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import yaml
 
 FILE = Path(__file__).with_name('calibration.yaml')
 
 
-class Objects(NamedTuple):
-    """Utility of a pose by its objects."""
+class Terms(dict[str, float]):
+    """The numbers of a section by their names; calibration.yaml says what each means."""
 
-    score: float
-    misfit: float
-    likeness: float
-    rarity: float
-    unlabelled: float
-    unexplained: float
-    depth: float
-    none_right: float
-    map_size: float
-    least_size: float
-    vertical: float
-    knee: float
-    slope: float
+    def __getattr__(self, name: str) -> float:
+        """Return a number."""
+        try:
+            return self[name]
+        except KeyError:
+            raise AttributeError(f'calibration.yaml has no {name} here') from None
 
-
-class Keyframes(NamedTuple):
-    """Utility of a pose by the points of keyframes."""
-
-    none: float
-    inliers: float
-    confirmed: float
-    most: float
-    explained: float
-    unexplained: float
-    most_objects: float
-    missed: float
-    good_covariance: float
-
-
-class Genuine(NamedTuple):
-    """Log odds that a recognized place is there, and no picture of it."""
-
-    none: float
-    points: float
-    confirmed: float
-    focal: float
-    aspect: float
-    reach: float
-    unexplained: float
-    rival: float
-    most_motion: float
-
-
-class Attitude(NamedTuple):
-    """The evidence of an attitude against a pose."""
-
-    wrong_mount: float
-    not_mirrored: float
-    vertical_sigmas: float
-
-
-class Places(NamedTuple):
-    """Log odds between places that look alike."""
-
-    likeness: float
-    unlabelled: float
-    aged: float
-    labels: float
-
-
-class Prior(NamedTuple):
-    """What a region says."""
-
-    most: float
-    least_m: float
-    least_deg: float
-
-
-class Search(NamedTuple):
-    """When a search is enough."""
-
-    least_samples: float
-    missed_is_right: float
-    early_share: float
-
-
-class SuccessiveLooks(NamedTuple):
-    """What successive looks must agree on."""
-
-    mean_confidence: float
-    most: int
-    drift_m: float
-    drift_deg: float
-
-
-class SystematicErrors(NamedTuple):
-    """Errors of a camera and its boxes, and when they are too large."""
-
-    wrong: float
-    sure: float
-    view: float
-    extent: float
-    focal: float
-    aspect: float
-    point: float
-    calibrated: float
-    corner: float
-    size: float
-
-
-class Spread(NamedTuple):
-    """How covariances count."""
-
-    caution: float
-    sharpness: float
-    most_confidence: float
-
-
-class Looking(NamedTuple):
-    """Log odds of a look of the watch, and how its looks add up."""
-
-    none: float
-    utility: float
-    any: float
-    unexplained: float
-    missed: float
-    away: float
-    aged: float
-    turned: float
-    crowd: float
-    least: float
-    least_unsure: float
-    most: float
-    lost_per_s: float
-    lost_per_m: float
-    correlated: float
-    correlated_m: float
-    correlated_deg: float
-    correlated_s: float
-    most_jump: float
-    lost: float
-    localized: float
+    def _replace(self, **numbers: float) -> 'Terms':
+        """Return the section with other numbers."""
+        return Terms(self | numbers)
 
 
 class Calibration(NamedTuple):
-    """All sections; calibration.yaml says what each number means."""
+    """All sections."""
 
-    objects: Objects
+    objects: Terms  #: Utility of a pose by its objects
     #: Share of each class among the things of any building; classes that are missing are rare
-    common: Mapping[str, float]
-    keyframes: Keyframes
-    genuine: Genuine
-    attitude: Attitude
-    places: Places
-    prior: Prior
-    search: Search
-    looks: SuccessiveLooks
-    camera: SystematicErrors
-    covariance: Spread
-    watch: Looking
+    common: Terms
+    keyframes: Terms  #: Utility of a pose by the points of keyframes
+    #: Log odds that a recognized place is there, and no picture of it
+    genuine: Terms
+    attitude: Terms  #: The evidence of an attitude against a pose
+    places: Terms  #: Log odds between places that look alike
+    prior: Terms  #: What a region says
+    search: Terms  #: When a search is enough
+    looks: Terms  #: What successive looks must agree on
+    camera: Terms  #: Errors of a camera and its boxes, and when they are too large
+    covariance: Terms  #: How covariances count
+    watch: Terms  #: Log odds of a look of the watch, and how its looks add up
 
 
-def load_calibration(path: Path = FILE) -> Calibration:
-    """Read the numbers; a missing or unknown one is a defect of the installation."""
-    sections: dict[str, Any] = yaml.safe_load(path.read_text())
-    kinds: dict[str, Any] = Calibration.__annotations__ | {'common': dict}
-    return Calibration(**{
-        name: kind(**{term: entry['value'] for term, entry in sections[name]['terms'].items()})
-        for name, kind in kinds.items()})
-
-
-#: The installed numbers.
-CALIBRATION = load_calibration()
+#: The installed numbers; a missing or unknown section is a defect of the installation.
+CALIBRATION = Calibration(**{
+    name: Terms({term: entry['value'] for term, entry in section['terms'].items()})
+    for name, section in yaml.safe_load(FILE.read_text()).items()})

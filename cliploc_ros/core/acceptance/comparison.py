@@ -347,7 +347,10 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
     places = [refined(joined, unrefined(found[row])) for row in inside]
     poses = np.array([best.pose, *(one.map_from_camera for one in places)])
     # a place that refinement moved back to the leading pose is no other one
-    others = _first_of_each(poses, ~SAME_ANSWER.agreeing(poses)[0])
+    elsewhere = ~SAME_ANSWER.agreeing(poses)[0]
+    # of each place, the first
+    before = np.tril(SAME_PLACE.agreeing(poses) & elsewhere, -1)
+    others = np.nonzero(elsewhere & ~before.any(axis=1))[0]
     if len(others) == 0:
         return 1.0, None
     rows = inside[others - 1]
@@ -361,12 +364,6 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
         leads[number] += best.prior - rival.prior + by_objects
     chance = float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum()))
     return chance, place_of(joined.landmark_map, poses[others][int(np.argmin(leads))])
-
-
-def _first_of_each(poses: NDArray[np.float64], eligible: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the eligible rows of poses (m, 4, 4) at whose place no such row is before them."""
-    agreeing = SAME_PLACE.agreeing(poses) & eligible
-    return np.nonzero(eligible & ~np.tril(agreeing, -1).any(axis=1))[0]
 
 
 def _leads_of_points(compared: Comparison, twins: NDArray[np.float64],

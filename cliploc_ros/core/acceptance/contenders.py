@@ -46,12 +46,6 @@ class JoinedFrames(NamedTuple):
         return Setting(len(self.landmark_map),
                        self.options.vertical_deviation_deg if self.knows_vertical else math.inf)
 
-    def prior_odds(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the log odds (m,) that the last frame's region gives to poses (m, 4, 4)."""
-        region = self.frames[-1].observation.region
-        return np.zeros(len(poses)) if region is None else region_odds(
-            self.landmark_map, region, poses)
-
 
 def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
                 frames: Sequence[SearchedFrame]) -> JoinedFrames:
@@ -111,9 +105,11 @@ def contenders_of(joined: JoinedFrames, finalists: Sequence[Finalist], upright: 
     supports = supports_of(joined, poses, matches)
     handicaps = np.where(upright, 0.0, CALIBRATION.attitude.wrong_mount) \
         if joined.knows_vertical else tilt_handicaps(poses, joined.options.tilt_deviation_deg)
+    region = joined.frames[-1].observation.region
+    priors = np.zeros(len(poses)) if region is None else region_odds(joined.landmark_map, region,
+                                                                     poses)
     return list(map(Contender, finalists, poses, matches, supports, upright, handicaps.tolist(),
-                    (utilities(supports) - handicaps).tolist(),
-                    joined.prior_odds(poses).tolist()))
+                    (utilities(supports) - handicaps).tolist(), priors.tolist()))
 
 
 def supports_of(joined: JoinedFrames, poses: NDArray[np.float64],

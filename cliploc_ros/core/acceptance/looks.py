@@ -59,7 +59,7 @@ class Looks:
                             for some in (self.past, self.recognized))
         if look.recognized is not None:
             recognized = (*recognized, look)[-_MOST_RECOGNIZED:]
-        return Looks(() if accepted else (*past, look)[-CALIBRATION.looks.most:], recognized)
+        return Looks(() if accepted else (*past, look)[-int(CALIBRATION.looks.most):], recognized)
 
     def confidences_in(self, observation: Observation, map_from_camera: NDArray[np.float64]
                        ) -> tuple[float, ...]:
@@ -72,7 +72,7 @@ class Looks:
         if odom_from_camera is None:
             return ()
         found = []
-        for one in _before(self.past, observation)[1 - terms.most:]:
+        for one in _before(self.past, observation)[1 - int(terms.most):]:
             assert one.observation.odom_from_camera is not None
             carried = one.map_from_camera @ invert_transform(
                 one.observation.odom_from_camera) @ odom_from_camera

@@ -114,8 +114,10 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
     unexplained = 0.0
     for number, (frame, map_from_camera, found) in enumerate(zip(
             frames, map_from_cameras, matches, strict=True)):
-        distinct = _each_object_once(found, landmark_map.objects)
-        if distinct:
+        best: dict[int, Match] = {}  # of each object
+        for match in sorted(found, key=lambda match: -match.iou):
+            best.setdefault(int(landmark_map.objects[match.landmark]), match)
+        if distinct := [*best.values()]:
             seen = np.array([match.detection for match in distinct])
             weights = 1.0 / frame.same[seen[:, None], seen].sum(axis=1)
             for match, row in zip(distinct, weights[:, None] * _contributions(
@@ -163,14 +165,6 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
         _misfits(frame.scene, map_from_camera, detections, landmarks, sigmas), likenesses,
         shares * frame.rarities[detections], ~compared,
         _depth_odds(frame.scene, map_from_camera, detections, landmarks, sigmas)])
-
-
-def _each_object_once(matches: Sequence[Match], objects: NDArray[np.int64]) -> list[Match]:
-    """Return the best match of each landmark's object."""
-    best: dict[int, Match] = {}
-    for match in sorted(matches, key=lambda match: -match.iou):
-        best.setdefault(int(objects[match.landmark]), match)
-    return [*best.values()]
 
 
 def one_thing(bboxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -39,7 +39,7 @@ from cliploc_ros.core.fit.refinement import (
     residuals_of,
 )
 from cliploc_ros.core.fit.verification import Rig, verify_rig
-from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_difference
+from cliploc_ros.core.geometry.transforms import invert_transform, pose_difference
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN
 
 # Scatter of box centres assumed before any box is seen, as a share of the box, and how many
@@ -133,7 +133,7 @@ def pose_covariance(map_from_camera: NDArray[np.float64], centers: NDArray[np.fl
         camera's position (ROS order). Symmetric and positive definite.
     """
     def projections(step: NDArray[np.float64]) -> NDArray[np.float64]:
-        camera_from_map = invert_transform(_moved(map_from_camera, step))
+        camera_from_map = invert_transform(moved_pose(map_from_camera, step))
         points = centers @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
         return (points[:, :2] / points[:, 2:]).ravel()
 
@@ -195,8 +195,8 @@ def normalized_square(map_from_camera: NDArray[np.float64], covariance: NDArray[
     return float(error @ np.linalg.solve(covariance, error))
 
 
-def _moved(pose: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a pose displaced by a step (6,) of position and of rotation about fixed axes."""
+def moved_pose(pose: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a pose (4, 4) after a step (6,) of position and of rotation about fixed axes."""
     moved = pose.copy()
     moved[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
     moved[:3, 3] += step[:3]
@@ -219,11 +219,8 @@ def fuse(first: NDArray[np.float64], first_covariance: NDArray[np.float64],
                    for weight in _WEIGHTS]
     best = int(np.argmin([np.trace(one[:3, :3]) for one in covariances]))
     covariance = (covariances[best] + covariances[best].T) / 2
-    step = np.concatenate([first[:3, 3] - second[:3, 3],
-                           Rotation.from_matrix(first[:3, :3] @ second[:3, :3].T).as_rotvec()])
-    moved = _WEIGHTS[best] * covariance @ informations[0] @ step
-    turn = Rotation.from_rotvec(moved[3:]).as_matrix()
-    return make_transform(turn @ second[:3, :3], second[:3, 3] + moved[:3]), covariance
+    moved = _WEIGHTS[best] * covariance @ informations[0] @ pose_difference(second, first)
+    return moved_pose(second, moved), covariance
 
 
 class _Fit(NamedTuple):
@@ -289,7 +286,9 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     pulls = _sums(np.sqrt(fit.weights)[:, :, None] * fit.own[:, :, None] * fit.jacobian,
                   fit.objects, len(fit.sigmas))
     edge_noise = np.asarray(_mean_square(fit) * pulls.transpose(0, 2, 1) @ pulls)
-    noise_of_objects = edge_noise + _position_noise(fit, of_objects)
+    # that of the landmarks' positions, for each object
+    moves = fit.sigmas[:, None, None] * of_objects[:, :, :3]
+    noise_of_objects = edge_noise + moves @ moves.transpose(0, 2, 1)
     of_frames = _sums(of_matches, fit.frames, len(fit.cameras)) + fit.verticals
     known = max(1, int(fit.verticals.any(axis=(1, 2)).sum()))
     noise = (noise_of_objects.sum(axis=0) + known * verticals + prior
@@ -299,7 +298,8 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     # of all objects: also without one, the others share them
     common = _calibration_noise(fit.calibrations, instants, camera_deviations)
     if shared is not None:
-        common += _shared_noise(of_objects, shared[fit.numbers])
+        deviations = np.repeat(shared[fit.numbers], 3, axis=1)
+        common += _squared((of_objects * deviations[:, None, :]).sum(axis=0))
     gradients = _sums(np.einsum('mei,me->mi', fit.jacobian, fit.weights * fit.residuals),
                       fit.objects, len(fit.sigmas))
     wrong = _change_without_each(information - of_objects, noise - noise_of_objects, gradients,
@@ -405,19 +405,6 @@ def _mean_square(fit: _Fit) -> float:
     freedom = max(0, 4 * len(fit.sigmas) + int(measured.sum()) - 6)
     return max(1.0, float((squares.sum() / max(views, 1.0) + _PRIOR_RESIDUALS * _PRIOR_SQUARE)
                           / (freedom + _PRIOR_RESIDUALS)))
-
-
-def _position_noise(fit: _Fit, of_objects: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the part of the landmarks' position errors in M, for each object (n, 6, 6)."""
-    pulls = fit.sigmas[:, None, None] * of_objects[:, :, :3]
-    return np.asarray(pulls @ pulls.transpose(0, 2, 1))
-
-
-def _shared_noise(of_objects: NDArray[np.float64], shared: NDArray[np.float64]
-                  ) -> NDArray[np.float64]:
-    """Return the part of the errors that n objects have in common in M (6, 6)."""
-    pulls = (of_objects * np.repeat(shared, 3, axis=1)[:, None, :]).sum(axis=0)
-    return np.asarray(pulls @ pulls.T)
 
 
 def _odometry_noise(cameras: NDArray[np.float64], information: NDArray[np.float64],

@@ -103,7 +103,8 @@ def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, coun
              for one in _leaders_of(frames, rig, frame)[:_SCORED // len(frames)**2]]
     if len(frames) > 1 and found:
         # The best distinct poses by their scores in all frames, best first.
-        rotations, translations = _poses(found)
+        rotations = np.stack([one.rotation for one in found])
+        translations = np.stack([one.translation for one in found])
         scores = scores_of(rig, rotations, translations)
         rows = choose_distinct(scores, rotations, translations, count)
         found = [found[row]._replace(score=float(scores[row])) for row in rows]
@@ -148,11 +149,6 @@ def first_of_each_place(order: Sequence[int], found: Sequence[Finalist], count: 
                 found[other].translation) for other in chosen):
             chosen.append(row)
     return chosen
-
-
-def _poses(found: Sequence[Finalist]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return (np.stack([one.rotation for one in found]),
-            np.stack([one.translation for one in found]))
 
 
 def matches_of(rig: Rig, pose: Finalist) -> list[tuple[Match, ...]]:
@@ -200,10 +196,9 @@ def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
                                   mount_deviation=mount_deviation,
                                   camera_deviations=camera_deviations)
     cameras = np.array([make_transform(camera[:, :3], camera[:, 3]) for camera in rig.cameras])
-    covariance = (_sample_covariance(frames, cameras, pose,
-                                     _scatter(frames, cameras, pose, matches))
-                  + np.diag(odometry_deviations(cameras[pose.frame]) ** 2))
-    return covariance
+    scatter = _scatter(frames, cameras, pose, matches)
+    return (_sample_covariance(frames, cameras, pose, scatter)
+            + np.diag(odometry_deviations(cameras[pose.frame]) ** 2))
 
 
 def _instants(frames: Sequence[SearchedFrame]) -> NDArray[np.int64]:

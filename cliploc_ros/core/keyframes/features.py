@@ -59,13 +59,11 @@ def extract(image_rgb: NDArray[np.uint8], most: int, longest_side_px: int = 800)
     strengths = np.array([point.response for point in points], dtype=np.float32)
     rows = np.argsort(-strengths, kind='stable')[:most]
     pixels = (np.array([point.pt for point in points])[rows] + 0.5) / scale - 0.5
-    return Features(pixels, _compact(descriptors[rows]), strengths[rows])
-
-
-def _compact(sift: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return SIFT descriptors (n, 128) as bytes: square roots of shares, times _SCALE."""
-    shares = sift / np.maximum(sift.sum(axis=1, keepdims=True), 1e-9)
-    return np.asarray(np.clip(np.round(_SCALE * np.sqrt(shares)), 0, 255), dtype=np.uint8)
+    # descriptors as bytes: square roots of shares, times _SCALE
+    found = descriptors[rows]
+    shares = found / np.maximum(found.sum(axis=1, keepdims=True), 1e-9)
+    compact = np.clip(np.round(_SCALE * np.sqrt(shares)), 0, 255).astype(np.uint8)
+    return Features(pixels, compact, strengths[rows])
 
 
 def unit_rows(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -31,10 +31,6 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CameraError, MapError
 from cliploc_ros.files.arrays import ArrayError, Arrays, Check, Field, Offsets, Schema
 
-#: Number of words. 1,024 find the keyframes of the kitchen as well as comparing all descriptors.
-WORDS = 1024
-# Descriptors that the words are learned from, and steps of k-means.
-_MOST_LEARNED, _STEPS = 50_000, 8
 # Focal lengths, as shares of the image's width, count as equal within this.
 _SAME_FOCAL = 0.02
 #: Deviations a metre from a keyframe: of points from depth, whose scale and registration are never
@@ -166,24 +162,6 @@ class KeyframeLayer:
         profiles *= weights.astype(np.float32)
         profiles /= np.maximum(np.linalg.norm(profiles, axis=1, keepdims=True), 1e-9)
         return profiles, weights
-
-
-def learn_words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the vocabulary (W, 128) of some descriptors (n, 128), by k-means.
-
-    The start is every n-th descriptor, so equal layers have equal words.
-    """
-    step = max(1, len(descriptors) // _MOST_LEARNED)
-    learned = unit_rows(descriptors[::step])
-    count = min(WORDS, len(learned))
-    means = learned[np.linspace(0, len(learned) - 1, count).astype(np.int64)]
-    for _ in range(_STEPS):
-        words = nearest_words(learned, means)
-        order = np.argsort(words, kind='stable')
-        found, starts = np.unique(words[order], return_index=True)
-        sums = np.add.reduceat(learned[order], starts, axis=0)
-        means[found] = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
-    return np.asarray(np.clip(np.round(means * 512.0), 0, 255), dtype=np.uint8)
 
 
 def nearest_words(descriptors: NDArray[np.float32], vocabulary: NDArray[np.float32]

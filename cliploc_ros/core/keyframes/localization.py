@@ -108,14 +108,15 @@ class KeyframeLocalizer:
         self.layer = layer
         layer.prepare()
 
-    def localize(self, image_rgb: NDArray[np.uint8], camera: Camera,
-                 guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
-                 prior: Prior = NOTHING_KNOWN) -> Recognition:
-        """Find where an image was taken.
+    def localize_features(self, features: Features, camera: Camera,
+                          guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
+                          prior: Prior = NOTHING_KNOWN) -> Recognition:
+        """Find where an image with these features was taken.
 
         Parameters
         ----------
-        image_rgb : ndarray (h, w, 3) uint8
+        features : Features
+            See query_features.
         guesses : sequence of ndarray (4, 4)
             Poses that objects propose; keyframes near them are matched, too.
         deadline : float
@@ -123,12 +124,6 @@ class KeyframeLocalizer:
         prior : Prior, optional
             Poses that its height range or max_tilt excludes are no places.
         """
-        return self.localize_features(query_features(image_rgb), camera, guesses, deadline, prior)
-
-    def localize_features(self, features: Features, camera: Camera,
-                          guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
-                          prior: Prior = NOTHING_KNOWN) -> Recognition:
-        """Find where an image with these features was taken, see localize."""
         bearings = camera.normalize_points(features.pixels)
         known = np.isfinite(bearings).all(axis=1)
         features = Features(features.pixels[known], features.descriptors[known],
@@ -289,16 +284,16 @@ def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS) -> _Pl
 
 
 def _focal(place: _Place, look: _Look, used: NDArray[np.int64]
-           ) -> tuple[float, float, float, float, int]:
-    """Return focal length and aspect, with deviations, and how many features agree with them."""
+           ) -> tuple[float, float, float, float]:
+    """Return focal length and aspect, with deviations."""
     among = place.among.select(np.nonzero(np.isin(place.among.keyframes, used))[0])
     found = free_focal(among.points, look.bearings[among.features],
                        invert_transform(place.map_from_camera))
     if found is None:
-        return 1.0, np.inf, 1.0, np.inf, 0
-    (ratio, aspect), inliers = np.exp(found[0]), found[2]
+        return 1.0, np.inf, 1.0, np.inf
+    ratio, aspect = np.exp(found[0])
     deviation, of_aspect = np.hypot(_MUCH_ALIKE * found[1], _STRETCHED)
-    return ratio, deviation, aspect, of_aspect, len(np.unique(among.features[inliers]))
+    return ratio, deviation, aspect, of_aspect
 
 
 def keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -33,7 +33,6 @@ class RecognizedPlace(NamedTuple):
     #: The same of the root of its aspect, x to y: a picture that is seen from the side is narrow
     aspect_ratio: float = 1.0
     aspect_deviation: float = np.inf
-    focal_inliers: int = 0  #: Number of features that agree under that focal length and aspect
     #: Angle off the known vertical in standard deviations, see Prior.tilt_error. It excludes no
     #: place: the vertical may be wrong, as with a wrong camera mount.
     tilt_error: float = 0.0

@@ -39,22 +39,15 @@ from cliploc_ros.core.search.strategies import Leaders, Progress
 _TURNS_DEG, _ROLLS_DEG, _SHIFTS_M = (-8.0, -4.0, 0.0, 4.0, 8.0), (-6.0, 6.0), (-0.25, 0.0, 0.25)
 _STEPS = np.array([*product(_TURNS_DEG, _TURNS_DEG, (0.0,), _SHIFTS_M, _SHIFTS_M),
                    *product(_TURNS_DEG, _TURNS_DEG, _ROLLS_DEG, (0.0,), (0.0,))])
+# Poses (k, 4, 4) of the grid, in the camera at the given pose.
+_GRID = np.tile(np.eye(4), (len(_STEPS), 1, 1))
+_GRID[:, :3, :3] = Rotation.from_rotvec(_STEPS[:, :3], degrees=True).as_matrix()
+_GRID[:, [0, 2], 3] = _STEPS[:, 3:]
 # Poses of the grid that are refined, and how far apart they are at least [m] [deg].
 _REFINED, _APART = 4, Tolerance(0.3, 5.0)
 # A pose of the neighbourhood leads over one nearer to the given pose by this much [log odds] at
 # least, where it is this far away [m] [deg].
 _PULL_M, _PULL_DEG = 0.3, 6.0
-
-
-def _grid() -> NDArray[np.float64]:
-    """Return the poses (k, 4, 4) of the grid, in the camera at the given pose."""
-    found = np.tile(np.eye(4), (len(_STEPS), 1, 1))
-    found[:, :3, :3] = Rotation.from_rotvec(_STEPS[:, :3], degrees=True).as_matrix()
-    found[:, [0, 2], 3] = _STEPS[:, 3:]
-    return found
-
-
-_GRID = _grid()
 
 
 class Alignment(NamedTuple):

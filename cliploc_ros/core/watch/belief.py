@@ -56,15 +56,19 @@ class Belief:
         self._last = observation, map_from_camera
         if last is None:
             return
-        away_m, away_deg = _moved_without_odometry(*last, observation, map_from_camera)
+        before, pose = last
+        away_m, away_deg = 0.0, 0.0  # against odometry
+        if before.odom_from_camera is not None and observation.odom_from_camera is not None:
+            away_m, away_deg = pose_error(pose @ invert_transform(
+                before.odom_from_camera) @ observation.odom_from_camera, map_from_camera)
         if away_m > SAME_PLACE.distance_m or away_deg > SAME_PLACE.angle_deg:
             # Where the camera had confirmed the pose before, this one is wrong, unless that was.
             self._log_odds = -min(max(self._log_odds, 0.0), terms.most_jump)
             self._looks.clear()
             self.has_jumped = True
             return
-        time_s = max(0, observation.stamp_ns - last[0].stamp_ns) / NS_PER_S
-        way_m = float(np.linalg.norm(map_from_camera[:3, 3] - last[1][:3, 3]))
+        time_s = max(0, observation.stamp_ns - before.stamp_ns) / NS_PER_S
+        way_m = float(np.linalg.norm(map_from_camera[:3, 3] - pose[:3, 3]))
         keep = math.exp(-terms.lost_per_s * time_s - terms.lost_per_m * way_m)
         likely = 0.5 + keep * (self.probability - 0.5)
         self._log_odds = math.log(likely / (1.0 - likely))
@@ -78,16 +82,6 @@ class Belief:
         if self.probability > CALIBRATION.watch.localized:
             self.has_jumped = False
         return weight
-
-
-def _moved_without_odometry(before: Observation, pose_before: NDArray[np.float64],
-                            now: Observation, pose_now: NDArray[np.float64]
-                            ) -> tuple[float, float]:
-    """Return how far a localizer moved its pose against odometry [m] [deg]; 0 without odometry."""
-    if before.odom_from_camera is None or now.odom_from_camera is None:
-        return 0.0, 0.0
-    carried = pose_before @ invert_transform(before.odom_from_camera) @ now.odom_from_camera
-    return pose_error(carried, pose_now)
 
 
 def _correlation(one: _Look, look: _Look) -> float:

@@ -81,7 +81,7 @@ def log_odds(evidence: LookEvidence, is_full: bool, calibration: Calibration = C
     terms = calibration.watch
     if not evidence.known:
         return 0.0  # something may hide everything
-    found = float(np.dot(terms[:len(evidence.terms)], evidence.terms))
+    found = float(np.dot([*terms.values()][:len(evidence.terms)], evidence.terms))
     return min(max(found, terms.least if is_full else terms.least_unsure), terms.most)
 
 

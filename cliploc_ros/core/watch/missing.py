@@ -50,15 +50,6 @@ class _Record(NamedTuple):
         return float(1.0 / (1.0 + exp(-odds)))
 
 
-def _may_show(seen_from: int, side: int) -> bool:
-    """Return whether a landmark shows from a side: a television does not from behind.
-
-    One that was never seen may show from everywhere.
-    """
-    near = [(side + step) % SIDES for step in (-1, 0, 1)]
-    return not seen_from or any(seen_from >> one & 1 for one in near)
-
-
 class Missing:
     """What looks said of each landmark that they expected."""
 
@@ -77,7 +68,9 @@ class Missing:
                 self._records[landmark] = _Record(
                     keep * (one.found + weight), keep * (one.missed + one.misses),
                     seen_from=one.seen_from | 1 << side)
-            elif in_sight and _may_show(one.seen_from, side):
+            # a television does not show from behind; one that was never seen may from everywhere
+            elif in_sight and (not one.seen_from or any(
+                    one.seen_from >> (side + step) % SIDES & 1 for step in (-1, 0, 1))):
                 self._records[landmark] = one._replace(misses=one.misses + weight)
         if len(expected.landmarks):
             self._expected.append(expected.landmarks.tolist())

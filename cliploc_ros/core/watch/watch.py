@@ -98,7 +98,10 @@ class Watch:
         OptionsError
             A pose is no rigid transform, the image has no pixels, or the observation is invalid.
         """
-        _check(observation, map_from_camera)
+        for name, pose in (('map_from_camera', map_from_camera),
+                           ('odom_from_camera', observation.odom_from_camera)):
+            if pose is not None and not is_rigid(pose, _RIGID):
+                raise OptionsError(f'{name} is no rigid transform: {np.asarray(pose).tolist()}')
         vertical_of(observation, self._options)  # refuses an invalid one
         if image is not None and not image.size:
             raise OptionsError(f'image of shape {image.shape} has no pixels')
@@ -152,13 +155,6 @@ class Watch:
             tuple(self._map.landmark_ids[row] for row in self._missing.named()),
             self._turn.turn, fault)
         return replace(report, reason=_reason(report, evidence))
-
-
-def _check(observation: Observation, map_from_camera: NDArray[np.float64]) -> None:
-    for name, pose in (('map_from_camera', map_from_camera),
-                       ('odom_from_camera', observation.odom_from_camera)):
-        if pose is not None and not is_rigid(pose, _RIGID):
-            raise OptionsError(f'{name} is no rigid transform: {np.asarray(pose).tolist()}')
 
 
 def _reason(report: WatchReport, evidence: LookEvidence | None) -> str:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.depth_image import MILLIMETRE, TUM_UNIT, DepthCamera
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.tilt import NO_VERTICAL, find_tilt, tilt_note
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     is_rigid,
@@ -50,6 +49,7 @@ from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, ImageFile, 
 from cliploc_ros.offline.datasets.intrinsics import find_camera, read_camera
 from cliploc_ros.offline.datasets.poses import Poses, TimedPoses
 from cliploc_ros.offline.datasets.tum import TumSequence, read_image_list, read_tum
+from cliploc_ros.offline.mapping.tilt import NO_VERTICAL, find_tilt, tilt_note
 from cliploc_ros.units import NS_PER_S
 
 # Colour images of 7-Scenes are not registered, and its authors give no intrinsics for them. These

@@ -11,18 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.depth_image import depths_of_points
+from cliploc_ros.core.depth_image import DepthImage, points_in_color
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.keyframes.features import extract, unit_rows
+from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.keyframes.features import extract, match, unit_rows
 from cliploc_ros.core.keyframes.layer import (
     FROM_DEPTH,
     PIXEL_SCALE,
     TRIANGULATED,
     KeyframeLayer,
-    learn_words,
     nearest_words,
 )
-from cliploc_ros.core.keyframes.triangulation import PosedFeatures, triangulate
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError, OptionsError
 from cliploc_ros.offline.datasets.frames import Frames, PosedImage, undistorted
@@ -33,6 +32,21 @@ _MOST_FOUND = 2000
 _LEAST_POINTS = 20
 # Stored images are for people: 7 to 9 kB each.
 _IMAGE_PX, _JPEG_QUALITY = 256, 60
+# Rays that cross at a smaller angle place a point too roughly.
+_LEAST_PARALLAX = np.radians(1.5)
+# A ray misses its point by no more than 2 px at f = 525 px.
+_MOST_ERROR = 2.0 / 525.0
+# Images that each one is compared with: the nearest ones that look the same way.
+_NEIGHBOURS = 8
+_LEAST_M, _MOST_M, _MOST_COS = 0.05, 2.0, np.cos(np.radians(40.0))
+#: The points of a room or hall are this far [m].
+_DEPTHS_M = (0.2, 40.0)
+# Number of words. 1,024 find the keyframes of the kitchen as well as comparing all descriptors.
+_WORDS = 1024
+# Descriptors that the words are learned from, and steps of k-means.
+_MOST_LEARNED, _STEPS = 50_000, 8
+# Pixels beside a pixel; one that is further away by this share belongs to another surface.
+_BESIDE, _EDGE = np.ones((3, 3), dtype=np.uint8), 0.1
 
 
 @dataclass(frozen=True)
@@ -58,6 +72,14 @@ class LayerOptions:
 
 
 _DEFAULT = LayerOptions()
+
+
+class PosedFeatures(NamedTuple):
+    """The n features of a posed image."""
+
+    map_from_camera: NDArray[np.float64]  #: (4, 4)
+    bearings: NDArray[np.float64]  #: (n, 2): on the plane z = 1
+    descriptors: NDArray[np.uint8]  #: (n, 128)
 
 
 class _Keyframe(NamedTuple):
@@ -187,3 +209,120 @@ def _assemble(landmark_map: LandmarkMap, cameras: Sequence[Camera],
                                    ).astype(np.uint16), vocabulary, deviation_per_metre,
         other_cameras=tuple(others), camera_rows=None if not others else np.array(
             [[camera, *others].index(one) for one in cameras]))
+
+
+def triangulate(images: Sequence[PosedFeatures], row: int) -> NDArray[np.float64]:
+    """Return the points (n, 3) of an image's features in its own coordinate frame [m].
+
+    Each feature is matched in the neighbouring images. Each match gives a point. The point
+    with which most matches agree is kept, or that with the widest angle. NaN: no point.
+    """
+    ours = images[row]
+    poses = np.array([one.map_from_camera for one in images])
+    distances = np.linalg.norm(poses[:, :3, 3] - poses[row, :3, 3], axis=1)
+    cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], poses[row, :3, :3]) - 1.0)
+    fit = (distances > _LEAST_M) & (distances < _MOST_M) & (cosines > _MOST_COS)
+    order = np.argsort(distances, kind='stable')
+    neighbours = [int(one) for one in order[fit[order]][:_NEIGHBOURS]]
+    count = len(ours.bearings)
+    seen = np.full((len(neighbours), count, 2), np.nan)
+    cameras = np.array([invert_transform(images[one].map_from_camera) @ ours.map_from_camera
+                        for one in neighbours]).reshape(-1, 4, 4)
+    descriptors = unit_rows(ours.descriptors)
+    for number, one in enumerate(neighbours):
+        pairs = match(descriptors, unit_rows(images[one].descriptors))
+        seen[number, pairs[:, 0]] = images[one].bearings[pairs[:, 1]]
+    best = np.full((count, 3), np.nan)
+    scores = np.zeros(count)
+    for number in range(len(neighbours)):
+        points, angles = _crossings(ours.bearings, seen[number], cameras[number])
+        agreed = np.sum([_agrees(points, other, camera)
+                         for other, camera in zip(seen, cameras, strict=True)], axis=0)
+        sound = (_agrees(points, seen[number], cameras[number])
+                 & _agrees(points, ours.bearings, np.eye(4)) & (angles >= _LEAST_PARALLAX)
+                 & (points[:, 2] > _DEPTHS_M[0]) & (points[:, 2] < _DEPTHS_M[1]))
+        score = np.where(sound, agreed + angles, 0.0)
+        best[score > scores] = points[score > scores]
+        scores = np.maximum(scores, score)
+    return best
+
+
+def _crossings(ours: NDArray[np.float64], theirs: NDArray[np.float64],
+               theirs_from_ours: NDArray[np.float64]
+               ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return where pairs of rays are nearest, in our coordinate frame, and their angles [rad]."""
+    back = invert_transform(theirs_from_ours)
+    first = _unit(np.column_stack([ours, np.ones(len(ours))]))
+    second = _unit(np.column_stack([theirs, np.ones(len(theirs))])) @ back[:3, :3].T
+    place = back[:3, 3]
+    cosines = np.sum(first * second, axis=1)
+    along, other = first @ place, second @ place
+    with np.errstate(divide='ignore', invalid='ignore'):
+        reach = (along - cosines * other) / (1.0 - cosines**2)
+        theirs_reach = (cosines * along - other) / (1.0 - cosines**2)
+        points = 0.5 * (first * reach[:, None] + place + second * theirs_reach[:, None])
+        return points, np.arccos(np.clip(cosines, -1.0, 1.0))
+
+
+def _agrees(points: NDArray[np.float64], bearings: NDArray[np.float64],
+            camera: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which points (n, 3) a camera sees at its bearings (n, 2)."""
+    inside = points @ camera[:3, :3].T + camera[:3, 3]
+    with np.errstate(divide='ignore', invalid='ignore'):
+        errors = np.linalg.norm(inside[:, :2] / inside[:, 2:] - bearings, axis=1)
+        return np.asarray((inside[:, 2] > 0.0) & (errors < _MOST_ERROR))
+
+
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float64]
+                     ) -> NDArray[np.float32]:
+    """Return the depth of what single pixels show.
+
+    Parameters
+    ----------
+    camera : Camera
+        Of the colour image.
+    pixels : ndarray (n, 2)
+        In the colour image, distorted [px].
+
+    Returns
+    -------
+    ndarray (n,) float32
+        Along z of the colour camera [m]: the nearest surface within a pixel of each; NaN where
+        nothing was measured, and at edges, where a neighbour is much further away.
+    """
+    height, width = depth.depths_m.shape
+    seen, values = points_in_color(depth, camera, 1)
+    places = np.round(seen * [[width / camera.width], [height / camera.height]]).astype(np.int64)
+    inside = ((places >= 0) & (places < [[width], [height]])).all(axis=0)
+    near = np.full((height, width), np.inf, dtype=np.float32)
+    np.minimum.at(near, (places[1, inside], places[0, inside]), values[inside])
+    nearest = cv2.erode(near, _BESIDE)
+    furthest = cv2.dilate(np.where(np.isfinite(near), near, 0.0), _BESIDE)
+    rows = np.round(pixels * (width / camera.width, height / camera.height)).astype(np.int64)
+    rows = np.clip(rows, 0, (width - 1, height - 1))
+    found, other = nearest[rows[:, 1], rows[:, 0]], furthest[rows[:, 1], rows[:, 0]]
+    with np.errstate(invalid='ignore'):
+        return np.where(np.isfinite(found) & (other - found <= _EDGE * found), found,
+                        np.float32(np.nan))
+
+
+def learn_words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the vocabulary (W, 128) of some descriptors (n, 128), by k-means.
+
+    The start is every n-th descriptor, so equal layers have equal words.
+    """
+    step = max(1, len(descriptors) // _MOST_LEARNED)
+    learned = unit_rows(descriptors[::step])
+    count = min(_WORDS, len(learned))
+    means = learned[np.linspace(0, len(learned) - 1, count).astype(np.int64)]
+    for _ in range(_STEPS):
+        words = nearest_words(learned, means)
+        order = np.argsort(words, kind='stable')
+        found, starts = np.unique(words[order], return_index=True)
+        sums = np.add.reduceat(learned[order], starts, axis=0)
+        means[found] = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
+    return np.asarray(np.clip(np.round(means * 512.0), 0, 255), dtype=np.uint8)

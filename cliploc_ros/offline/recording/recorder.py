@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from cliploc_ros.core.depth_image import check_depth_unit
+from cliploc_ros.core.depth_image import PLAUSIBLE_DEPTH_M
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
@@ -370,3 +370,18 @@ def _state(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return (0, stat.st_mtime_ns) if path.is_dir() else (stat.st_size, stat.st_mtime_ns)
+
+
+def check_depth_unit(depths_m: NDArray[np.float32], where: str) -> None:
+    """Refuse depths of boxes that no camera in a room or hall measures.
+
+    DatasetError: the median is implausible; says how to give the unit.
+    """
+    known = depths_m[np.isfinite(depths_m)]
+    if len(known) == 0:
+        return
+    median, (least, greatest) = float(np.median(known)), PLAUSIBLE_DEPTH_M
+    if not least < median < greatest:
+        raise DatasetError(
+            f'{where}: the median depth of the boxes is {median:.4g} m, expected {least} to '
+            f'{greatest:.0f} m: wrong unit? give --depth-unit (0.001 for mm, 0.0002 for TUM)')

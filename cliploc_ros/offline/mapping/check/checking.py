@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 
-from cliploc_ros.core.geometry.tilt import tilt_note
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
@@ -46,6 +45,7 @@ from cliploc_ros.offline.mapping.evidence import best_ious
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.systematic import find_corrections
+from cliploc_ros.offline.mapping.tilt import tilt_note
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views
 from cliploc_ros.offline.simulation.detector import DetectorModel, guess_detector
 
