@@ -360,7 +360,8 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
         # as much as if the search had met it, see confidences
         by_objects = (1.0 + CALIBRATION.objects.slope) * (best.odds - rival.odds)
         if row < len(twins):
-            by_objects = lead_over_twin(best.support, rival.support, float(shares[row]))
+            by_objects = lead_over_twin(best.support, rival.support, float(shares[row]),
+                                        bool(rooms[row]))
         leads[number] += best.prior - rival.prior + by_objects
     chance = float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum()))
     return chance, place_of(joined.landmark_map, poses[others][int(np.argmin(leads))])

@@ -188,18 +188,21 @@ def turned_about_axis(landmark_map: LandmarkMap, map_from_camera: NDArray[np.flo
     return np.concatenate(found) if found else _NOWHERE
 
 
-def lead_over_twin(its: Support, twin: Support, place_share: float = 0.0) -> float:
+def lead_over_twin(its: Support, twin: Support, place_share: float = 0.0,
+                   is_room: bool = True) -> float:
     """Return the log odds by which objects prefer a pose to one at a place that looks alike.
 
     Labels tell objects apart that both poses explain. An object that only one pose explains counts
     as its label says, where the places share few objects. Where they share many, one of both is
-    out of date, or was furnished like the other: that one cause explains all such objects. Labels
-    of things that are alike err alike, so they count less there.
+    out of date, or was furnished like the other: that one cause explains all such objects.
 
     Parameters
     ----------
     place_share : float
         Share of the landmarks around the pose that the other place has, too.
+    is_room : bool
+        Whether the other place is a room of its own. Whoever furnished and labelled rooms alike
+        erred alike, so that their labels count less; a place repeats itself by chance.
     """
     terms = CALIBRATION.places
     common = its.shown.keys() & twin.shown.keys()
@@ -215,7 +218,8 @@ def lead_over_twin(its: Support, twin: Support, place_share: float = 0.0) -> flo
     alike = max(float(np.interp(share, _ALIKE, (0.0, 1.0))),
                 float(np.interp(place_share, _ALIKE_AROUND, (0.0, 1.0))))
     most = min(abs(further), terms.unlabelled * abs(counts), terms.aged)
-    lead *= 1.0 - (1.0 - terms.labels) * alike
+    if is_room:
+        lead *= 1.0 - (1.0 - terms.labels) * alike
     return lead + (1.0 - alike) * further + alike * math.copysign(most, further)
 
 
