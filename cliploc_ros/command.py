@@ -62,7 +62,9 @@ def run_command(command: Callable[[], int], failure: int = 1) -> int:
     try:
         return command()
     except CliplocError as error:
-        print('error:', ' '.join(str(error).split()), file=sys.stderr)
+        # the library names its own `parameters`
+        text = re.sub('`([a-z_]+)`', lambda name: f'--{name[1].replace("_", "-")}', str(error))
+        print('error:', ' '.join(text.split()), file=sys.stderr)
         return failure
     except ModuleNotFoundError as error:
         if not error.name or error.name.startswith('cliploc_ros'):

@@ -3,15 +3,10 @@
 """A robot with four cameras among objects: simulated."""
 
 import numpy as np
-from scene import CAMERA, make_room
+from scene import CAMERA, boxes_of, make_room
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.ellipsoid import (
-    ellipse_bboxes,
-    ellipses_in_pixels,
-    project_ellipsoids,
-)
-from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 
@@ -46,9 +41,7 @@ def look(rng, map_from_robot=None, objects=3, stamp_ns=0, mounts=MOUNTS, noise_p
     map_from_robot = np.eye(4) if map_from_robot is None else map_from_robot
     seen = []
     for name, mount, stated in zip(NAMES, mounts, MOUNTS, strict=True):
-        outlines = project_ellipsoids(invert_transform(map_from_robot @ mount), MAP.centers,
-                                      MAP.shapes)
-        boxes = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
+        boxes = boxes_of(MAP, map_from_robot @ mount)
         with np.errstate(invalid='ignore'):
             inside = ((boxes[:, :2] > 0.0) & (boxes[:, 2:] < (CAMERA.width, CAMERA.height))
                       ).all(axis=1)

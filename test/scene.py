@@ -48,11 +48,16 @@ def doubled_room(offset) -> LandmarkMap:
                    quats_xyzw=np.tile(room.quats_xyzw, (2, 1)))
 
 
+def boxes_of(landmarks: LandmarkMap, map_from_camera=MAP_FROM_CAMERA, camera=CAMERA):
+    """Boxes (n, 4) of landmarks for a perfect detector; NaN of those behind the camera."""
+    outlines = project_ellipsoids(invert_transform(map_from_camera), landmarks.centers,
+                                  landmarks.shapes)
+    return ellipse_bboxes(ellipses_in_pixels(outlines, camera))
+
+
 def see_room(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA) -> Detections:
     """What a perfect detector sees of the room, one box for each landmark in its order."""
-    outlines = project_ellipsoids(invert_transform(map_from_camera), room.centers, room.shapes)
-    boxes = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
-    return Detections(boxes, room.class_ids, np.full(len(room), 0.9))
+    return Detections(boxes_of(room, map_from_camera), room.class_ids, np.full(len(room), 0.9))
 
 
 def depth_image(room: LandmarkMap, map_from_camera, bboxes_xyxy):

@@ -120,5 +120,5 @@ def test_descriptions_are_made(name, nodes):
 
 @pytest.mark.needs('launch_ros')
 def test_a_missing_parameter_file_stops_the_launch(tmp_path):
-    with pytest.raises(RuntimeError, match='there is no such file'):
+    with pytest.raises(RuntimeError, match='no such file'):
         made('relocalization.launch.py', parameters=str(tmp_path / 'robot.yaml'))

@@ -20,8 +20,8 @@ from cliploc_ros.cli.map_layer import (
     make_layer,
     write_layer,
 )
+from cliploc_ros.cli.options import add_source_options
 from cliploc_ros.cli.sources import (
-    add_source_options,
     clip_options,
     folder_of,
     metres_of,

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
-from cliploc_ros.cli.sources import add_topic_options
+from cliploc_ros.cli.options import add_topic_options
 from cliploc_ros.command import (
     SEEDS,
     StageBar,
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.offline.mapping.check.relocalization import PosedObservation
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
     from cliploc_ros.offline.studio.images import Images
 
@@ -104,7 +102,7 @@ def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
 
 def _add_thresholds(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('thresholds; beyond one of them, the exit code is 1')
-    share = within(0.0, 1.0)
+    share, count = within(0.0, 1.0), within(0, 10**9)
     for name, kind, text in (
             ('min_explained', share, 'share of held-out boxes that a landmark explains'),
             ('min_iou', share, 'their median IoU'),
@@ -112,8 +110,8 @@ def _add_thresholds(parser: argparse.ArgumentParser) -> None:
             ('max_misled', share, 'share of views in which a wrong pose is accepted'),
             ('min_positions', share, 'share of grid positions with an accepted heading'),
             ('max_faulty', share, 'share of landmarks with a serious fault'),
-            ('max_duplicates', _count, 'pairs of landmarks that are one object'),
-            ('max_look_alikes', _count, 'pairs of places that look alike')):
+            ('max_duplicates', count, 'pairs of landmarks that are one object'),
+            ('max_look_alikes', count, 'pairs of places that look alike')):
         group.add_argument(f'--{name.replace("_", "-")}', type=kind, metavar='N',
                            default=getattr(Thresholds, name), help=f'{text} (%(default)s)')
 
@@ -123,10 +121,13 @@ def check(options: argparse.Namespace) -> int:
     # Late, so that --help is fast.
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
+    from cliploc_ros.offline.datasets.queries import load_queries
     from cliploc_ros.offline.evaluation.map_check.page import PAGE, summary_lines, write_report
     from cliploc_ros.offline.evaluation.map_check.pictures import draw_pictures
     from cliploc_ros.offline.evaluation.map_check.views import ViewPainter
+    from cliploc_ros.offline.evaluation.trials import make_queries
     from cliploc_ros.offline.mapping.check.checking import check_map
+    from cliploc_ros.offline.mapping.check.relocalization import PosedObservation
     from cliploc_ros.offline.mapping.tilt import tilt_note
 
     begin = time.monotonic()
@@ -147,7 +148,10 @@ def check(options: argparse.Namespace) -> int:
             image_of = partial(_image_of, detections, images)
     if detections is not None and (note := tilt_note(detections.map_from_camera)):
         print(f'note: {note}', flush=True)
-    queries = _read_queries(options.queries, landmark_map) if options.queries else []
+    queries = [PosedObservation(one.observation, one.map_from_camera,
+                                one.observation.stamp_ns / NS_PER_S)
+               for one in make_queries(load_queries(options.queries, landmark_map.landmark_ids),
+                                       landmark_map)] if options.queries else []
     layer = read_layer(options.map, landmark_map, options.keyframes)
     out = options.out or options.map.with_name(f'{options.map.stem}_check')
     make_folder(out)
@@ -205,23 +209,6 @@ def _image_of(detections: 'PosedDetections', images: 'Images', frame: int
               ) -> 'NDArray[np.uint8] | None':
     return images.near(float(detections.stamps_s[frame]), detections.name_of(frame),
                        detections.camera_of(frame))
-
-
-def _read_queries(path: Path, landmark_map: 'LandmarkMap') -> list['PosedObservation']:
-    from cliploc_ros.offline.datasets.queries import load_queries
-    from cliploc_ros.offline.evaluation.trials import make_queries
-    from cliploc_ros.offline.mapping.check.relocalization import PosedObservation
-
-    found = make_queries(load_queries(path, landmark_map.landmark_ids), landmark_map)
-    return [PosedObservation(one.observation, one.map_from_camera,
-                             one.observation.stamp_ns / NS_PER_S) for one in found]
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f'{text} is not 0 or more')
-    return value
 
 
 if __name__ == '__main__':

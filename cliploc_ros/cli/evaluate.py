@@ -12,26 +12,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
+from cliploc_ros.cli.options import add_folders, add_network_options, add_reading_options
 from cliploc_ros.cli.sources import (
-    add_folder_options,
-    add_folders,
-    add_network_options,
-    add_topic_options,
-    camera_names,
     check_folder_options,
     clip_options,
     detector_options,
     find_topics,
     folder_of,
-    mount_of,
-    read_named_folder,
+    read_cameras,
+    reading_of,
     source_of,
 )
-from cliploc_ros.command import SEEDS, finite, limit, not_negative, positive_int, run_main, within
+from cliploc_ros.command import SEEDS, limit, not_negative, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.evaluation.methods import ALL, AUTO, PAPER_METHODS
-from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
 
@@ -76,7 +71,6 @@ def make_parser() -> argparse.ArgumentParser:
                          help='recorded boxes and similarities')
     sources.add_argument('--bag', type=Path, help='a rosbag2 recording with ground truth; or a '
                          'request that ~/record stored (npz), which is answered again')
-    sources.add_argument('--tum', type=Path, metavar='DIR', help='a TUM RGB-D folder')
     add_folders(sources)
     parser.add_argument('--map', type=Path, nargs='+', required=True, metavar='YAML',
                         help='several maps are searched as one; true poses are in the first')
@@ -94,8 +88,6 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--out', type=Path, default=Path('evaluation'), metavar='DIR')
     parser.add_argument('--workers', type=positive_int, metavar='N',
                         help=f'local processes ({_cores()} for searches, 1 for detector and CLIP)')
-    parser.add_argument('--scheduler', default='', metavar='ADDRESS',
-                        help='of a Dask cluster, instead of local processes')
     parser.add_argument('--resume', action='store_true', help='continue an unfinished run')
     parser.add_argument('--no-figures', dest='figures', action='store_false')
     add_use_option(parser, f"'{AUTO}' uses the keyframes of the map, as the relocalizer does; "
@@ -103,7 +95,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_paper_options(parser)
     _add_sensor_options(parser)
     _add_recording_options(parser)
-    add_folder_options(parser)
+    add_reading_options(parser)
     return parser
 
 
@@ -145,28 +137,14 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--save-queries', type=Path, metavar='NPZ',
                        help='write the recorded boxes and similarities, for --queries')
     add_network_options(group)
-    group.add_argument('--no-clip', dest='clip', action='store_false',
-                       help=f"run no CLIP: '{AUTO}' matches by class, as class_* do")
     group.add_argument('--landmark-embeddings', choices=COMPARED, default='image',
                        help="compare crops with the map's labels (text), with the images next to "
                        'it, or with both (%(default)s)')
     group.add_argument('--every', type=positive_int, default=1, metavar='N',
                        help='use every N-th image of a folder')
-    group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE',
-                       help='camera of TUM RGB-D and 7-Scenes')
-    add_topic_options(group)
     group.add_argument('--sync-tolerance', type=not_negative, default=0.05, metavar='SECONDS',
                        help='images of several --cameras within this time are of one instant, and '
                        'localized together, from the first camera (%(default)s)')
-    group.add_argument('--ground-truth', metavar='TOPIC',
-                       help='PoseStamped, PoseWithCovarianceStamped or Odometry (/ground_truth; '
-                       'where the bag has none, tf)')
-    group.add_argument('--map-frame', metavar='FRAME',
-                       help="take ground truth from /tf: the map's coordinate frame (map)")
-    group.add_argument('--max-gap', type=not_negative, default=0.5, metavar='SECONDS',
-                       help='of tf: interpolate between poses so far apart (%(default)s)')
-    group.add_argument('--body-from-camera', type=finite, nargs=7, metavar='V',
-                       help='x y z qx qy qz qw of the camera on the body of the ground truth')
 
 
 def evaluate(options: argparse.Namespace) -> int:
@@ -205,15 +183,16 @@ def evaluate(options: argparse.Namespace) -> int:
     options.clip = _needs_clip(options, methods)
     layer = _read_layer(options, landmark_map, methods)
     make_folder(options.out)
-    of_cameras = {camera: _read_queries(options, landmark_map, camera)
-                  for camera in camera_names(options)}
-    recorded = of_cameras[options.cameras[0]]
+    images = {} if options.queries is not None else _read_images(options)
+    of_cameras = {camera: _read_queries(options, landmark_map, camera, images.get(camera))
+                  for camera in images or ('',)}
+    recorded = next(iter(of_cameras.values()))
     queries = make_queries(recorded, landmark_map, every_frame=True)
     if len(of_cameras) > 1:
         queries = join_cameras({camera: make_queries(its, landmark_map, every_frame=True)
                                 for camera, its in of_cameras.items()}, options.sync_tolerance)
     if layer is not None:
-        queries = with_features(queries, _frames(options, options.cameras[0]))
+        queries = with_features(queries, next(iter(images.values())))
         notes = {layer.camera_note(one.image.camera) for one in queries if one.image is not None}
         print(''.join(f'note: {note}\n' for note in sorted(notes) if note), end='', flush=True)
 
@@ -301,12 +280,6 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
     return None
 
 
-def _truth(options: argparse.Namespace) -> str:
-    from cliploc_ros.offline.datasets.bag_poses import GROUND_TRUTH
-
-    return str(options.ground_truth or GROUND_TRUTH)
-
-
 def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
     """Answer a recorded request again; return 0 if the verdict is the same, else 1."""
     from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
@@ -335,25 +308,21 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
     return 0 if is_same else 1
 
 
-def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', camera: str
-                  ) -> 'Queries':
-    """Return the queries of a file, or record them, of one of several cameras."""
+def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', camera: str,
+                  frames: 'Frames | None') -> 'Queries':
+    """Return the queries of a file, or those of the images of a camera, recorded once."""
     from cliploc_ros.offline.datasets.queries import load_queries, save_queries
     from cliploc_ros.offline.evaluation.recording import recorded_queries
     from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions
 
-    if options.queries is not None:
+    if frames is None:
         if options.save_queries is not None:
             raise OptionsError('--save-queries needs --bag or a folder')
         return load_queries(options.queries, landmark_map.landmark_ids)
-    frames = _frames(options, camera)
     print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
-    reading = repr([options.every, options.intrinsics, options.image, options.camera_info,
-                    _truth(options), options.body_from_camera, options.rectified,
-                    *filter(None, (options.map_frame, camera))])
     recording = RecordingOptions(
         detector_options(options), clip_options(options) if options.clip else None, EVERY_FRAME,
-        reading, options.workers or 1, options.scheduler)
+        reading_of(options, options.every, camera), options.workers or 1, options.scheduler)
     queries = recorded_queries(frames, landmark_map, recording, list(map(str, options.map)),
                                options.landmark_embeddings)
     if without := frames.count - len(queries):
@@ -365,35 +334,18 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
     return queries
 
 
-def _frames(options: argparse.Namespace, camera: str) -> 'Frames':
-    from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames, topic_of
-    from cliploc_ros.offline.datasets.bag_poses import (
-        GROUND_TRUTH,
-        find_poses,
-        poses_of_tf,
-        poses_of_topic,
-    )
-    from cliploc_ros.offline.datasets.folders import FolderOptions
+def _read_images(options: argparse.Namespace) -> 'dict[str, Frames]':
+    """Return the images of each camera with the true poses; of a folder, every n-th."""
     from cliploc_ros.offline.datasets.map_recording import load_recording
 
-    if options.bag is None:
-        frames = read_named_folder(options, FolderOptions(options.intrinsics))
-        return frames.select(range(0, frames.count, options.every))
-    if (built_from := load_recording(options.map[0])) is not None and built_from.is_moved:
+    built_from = load_recording(options.map[0])
+    if options.bag is not None and built_from is not None and built_from.is_moved:
         raise OptionsError(f'{options.map[0]}: was turned or scaled by build_map, the poses of '
                            '--bag are not; build it without --level and --object-size')
-    mount, max_gap_ns = mount_of(options.body_from_camera), round(options.max_gap * NS_PER_S)
-    if options.map_frame is not None:
-        if options.ground_truth is not None or mount is not None:
-            raise OptionsError('--map-frame is not for --ground-truth or --body-from-camera')
-        poses = poses_of_tf(options.map_frame, None, max_gap_ns)
-    elif options.ground_truth is None and mount is None:
-        poses = find_poses(max_gap_ns, topic_of(camera, GROUND_TRUTH), topic_gap_ns=0)
-    else:
-        poses = poses_of_topic(topic_of(camera, options.ground_truth or GROUND_TRUTH),
-                               body_from_camera=mount)
-    topics = BagTopics(options.image, options.camera_info, options.rectified)
-    return bag_frames(options.bag, topics.of_camera(camera), poses)
+    images = read_cameras(options, gap_s=0.0)
+    return images if options.bag is not None else {
+        name: frames.select(range(0, frames.count, options.every))
+        for name, frames in images.items()}
 
 
 def _cores() -> int:

@@ -87,8 +87,6 @@ def import_map(options: argparse.Namespace) -> int:
 
     begin = time.monotonic()
     _check_paths(options)
-    if not 0.0 < options.scale < float('inf'):
-        raise OptionsError(f'--scale {options.scale}: must be above 0')
     if not options.frame_id.strip():
         raise OptionsError('--frame-id: must not be empty')
     try:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Options that name a recording and say how to look at it, and what comes of them."""
+"""Read the recording that the options of a program name, see cli.options."""
 
 import argparse
 from collections.abc import Sequence
@@ -8,10 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from cliploc_ros.command import finite, not_negative, positive, positive_int, within
+from cliploc_ros.command import positive
 from cliploc_ros.errors import DatasetError, OptionsError
-from cliploc_ros.models.devices import INFERENCES
-from cliploc_ros.models.profiles import PROFILE_NAMES, with_detector, with_encoder
+from cliploc_ros.models.profiles import with_detector, with_encoder
 from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -19,9 +18,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from cliploc_ros.models.clip_weights import ClipOptions
-    from cliploc_ros.models.protocols import DetectorOptions, Prompts
+    from cliploc_ros.models.protocols import DetectorOptions
     from cliploc_ros.offline.datasets.bag_poses import ReadPoses
-    from cliploc_ros.offline.datasets.folders import FolderOptions
     from cliploc_ros.offline.datasets.frames import DepthFormat, Frames
     from cliploc_ros.offline.datasets.map_recording import MapRecording
     from cliploc_ros.offline.datasets.observations import Recorded
@@ -35,44 +33,19 @@ _READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'm
 _PLACING = ('images', 'axes', 'scale', 'known_distance')
 
 
-def add_network_options(group: Any) -> None:
-    """Add the options that name detector and CLIP to a group of a parser."""
-    group.add_argument('--profile', choices=PROFILE_NAMES, default='auto',
-                       help='detector and CLIP: that of the robot, as image embeddings are of one '
-                       'CLIP (%(default)s: accurate on a GPU, balanced on a CPU)')
-    group.add_argument('--model', default='', help=
-                       "YOLO weights, or a detector of transformers: folder or OWNER/NAME "
-                       "(the profile's)")
-    group.add_argument('--detector-vocabulary', default='', metavar='NAMES',
-                       help="what a YOLO-World or YOLOE looks for: 'mug, chair', or a map (.yaml) "
-                       'with its classes and labels')
-    group.add_argument('--text-model', default='', metavar='FILE',
-                       help='text tower of that detector (downloaded once)')
-    group.add_argument('--clip-model', default='', help="(the profile's)")
-    group.add_argument('--clip-pretrained', default='', help="tag or file (the profile's)")
-    group.add_argument('--device', default='auto', help='(%(default)s)')
-    group.add_argument('--inference', choices=INFERENCES, default='auto',
-                       help='(%(default)s: OpenVINO on a CPU where it is installed)')
-
-
 def detector_options(options: argparse.Namespace, **more: Any) -> 'DetectorOptions':
     """Return the detector that the command line names."""
-    from cliploc_ros.models.protocols import DetectorOptions
-
-    return with_detector(DetectorOptions(
-        model=options.model, device=options.device, inference=options.inference,
-        prompts=_prompts(options.detector_vocabulary), text_model=options.text_model, **more),
-        options.profile)
-
-
-def _prompts(vocabulary: str) -> 'Prompts':
-    if not vocabulary:
-        return ()
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.models.open_vocabulary import prompts_of_map, prompts_of_names
+    from cliploc_ros.models.protocols import DetectorOptions
 
-    return (prompts_of_map(LandmarkMap.from_file(vocabulary), vocabulary)
-            if vocabulary.endswith('.yaml') else prompts_of_names(vocabulary))
+    words = options.detector_vocabulary
+    prompts = () if not words else (
+        prompts_of_map(LandmarkMap.from_file(words), words) if words.endswith('.yaml')
+        else prompts_of_names(words))
+    return with_detector(DetectorOptions(
+        model=options.model, device=options.device, inference=options.inference, prompts=prompts,
+        text_model=options.text_model, **more), options.profile)
 
 
 def clip_options(options: argparse.Namespace) -> 'ClipOptions':
@@ -84,74 +57,11 @@ def clip_options(options: argparse.Namespace) -> 'ClipOptions':
                         options.profile)
 
 
-def add_source_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of all sources to a parser."""
-    sources = parser.add_mutually_exclusive_group(required=True)
-    sources.add_argument('--bag', type=Path, help='a rosbag2 recording with images and poses')
-    sources.add_argument('--tum', type=Path, metavar='DIR', help='a TUM RGB-D folder, no depth')
-    sources.add_argument('--rgbd', type=Path, metavar='DIR',
-                         help='a folder with depth: TUM RGB-D or 7-Scenes')
-    add_folders(sources)
-    sources.add_argument('--observations', type=Path, metavar='NPZ',
-                         help='boxes and poses that were recorded before')
-    _add_pose_options(parser)
-    add_folder_options(parser)
-    _add_image_options(parser)
-    _add_network_options(parser)
-
-
-def add_folders(group: Any) -> None:
-    """Add the options that name a folder of other layouts to a group of a parser."""
-    group.add_argument('--folder', type=Path, metavar='DIR',
-                       help='a folder of any known layout, with its depth: TUM RGB-D, 7-Scenes, '
-                       'Polycam, Record3D, Stray Scanner, ARKitScenes, HoloLens 2, '
-                       'transforms.json, COLMAP')
-    group.add_argument('--colmap', type=Path, metavar='DIR',
-                       help='a COLMAP model, or a project with sparse/0 and images/')
-    group.add_argument('--nerf', type=Path, metavar='DIR',
-                       help='a transforms.json of nerfstudio or Instant-NGP, or its folder')
-
-
-def add_folder_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say what poses of a folder mean."""
-    group = parser.add_argument_group('poses of --folder, --colmap and --nerf')
-    group.add_argument('--images', type=Path, metavar='DIR',
-                       help='where the images of --colmap or --nerf are, if not beside them')
-    group.add_argument('--scale', type=positive, metavar='METRES', help='of a unit of the poses')
-    group.add_argument('--known-distance', nargs=3, metavar=('IMAGE_A', 'IMAGE_B', 'METRES'),
-                       help='between the cameras of two images: another way to say the scale')
-    group.add_argument('--level', action='store_true',
-                       help='turn z up, by the tilt of the cameras; of --bag and --observations, '
-                       'too')
-    group.add_argument('--axes', choices=('opencv', 'opengl', 'opencv-inverse', 'opengl-inverse'),
-                       help='what the poses are: of cameras with these axes, or inverse '
-                       "(the layout's own)")
-
-
 def folder_of(options: argparse.Namespace) -> 'tuple[Path, str] | None':
     """Return the folder that the command line names and the key of its layout; '' to find it."""
     named = {'tum': 'tum', 'rgbd': 'rgbd', 'folder': '', 'colmap': 'colmap', 'nerf': 'nerf'}
     return next(((getattr(options, name), key) for name, key in named.items()
-                 if getattr(options, name, None) is not None), None)
-
-
-def read_named_folder(options: argparse.Namespace, folder: 'FolderOptions') -> 'Frames':
-    """Return the images of the folder that the command line names, and print what is to know."""
-    from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
-
-    found = folder_of(options)
-    assert found is not None
-    path, key = found
-    distance = None
-    if options.known_distance is not None:
-        first, second, metres = options.known_distance
-        distance = first, second, metres_of(metres, '--known-distance')
-    if distance is not None and options.scale is not None:
-        raise OptionsError('give --scale or --known-distance, not both')
-    folder = replace(folder, layout=key, images=options.images, axes=options.axes,
-                     scale=options.scale, known_distance=distance, level=options.level,
-                     any_unit=getattr(options, 'object_size', None) is not None)
-    return rgbd_frames(path, folder) if key == 'rgbd' else read_folder(path, folder)
+                 if getattr(options, name) is not None), None)
 
 
 def metres_of(text: str, option: str) -> float:
@@ -160,74 +70,6 @@ def metres_of(text: str, option: str) -> float:
         return positive(text)
     except (ValueError, argparse.ArgumentTypeError):
         raise OptionsError(f'{option}: {text} is no length above 0 m') from None
-
-
-def _add_pose_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('poses of --bag and TUM RGB-D')
-    group.add_argument('--pose-topic', metavar='TOPIC',
-                       help='PoseStamped, PoseWithCovarianceStamped or Odometry')
-    group.add_argument('--map-frame', metavar='FRAME',
-                       help='take poses from /tf: the coordinate frame of the map (map, where '
-                       'the bag has no /ground_truth and nothing else is named)')
-    group.add_argument('--camera-frame', metavar='FRAME',
-                       help="the camera's optical coordinate frame in /tf (that of the images)")
-    group.add_argument('--trajectory', type=Path, metavar='FILE',
-                       help='take poses from a file in TUM format')
-    group.add_argument('--mount', type=finite, nargs='+', metavar='V',
-                       help='x y z qx qy qz qw of the camera (z forward) on what the poses of a '
-                       'topic or file are of; 7 numbers for each of --cameras, in their order')
-    odometry = group.add_mutually_exclusive_group()
-    odometry.add_argument('--odometry-topic', metavar='TOPIC',
-                          help='odometry of --bag, of what --pose-topic or --trajectory is of: '
-                          'Odometry, or another type of pose')
-    odometry.add_argument('--odometry-frame', metavar='FRAME',
-                          help='take odometry of --bag from /tf: its coordinate frame')
-    group.add_argument('--max-gap', type=not_negative, default=0.5, metavar='SECONDS',
-                       help='interpolate between poses at most so far apart (%(default)s)')
-
-
-def add_topic_options(group: Any) -> None:
-    """Add the options that name the images of a bag to a parser or a group of it."""
-    group.add_argument('--cameras', nargs='+', default=[''], metavar='NAME',
-                       help='several cameras of the recording, by the namespaces of their topics: '
-                       '/NAME/image, /NAME/camera_info and so on')
-    group.add_argument('--image', metavar='TOPIC',
-                       help="(the recording's only colour image; /image of --cameras)")
-    group.add_argument('--camera-info', metavar='TOPIC', help='(the one beside the image)')
-    group.add_argument('--rectified', action='store_true', help='the bag has rectified images')
-
-
-def _add_image_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('images and depth of --bag and folders')
-    add_topic_options(group)
-    group.add_argument('--depth', metavar='TOPIC', help='depth registered to the images of --bag')
-    group.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE',
-                       help='camera of TUM RGB-D and 7-Scenes, where the folder does not say it')
-    group.add_argument('--depth-unit', type=positive, metavar='METRES',
-                       help='one count of a depth image (0.001; 0.0002 for TUM; 1 for floats)')
-    group.add_argument('--depth-intrinsics', type=finite, nargs=4,
-                       metavar=('FX', 'FY', 'CX', 'CY'),
-                       help='of a depth camera that is not registered to the images')
-    group.add_argument('--depth-baseline', type=finite, nargs=3, metavar=('X', 'Y', 'Z'),
-                       help='its origin, seen from the colour camera [m] (0 0 0)')
-
-
-def _add_network_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('detector and CLIP, which run once on a recording')
-    group.add_argument('--keyframes', type=not_negative, nargs=2, default=(0.1, 5.0),
-                       metavar=('METRES', 'DEGREES'),
-                       help='look at an image this far from the last one (0.1 5; 0 0: at all)')
-    add_network_options(group)
-    group.add_argument('--conf', type=within(0.0, 1.0), default=0.25,
-                       help='least confidence of a detection (%(default)s)')
-    group.add_argument('--no-clip', dest='clip', action='store_false',
-                       help='classes and boxes only; no embeddings')
-    group.add_argument('--record-to', type=Path, metavar='NPZ',
-                       help='the observation file (next to the recording)')
-    group.add_argument('--workers', type=positive_int, default=1, metavar='N',
-                       help='local processes (%(default)s)')
-    group.add_argument('--scheduler', default='', metavar='ADDRESS',
-                       help='of a Dask cluster, instead of local processes')
 
 
 def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
@@ -280,11 +122,15 @@ def read_source(options: argparse.Namespace) -> Source:
     recording = RecordingOptions(
         detector_options(options, conf=options.conf),
         clip_options(options) if options.clip else None, KeyframeOptions(*options.keyframes),
-        repr([str(getattr(options, name)) for name in _READING]
-             + (options.cameras if options.cameras != [''] else [])), options.workers,
-        options.scheduler)
+        reading_of(options), options.workers, options.scheduler)
     file = options.record_to or observation_file(frames, recording)
     return Source(record_once(frames, recording, file, _odometry(options)), file, frames)
+
+
+def reading_of(options: argparse.Namespace, *more: object) -> str:
+    """Return all that says how a recording is read: another text, another observation file."""
+    return repr([str(getattr(options, name)) for name in _READING]
+                + (options.cameras if options.cameras != [''] else []) + list(map(str, more)))
 
 
 def recording_of(options: argparse.Namespace, file: Path, scale: float,
@@ -318,25 +164,40 @@ def source_of(options: argparse.Namespace) -> Path:
 
 
 def read_frames(options: argparse.Namespace) -> 'Frames':
-    """Return the images of the source, with their poses; not for --observations.
-
-    CliplocError: the source or the options cannot be used.
-    """
-    from cliploc_ros.offline.datasets.folders import FolderOptions
+    """Return the images of the source, of all its cameras, see read_cameras."""
     from cliploc_ros.offline.datasets.frames import join_frames
+
+    of_cameras = read_cameras(options)
+    return of_cameras[''] if '' in of_cameras else join_frames(of_cameras)
+
+
+def read_cameras(options: argparse.Namespace, gap_s: float | None = None) -> 'dict[str, Frames]':
+    """Return the images of the source with their poses, by the name of the camera, '' for one.
+
+    The poses of a topic or a folder are interpolated over gaps of `gap_s` [s]; None: as those of
+    tf. Not for --observations. CliplocError: the source or the options cannot be used.
+    """
+    from cliploc_ros.offline.datasets.folders import FolderOptions, read_folder, rgbd_frames
     from cliploc_ros.offline.datasets.tum import read_tum_trajectory
 
-    names, mounts = camera_names(options), _mounts(options)
-    if options.bag is not None:
-        of_cameras = {name: _frames_of(options, name, mounts[name]) for name in names}
-        return of_cameras[''] if names == [''] else join_frames(of_cameras)
+    mounts = _mounts(options)
+    gap_ns = round((options.max_gap if gap_s is None else gap_s) * NS_PER_S)
+    if (found := folder_of(options)) is None:
+        return {name: _frames_of(options, name, mount, gap_ns) for name, mount in mounts.items()}
     if options.pose_topic or options.map_frame or options.depth:
         raise OptionsError('--pose-topic, --map-frame and --depth are for --bag')
-    return read_named_folder(options, FolderOptions(
-        options.intrinsics,
-        None if options.trajectory is None else read_tum_trajectory(options.trajectory),
-        round(options.max_gap * NS_PER_S),
-        mounts[''], _depth_format(options)))
+    distance = None
+    if options.known_distance is not None:
+        first, second, metres = options.known_distance
+        distance = first, second, metres_of(metres, '--known-distance')
+        if options.scale is not None:
+            raise OptionsError('give --scale or --known-distance, not both')
+    path, key = found
+    folder = FolderOptions(
+        options.intrinsics, options.trajectory and read_tum_trajectory(options.trajectory), gap_ns,
+        mounts[''], _depth_format(options), key, options.images, options.axes, options.scale,
+        distance, getattr(options, 'object_size', None) is not None, options.level)
+    return {'': rgbd_frames(path, folder) if key == 'rgbd' else read_folder(path, folder)}
 
 
 def camera_names(options: argparse.Namespace) -> list[str]:
@@ -363,13 +224,13 @@ def _mounts(options: argparse.Namespace) -> 'dict[str, NDArray[np.float64] | Non
     return {name: mount_of(numbers[7 * row:7 * row + 7]) for row, name in enumerate(names)}
 
 
-def _frames_of(options: argparse.Namespace, name: str, mount: 'NDArray[np.float64] | None'
-               ) -> 'Frames':
+def _frames_of(options: argparse.Namespace, name: str, mount: 'NDArray[np.float64] | None',
+               gap_ns: int) -> 'Frames':
     """Return the images of one camera of a bag; its name is '' where it is the only one."""
     from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
 
     topics = BagTopics(options.image, options.camera_info, options.rectified, options.depth or '')
-    read = _read_poses(options, name, mount)
+    read = _read_poses(options, name, mount, gap_ns)
     try:
         return bag_frames(options.bag, topics.of_camera(name), read, _depth_format(options))
     except DatasetError as error:
@@ -385,9 +246,9 @@ def mount_of(numbers: Sequence[float] | None) -> 'NDArray[np.float64] | None':
     return None if numbers is None else mount_from_numbers(numbers)
 
 
-def _read_poses(options: argparse.Namespace, camera: str, mount: 'NDArray[np.float64] | None'
-                ) -> 'ReadPoses':
-    """Return what reads the poses of a camera of a bag.
+def _read_poses(options: argparse.Namespace, camera: str, mount: 'NDArray[np.float64] | None',
+                gap_ns: int) -> 'ReadPoses':
+    """Return what reads the poses of a camera of a bag; the gap [ns] is that of a topic.
 
     A topic without a mount is the camera's own, in its namespace.
     """
@@ -409,10 +270,11 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: 'NDArray[np.flo
     if not given:
         if mount is not None:
             raise OptionsError('--mount is for --pose-topic and --trajectory: name one of them')
-        return find_poses(max_gap_ns, topic_of(camera, GROUND_TRUTH), options.camera_frame)
+        return find_poses(max_gap_ns, topic_of(camera, GROUND_TRUTH), options.camera_frame,
+                          gap_ns)
     if options.pose_topic is not None:
         topic = options.pose_topic if mount is not None else topic_of(camera, options.pose_topic)
-        return poses_of_topic(topic, max_gap_ns, mount)
+        return poses_of_topic(topic, gap_ns, mount)
     if options.trajectory is not None:
         if mount is None and len(options.cameras) > 1:
             raise OptionsError('--trajectory of several cameras: give the --mount of each')

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import read_layer
-from cliploc_ros.cli.sources import add_topic_options, find_topics
-from cliploc_ros.command import run_main, within
+from cliploc_ros.cli.options import add_topic_options
+from cliploc_ros.cli.sources import find_topics
+from cliploc_ros.command import needs_ros, run_main, within
 from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:
@@ -109,11 +110,8 @@ def follow(options: argparse.Namespace) -> 'AbstractContextManager[LiveRelocaliz
     """Return the running relocalizer where it is asked for; OptionsError: there is no ROS."""
     if not options.ros:
         return nullcontext()
-    try:
+    with needs_ros('--ros'):
         from cliploc_ros.offline.studio.live import follow_relocalizer
-    except ImportError as error:
-        raise OptionsError(f'--ros needs ROS ({error}): source it first, as with source '
-                           '/opt/ros/jazzy/setup.bash') from error
     return follow_relocalizer(options.relocalizer, options.ros_args)
 
 

@@ -67,8 +67,11 @@ def convert(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from cliploc_ros.offline.datasets.folders import read_sequence
-    from cliploc_ros.offline.datasets.recorded_detections import read_recorded_detections
-    from cliploc_ros.offline.datasets.tum_conversion import ConversionOptions, convert_tum
+    from cliploc_ros.offline.datasets.tum_conversion import (
+        ConversionOptions,
+        convert_tum,
+        read_recorded_detections,
+    )
 
     begin = time.monotonic()
     sequence, camera, origin = read_sequence(options.folder, options.intrinsics)

@@ -179,15 +179,16 @@ class Relocalizer:
 def _hypotheses(pose: NDArray[np.float64], compared: Comparison, evidence: Evidence
                 ) -> tuple[Hypothesis, ...]:
     """Return the pose that leads, and the best one of each other place."""
-    found: list[Hypothesis] = []
-    for one, its_pose, likely in zip(compared.contenders, [pose, *compared.poses[1:]],
-                                     compared.likely, strict=True):
-        if not any(SAME_PLACE.agree(its_pose, other.map_from_camera) for other in found):
-            found.append(Hypothesis(
-                its_pose, one.finalist.score, evidence.confidence if not found
-                else float(likely) * evidence.found * evidence.certainty, one.support,
-                one.handicap))
-    return tuple(found)
+    poses = np.array([pose, *compared.poses[1:]])
+    confidences = compared.likely * evidence.found * evidence.certainty
+    same, rows = SAME_PLACE.agreeing(poses), list[int]()
+    for row in range(len(poses)):
+        if not same[row, rows].any():
+            rows.append(row)
+    found = [compared.contenders[row] for row in rows]
+    return tuple(Hypothesis(
+        poses[row], one.finalist.score, float(confidences[row]) if row else evidence.confidence,
+        one.support, one.handicap) for row, one in zip(rows, found, strict=True))
 
 
 def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget) -> Relocalization:

@@ -205,7 +205,7 @@ def _cluster(make_work: MakeWork, address: str) -> Iterator[_Pool]:
         from distributed import Client, KilledWorker
         from distributed import wait as wait_on_dask
     except ImportError as error:
-        raise OptionsError('--scheduler needs Dask: pip install distributed') from error
+        raise OptionsError('a `scheduler` needs Dask: pip install distributed') from error
     try:
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -54,7 +54,7 @@ def make_folder(folder: Path) -> None:
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise OptionsError(f'--out {folder}: cannot be written to: {error.strerror}') from error
+        raise OptionsError(f'{folder}: cannot be written to: {error.strerror}') from error
 
 
 def write_text(path: Path, text: str) -> None:

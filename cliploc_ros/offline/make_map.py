@@ -21,7 +21,7 @@ from cliploc_ros.offline.mapping.landmarks import classes_of
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.systematic import MountCorrection
-from cliploc_ros.offline.mapping.update.renewal import UpdateReport
+from cliploc_ros.offline.mapping.update.updating import UpdateReport
 from cliploc_ros.offline.mapping.update.updating import update_map as update_landmarks
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.offline.vocabulary.phrase_embeddings import phrases_of_classes
@@ -94,7 +94,7 @@ def find_labeller(detections: PosedDetections, clip: Callable[[], ClipOptions] |
     words = load_vocabulary(vocabulary)
     try:
         if clip is None:
-            raise ModelError('--no-clip was given')
+            raise ModelError('CLIP does not run')
         if not _has_embeddings(detections):
             raise ModelError('the observations have no CLIP embeddings that name their encoder; '
                              'record them again with CLIP')
@@ -108,7 +108,7 @@ def find_labeller(detections: PosedDetections, clip: Callable[[], ClipOptions] |
 
 def _weights_of(detections: PosedDetections, clip: ClipOptions) -> ClipWeights:
     """Return the weights that made the embeddings; ModelError where they are not at hand."""
-    hint = 'give the --profile, or --clip-model and --clip-pretrained, of the recording'
+    hint = 'give the profile, or the CLIP model with its weights, of the recording'
     theirs = detections.encoder_key.split(':')[0]
     ours = Path(clip.model).stem if clip.model.endswith('.json') else clip.model.replace('/', '-')
     # compared first, since the weights of another model would be downloaded in vain
@@ -174,15 +174,15 @@ def scale_of_objects(detections: PosedDetections, options: MappingOptions, class
         The detections have depth, which says the scale, or no object of the class is mapped.
     """
     if detections.depths is not None:
-        raise MappingError('--object-size: the recording has depth, which is in metres; give '
-                           '--scale where the poses are not')
+        raise MappingError('`object_size`: the recording has depth, which is in metres; give '
+                           '`scale` where the poses are not')
     scale = 1.0
     for _ in range(_TRIALS):
         built = build_map(detections.moved(scale, np.eye(3)), options).landmark_map
         own = [row for row, one in enumerate(built.class_ids) if one == class_name]
         if not own:
             raise MappingError(
-                f"--object-size: no object of class '{class_name}' is mapped; there are "
+                f"`object_size`: no object of class '{class_name}' is mapped; there are "
                 f'{", ".join(sorted(set(built.class_ids)))}')
         step = metres / float(np.median(2.0 * built.semi_axes[own].max(axis=1)))
         scale *= step

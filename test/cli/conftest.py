@@ -7,6 +7,8 @@ import subprocess
 import pytest
 from executables import PROJECT, Listener, command, write_sequence
 
+from cliploc_ros.offline.datasets.observations import load_observations, save_observations
+
 
 @pytest.fixture
 def start():
@@ -29,6 +31,15 @@ def start():
 def make_sequence(tmp_path):
     """Write a small TUM folder."""
     return lambda **options: write_sequence(tmp_path / 'sequence', **options)
+
+
+@pytest.fixture(scope='session')
+def observations(shared_data, tmp_path_factory):
+    """Every sixteenth frame of the office: enough for a map, and quick."""
+    whole = load_observations(shared_data / 'tum_fr3_office' / 'observations.npz')
+    path = tmp_path_factory.mktemp('office') / 'office.npz'
+    save_observations(path, whole.select_frames(range(0, len(whole), 16)))
+    return path
 
 
 @pytest.fixture

@@ -26,6 +26,8 @@ from cliploc_ros.offline.datasets.folders import read_sequence
 from cliploc_ros.offline.datasets.poses import mount_from_numbers
 from demo import ASSETS
 
+pytestmark = pytest.mark.full
+
 PAGES = [PROJECT / page for page in ('doc/from_a_bag.md', 'README.md', 'doc/your_robot.md',
                                      'doc/mapping.md', 'doc/keyframes.md')]
 # Of another robot or recording.
@@ -140,7 +142,6 @@ def test_the_other_commands_run(built, monkeypatch):
             assert layer_path('other.yaml').exists() != ('--no-keyframe-layer' in arguments)
 
 
-@pytest.mark.full
 @BOTH
 def test_the_nodes_answer_as_the_page_says(built, monkeypatch):
     folder, _, parameters, _ = built

@@ -16,7 +16,7 @@ from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.studio.images import open_images
 
-pytestmark = pytest.mark.needs('pycolmap')
+pytestmark = [pytest.mark.full, pytest.mark.needs('pycolmap')]
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--device', 'cpu')
 CLIP = ('--clip-model', ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'clip.safetensors')
 

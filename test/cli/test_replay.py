@@ -20,9 +20,12 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import LATCHED_QOS, BagReader, BagWriter
 from cliploc_ros.offline.datasets.intrinsics import PRESETS
-from cliploc_ros.offline.datasets.recorded_detections import read_recorded_detections
 from cliploc_ros.offline.datasets.tum import read_tum
-from cliploc_ros.offline.datasets.tum_conversion import ConversionOptions, convert_tum
+from cliploc_ros.offline.datasets.tum_conversion import (
+    ConversionOptions,
+    convert_tum,
+    read_recorded_detections,
+)
 
 CLASSES = {
     '/image': Image,

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from scene import make_room
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -43,6 +44,11 @@ def observe(queries):
         return Observation(camera, Detections(frame.bboxes_xyxy, frame.class_ids, frame.scores),
                            frame.similarities, frame.stamp_ns)
     return make
+
+
+@pytest.fixture(scope='session')
+def room() -> LandmarkMap:
+    return make_room()
 
 
 @pytest.fixture

@@ -88,6 +88,18 @@ def pair_iou(scene: Scene, detection: int, outline: NDArray[np.float64]) -> floa
     return ellipse_iou(*scene.box_ellipses[detection], *outline)
 
 
+def bearings_of(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the bearings (n, 3), of unit length, of points in the camera's frame."""
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def nearest(rotations: NDArray[np.float64], translations: NDArray[np.float64],
+            rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> float:
+    """Return how far the nearest of some poses is from another, as the largest difference."""
+    return min((max(np.abs(r - rotation).max(), np.abs(t - translation).max())
+                for r, t in zip(rotations, translations, strict=True)), default=np.inf)
+
+
 def verify(scene: Scene, rotation: NDArray[np.float64], translation: NDArray[np.float64]
            ) -> Verified:
     """Return what a pose explains in one frame, by the kernel: a rig of one."""

@@ -46,11 +46,6 @@ def test_balanced_order_is_balanced(detections, landmarks, data):
         assert (np.bincount(head, minlength=detections) == rank + 1).all()
 
 
-def test_equal_similarities_keep_the_map_order():
-    found = nearest_candidates(np.zeros((1, 5), dtype=np.float32), 5)
-    assert found.landmarks.tolist() == [0, 1, 2, 3, 4]
-
-
 def test_rare_classes_come_first_and_nothing_twice():
     index = ClassIndex.of(('a', 'a', 'a', 'b'))
     rare = rarest_class_candidates(index, index.classes_of(('a', 'b', 'a')), 100)

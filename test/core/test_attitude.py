@@ -76,8 +76,7 @@ def test_a_pose_of_uncertain_position_is_refused_and_says_so():
     options = RelocalizerOptions(min_confidence=0.99)
     assert refusal(certain, options) is None
     assert vague.confidence == pytest.approx(0.9499, abs=1e-4)
-    reason = refusal(vague, options).reason
-    assert reason.startswith('confidence 0.94 < 0.99; position uncertain by 0.51 m; turn the')
+    assert 'uncertain by 0.51 m' in refusal(vague, options).reason
 
 
 def test_the_likeliest_hypothesis_leads_and_without_refinement_the_greatest_score(

@@ -56,11 +56,9 @@ def test_boxes_of_the_plane_come_back_as_pixels():
 
 
 @pytest.mark.parametrize(('changes', 'message'), [
-    ({'fx': 0.0}, 'focal lengths must be positive'),
-    ({'fy': float('nan')}, 'all values finite'),
-    ({'width': 0}, 'image size 0x480'),
-    ({'distortion_model': 'mystery', 'distortion': (0.1,)}, "'mystery' is none of"),
-    ({'distortion_model': 'plumb_bob', 'distortion': (0.1,)}, '4 or 5 coefficients, not 1'),
+    ({'fx': 0.0}, 'positive'), ({'fy': float('nan')}, 'finite'), ({'width': 0}, '0x480'),
+    ({'distortion_model': 'mystery', 'distortion': (0.1,)}, "'mystery'"),
+    ({'distortion_model': 'plumb_bob', 'distortion': (0.1,)}, '4 or 5'),
     ({'distortion_model': 'plumb_bob', 'distortion': (float('inf'),)}, 'not finite'),
 ])
 def test_impossible_cameras_are_refused(changes, message):

@@ -6,7 +6,7 @@ from math import comb
 
 import numpy as np
 import pytest
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from scene import CAMERA, MAP_FROM_CAMERA, see_room
 
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.search.sampling import (
@@ -19,11 +19,6 @@ from cliploc_ros.core.search.sampling import (
 )
 from cliploc_ros.core.search.scene import make_scene
 from cliploc_ros.core.search.strategies import Leaders, search_exhaustively, search_progressively
-
-
-@pytest.fixture(scope='module')
-def room():
-    return make_room()
 
 
 def scene_of(room, rows=slice(None)):

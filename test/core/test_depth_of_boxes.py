@@ -65,14 +65,14 @@ def _matrix(shape):
 
 def test_right_depth_makes_poses_better_and_surer():
     rng, errors, deviations = np.random.default_rng(0), [], []
-    for _ in range(60):
+    for _ in range(40):
         one = look(rng, noise_px=8.0)
         pair = [RELOCALIZER.relocalize([replace(one, depths=depths)])
                 for depths in (None, one.depths)]
         if all(found.solved and error_m(found) < 1.0 for found in pair):
             errors.append([error_m(found) for found in pair])
             deviations.append([np.sqrt(np.trace(found.covariance[:3, :3])) for found in pair])
-    assert len(errors) >= 50
+    assert len(errors) >= 33
     assert np.median(errors, axis=0)[1] < np.median(errors, axis=0)[0]
     assert np.median(deviations, axis=0)[1] < 0.95 * np.median(deviations, axis=0)[0]
 
@@ -117,7 +117,7 @@ def test_no_depth_is_as_no_depth_camera(rng, depths):
 @pytest.mark.parametrize('given', [{'depths': NONE[1:]},
                                    {'depths': NONE, 'depth_deviations': NONE[1:]}])
 def test_depths_of_another_number_of_boxes_are_refused(rng, given):
-    with pytest.raises(OptionsError, match='but there are 12 detections'):
+    with pytest.raises(OptionsError, match='12 detections'):
         RELOCALIZER.relocalize([replace(look(rng), **given)])
 
 

@@ -104,15 +104,3 @@ def test_boxes_far_from_the_axis_of_a_fisheye_have_no_use():
         True, True, False, False]
     straight = Camera(1000, 1000, 100.0, 100.0, 500.0, 500.0)
     assert np.isfinite(straight.normalize_bboxes(boxes)).all()
-
-
-def test_objects_behind_a_fisheye_give_no_pose(room):
-    """All are beyond 90 degrees: nothing to localize with, and no error."""
-    behind = np.array([3.0, 30.0, 1.0])
-    pose = make_transform(Rotation.from_euler('ZX', (0, -90), degrees=True).as_matrix(), behind)
-    pixels = fisheye_pixels((room.centers - behind) @ pose[:3, :3], 110.0, (0.0,) * 4)
-    camera = Camera(*SIZE.tolist(), 110.0, 110.0, *(SIZE / 2), 'equidistant', (0.0,) * 4)
-    boxes = np.concatenate([pixels - 8, pixels + 8], axis=1)
-    found = Relocalizer(room, RelocalizerOptions(matching='class')).relocalize(
-        [Observation(camera, Detections(boxes, room.class_ids, np.full(len(room), 0.8)))])
-    assert not found.accepted and found.refusal_kind == 'too_few_objects'

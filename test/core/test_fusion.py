@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 from reference import verify
-from scene import CAMERA, MAP_FROM_CAMERA, make_room
+from scene import CAMERA, MAP_FROM_CAMERA, boxes_of
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.fit.refinement import (
@@ -17,11 +17,6 @@ from cliploc_ros.core.fit.refinement import (
     robust_cost,
 )
 from cliploc_ros.core.fit.verification import choose_distinct, make_rig, scores_of, verify_rig
-from cliploc_ros.core.geometry.ellipsoid import (
-    ellipse_bboxes,
-    ellipses_in_pixels,
-    project_ellipsoids,
-)
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
@@ -30,11 +25,6 @@ from cliploc_ros.core.search.candidates import match_frame
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
 
 FRAMES = 4
-
-
-@pytest.fixture(scope='module')
-def room():
-    return make_room()
 
 
 @pytest.fixture
@@ -50,9 +40,7 @@ def walk(rng):
 
 def see(room, map_from_camera, noise_px=0.0, rng=None, rows=slice(None)):
     """The scene of one frame: boxes of some landmarks, which may be any of their class."""
-    outlines = project_ellipsoids(invert_transform(map_from_camera), room.centers[rows],
-                                  room.shapes[rows])
-    boxes = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
+    boxes = boxes_of(room, map_from_camera)[rows]
     if noise_px:
         boxes = boxes + rng.normal(0, noise_px, boxes.shape)
     classes = np.array(room.class_ids)
@@ -105,8 +93,7 @@ def test_frames_of_a_large_map_are_joined_with_their_groups(room, walk):
         np.tile(room.semi_axes, (count, 1)), np.tile(room.quats_xyzw, (count, 1)))
     scenes = []
     for rows in ([0, 1, 2, 3, 5], [], [4, 7], [6]):  # no two frames show the same classes
-        boxes = ellipse_bboxes(ellipses_in_pixels(project_ellipsoids(
-            invert_transform(walk[len(scenes)]), room.centers[rows], room.shapes[rows]), CAMERA))
+        boxes = boxes_of(room, walk[len(scenes)])[rows]
         seen = Detections(boxes, tuple(room.class_ids[row] for row in rows), np.ones(len(rows)))
         scenes.append(match_frame(many, Observation(CAMERA, seen),
                                   RelocalizerOptions(matching='class'))[0])

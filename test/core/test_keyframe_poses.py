@@ -17,7 +17,7 @@ from cliploc_ros.core.keyframes.features import (
     match,
     unit_rows,
 )
-from cliploc_ros.core.keyframes.point_pose import find_pose, free_focal
+from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, find_pose, free_focal
 from cliploc_ros.core.search.scene import Prior
 from cliploc_ros.offline.recording.keyframe_layer import PosedFeatures, triangulate
 
@@ -136,19 +136,39 @@ def test_a_prior_excludes_by_height_and_tilt_and_tells_how_far_the_vertical_is_o
     assert known.tilt_error(tilted(0.0), covariance) == pytest.approx(0.0)
 
 
-def test_of_equal_rooms_each_is_a_place_of_its_own():
-    rng = np.random.default_rng(9)
-    pose, points, bearings = look(rng, 40)
+MANY, WEAK = np.arange(40), np.tile(np.arange(LEAST_INLIERS - 2), 2)
+
+
+def places_of(*rows):
+    """Return the places of equal rooms, whose image shows some points each, and where [m]."""
+    pose, points, bearings = look(np.random.default_rng(9), len(MANY))
     features = Features(bearings * CAMERA.fx + (CAMERA.cx, CAMERA.cy),
-                        np.zeros((40, DIMENSIONS), np.uint8), np.ones(40, np.float32))
-    rooms = [points + np.array([x, 0.0, 0.0]) for x in (0.0, 10.0, 20.0)]
-    matched = localization._Matched(np.tile(np.arange(40), 3), np.concatenate(rooms),
-                                    np.repeat([0, 1, 2], 40), np.arange(120))
+                        np.zeros((len(points), DIMENSIONS), np.uint8),
+                        np.ones(len(points), np.float32))
+    rooms = [points[some] + np.array([10.0 * number, 0.0, 0.0])
+             for number, some in enumerate(rows)]
+    counts = [len(some) for some in rows]
+    matched = localization._Matched(np.concatenate(rows), np.concatenate(rooms),
+                                    np.repeat(np.arange(len(rows)), counts),
+                                    np.arange(sum(counts)))
     look_at = localization._Look(features, bearings, CAMERA)
     found = localization._places(localization._place(matched, look_at), matched, look_at)
-    assert sorted(np.round([one.map_from_camera[0, 3] - pose[0, 3] for one in found])) == [
-        0.0, 10.0, 20.0]
+    return found, sorted(np.round([one.map_from_camera[0, 3] - pose[0, 3] for one in found]))
+
+
+def test_of_equal_rooms_each_is_a_place_of_its_own():
+    found, at_m = places_of(MANY, MANY, MANY)
+    assert at_m == [0.0, 10.0, 20.0]
     assert [one.agreed for one in found] == [40, 40, 40]
+    most = localization.MOST_PLACES
+    assert len(places_of(*[MANY] * (most + 2))[0]) == most
+
+
+def test_few_features_are_a_place_where_there_is_no_other():
+    """Those of two keyframes count once."""
+    assert [one.agreed for one in places_of(WEAK)[0]] == [LEAST_INLIERS - 2]
+    assert places_of(MANY, WEAK)[1] == [0.0]
+    assert places_of(MANY, MANY[:LEAST_INLIERS + 2])[1] == [0.0, 10.0]
 
 
 def test_rays_of_equal_features_meet_in_their_point():

@@ -98,7 +98,7 @@ def test_image_embeddings_belong_to_one_map(tmp_path):
     write_map(path, room)
     assert load_embeddings_of_map(path, room.landmark_ids) is None
     embeddings_path(path).mkdir()
-    with pytest.raises(MapError, match=r'map\.embeddings\.npz: .*cannot be removed'):
+    with pytest.raises(MapError, match='cannot be removed'):
         write_map(path, room)
 
 
@@ -114,13 +114,13 @@ def test_labels_may_stand_in_place_of_a_label():
 
 @pytest.mark.parametrize(('fields', 'message'), [
     ({'labels': []}, 'labels: is empty'),
-    ({'labels': {'text': ['a'], 'weight': [1.0, 2.0]}}, 'two lists of equal length'),
-    ({'labels': [{'text': 'a', 'weight': 0.0}]}, 'weights must be above 0'),
-    ({'label': 'a', 'class_weights': ['cup']}, 'class_weights: must map class names to weights'),
-    ({'label': 'a', 'position_sigma': float('nan')}, 'position_sigma: nan must be finite'),
-    ({'label': 'a', 'seen_ratio': -0.5}, 'seen_ratio: -0.5 must be finite and not negative')])
+    ({'labels': {'text': ['a'], 'weight': [1.0, 2.0]}}, 'equal length'),
+    ({'labels': [{'text': 'a', 'weight': 0.0}]}, 'above 0'),
+    ({'label': 'a', 'class_weights': ['cup']}, 'class_weights'),
+    ({'label': 'a', 'position_sigma': float('nan')}, 'position_sigma: nan'),
+    ({'label': 'a', 'seen_ratio': -0.5}, 'seen_ratio: -0.5')])
 def test_refuses_wrong_details(fields, message):
-    with pytest.raises(MapError, match=f"here: landmark 'cup_1': .*{message}|{message}"):
+    with pytest.raises(MapError, match=message):
         read(CUP | fields)
 
 

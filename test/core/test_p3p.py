@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from reference import bearings_of, nearest
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.p3p import solve_p3p
@@ -16,16 +17,6 @@ def random_problem(rng):
     rotation = Rotation.from_rotvec(rng.normal(size=3) * 2).as_matrix()
     translation = rng.normal(size=3) * 2
     return seen, (seen - translation) @ rotation, rotation, translation
-
-
-def bearings_of(seen):
-    return seen / np.linalg.norm(seen, axis=1, keepdims=True)
-
-
-def nearest(rotations, translations, rotation, translation):
-    """How far the nearest of some poses is from another, as the largest difference."""
-    return min((max(np.abs(r - rotation).max(), np.abs(t - translation).max())
-                for r, t in zip(rotations, translations, strict=True)), default=np.inf)
 
 
 def test_recovers_random_poses(rng):

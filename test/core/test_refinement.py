@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 from reference import verify
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from scene import CAMERA, MAP_FROM_CAMERA, see_room
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.fit.refinement import (
@@ -18,11 +18,6 @@ from cliploc_ros.core.fit.refinement import (
 from cliploc_ros.core.fit.verification import make_rig
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
-
-
-@pytest.fixture(scope='module')
-def room():
-    return make_room()
 
 
 def see(room, noise_px=0.0, rng=None):

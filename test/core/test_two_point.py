@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
+from reference import bearings_of, nearest
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.two_point import two_point
@@ -27,16 +28,6 @@ def random_problem(rng):
     up_in_map = rng.normal(size=3)
     up_in_map /= np.linalg.norm(up_in_map)
     return seen, (seen - translation) @ rotation, rotation, translation, up_in_map
-
-
-def bearings_of(seen):
-    return seen / np.linalg.norm(seen, axis=1, keepdims=True)
-
-
-def nearest(rotations, translations, rotation, translation):
-    """How far the nearest of some poses is from another, as the largest difference."""
-    return min((max(np.abs(r - rotation).max(), np.abs(t - translation).max())
-                for r, t in zip(rotations, translations, strict=True)), default=np.inf)
 
 
 def test_recovers_random_poses(rng):

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from scene import CAMERA, MAP_FROM_CAMERA, see_room
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.transforms import pose_error
@@ -20,11 +20,6 @@ LIMITS_M = (0.25, 0.5, 1.0)
 HEIGHTS = (0.8, 2.2)
 UP_IN_CAMERA = MAP_FROM_CAMERA[2, :3]
 LEVEL = np.s_[3:5, 3:5]  # of a covariance: turns about level axes
-
-
-@pytest.fixture(scope='module')
-def room():
-    return make_room()
 
 
 def with_vertical(room, up=UP_IN_CAMERA):

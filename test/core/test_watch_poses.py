@@ -6,15 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scene import boxes_of
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.ellipsoid import (
-    ellipse_bboxes,
-    ellipses_in_pixels,
-    project_ellipsoids,
-)
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
@@ -64,8 +60,7 @@ def drive(count):
 
 def see(landmark_map, pose, number=0, odom=True, rng=None, rows=None):
     """What a detector finds at a true pose, of some of the landmarks."""
-    boxes = ellipse_bboxes(ellipses_in_pixels(project_ellipsoids(
-        invert_transform(pose), landmark_map.centers, landmark_map.shapes), CAMERA))
+    boxes = boxes_of(landmark_map, pose, CAMERA)
     shown = np.clip(boxes, 0.0, [CAMERA.width, CAMERA.height] * 2)
     with np.errstate(invalid='ignore'):
         in_view = ((shown[:, 2:] - shown[:, :2]).prod(axis=1)
@@ -249,9 +244,9 @@ def test_the_turn_of_a_camera_is_known_after_twenty_looks(watch, room, rotvec):
 def test_invalid_inputs_are_named(watch, room):
     pose = drive(1)[0]
     for wrong in (np.full((4, 4), np.nan), np.eye(3), 2.0 * np.eye(4)):
-        with pytest.raises(OptionsError, match='map_from_camera is no rigid transform'):
+        with pytest.raises(OptionsError, match='map_from_camera'):
             watch.look(see(room, pose), wrong)
-    with pytest.raises(OptionsError, match='odom_from_camera is no rigid transform'):
+    with pytest.raises(OptionsError, match='odom_from_camera'):
         watch.look(replace(see(room, pose), odom_from_camera=np.full((4, 4), np.nan)), pose)
     with pytest.raises(OptionsError, match='is no unit vector'):
         watch.look(replace(see(room, pose), up_in_camera=np.full(3, np.nan)), pose)

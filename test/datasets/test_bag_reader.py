@@ -106,5 +106,5 @@ def test_missing_recording_and_topic_are_named(tmp_path):
     with pytest.raises(DatasetError, match='txt'), BagReader(tmp_path / 'notes.txt'):
         pass
     bag = write_bag(tmp_path / 'bag', 'mcap', [make_messages(3)])
-    with BagReader(bag) as reader, pytest.raises(DatasetError, match=r'/chatter \(std_msgs/msg'):
+    with BagReader(bag) as reader, pytest.raises(DatasetError, match='/chatter'):
         reader.topic('/image')

@@ -49,32 +49,30 @@ def test_folders_without_poses_or_images(shots, tmp_path):
     refuses(tmp_path / 'gone', 'no such folder')
     (tmp_path / 'photos').mkdir()
     shutil.copy(shots[0].path, tmp_path / 'photos')
-    refuses(tmp_path / 'photos', 'no known layout: .*images alone need poses, as COLMAP makes')
+    refuses(tmp_path / 'photos', 'need poses')
     (tmp_path / 'scan.r3d').touch()
-    refuses(tmp_path / 'scan.r3d', 'no known layout: .*; unpack it')
+    refuses(tmp_path / 'scan.r3d', 'unpack it')
     (tmp_path / 'photos/metadata.yaml').touch()
-    refuses(tmp_path / 'photos', 'it is a recording: give --bag')
+    refuses(tmp_path / 'photos', 'give --bag')
     refuses(tmp_path / 'photos', 'no COLMAP model here', FolderOptions(layout='colmap'))
     folder = write_colmap(tmp_path / 'scan', shots)
     shutil.move(folder / 'images', tmp_path / 'moved')
-    refuses(folder, 'none of 4 images is there, such as .*; give the folder of the images with '
-                    '--images')
+    refuses(folder, 'none of 4 .* --images')
     found = read_folder(folder, FolderOptions(scale=1.0, images=tmp_path / 'moved'))
     assert found.count == 4
     (tmp_path / 'moved/walk' / shots[0].path.name).unlink()
     notes = read_folder(folder, FolderOptions(scale=1.0, images=tmp_path / 'moved')).notes
-    assert any('1 of 4 images of the model are not in ' in note for note in notes)
+    assert any('1 of 4 images' in note for note in notes)
 
 
 def test_the_unit_must_be_known(shots, tmp_path):
-    refuses(write_colmap(tmp_path / 'c', shots), 'COLMAP model does not know its unit: give '
-            '--scale METRES of a unit', FolderOptions())
-    refuses(tmp_path / 'c', 'no images with a pose are named z.jpg; there are ',
+    refuses(write_colmap(tmp_path / 'c', shots), '--scale METRES', FolderOptions())
+    refuses(tmp_path / 'c', 'named z.jpg',
             FolderOptions(known_distance=('z.jpg', shots[1].path.name, 1.0)))
     name = shots[0].path.name
-    refuses(tmp_path / 'c', 'were taken at one place',
+    refuses(tmp_path / 'c', 'at one place',
             FolderOptions(known_distance=(name, name, 1.0)))
-    refuses(write_nerf(tmp_path / 'z', shots, applied_scale=0), 'applied_scale is 0, not above 0')
+    refuses(write_nerf(tmp_path / 'z', shots, applied_scale=0), 'applied_scale is 0')
     doubled = []
     for shot in shots:
         pose = shot.pose.copy()
@@ -89,11 +87,10 @@ def test_models_in_pieces_and_turned_images(shots, tmp_path):
     folder = write_colmap(tmp_path / 'a', shots)
     other = write_colmap(tmp_path / 'b', shots[:1])
     shutil.move(other / 'sparse/0', folder / 'sparse/1')
-    assert ('the model is in 2 pieces: 0 with 4 images is used, 1 images of the others are not'
-            in read_folder(folder, METRES).notes)
+    assert any('2 pieces' in note for note in read_folder(folder, METRES).notes)
     path = folder / 'images/walk' / shots[0].path.name
     cv2.imwrite(str(path), np.zeros((640, 480, 3), dtype=np.uint8))
-    refuses(folder, '480x640 px, but the camera has 640x480 px; is it turned by its EXIF')
+    refuses(folder, '480x640 px.*EXIF')
 
 
 def test_files_cut_short_and_false_counts_cost_nothing(shots, tmp_path):
@@ -103,10 +100,10 @@ def test_files_cut_short_and_false_counts_cost_nothing(shots, tmp_path):
         data = path.read_bytes()
         for length in range(0, len(data), 7):
             path.write_bytes(data[:length])
-            refuses(folder, 'is cut short or damaged|cannot be read')
+            refuses(folder, 'cut short|cannot be')
         tracemalloc.start()
         path.write_bytes(struct.pack('<Q', 2**62) + data[8:])
-        refuses(folder, f'{name}: is cut short or damaged: {2**62} entries do not fit')
+        refuses(folder, f'{name}: .*{2**62}')
         assert tracemalloc.get_traced_memory()[1] < 2e6
         tracemalloc.stop()
         path.write_bytes(data)
@@ -114,15 +111,15 @@ def test_files_cut_short_and_false_counts_cost_nothing(shots, tmp_path):
 
 @pytest.mark.parametrize(('edit', 'expected'), [
     (lambda v: v.pop('frames'), 'lists no frames'),
-    (lambda v: v.pop('fl_x'), 'has no intrinsics: neither fl_x nor camera_angle_x'),
-    (lambda v: v.update(fl_x='wide'), 'fl_x is wide, not a finite number'),
-    (lambda v: v.update(camera_model='EQUIRECTANGULAR'), 'EQUIRECTANGULAR is not known here'),
-    (lambda v: v['frames'][0].pop('file_path'), "frame 0: field 'file_path' is missing"),
+    (lambda v: v.pop('fl_x'), 'no intrinsics'),
+    (lambda v: v.update(fl_x='wide'), 'fl_x is wide'),
+    (lambda v: v.update(camera_model='EQUIRECTANGULAR'), 'EQUIRECTANGULAR'),
+    (lambda v: v['frames'][0].pop('file_path'), "'file_path'"),
     (lambda v: v['frames'][0].update(transform_matrix=[[1, 0], [0, 1]]), 'transform_matrix is'),
     (lambda v: v['frames'][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()),
      'it is a reflection'),
     (lambda v: v['frames'][0].update(transform_matrix=(np.eye(4) * np.nan).tolist()),
-     'not numbers of shape')])
+     'of shape')])
 def test_faults_of_transforms_json(edit, expected, shots, tmp_path):
     refuses(edited(write_nerf(tmp_path, shots), edit), expected)
 

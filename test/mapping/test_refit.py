@@ -81,8 +81,7 @@ def test_a_duplicate_is_part_of_the_other(table, detections):
     for first, second in ((2, 9), (5, 10)):
         assert refit.part_of[first] == refit.part_of[second]
         gone = first if refit.part_of[first] != first else second
-        assert refit.reasons[gone] == (
-            f"is one object with '{given.landmark_ids[first + second - gone]}'")
+        assert given.landmark_ids[first + second - gone] in refit.reasons[gone]
     kept = np.unique(refit.part_of)
     assert errors_m(refit.landmark_map.select(kept), table.select(
         [row if row < 9 else {9: 2, 10: 5}[row] for row in kept])).max() < 0.01
@@ -95,22 +94,18 @@ def test_a_landmark_without_boxes_stays_and_gets_a_reason(table, detections):
                      centers=np.array([[0.2, -0.3, 1.2], [60.0, 0.0, 40.0], [0.0, 0.0, 2.0]]))
     refit = refit_map(detections, join_maps(given, ghosts))
     assert refit.reasons[:9] == (None,) * 9
-    assert refit.reasons[9].endswith('no box shows it: hidden, missed or gone')
-    assert refit.reasons[10] == 'its place is in no image'
-    assert refit.reasons[11] == "the recording has no boxes of its class, 'lamp'"
+    for reason, named in zip(refit.reasons[9:], ('no box', 'in no image', 'lamp'), strict=True):
+        assert named in reason
     assert (refit.landmark_map.centers[9:] == ghosts.centers).all()
     assert errors_m(refit.landmark_map.select(range(9)), table).max() < 0.01
 
 
 def test_one_side_is_not_enough(table):
     detections = see(table, walk_around(frames=12, turn_deg=12.0))
-    with pytest.raises(MappingError, match=r'no landmark can be fitted, the first one because: '
-                                           r'seen from one side only: .* explains 100% of the'):
+    with pytest.raises(MappingError, match='one side only'):
         refit_map(detections, table)
-    chosen = np.arange(len(table)) < 8
-    refit = refit_map(detections, table, chosen)
-    assert refit.reasons[8] is None
-    assert all(reason.startswith('seen from one side only') for reason in refit.reasons[:8])
+    refit = refit_map(detections, table, np.arange(len(table)) < 8)
+    assert ['one side' in str(reason) for reason in refit.reasons] == [True] * 8 + [False]
 
 
 @pytest.mark.parametrize(('turn_deg', 'shift_m', 'scale'), [
@@ -121,14 +116,13 @@ def test_a_map_in_another_coordinate_frame_is_refused(table, detections, turn_de
         table, centers=turn.apply(table.centers * scale) + np.array([shift_m, 0.0, 0.0]),
         semi_axes=table.semi_axes * scale,
         quats_xyzw=(turn * Rotation.from_quat(table.quats_xyzw)).as_quat())
-    with pytest.raises(MappingError, match=r'where the boxes are: it expl|coordinate frame\?$'):
+    with pytest.raises(MappingError, match=r'boxes are|frame\?'):
         refit_map(detections, elsewhere)
 
 
 def test_a_map_of_other_classes_is_refused(table, detections):
     foreign = replace(table, class_ids=('tvmonitor',) * len(table))
-    with pytest.raises(MappingError, match="no boxes of the map's classes; map: tvmonitor; "
-                                           'recording: book, bottle, cup'):
+    with pytest.raises(MappingError, match=r'tvmonitor; .*: book, bottle'):
         refit_map(detections, foreign)
 
 
@@ -140,5 +134,5 @@ def test_a_landmark_does_not_become_a_distant_object(table):
                     semi_axes=np.full((1, 3), 0.2))
     refit = refit_map(detections, join_maps(table.select([0, 1, 2, 4, 5, 6, 7]), stray))
     assert refit.reasons[:-1] == (None,) * 7
-    assert refit.reasons[-1].endswith('m away: they show another object')
+    assert 'another object' in refit.reasons[-1]
     assert (refit.landmark_map.centers[-1] == stray.centers[0]).all()

@@ -5,19 +5,13 @@
 from dataclasses import replace
 
 import numpy as np
+from scene import CAMERA, boxes_of
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.ellipsoid import (
-    ellipse_bboxes,
-    ellipses_in_pixels,
-    project_ellipsoids,
-)
-from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
-CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 CLASSES = ('book', 'bottle', 'cup')
 
 
@@ -83,8 +77,7 @@ def see_rows(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0, camera
     size = np.array([camera.width, camera.height] * 2, dtype=float)
     rows, boxes, counts = [], [], [0]
     for pose in poses:
-        outlines = project_ellipsoids(invert_transform(pose), table.centers, table.shapes)
-        full = ellipse_bboxes(ellipses_in_pixels(outlines, camera))
+        full = boxes_of(table, pose, camera)
         full = full + rng.normal(scale=noise_px, size=full.shape) if noise_px else full
         clipped = np.clip(full, 0.0, size)
         seen = (clipped[:, 2:] - clipped[:, :2] > 8.0).all(axis=1)

@@ -121,5 +121,5 @@ def test_weights_that_do_not_fit_on_the_disk(hub, tmp_path):
     disk = tmp_path / 'disk'
     disk.mkdir()
     text = run(RESOLVE, disk, *small_disk(disk))['error']
-    assert f'the disk of {disk}/weights is full: make room, or set cache_dir' in text
+    assert f'{disk}/weights is full' in text
     assert 'on another machine' in text

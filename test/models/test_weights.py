@@ -36,7 +36,7 @@ def refusal(clip_options: ClipOptions) -> str:
     (b'', 'is empty'),
     (b'version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 3\n', 'git lfs pull'),
     (b'\n<!DOCTYPE html><html><body>Sign in</body></html>', 'is a web page'),
-    (b'just text', 'holds no weights'), (b'PK\x03\x04' + bytes(1000), 'truncated or corrupt'),
+    (b'just text', 'holds no weights'), (b'PK\x03\x04' + bytes(1000), 'truncated'),
     (b'\x80\x02garbage', 'no checkpoint')])
 def test_files_that_are_no_weights(tmp_path, content, message):
     file = tmp_path / 'weights.pt'

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from scene import make_room, write_map
-from std_srvs.srv import Trigger
 from tester import class_matching, make_frame, transform_of
 
 from cliploc_ros.cli.evaluate import main as evaluate
@@ -59,7 +58,7 @@ def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
     assert answer.success, answer.message
     assert 'pose by keyframes' in answer.message
     assert 'points of keyframes' in answer.message
-    assert tester.call(Trigger, '/relocalizer/record', Trigger.Request()).success
+    assert tester.trigger('record').success
     case, = (tmp_path / 'cases').iterdir()
     again = ['--bag', str(case), '--map', str(room_map)]
     assert evaluate(again) == 0
@@ -77,7 +76,7 @@ def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
     assert health['keyframes file'] == str(layer_path(room_map))
     assert health['keyframes hash'] == layer_hash(layer_path(room_map))
     layer_path(room_map).write_bytes(b'no layer')
-    assert tester.call(Trigger, '/relocalizer/reload_map', Trigger.Request()).success
+    assert tester.trigger('reload_map').success
     process.wait_for_output('without keyframes')
     assert not tester.relocalize((image, info, detections)).success
     assert 'keyframes' not in diagnostics_of(tester)

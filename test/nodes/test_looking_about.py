@@ -5,32 +5,23 @@
 
 import numpy as np
 import pytest
-from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
 from processes import wait_for
-from scene import CAMERA, MAP_FROM_CAMERA, make_room
+from scene import CAMERA, MAP_FROM_CAMERA, boxes_of, make_room
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from std_msgs.msg import Header
 from tester import RELIABLE, make_frame, transform_of
+from watched import BASE_FROM_CAMERA, MOUNT, stamp
 
-from cliploc_ros.core.geometry.ellipsoid import (
-    ellipse_bboxes,
-    ellipses_in_pixels,
-    project_ellipsoids,
-)
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     make_transform,
-    transform_from_pose,
 )
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.ros.conversions import pose_to_msg
 
 ROOM = make_room()
-# The camera looks along the base's x axis, and turns about the base's z axis.
-MOUNT = [0.0, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5]
-BASE_FROM_CAMERA = transform_from_pose(np.array(MOUNT[:3]), np.array(MOUNT[3:]))
 MAP_FROM_BASE = MAP_FROM_CAMERA @ invert_transform(BASE_FROM_CAMERA)
 ODOM_FROM_MAP = make_transform(Rotation.from_euler('z', 70, degrees=True).as_matrix(),
                                np.array([3.0, -4.0, 1.0]))
@@ -41,10 +32,6 @@ PARAMETERS = {'base_frame': 'base_link', 'base_from_camera': MOUNT, 'algorithm':
               'min_inliers': BOXES + 1, 'timeout_s': 20.0, 'max_turn_rad_s': 1.0}
 
 
-def make_stamp(seconds):
-    return Time(sec=int(seconds), nanosec=round((seconds % 1) * 1e9))
-
-
 def turned(yaw_deg):
     """Where the robot's base is when it has turned on the spot."""
     turn = Rotation.from_euler('z', yaw_deg, degrees=True).as_matrix()
@@ -53,10 +40,10 @@ def turned(yaw_deg):
 
 def look(yaw_deg, stamp_s):
     """The messages of a frame of a robot that turned."""
-    camera_from_map = invert_transform(turned(yaw_deg) @ BASE_FROM_CAMERA)
-    in_front = np.nonzero(ROOM.centers @ camera_from_map[2, :3] + camera_from_map[2, 3] > 1.0)[0]
-    outlines = project_ellipsoids(camera_from_map, ROOM.centers[in_front], ROOM.shapes[in_front])
-    boxes = ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
+    map_from_camera = turned(yaw_deg) @ BASE_FROM_CAMERA
+    ahead = (ROOM.centers - map_from_camera[:3, 3]) @ map_from_camera[:3, 2]
+    in_front = np.nonzero(ahead > 1.0)[0]
+    boxes = boxes_of(ROOM, map_from_camera)[in_front]
     aside = np.abs(0.5 * (boxes[:, 0] + boxes[:, 2]) - CAMERA.cx)
     middle = np.sort(np.argsort(aside)[:BOXES])
     return make_frame(Detections(boxes[middle], tuple(ROOM.class_ids[in_front[row]]
@@ -84,7 +71,7 @@ class Robot:
         """Turn for 0.12 s, with an image between two messages of odometry."""
         for tick in range(6):
             odometry = Odometry(child_frame_id='base_link', header=Header(
-                frame_id='odom', stamp=make_stamp(self._now_s)))
+                frame_id='odom', stamp=stamp(self._now_s)))
             odometry.pose.pose = pose_to_msg(ODOM_FROM_MAP
                                              @ turned(swept(self._now_s, turn_deg_s)))
             change(odometry, self._now_s)

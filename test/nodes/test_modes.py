@@ -49,7 +49,7 @@ def test_any_detector_will_do(own_relocalizer, tester):
     process = own_relocalizer()
     answer = tester.relocalize((image, info, detections))
     assert not answer.success
-    assert 'correspondence candidates' in answer.message
+    assert 'candidates' in answer.message
     process.stop()
     own_relocalizer(class_map="'class/0=a, Beta=b, gamma ray=c'")
     assert tester.relocalize((image, info, detections)).success
@@ -92,7 +92,7 @@ def test_a_missing_transform_is_named_when_the_time_ends_in_the_next_look(start,
     process.wait_for_output('ready after')
     tester.connect()
     answer = tester.relocalize(make_frame())
-    assert "no transform from 'nowhere'" in answer.message
+    assert "'nowhere'" in answer.message
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
@@ -102,7 +102,7 @@ def test_a_request_is_answered_when_its_node_is_told_to_stop(own_relocalizer, te
     tester.wait(tester.listened_to, 'the request to wait for images')
     process.send(number)
     answer = tester.answer(future)
-    assert not answer.success and 'the node is shutting down' in answer.message
+    assert not answer.success and 'shutting down' in answer.message
     tester.wait(lambda: not process.alive, 'its end')
     assert process.stop()[0] == 0
     assert 'internal error' not in process.output() and 'Traceback' not in process.output()

@@ -4,11 +4,9 @@
 
 import re
 
-import pytest
 import yaml
 from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.parameter import parameter_value_to_python
-from std_srvs.srv import Trigger
 from tester import class_matching, make_frame
 
 
@@ -67,32 +65,22 @@ def test_one_file_serves_both_nodes(start, tester, tmp_path):
         assert node.output().count('unknown parameter') == 1, node.output()
 
 
-def reload_map(tester):
-    return tester.call(Trigger, '/relocalizer/reload_map', Trigger.Request())
-
-
-@pytest.fixture
-def own_map(room_map, tmp_path):
-    path = tmp_path / 'map.yaml'
-    path.write_text(room_map.read_text())
-    return path
-
-
-def test_the_map_is_read_anew_and_a_bad_one_changes_nothing(own_relocalizer, tester, own_map):
+def test_the_map_is_read_anew_and_a_bad_one_changes_nothing(own_relocalizer, tester, room_map,
+                                                            tmp_path):
+    own_map, text = tmp_path / 'map.yaml', room_map.read_text()
+    own_map.write_text(text)
     own_relocalizer(map_file=own_map)
-    text = own_map.read_text()
     own_map.write_text(text.replace('frame_id: map', 'frame_id: hall'))
-    answer = reload_map(tester)
+    answer = tester.trigger('reload_map')
     assert answer.success
-    assert re.fullmatch("loaded: 12 landmarks in frame 'hall', matching class, algorithm bf; map "
-                        '[0-9a-f]{12}', answer.message)
+    assert re.search("12 landmarks in frame 'hall'.* map [0-9a-f]{12}$", answer.message)
     assert tester.relocalize(make_frame()).success
     tester.wait(lambda: tester.poses, 'a pose')
     assert tester.poses[-1].header.frame_id == 'hall'
-    for bad, reason in ((text.replace('semi_axes', 'half_axes'), 'unknown field: half_axes'),
+    for bad, reason in ((text.replace('semi_axes', 'half_axes'), 'half_axes'),
                         ('', 'YAML'), (text[:len(text) // 2], str(own_map))):
         own_map.write_text(bad)
-        answer = reload_map(tester)
+        answer = tester.trigger('reload_map')
         assert not answer.success
         assert reason in answer.message
         assert tester.relocalize(make_frame()).message.count(' in hall,') == 1

@@ -8,7 +8,6 @@ import numpy as np
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from scene import make_room
 from sensor_msgs.msg import Image
-from std_srvs.srv import Trigger
 from tester import make_frame
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -42,7 +41,7 @@ def test_whoever_looks_sees_the_map_early_or_late(own_relocalizer, tester, room_
             assert late[0] == early[0]
         assert len(early) == 1, 'it was published once'
         path.write_text(path.read_text().replace('thing number 0', 'another thing'))
-        assert tester.call(Trigger, '/relocalizer/reload_map', Trigger.Request()).success
+        assert tester.trigger('reload_map').success
         tester.wait(lambda: len(early) == 2, 'the new map')
         assert 'another thing' in {marker.text for marker in early[1].markers}
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scene import make_room, see_room, write_map
-from std_srvs.srv import Trigger
 from tester import make_frame
 
 ROOM = make_room()
@@ -34,10 +33,6 @@ def listed(files):
     return f'[{", ".join(files)}]'
 
 
-def reload_map(tester):
-    return tester.call(Trigger, '/relocalizer/reload_map', Trigger.Request())
-
-
 def test_each_floor_answers_in_its_own_coordinate_frame(own_relocalizer, tester, floors):
     files = floors(ROOM, other_room())
     process = own_relocalizer(map_file="''", map_files=listed(files),
@@ -58,21 +53,19 @@ def test_maps_change_while_the_node_runs(own_relocalizer, tester, floors):
     first, second = floors(ROOM, other_room())
     own_relocalizer(map_file=first)
     frame = make_frame(see_room(other_room()))
+
+    def reloaded(**parameters):
+        """Set parameters; return whether the maps could be read anew."""
+        assert all(tester.set_parameter(*one).successful for one in parameters.items())
+        return tester.trigger('reload_map').success
     assert not tester.relocalize(frame).success
-    assert tester.set_parameter('map_files', [first, second]).successful
-    assert not reload_map(tester).success
-    assert tester.set_parameter('map_file', '').successful
-    assert reload_map(tester).success
+    assert not reloaded(map_files=[first, second])
+    assert reloaded(map_file='')
     assert ' in floor_1, ' in tester.relocalize(frame).message
-    assert tester.set_parameter('map_files', [first, first]).successful
-    assert not reload_map(tester).success
-    assert tester.set_parameter('map_files', [first, '/nowhere.yaml']).successful
-    assert '/nowhere.yaml' in reload_map(tester).message
+    for bad in ([first, first], [first, '/nowhere.yaml']):
+        assert not reloaded(map_files=bad)
     assert ' in floor_1, ' in tester.relocalize(frame).message
-    assert tester.set_parameter('map_files', ['']).successful
-    assert tester.set_parameter('map_file', first).successful
-    assert reload_map(tester).message.startswith(
-        "loaded: 12 landmarks in frame 'floor_0', matching class, algorithm bf; map ")
+    assert reloaded(map_files=[''], map_file=first)
     assert not tester.relocalize(frame).success
 
 

@@ -167,13 +167,10 @@ def test_an_interrupt_stops_the_robot(relocalizer, start, end, tester, serve_spi
 def test_a_relocalizer_that_does_not_watch_is_named(relocalizer, start, end):
     process = start('cli.wake_up', '--watch')
     assert end(process, make_frame) == NOT_READY
-    assert process.output().endswith(
-        'the relocalizer does not watch: set its parameter watch to tf or amcl_pose\n')
+    assert 'parameter watch' in process.output()
 
 
 def test_without_a_relocalizer_it_is_not_ready(start, end):
     process = start('cli.wake_up', '--relocalizer', '/nowhere/relocalizer', '--timeout', 1)
     assert end(process) == NOT_READY
-    assert process.output().endswith(
-        'not ready: nothing serves /nowhere/relocalizer/relocalize_fields: start the relocalizer, '
-        'or name it with --relocalizer or a namespace\n')
+    assert 'not ready: nothing' in process.output()

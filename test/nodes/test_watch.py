@@ -10,7 +10,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from processes import wait_for
 from scene import make_room, write_map
 from std_msgs.msg import Bool, Header, String
-from std_srvs.srv import Trigger
 from tester import transform_of
 from watched import MOUNT, Robot, stamp
 
@@ -99,7 +98,7 @@ def watch(own_relocalizer, tester):
     tester.localizer.is_on = True
 
 
-def test_a_right_localizer_stays_localized(watch):
+def test_a_right_localizer_stays_localized_and_a_kidnapped_robot_is_only_reported(watch):
     watched = watch()
     watched.until_state('localized')
     assert set(watched.looks(10)) == {'localized'}
@@ -107,13 +106,6 @@ def test_a_right_localizer_stays_localized(watch):
     assert float(watched.values['watch probability']) > 0.9
     assert int(watched.values['watch looks']) > 5
     assert 'expected' in watched.values['watch matched']
-    assert not watched.tester.initial_poses
-
-
-def test_a_kidnapped_robot_is_lost_and_only_reported(watch):
-    watched = watch()
-    watched.until_state('localized')
-    watched.looks(5)
     watched.kidnap()
     assert watched.flags[-1] is False
     watched.robot.speed_m_s = 0.0
@@ -130,7 +122,7 @@ def test_a_lost_robot_is_relocalized_once_it_stands(watch):
     watched.until_state('lost')
     watched.looks(3)
     assert watched.values['on lost'].startswith(
-        ('the robot moves at 0.', 'the robot has just stopped')), 'nothing is done'
+        ('the robot moves', 'the robot has just')), 'nothing is done'
     assert 'relocalizing' not in watched.process.output()
     assert not watched.tester.poses and not watched.tester.initial_poses
     watched.robot.speed_m_s = 0.0
@@ -151,7 +143,7 @@ def test_a_map_of_another_frame_ends_the_verdict_of_the_one_before(watch, tester
     watched.until_state('localized')
     write_map(replace(make_room(), frame_id='elsewhere'), tmp_path / 'elsewhere.yaml')
     assert tester.set_parameter('map_file', str(tmp_path / 'elsewhere.yaml'))
-    assert tester.call(Trigger, 'relocalizer/reload_map', Trigger.Request()).success
+    assert tester.trigger('reload_map').success
     tester.wait(lambda: 'a map was loaded' in watched.values['watch reason'], 'the end')
     assert watched.states[-1] == 'uncertain'
     watched.until_reason("the localizer's pose is in frame 'map'")

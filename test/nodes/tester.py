@@ -99,6 +99,10 @@ class Tester(Node):
         self.destroy_client(client)
         return answer
 
+    def trigger(self, name):
+        """Call a service of the relocalizer that takes no arguments; return its answer."""
+        return self.call(Trigger, f'/relocalizer/{name}', Trigger.Request())
+
     def set_parameter(self, name, value):
         """Set a parameter of the relocalizer; return rclpy's result."""
         request = SetParameters.Request(
@@ -162,6 +166,15 @@ class Tester(Node):
         future = self.ask()
         self.feed_until(future.done, frame)
         return future.result()
+
+
+def ask_until(ask, text, *given):
+    """Ask until an answer says something: on a busy machine a message is late at times."""
+    for _ in range(30):
+        answer = ask(*given)
+        if text in answer.message:
+            return answer
+    raise AssertionError(f'{text!r} in {answer.message}')
 
 
 def transform_of(pose):

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Observations of the demo's walk, with its real networks: once, resumed, by two workers."""
 
-import os
 import shutil
 import signal
 import subprocess
@@ -68,7 +67,7 @@ def recorded(walk):
             '--tum', walk, *NETWORKS, *CLIP, *ALL, '--out', walk.parent / 'map.yaml')],
         cwd=PROJECT, text=True, capture_output=True, timeout=TIMEOUT_S)
     assert done.returncode == 0, done.stderr
-    assert 'no pose: 1 of 16 images' in done.stdout
+    assert 'no pose: 1 of 16' in done.stdout
     file, = walk.parent.glob('tum.cliploc-*.npz')
     assert not list(walk.parent.glob('.*.unfinished'))
     return file
@@ -114,9 +113,9 @@ def test_a_run_that_fails_leaves_no_more_than_it_says(tmp_path, caplog, seen):
     def read(wanted):
         for place in range(seen):
             yield RawFrame(place, place, np.eye(4), lambda: (image, camera), None)
-        raise DatasetError('the recording ends here')
+        raise DatasetError('ends here')
     options = RecordingOptions(DetectorOptions(str(ASSETS / 'yolo.pt'), device='cpu'), None)
-    with pytest.raises(DatasetError, match='the recording ends here'):
+    with pytest.raises(DatasetError, match='ends here'):
         record_once(Frames(tmp_path / 'walk', 3, read), options, tmp_path / 'seen.npz')
     left = tmp_path / '.seen.npz.unfinished'
     assert left.exists() == bool(seen)
@@ -167,7 +166,7 @@ def test_a_bag_says_the_same_and_its_topics_are_found(walk, recorded, tmp_path, 
     command = ('--bag', bag, *NETWORKS, '--no-clip', *ALL, '--record-to', file, '--out',
                tmp_path / 'map.yaml')
     assert main(arguments(*command)) == 0
-    assert f'{bag}: /image and /camera_info' in capsys.readouterr().out
+    assert '/camera_info' in capsys.readouterr().out
     assert main(arguments(*command, '--pose-topic', '/ground_truth')) == 0
     from_bag, from_folder = load_recorded(file).detections, load_recorded(recorded).detections
     np.testing.assert_allclose(from_bag.bboxes_xyxy, from_folder.bboxes_xyxy, atol=1e-2)
@@ -183,7 +182,7 @@ def test_a_bag_says_the_same_and_its_topics_are_found(walk, recorded, tmp_path, 
     assert (again.bboxes_xyxy == from_bag.bboxes_xyxy).all()
     assert main(arguments(*linked, '/ground_truth', '--pose-noise', 0.02, 0.5,
                           '--odometry-noise', 0.02, 1)) == 0
-    assert 'odometry joins 14 of 14 pairs of frames' in capsys.readouterr().out
+    assert 'joins 14 of 14' in capsys.readouterr().out
     stamp = file.stat().st_mtime_ns
     assert main(arguments(*command, '--pose-topic', '/ground_truth')) == 0
     assert 'odometry' not in capsys.readouterr().out
@@ -191,25 +190,20 @@ def test_a_bag_says_the_same_and_its_topics_are_found(walk, recorded, tmp_path, 
 
 
 @pytest.mark.parametrize(('options', 'expected'), [
-    (('--bag', 'none'), 'none: no such recording'),
+    (('--bag', 'none'), 'no such recording'),
     (('--tum', '{walk}', '--pose-topic', '/pose'), 'are for --bag'),
-    (('--tum', '{walk}', '--trajectory', '{other}'), 'do not overlap; one of them uses another'),
+    (('--tum', '{walk}', '--trajectory', '{other}'), 'do not overlap'),
     (('--rgbd', '{folder}'), 'has neither rgb.txt'),
-    (('--observations', '{cut}'), 'record the observations again')])
-def test_refusals(walk, recorded, tmp_path, capsys, options, expected):
-    other = tmp_path / 'other.txt'
+    (('--observations', '{cut}'), 'observations again')])
+def test_refusals(walk, recorded, tmp_path, run_here, options, expected):
+    other, cut = tmp_path / 'other.txt', tmp_path / 'cut.npz'
     other.write_text('5000 0 0 0 0 0 0 1\n5001 1 0 0 0 0 0 1\n')
-    cut = tmp_path / 'cut.npz'
     cut.write_bytes(recorded.read_bytes()[:-200])
     filled = [one.format(walk=walk, other=other, folder=tmp_path, cut=cut) for one in options]
-    handler = signal.getsignal(signal.SIGTERM)
-    code = main(arguments(*filled, *NETWORKS, '--no-clip', '--out', tmp_path / 'map.yaml'))
-    signal.signal(signal.SIGTERM, handler)
-    error = capsys.readouterr().err
-    assert code == 1 and expected in error, error
-    assert len([line for line in error.splitlines() if line.startswith('error:')]) == 1
+    done = run_here(main, *filled, *NETWORKS, '--no-clip', '--out', tmp_path / 'map.yaml')
+    assert done.returncode == 1 and expected in done.stderr, done.stderr
+    assert len([line for line in done.stderr.splitlines() if line.startswith('error:')]) == 1
     assert not (tmp_path / 'map.yaml').exists()
-    assert os.listdir(tmp_path)  # noqa: PTH208
 
 
 def pose(x=0.0, turn_deg=0.0):

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A relocalizer's hand-over, a localizer, and the odometry of a robot."""
 
+import math
 import threading
 import time
 from dataclasses import replace
@@ -20,6 +21,10 @@ PARAMETERS = RelocalizerParameters(base_frame='base_link')
 
 # Moments of odometry since the image [s].
 ONE_HZ, TEN_HZ = (0.0, 1.0, 2.0), tuple(tick / 10 for tick in range(10))
+
+
+def stamp(seconds):
+    return Time(sec=math.floor(seconds), nanosec=round(seconds % 1 * 1e9))
 
 
 def make_pose():
@@ -75,22 +80,19 @@ class Robot:
         self.wait(self.handoff._updater.service_is_ready, 'the service')
 
 
-def rest(wheels):
-    """Publish half a second of odometry of a robot at rest."""
-    for tick in range(6):
-        odometry = Odometry()
-        odometry.header.stamp = Time(sec=100, nanosec=tick * 10**8)
-        odometry.pose.pose.orientation.w = 1.0
-        wheels.publish(odometry)
-
-
 def tell(robot, wheels, moments_s, speed_m_s=0.0, twist_m_s=0.0):
     """Publish odometry at moments since the image, and wait until the last is heard."""
-    for moment_s in moments_s:
+    stand(robot, wheels, {moment_s: speed_m_s * moment_s for moment_s in moments_s}, twist_m_s)
+
+
+def stand(robot, wheels, places, twist_m_s=0.0, rad_per_m=0.0):
+    """Publish where the robot was at moments since the image, and wait until that is heard."""
+    for moment_s, x_m in places.items():
         odometry = Odometry()
-        odometry.header.stamp = Time(sec=100 + int(moment_s), nanosec=round(moment_s % 1 * 1e9))
-        odometry.pose.pose.position.x = speed_m_s * moment_s
-        odometry.twist.twist.linear.x = twist_m_s
+        odometry.header.stamp = stamp(100.0 + moment_s)
+        odometry.pose.pose.position.x, odometry.twist.twist.linear.x = x_m, twist_m_s
+        odometry.pose.pose.orientation.z = math.sin(rad_per_m * x_m / 2)
+        odometry.pose.pose.orientation.w = math.cos(rad_per_m * x_m / 2)
         wheels.publish(odometry)
     robot.wait(lambda: (newest := robot.odometry.recent(60.0, 0.0)) is not None
                and newest == odometry, 'odometry')

@@ -71,26 +71,10 @@ def test_colour_images(encoding, padding):
     assert image.dtype == np.uint8 and image.flags.c_contiguous
 
 
-@given(width=st.integers(1, 7), height=st.integers(1, 5), padding=st.integers(0, 9),
-       encoding=st.sampled_from(['mono8', *FIRST_ROWS]), seed=st.integers(0, 2**32 - 1))
-def test_pixels_stay_where_they_are(width, height, padding, encoding, seed):
-    channels = 1 if encoding == 'mono8' else len(FIRST_ROWS[encoding]) // 3
-    rows = np.random.default_rng(seed).integers(
-        0, 256, (height, width * channels + padding), dtype=np.uint8)
-    msg = Image(height=height, width=width, encoding=encoding, step=rows.shape[1],
-                data=rows.tobytes())
-    image = image_from_msg(msg)
-    assert image.shape == (height, width, 3)
-    green = 0 if channels == 1 else 1
-    np.testing.assert_array_equal(image[:, :, 1], rows[:, green:width * channels:channels])
-
-
 @pytest.mark.parametrize(('changes', 'message'), [
-    ({'encoding': 'bayer_rggb8'}, "encoding 'bayer_rggb8' is none of rgb8"),
-    ({'width': 0}, 'image size 0x2'),
-    ({'width': 2**32 - 1, 'height': 2**32 - 1}, 'image size 4294967295x4294967295'),
-    ({'step': 8}, 'step 8 is shorter than a row of 3 rgb8 pixels'),
-    ({'data': b'\0' * 17}, 'image data has 17 bytes, but 2 rows of 9 bytes are 18')])
+    ({'encoding': 'bayer_rggb8'}, "'bayer_rggb8' is none of"), ({'width': 0}, 'size 0x2'),
+    ({'width': 2**32 - 1, 'height': 2**32 - 1}, 'size 4294967295x'), ({'step': 8}, 'step 8 is'),
+    ({'data': b'\0' * 17}, '17 bytes, but 2 rows')])
 def test_images_that_cannot_be(changes, message):
     msg = image_msg('rgb8', [FIRST_ROWS['rgb8'], SECOND_ROWS['rgb8']])
     for name, value in changes.items():
@@ -99,20 +83,19 @@ def test_images_that_cannot_be(changes, message):
         image_from_msg(msg)
 
 
-def compressed(extension, image_bgr):
-    return CompressedImage(format=extension,
-                           data=cv2.imencode(f'.{extension}', image_bgr)[1].tobytes())
-
-
 @pytest.mark.parametrize('extension', ['png', 'jpg'])
 def test_a_small_file_that_claims_a_huge_size_is_not_decoded(extension):
-    data = bytearray(cv2.imencode(f'.{extension}', np.zeros((8, 16, 3), dtype=np.uint8))[1])
+    red = np.full((8, 16, 3), (10, 20, 230), dtype=np.uint8)
+    data = bytearray(cv2.imencode(f'.{extension}', red)[1])
+    image = image_from_msg(CompressedImage(format=extension, data=bytes(data)))
+    assert image.shape == (8, 16, 3)
+    np.testing.assert_allclose(image[4, 8], [230, 20, 10], atol=8, err_msg='red first')
     if extension == 'png':
         data[16:24] = (60_000).to_bytes(4) * 2
     else:
         frame = data.index(b'\xff\xc0')
         data[frame + 5:frame + 9] = (60_000).to_bytes(2) * 2
-    with pytest.raises(ImageError, match='image size 60000x60000'):
+    with pytest.raises(ImageError, match='60000x60000'):
         image_from_msg(CompressedImage(format=extension, data=bytes(data)))
 
 
@@ -137,16 +120,9 @@ def test_a_turned_box_stands_as_the_upright_one_around_it():
         np.array([[25.0, 5.0, 35.0, 45.0]]))
 
 
-def test_jpeg_keeps_colours_in_their_order():
-    red = np.full((32, 48, 3), (10, 20, 230), dtype=np.uint8)
-    image = image_from_msg(compressed('jpg', red))
-    assert image.shape == (32, 48, 3)
-    np.testing.assert_allclose(image[16, 24], [230, 20, 10], atol=8)
-
-
 @given(st.binary(max_size=200))
 def test_bytes_that_are_no_image_are_refused(data):
-    with pytest.raises(ImageError, match=r"compressed image \('jpeg'.* does not decode"):
+    with pytest.raises(ImageError, match='does not decode'):
         image_from_msg(CompressedImage(format='jpeg', data=data))
 
 
@@ -158,15 +134,12 @@ def camera_info(**changes):
     return CameraInfo(header=HEADER, **(fields | changes))
 
 
-def test_a_raw_image_has_k_and_distortion():
+def test_a_raw_image_has_k_and_distortion_and_a_rectified_one_p():
     camera = camera_from_msg(camera_info(), (640, 480), rectified=False)
     assert (camera.width, camera.height) == (640, 480)
     assert camera.matrix.tolist() == [[500, 0, 320], [0, 510, 240], [0, 0, 1]]
     assert (camera.distortion_model, camera.distortion) == (
         'plumb_bob', (0.1, -0.2, 0.001, 0.002, 0.0))
-
-
-def test_a_rectified_image_has_p_and_no_distortion():
     for model in ('plumb_bob', 'of my own'):
         camera = camera_from_msg(camera_info(distortion_model=model), (640, 480), rectified=True)
         assert camera.matrix.tolist() == [[400, 0, 300], [0, 410, 200], [0, 0, 1]]
@@ -223,15 +196,10 @@ def test_detections_come_back_over_the_wire(found):
     np.testing.assert_allclose(received.bboxes_xyxy, sent.bboxes_xyxy, rtol=0, atol=1e-9)
     assert received.class_ids == sent.class_ids
     np.testing.assert_array_equal(received.scores, sent.scores)
-
-
-def test_one_detection_in_numbers():
-    sent = Detections(np.array([[10.0, 20.0, 50.0, 100.0]]), ('cup',), np.array([0.75]))
-    detection, = detections_to_msg(sent, HEADER).detections
-    centre = detection.bbox.center.position
-    assert (centre.x, centre.y, detection.bbox.size_x, detection.bbox.size_y) == (30, 60, 40, 80)
-    result, = detection.results
-    assert (result.hypothesis.class_id, result.hypothesis.score) == ('cup', 0.75)
+    for detection, (left, top, right, bottom) in zip(msg.detections, boxes, strict=True):
+        box = detection.bbox
+        assert (box.center.position.x, box.center.position.y, box.size_x, box.size_y) == (
+            pytest.approx(((left + right) / 2, (top + bottom) / 2, right - left, bottom - top)))
 
 
 def classified(*hypotheses):
@@ -241,19 +209,14 @@ def classified(*hypotheses):
 
 
 def test_the_most_confident_class_counts():
+    nan = float('nan')  # hides no other class
     msg = Detection2DArray(detections=[
         classified(('cup', 0.2), ('vase', 0.7), ('bowl', 0.1)), classified(),
-        classified(('chair', 0.5))])
+        classified(('chair', 0.5)), classified(('cup', 0.9), ('vase', nan)),
+        classified(('vase', nan), ('cup', 0.9))])
     received = detections_from_msg(msg)
-    assert received.class_ids == ('vase', '', 'chair')
-    assert received.scores.tolist() == [0.7, 0.0, 0.5]
-
-
-@pytest.mark.parametrize('hypotheses', [(('cup', 0.9), ('vase', float('nan'))),
-                                        (('vase', float('nan')), ('cup', 0.9))])
-def test_a_score_that_is_no_number_hides_no_other_class(hypotheses):
-    received = detections_from_msg(Detection2DArray(detections=[classified(*hypotheses)]))
-    assert (received.class_ids, received.scores.tolist()) == (('cup',), [0.9])
+    assert received.class_ids == ('vase', '', 'chair', 'cup', 'cup')
+    assert received.scores.tolist() == [0.7, 0.0, 0.5, 0.9, 0.9]
 
 
 def test_stamps_are_exact():

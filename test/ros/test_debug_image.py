@@ -5,9 +5,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scene import CAMERA, make_room, see_room
+from scene import CAMERA, make_layer, make_room, see_room
 
-from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -68,11 +67,8 @@ def test_boxes_beyond_all_measure_do_no_harm(room, found):
 def layer_of(room, **images):
     """One keyframe with the camera's size, and ten points along its middle row."""
     pixels = np.column_stack([np.linspace(50, 590, 10), np.full(10, 240.0)])
-    return KeyframeLayer(
-        'map', room.landmark_ids, room.centers.astype(np.float32), CAMERA, np.eye(4)[None],
-        np.array([0, 10]), (16 * pixels).astype(np.uint16), np.ones((10, 3), np.float32),
-        np.ones((10, 128), np.uint8), np.zeros(10, np.uint16), np.ones((1, 128), np.uint8),
-        **images)
+    return replace(make_layer(room, keyframes=1, points=10),
+                   pixels=(16 * pixels).astype(np.uint16), **images)
 
 
 def recognized(found):

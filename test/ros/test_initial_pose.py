@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from handing_over import PARAMETERS, TEN_HZ, make_pose, rest, tell
+from handing_over import PARAMETERS, TEN_HZ, make_pose, tell
 
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
 from cliploc_ros.ros.outputs.handoff import (
@@ -22,8 +22,7 @@ from cliploc_ros.ros.outputs.handoff import (
 @pytest.mark.clock
 def test_without_a_localizer_the_pose_is_withheld(robot):
     start = time.monotonic()
-    with pytest.raises(NoLocalizerError, match=r'^nobody subscribes /initialpose: start the '
-                       r'localizer \(AMCL\), or set require_localizer: false$'):
+    with pytest.raises(NoLocalizerError, match='/initialpose'):
         robot.hand_over()
     assert 1.0 < time.monotonic() - start < 5.0
     robot.localizer.subscribe()
@@ -41,39 +40,37 @@ def test_a_localizer_that_starts_meanwhile_is_waited_for(robot):
     starting.join()
 
 
-def test_a_localizer_that_is_known_gets_a_pose_after_the_deadline(robot):
+@pytest.fixture
+def served(robot):
+    """The robot, whose localizer hears poses and serves updates."""
     robot.localizer.subscribe()
     robot.localizer.serve()
     robot.meet()
     robot.meet_service()
-    assert robot.hand_over(-1.0) < 0.5
-    robot.wait(lambda: robot.localizer.poses, 'the pose')
-    assert not robot.localizer.updates
+    return robot
 
 
-def test_updates_come_no_faster_than_scans(robot):
-    robot.localizer.subscribe()
-    robot.localizer.serve()
-    robot.meet()
-    robot.meet_service()
-    assert 2.0 < robot.hand_over() < 6.0
-    assert len(robot.localizer.updates) == PARAMETERS.nomotion_updates
+def test_a_localizer_that_is_known_gets_a_pose_after_the_deadline(served):
+    assert served.hand_over(-1.0) < 0.5
+    served.wait(lambda: served.localizer.poses, 'the pose')
+    assert not served.localizer.updates
+
+
+def test_updates_come_no_faster_than_scans(served):
+    assert 2.0 < served.hand_over() < 6.0
+    assert len(served.localizer.updates) == PARAMETERS.nomotion_updates
 
 
 @pytest.mark.parametrize(('timeout_s', 'longest_s'), [(10.0, 4.0), (0.5, 1.0)])
-def test_a_service_that_never_answers_costs_little_and_leaves_nothing(robot, timeout_s,
-                                                                         longest_s):
-    robot.localizer.subscribe()
-    robot.localizer.may_answer.clear()
-    robot.localizer.serve()
-    robot.meet()
-    robot.meet_service()
-    for number in range(1, 4):
-        assert robot.hand_over(timeout_s) < longest_s
-        robot.wait(lambda n=number: len(robot.localizer.poses) == n, 'the pose')
-    assert not robot.handoff._updater._pending_requests, 'their futures are freed'
-    robot.localizer.may_answer.set()
-    assert robot.hand_over(nomotion_updates=1) < 2.0, 'late answers do no harm'
+def test_a_service_that_never_answers_costs_little_and_leaves_nothing(served, timeout_s,
+                                                                      longest_s):
+    served.localizer.may_answer.clear()
+    for number in range(1, 3):
+        assert served.hand_over(timeout_s) < longest_s
+        served.wait(lambda n=number: len(served.localizer.poses) == n, 'the pose')
+    assert not served.handoff._updater._pending_requests, 'their futures are freed'
+    served.localizer.may_answer.set()
+    assert served.hand_over(nomotion_updates=1) < 2.0, 'late answers do no harm'
 
 
 def test_a_jump_during_the_hand_over_withholds_the_pose(robot, wheels):
@@ -84,13 +81,12 @@ def test_a_jump_during_the_hand_over_withholds_the_pose(robot, wheels):
         handing_over = pool.submit(robot.hand_over)
         robot.wait(lambda: robot.odometry._heard._waiters, 'it to wait for odometry')
         robot.handoff.forget()
-        rest(wheels)
-        with pytest.raises(TimeJumpError, match='time jumped back before'):
+        tell(robot, wheels, TEN_HZ)
+        with pytest.raises(TimeJumpError):
             handing_over.result()
-        assert not robot.localizer.poses
-        handing_over = pool.submit(robot.hand_over)
-        robot.wait(handing_over.done, 'the next hand-over', lambda: rest(wheels))
-        assert handing_over.exception() is None
+    assert not robot.localizer.poses
+    tell(robot, wheels, (1.0, 1.1))
+    robot.hand_over()
     robot.wait(lambda: robot.localizer.poses, 'the pose')
 
 
@@ -110,24 +106,18 @@ def test_who_hears_the_pose_but_shows_none_is_no_localizer(robot):
     robot.localizer.subscribe()
     robot.handoff.open('amcl_pose')
     robot.meet()
-    with pytest.raises(NoLocalizerError, match=r'^nobody publishes /amcl_pose: start the '
-                       r'localizer \(AMCL\), or name the topic of its pose by localizer_pose$'):
+    with pytest.raises(NoLocalizerError, match='/amcl_pose'):
         robot.hand_over()
     assert not robot.localizer.poses
     robot.handoff.close()
 
 
-def test_the_pose_comes_again_until_time_is_up(silent):
-    with pytest.raises(NoLocalizerError, match=r'^the localizer did not take the pose: /amcl_pose '
-                       r'shows nothing since initialpose was published 3 times in 3 s: see '):
-        silent.hand_over(3.2)
-    assert len(silent.localizer.poses) == 3
-
-
-def test_a_pose_is_not_given_without_time_to_see_it_taken(silent):
-    with pytest.raises(NoLocalizerError, match=r'^too little time is left to see whether'):
-        silent.hand_over(0.3)
-    assert not silent.localizer.poses
+@pytest.mark.parametrize(('timeout_s', 'named', 'times'), [
+    (3.2, 'shows nothing', 3), (0.3, 'too little time', 0)])
+def test_the_pose_comes_again_until_time_is_up(silent, timeout_s, named, times):
+    with pytest.raises(NoLocalizerError, match=named):
+        silent.hand_over(timeout_s)
+    assert len(silent.localizer.poses) == times
 
 
 def test_a_robot_that_moves_meanwhile_gets_the_pose_no_more(silent, wheels):
@@ -136,7 +126,7 @@ def test_a_robot_that_moves_meanwhile_gets_the_pose_no_more(silent, wheels):
         handing_over = pool.submit(silent.hand_over)
         silent.wait(lambda: silent.localizer.poses, 'the pose')
         tell(silent, wheels, (1.0, 1.1, 1.2), twist_m_s=0.5)
-        with pytest.raises(HandOffError, match=r'^the robot moves at 0\.50 m/s'):
+        with pytest.raises(HandOffError, match=r'moves at 0\.50'):
             handing_over.result()
     assert len(silent.localizer.poses) == 1
 
@@ -148,7 +138,7 @@ def test_what_ends_a_hand_over_ends_the_wait_for_the_localizer(silent, what, err
         silent.wait(lambda: silent.localizer.poses, 'the pose')
         start = time.monotonic()
         getattr(silent.handoff, what)()
-        with pytest.raises(error, match=r'time jumped|was deactivated'):
+        with pytest.raises(error):
             handing_over.result()
     assert time.monotonic() - start < 3.0
     assert len(silent.localizer.poses) == 1

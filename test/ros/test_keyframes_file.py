@@ -4,12 +4,10 @@
 
 import logging
 
-import numpy as np
 import pytest
-from scene import CAMERA, make_room, write_map
+from scene import make_layer, make_room, write_map
 
-from cliploc_ros.core.keyframes.features import DIMENSIONS
-from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, save_layer
+from cliploc_ros.core.keyframes.layer import layer_path, save_layer
 from cliploc_ros.ros.frame_localizer import load_keyframes
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -18,14 +16,10 @@ ROOM = make_room()
 
 @pytest.fixture
 def room(tmp_path):
-    """A map with a layer of one keyframe next to it."""
+    """A map with a layer next to it."""
     path = tmp_path / 'room.yaml'
     write_map(ROOM, path)
-    save_layer(layer_path(path), KeyframeLayer(
-        'map', ROOM.landmark_ids, ROOM.centers.astype(np.float32), CAMERA, np.eye(4)[None],
-        np.array([0, 5]), np.zeros((5, 2), np.uint16), np.ones((5, 3), np.float32),
-        np.ones((5, DIMENSIONS), np.uint8), np.zeros(5, np.uint16),
-        np.ones((1, DIMENSIONS), np.uint8)))
+    save_layer(layer_path(path), make_layer(ROOM))
     return path
 
 
@@ -34,18 +28,13 @@ def load(map_file, keyframes_file='auto'):
         map_file=str(map_file), keyframes_file=str(keyframes_file)), ROOM)
 
 
-def test_the_layer_next_to_the_map_or_a_named_one_is_read(room, tmp_path):
-    assert len(load(room).layer) == 1
+def test_the_layer_next_to_the_map_or_a_named_one_is_read_where_it_is_wanted(room, tmp_path):
+    assert len(load(room).layer) == 6
+    assert load(room, '') is load('') is None
     moved = tmp_path / 'other.npz'
     (tmp_path / 'room.keyframes.npz').rename(moved)
     assert load(room) is None
-    assert len(load(room, moved).layer) == 1
-    assert len(load('', moved).layer) == 1
-
-
-def test_no_layer_is_read_where_none_is_wanted(room):
-    assert load(room, '') is None
-    assert load('') is None
+    assert len(load(room, moved).layer) == len(load('', moved).layer) == 6
 
 
 @pytest.mark.parametrize('spoil', ['truncated', 'missing'])

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
-from scene import CAMERA, make_room
+from scene import make_layer, make_room
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
-from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.ros.outputs.visualization import (
     class_color,
     landmark_markers,
@@ -38,10 +39,7 @@ def test_keyframes_are_cameras_in_a_namespace_of_their_own():
     room = make_room()
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = 1.0, 2.0, 3.0
-    layer = KeyframeLayer(
-        room.frame_id, room.landmark_ids, room.centers.astype(np.float32), CAMERA, poses,
-        np.zeros(4, np.int64), np.empty((0, 2), np.uint16), np.empty((0, 3), np.float32),
-        np.empty((0, 128), np.uint8), np.empty(0, np.uint16), np.ones((1, 128), np.uint8))
+    layer = replace(make_layer(room, keyframes=3), map_from_camera=poses)
     *others, cameras = landmark_markers(room, layer).markers
     assert len(others) == 1 + 2 * len(room)
     assert (cameras.ns, cameras.type, cameras.header.frame_id) == (

@@ -54,17 +54,21 @@ def test_a_node_takes_the_generated_file(declare, kind, capfd):
     assert 'unknown parameter' not in capfd.readouterr().err
 
 
-def test_given_values_are_taken_whole_numbers_too(declare):
-    _, parameters = declare(given(low=2, ratio=1, mode='wild', span='[1, 2]'))
+def test_values_are_taken_and_changed_whole_numbers_too(declare):
+    node, parameters = declare(given(low=2, ratio=1, mode='wild', span='[1, 2]'))
     assert parameters.snapshot() == Probe(low=2, ratio=1.0, mode='wild', span=[1.0, 2.0])
     assert type(parameters.values.ratio) is float
+    assert set_values(node, low=50, high=60).successful
+    assert set_values(node, span=[2.0, 3.0]).successful
+    assert parameters.snapshot() == Probe(low=50, high=60, ratio=1.0, mode='wild',
+                                          span=[2.0, 3.0])
 
 
 @pytest.mark.parametrize(('values', 'reason'), [
-    ({'low': 101}, 'must be 0 to 100; correct it with: ros2 param set node_under_test low'),
-    ({'ratio': '.nan'}, 'ratio: nan must be 0 to 1'),
-    ({'mode': 'willd'}, "did you mean 'wild'?); correct it and restart"),
-    ({'span': '[1.0]'}, 'span: must be 2 finite numbers'), ({'low': 6}, 'low: above high')])
+    ({'low': 101}, '0 to 100'),
+    ({'ratio': '.nan'}, 'ratio: nan'),
+    ({'mode': 'willd'}, "mean 'wild'?"),
+    ({'span': '[1.0]'}, 'span: '), ({'low': 6}, 'low: above high')])
 def test_an_invalid_start_is_reported_until_it_is_corrected(declare, values, reason):
     _, parameters = declare(given(**values))
     for _ in range(2):
@@ -76,22 +80,15 @@ def test_an_invalid_start_is_reported_until_it_is_corrected(declare, values, rea
 def test_mistyped_names_are_warned_of_with_the_nearest(declare, capfd):
     declare(given(ratoi=0.5, qqq=1) + '    map:\n      frame_id: map\n')
     log = capfd.readouterr().err
-    assert "unknown parameter 'ratoi' has no effect (did you mean 'ratio'?)" in log
-    assert "unknown parameter 'qqq' has no effect\n" in log
+    assert log.count('unknown parameter') == 2 and "'ratoi'" in log and "'qqq'" in log
+    assert log.count('did you mean') == 1 and "'ratio'?" in log
     assert 'map' not in log and 'use_sim_time' not in log
-
-
-def test_changes_at_run_time(declare):
-    node, parameters = declare()
-    assert set_values(node, low=50, high=60).successful
-    assert set_values(node, span=[2.0, 3.0]).successful
-    assert parameters.snapshot() == Probe(low=50, high=60, span=[2.0, 3.0])
 
 
 @pytest.mark.parametrize(('values', 'reason'), [
     ({'low': -1}, 'low out of range'), ({'low': 2, 'high': 1}, 'low: above high'),
-    ({'span': [1.0]}, 'span: must be 2 finite numbers'),
-    ({'ratio': 'half'}, 'Wrong parameter type'), ({'mode': 'wild'}, 'read-only'),
+    ({'span': [1.0]}, 'span: '),
+    ({'ratio': 'half'}, 'type'), ({'mode': 'wild'}, 'read-only'),
     ({'use_sim_time': False, 'high': 0}, 'low: above high')])
 def test_a_refused_change_changes_nothing(declare, values, reason):
     node, parameters = declare()
@@ -103,5 +100,5 @@ def test_a_refused_change_changes_nothing(declare, values, reason):
 def test_the_map_does_not_change_at_run_time(declare):
     node, _ = declare(given() + '    map:\n      frame_id: map\n')
     answer = set_values(node, **{'map.frame_id': 'odom'})
-    assert not answer.successful and 'the map is read at start-up' in answer.reason
+    assert not answer.successful and 'at start-up' in answer.reason
     assert node.get_parameter('map.frame_id').value == 'map'

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builtin_interfaces.msg import Time
+from handing_over import stamp
 from nav_msgs.msg import Odometry
 from scipy.spatial.transform import Rotation
 from std_msgs.msg import Header
@@ -21,10 +21,6 @@ OPTICAL = [0.3, 0.0, 1.0, -0.5, 0.5, -0.5, 0.5]  # looks along the base's x axis
 BASE_FROM_CAMERA = transform_from_pose(np.array(OPTICAL[:3]), np.array(OPTICAL[3:]))
 PARAMETERS = RelocalizerParameters(base_frame='base_link', base_from_camera=OPTICAL,
                                    tf_timeout_s=0.0)
-
-
-def stamp(seconds):
-    return Time(sec=int(seconds), nanosec=round((seconds % 1) * 1e9))
 
 
 def odom_from_base(seconds):
@@ -99,58 +95,39 @@ def test_places_in_two_odometry_frames_do_not_compare(robot, source, frames):
     assert place(robot, 9.95) is None
 
 
-@pytest.fixture
-def restarts(source):
-    """Keep the stamps of the restarts that are reported [ns]."""
+@pytest.mark.parametrize(('moments_s', 'moved'), [
+    ((10.1, 10.2), {'x': -100.0}),  # at once
+    ((13.0, 13.1), {'y': 0.6})])  # 1.4 m away and turned, after a silence
+def test_an_origin_that_is_reset_is_a_restart_and_reported_once(robot, source, moments_s, moved):
     stamps_ns = []
     source.on_restart(stamps_ns.append)
-    return stamps_ns
-
-
-def test_an_origin_that_is_reset_is_a_restart(source, restarts, capfd):
-    talk(source, 9.9, 10.0)
-    for moment, x_m in ((10.1, -100.0), (10.2, -99.9)):
-        reset = message(moment)
-        reset.pose.pose.position.x = x_m
-        source.take(reset)
-    assert restarts == [10_100_000_000]
-    assert '/odom restarted, for its time, place or frames jumped' in capfd.readouterr().err
-
-
-def test_a_driver_that_begins_anew_after_a_silence_is_a_restart(robot, source, restarts):
     talk(source, *np.arange(9.5, 10.05, 0.1))
     run = place(robot, 10.0).run
-    for moment in (13.0, 13.1):
+    for moment in moments_s:
         anew = message(moment)
-        anew.pose.pose.position.y = 0.6  # 1.4 m away, and turned
+        for axis, metres in moved.items():
+            setattr(anew.pose.pose.position, axis, metres)
         source.take(anew)
-    assert restarts == [13_000_000_000]
-    assert place(robot, 13.05).run != run
+    assert stamps_ns == [round(moments_s[0] * 1e9)]
+    assert place(robot, sum(moments_s) / 2).run != run
 
 
-def test_odometry_that_goes_on_is_no_restart(source, restarts):
-    broken = message(10.15)
-    broken.pose.pose.orientation.w = float('nan')
+def test_odometry_that_goes_on_is_no_restart_and_invalid_messages_change_nothing(robot, source):
+    restarts = []
+    source.on_restart(restarts.append)
     talk(source, 9.9, 10.1, 10.0)  # one of them late
-    source.take(broken)
+    run = place(robot, 9.95).run
+    for broken in (message(10.05), message(10.15)):
+        broken.pose.pose.position.x = broken.pose.pose.orientation.w = float('nan')
+        source.take(broken)
     talk(source, 10.2)
-    assert not restarts
+    np.testing.assert_allclose(place(robot, 10.05).odom_from_camera,
+                               odom_from_base(10.05) @ BASE_FROM_CAMERA, atol=1e-9)
+    assert place(robot, 10.05).run == run
+    assert source.recent(1.0, 1.0).header.stamp == stamp(10.2)
     source.forget()
     talk(source, 2.0)
     assert not restarts, 'a jump of the clock is reported by TimeJumps'
-
-
-def test_an_invalid_message_changes_nothing(robot, source):
-    talk(source, 9.9, 10.0)
-    first = place(robot, 9.95)
-    broken = message(10.05)
-    broken.pose.pose.position.x = float('nan')
-    source.take(broken)
-    talk(source, 10.1)
-    np.testing.assert_allclose(place(robot, 10.05).odom_from_camera,
-                               odom_from_base(10.05) @ BASE_FROM_CAMERA, atol=1e-9)
-    assert place(robot, 10.05).run == first.run
-    assert source.recent(1.0, 1.0).header.stamp == stamp(10.1)
 
 
 def test_it_subscribes_while_it_is_open(make_node, spin_until):
@@ -169,14 +146,10 @@ def test_it_subscribes_while_it_is_open(make_node, spin_until):
     assert place(robot, 10.0).run != run, 'the robot may have moved in between'
 
 
-def test_poses_give_the_speed_where_the_twist_is_empty(source):
-    talk(source, *np.arange(9.5, 10.05, 0.05))
-    assert source.speeds_by_poses(1.0) == (pytest.approx(0.1), pytest.approx(np.radians(20.0)))
-
-
 @pytest.mark.parametrize('moments', [
-    [9.6, 10.0], [9.4, 10.0], [9.0, 10.0], [9.7, 9.8, 10.8], [7.0, 10.0]])
-def test_slow_odometry_gives_its_mean_speed(source, moments):
+    np.arange(9.5, 10.05, 0.05), [9.6, 10.0], [9.4, 10.0], [9.0, 10.0], [9.7, 9.8, 10.8],
+    [7.0, 10.0]])
+def test_poses_give_the_mean_speed_where_the_twist_is_empty(source, moments):
     talk(source, *moments)
     assert source.speeds_by_poses(0.0) == (pytest.approx(0.1), pytest.approx(np.radians(20.0)))
 

@@ -20,6 +20,7 @@ COUNT = ParameterRow('count', 3, 'How many.', low=1, high=10)
 LENGTH = ParameterRow('length', 0.5, 'How long.', unit='m', low=0.0, high=2.0)
 SWITCH = ParameterRow('switch', False, 'On or off.')
 MOUNT = ParameterRow('mount', [0.0, 0.0], 'Two numbers.', unit='m')
+NAMES = ParameterRow('names', [''], 'Some texts.')
 
 TABLES = {'detector': DetectorParameters.rows(), 'relocalizer': RelocalizerParameters.rows()}
 
@@ -27,40 +28,32 @@ TABLES = {'detector': DetectorParameters.rows(), 'relocalizer': RelocalizerParam
 @pytest.mark.parametrize(('row', 'value', 'validated'), [
     (TEXT, 'b', 'b'), (CHOICE, 'compressed', 'compressed'), (COUNT, 10, 10),
     (LENGTH, 2.0, 2.0), (LENGTH, 1, 1.0), (SWITCH, True, True), (MOUNT, [1, 2.5], [1.0, 2.5]),
-    (MOUNT, array.array('q', [3, 4]), [3.0, 4.0])])
+    (MOUNT, array.array('q', [3, 4]), [3.0, 4.0]), (NAMES, ('a', 'b'), ['a', 'b'])])
 def test_good_values_come_back_in_the_parameters_type(row, value, validated):
     result = row.validated(value)
     assert result == validated and type(result) is type(validated)
     if isinstance(result, list):
-        assert all(type(item) is float for item in result)
+        assert all(type(item) is type(row.default[0]) for item in result)
 
 
 @pytest.mark.parametrize(('row', 'value', 'message'), [
-    (TEXT, 1, 'text: must be of type str, not int'),
-    (CHOICE, 'RAW', "choice: 'RAW' is none of raw, compressed"),
-    (CHOICE, 'compresed', "did you mean 'compressed'"),
-    (COUNT, 0, 'count: 0 must be 1 to 10'), (COUNT, 11, 'count: 11 must be 1 to 10'),
-    (COUNT, 3.0, 'count: must be of type int, not float'),
-    (COUNT, True, 'count: must be of type int, not bool'),
-    (LENGTH, 3, 'length: 3.0 must be 0 to 2'),
-    (LENGTH, math.nan, 'length: nan must be 0 to 2'),
-    (SWITCH, 1, 'switch: must be of type bool, not int'),
-    (MOUNT, [], 'mount: must be 2 finite numbers'),
-    (MOUNT, [1.0], 'mount: must be 2 finite numbers'),
-    (MOUNT, [1.0, -math.inf], 'mount: must be 2 finite numbers'),
-    (MOUNT, '12', 'mount: must be 2 finite numbers')])
+    (TEXT, 1, 'str, not int'), (CHOICE, 'RAW', 'raw, compressed'),
+    (CHOICE, 'compresed', "mean 'compressed'"), (COUNT, 0, '1 to 10'), (COUNT, 11, '1 to 10'),
+    (COUNT, 3.0, 'int, not float'), (COUNT, True, 'int, not bool'), (LENGTH, 3, '0 to 2'),
+    (LENGTH, math.nan, 'nan'), (SWITCH, 1, 'bool, not int'), (MOUNT, [], '2 finite'),
+    (MOUNT, [1.0], '2 finite'), (MOUNT, [1.0, -math.inf], '2 finite'), (MOUNT, '12', '2 finite'),
+    (NAMES, ['a', 1], 'texts'), (NAMES, 'a', 'texts'), (NAMES, 1, 'texts')])
 def test_a_bad_value_is_refused_by_name_and_with_what_is_allowed(row, value, message):
-    with pytest.raises(OptionsError) as raised:
+    with pytest.raises(OptionsError, match=message) as raised:
         row.validated(value)
-    assert message in str(raised.value)
-    assert len(str(raised.value)) < 200
+    assert str(raised.value).startswith(f'{row.name}: ') and len(str(raised.value)) < 200
 
 
 @given(st.one_of(
     st.none(), st.booleans(), st.integers(), st.floats(), st.text(), st.binary(),
     st.lists(st.one_of(st.integers(-2**63, 2**63 - 1), st.floats(), st.text()), max_size=4)))
 def test_whatever_comes_it_is_allowed_or_refused(value):
-    for row in (TEXT, CHOICE, COUNT, LENGTH, SWITCH, MOUNT):
+    for row in (TEXT, CHOICE, COUNT, LENGTH, SWITCH, MOUNT, NAMES):
         try:
             validated = row.validated(value)
         except OptionsError as error:
@@ -105,9 +98,9 @@ def test_the_methods_options_are_parameters_of_equal_defaults_and_limits():
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'matching': 'class', 'algorithm': 'b-prosac'}, "'b-prosac' needs "),
     ({'height_range_m': [2.0, 1.0]}, 'height_range_m'),
-    ({'gravity': 'base_frame'}, 'needs the parameter base_frame'),
-    ({'base_from_camera': [0.0] * 6 + [2.0]}, 'base_from_camera: .* not of unit length'),
-    ({'base_from_camera': [1.0] + [0.0] * 6}, 'base_from_camera: .* not of unit length')])
+    ({'gravity': 'base_frame'}, 'base_frame'),
+    ({'base_from_camera': [0.0] * 6 + [2.0]}, 'base_from_camera'),
+    ({'base_from_camera': [1.0] + [0.0] * 6}, 'base_from_camera')])
 def test_values_that_do_not_fit_together(changes, message):
     with pytest.raises(OptionsError, match=message):
         RelocalizerParameters(**changes).check()

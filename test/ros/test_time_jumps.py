@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from handing_over import stamp
 from nav_msgs.msg import Odometry
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
@@ -29,10 +30,6 @@ from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 S = 1_000_000_000
-
-
-def stamp(seconds):
-    return Time(sec=int(seconds), nanosec=round((seconds % 1) * S))
 
 
 class Simulation:
@@ -86,15 +83,12 @@ def test_time_that_goes_on_is_no_jump(simulation, jumps):
         assert not is_refused(jumps, stamp_s, start)
 
 
-@pytest.mark.parametrize(('before_s', 'after_s'), [(100.0, 95.0), (600.0, 2.0), (10.0, 9.9)])
-def test_a_jump_back_is_seen_once(simulation, jumps, before_s, after_s):
-    simulation.set_time(before_s, after_s, after_s + 0.01, after_s + 1.0)
-    assert [one.nanoseconds for one in jumps.forgot] == [round(after_s * S)]
-
-
-def test_each_jump_of_a_bag_that_loops_is_seen(simulation, jumps):
-    simulation.set_time(*3 * [100.0, 101.0])
-    assert len(jumps.forgot) == 2
+@pytest.mark.parametrize(('moments_s', 'jumps_s'), [
+    ((100.0, 95.0, 95.01, 96.0), [95.0]), ((10.0, 9.9, 9.91, 10.9), [9.9]),
+    (3 * (100.0, 101.0), [100.0, 100.0])])  # a bag that loops
+def test_each_jump_back_is_seen_once(simulation, jumps, moments_s, jumps_s):
+    simulation.set_time(*moments_s)
+    assert [one.nanoseconds for one in jumps.forgot] == [round(one * S) for one in jumps_s]
 
 
 def test_messages_from_before_a_jump_are_refused(simulation, jumps):
@@ -102,7 +96,7 @@ def test_messages_from_before_a_jump_are_refused(simulation, jumps):
     before = time.monotonic()
     simulation.set_time(95.0)
     after = time.monotonic()
-    with pytest.raises(TimeJumpError, match=r'time jumped back by 5\.000 s'):
+    with pytest.raises(TimeJumpError, match=r' 5\.000 s'):
         jumps.check(stamp(99.9), before)
     assert is_refused(jumps, 95.0, before), 'its counterparts may be from before'
     assert is_refused(jumps, 99.9, after), 'it waited in the middleware'
@@ -126,7 +120,7 @@ def test_a_node_that_leaves_or_enters_simulated_time_forgets(simulation, jumps):
         before = time.monotonic()
         simulation.node.set_parameters([Parameter('use_sim_time', value=simulated)])
         assert len(jumps.forgot) == number
-        with pytest.raises(TimeJumpError, match='use_sim_time changed'):
+        with pytest.raises(TimeJumpError, match='use_sim_time'):
             jumps.check(stamp(5.0), before)
         assert not is_refused(jumps, 5.0, time.monotonic())
     assert is_refused(jumps, 9.0, time.monotonic())
@@ -202,7 +196,7 @@ class Inputs:
             return False
 
 
-@pytest.mark.parametrize('restart_s', [95.0, 99.9, 2.0])
+@pytest.mark.parametrize('restart_s', [99.9, 2.0])
 def test_what_was_heard_before_a_jump_is_forgotten(simulation, restart_s):
     inputs = Inputs(simulation)
     jumps = TimeJumps(simulation.node, inputs.forget)

@@ -51,8 +51,7 @@ def test_a_base_stands_upright(source):
 
 def test_an_accelerometer_at_rest_points_up(source):
     for number in range(10):  # half of them too old to count
-        tilt = 0.0 if number > 4 else 5.0
-        source.take(imu((tilt, 0.0, 9.81), seconds=49.55 + 0.05 * number))
+        source.take(imu((0.0 if number > 4 else 5.0, 0.0, 9.81), seconds=49.55 + 0.05 * number))
     np.testing.assert_allclose(up(source), [0, -1, 0], atol=1e-12)
 
 
@@ -61,45 +60,36 @@ GRAVITY = tuple(9.81 * TILT.inv().apply([0, 0, 1]))
 TILTED_UP = CAMERA_FROM_BASE[:3, :3] @ TILT.inv().apply([0, 0, 1])
 
 
-@pytest.mark.parametrize('acceleration', [
-    GRAVITY,
-    (3.0, 0.0, 11.0),  # of a robot that moves
-    (0.0, 0.0, 0.0),  # not filled
-    (GRAVITY[0] + 0.5, *GRAVITY[1:]),  # 3 degrees off: a cheap accelerometer
-])
-def test_an_orientation_counts_more_than_an_acceleration(source, acceleration):
-    source.take(imu(acceleration, TILT.as_quat()))
-    np.testing.assert_allclose(up(source), TILTED_UP, atol=1e-12)
-
-
-def test_a_default_orientation_is_none(source):
-    """rclcpp, rclpy and every driver that fills the acceleration alone send w = 1."""
-    source.take(imu(GRAVITY, (0, 0, 0, 1)))
-    np.testing.assert_allclose(up(source), TILTED_UP, atol=1e-12)
-
-
-def test_an_upright_robot_has_its_vertical_by_either(source):
-    """A simulator without noise: no rotation, and a covariance of zeros or of its own."""
-    for covariance in (0.0, 1e-6):
-        source.forget()
-        msg = imu((0.0, 0.0, 9.81), (0, 0, 0, 1))
-        msg.orientation_covariance[0] = covariance
-        source.take(msg)
-        np.testing.assert_allclose(up(source), [0, -1, 0], atol=1e-12)
+@pytest.mark.parametrize(('acceleration', 'quat_xyzw', 'covariance', 'expected'), [
+    (GRAVITY, TILT.as_quat(), 0.0, TILTED_UP),
+    ((3.0, 0.0, 11.0), TILT.as_quat(), 0.0, TILTED_UP),  # of a robot that moves
+    ((0.0, 0.0, 0.0), TILT.as_quat(), 0.0, TILTED_UP),  # not filled
+    # 3 degrees off: a cheap accelerometer
+    ((GRAVITY[0] + 0.5, *GRAVITY[1:]), TILT.as_quat(), 0.0, TILTED_UP),
+    # rclcpp, rclpy and every driver that fills the acceleration alone send w = 1
+    (GRAVITY, (0, 0, 0, 1), 0.0, TILTED_UP),
+    # a simulator without noise: a covariance of zeros or of its own
+    ((0.0, 0.0, 9.81), (0, 0, 0, 1), 0.0, (0, -1, 0)),
+    ((0.0, 0.0, 9.81), (0, 0, 0, 1), 1e-6, (0, -1, 0))])
+def test_an_orientation_counts_more_than_an_acceleration_but_not_a_default_one(
+        source, acceleration, quat_xyzw, covariance, expected):
+    msg = imu(acceleration, quat_xyzw)
+    msg.orientation_covariance[0] = covariance
+    source.take(msg)
+    np.testing.assert_allclose(up(source), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(('quat_xyzw', 'acceleration', 'named'), [
-    ((0, 0, 0, 1), GRAVITY, '9 degrees off gravity'),  # a constant one, with a covariance
-    ((1, 0, 0, 0), (0.0, 0.0, 9.81), '180 degrees off gravity'),  # NED in place of ENU
-    ((0, 0, 0, 1), (9.81, 0.0, 0.0), '90 degrees off gravity'),  # mounted on its side
+    ((0, 0, 0, 1), GRAVITY, ' 9 degrees'),  # a constant one, with a covariance
+    ((1, 0, 0, 0), (0.0, 0.0, 9.81), '180 degrees'),  # NED in place of ENU
+    ((0, 0, 0, 1), (9.81, 0.0, 0.0), '90 degrees'),  # mounted on its side
 ])
 def test_an_orientation_that_contradicts_gravity_is_refused(source, quat_xyzw, acceleration,
                                                             named):
     msg = imu(acceleration, quat_xyzw)
     msg.orientation_covariance[0] = 1e-4
     source.take(msg)
-    with pytest.raises(NoVerticalError, match=f'^the orientation of /imu is {named}.*set '
-                                              r'orientation_covariance\[0\] to -1$'):
+    with pytest.raises(NoVerticalError, match=named):
         up(source)
 
 
@@ -109,7 +99,7 @@ def test_a_wrong_orientation_stays_refused_when_the_robot_starts(source):
     for number in range(20):
         acceleration = (0.0, 0.0, 9.81) if number < 15 else (4.0, 0.0, 9.81)
         source.take(imu(acceleration, wrong, seconds=48.1 + 0.1 * number))
-    with pytest.raises(NoVerticalError, match='60 degrees off gravity'):
+    with pytest.raises(NoVerticalError, match='60 degrees'):
         up(source)
 
 
@@ -123,13 +113,13 @@ def test_a_message_out_of_order_costs_nothing(source):
 
 
 @pytest.mark.parametrize(('messages', 'named'), [
-    ([], 'no message of /imu is within 100 ms'), ([imu(frame_id='')], 'no frame_id'),
-    ([imu((0.0, 0.0, 11.0))], r'the IMU is moving: it measures 11\.00 m/s\^2'),
-    ([imu((0.0, 0.0, 0.0))], 'neither an orientation nor an acceleration'),
+    ([], '/imu is within'), ([imu(frame_id='')], 'no frame_id'),
+    ([imu((0.0, 0.0, 11.0))], r'11\.00 m/s'),
+    ([imu((0.0, 0.0, 0.0))], 'neither an'),
     ([imu(quat_xyzw=Rotation.from_euler('y', angle, degrees=True).as_quat(), seconds=seconds,
           acceleration=(0.0, 0.0, 0.0)) for angle, seconds in ((-40, 49.95), (40, 50.05))],
      'turns too fast'),
-    ([imu(seconds=50.0), imu(seconds=10.0)], 'no message of /imu is within')])
+    ([imu(seconds=50.0), imu(seconds=10.0)], '/imu is within')])
 def test_what_is_not_known_is_said(source, messages, named):
     for msg in messages:
         source.take(msg)

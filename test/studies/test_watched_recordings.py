@@ -12,13 +12,14 @@ import pytest
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames, bag_odometry
-from cliploc_ros.offline.datasets.bag_messages import map_from_camera_of, pose_message, stamp_ns
+from cliploc_ros.offline.datasets.bag_messages import pose_message, stamp_ns
 from cliploc_ros.offline.datasets.bag_poses import poses_of_topic
 from cliploc_ros.offline.datasets.bags import BagReader, BagWriter
 from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.datasets.tum_conversion import ConversionOptions, convert_tum
 from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
+from cliploc_ros.ros.conversions import pose_from_msg
 from studies.watch.__main__ import run
 from studies.watch.recordings import (
     WatchedLook,
@@ -83,7 +84,7 @@ def observations(tmp_path_factory):
             writer.write(message.topic, message.stamp_ns, message.data)
             if message.topic == '/ground_truth':
                 truth = reader.deserialize(message)
-                pose, stamp = map_from_camera_of(truth), stamp_ns(truth)
+                pose, stamp = pose_from_msg(truth.pose), stamp_ns(truth)
                 jump = 2.0 * (stamp > sequence.stamps_ns[IMAGES // 2])
                 writer.write('/wheels', message.stamp_ns, pose_message(stamp, 'odom', pose))
                 writer.write('/localizer', message.stamp_ns, pose_message(

@@ -41,9 +41,8 @@ def test_an_edit_changes_the_figures_and_the_positions_stay(studio):
     assert not after.look_alikes
     assert np.array_equal(after.grid.positions, before.grid.positions)
     lines = after.lines(before)
-    assert 'pairs of places that look alike: 0 (was 1)' in lines
-    assert any(re.match(r'views accepted: \d+ of \d+ \(was \d+ of \d+\)', line)
-               for line in lines)
+    assert any(line.endswith('alike: 0 (was 1)') for line in lines)
+    assert any(re.search(r'\d+ of \d+ \(was \d+ of \d+\)', line) for line in lines)
     again = find_places(document.landmarks, None, after, silent)
     assert again.figures == after.figures, 'equal maps, equal figures'
 

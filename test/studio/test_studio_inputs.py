@@ -5,11 +5,11 @@
 
 import numpy as np
 import pytest
-from scene import CAMERA, make_room, write_map
+from scene import make_layer, make_room, write_map
 
 from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, save_layer
+from cliploc_ros.core.keyframes.layer import layer_path, save_layer
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bag_frames import BagTopics
 from cliploc_ros.offline.datasets.bags import BagWriter
@@ -57,11 +57,8 @@ def test_the_layer_comes_with_its_map(tmp_path, capsys):
     assert layer_of(path) is None, 'an empty map has none'
     write_map(room, path)
     assert layer_of(path) is None
-    save_layer(layer_path(path), KeyframeLayer(
-        'map', room.landmark_ids, room.centers.astype(np.float32), CAMERA, np.eye(4)[None],
-        np.array([0, 5]), np.zeros((5, 2), np.uint16), np.ones((5, 3), np.float32),
-        np.ones((5, 128), np.uint8), np.zeros(5, np.uint16), np.ones((1, 128), np.uint8)))
-    assert len(layer_of(path)) == 1
+    save_layer(layer_path(path), make_layer(room))
+    assert len(layer_of(path)) == 6
     assert capsys.readouterr().out == ''
     layer_path(path).write_bytes(b'no layer')
     assert layer_of(path) is None

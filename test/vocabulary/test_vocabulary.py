@@ -31,12 +31,12 @@ def test_a_symbol_has_one_value_in_a_phrase_and_phrases_are_told_once():
 
 
 @pytest.mark.parametrize(('rules', 'message'), [
-    ({'phrases': ['a {brand}']}, r'\{brand\} has no words; add the rule brand'),
+    ({'phrases': ['a {brand}']}, 'add the rule brand'),
     ({'phrases': ['{a}'], 'a': ['{b}'], 'b': ['{a}']}, 'does not end'),
     ({'phrases': ['{second}'], 'colour': ['red']}, None),
     ({'phrases': ['{colour} {second}'], 'colour': ['red']}, 'needs two colours'),
     ({'phrases': ['{a} {b} {c} {d}'], **{name: [f'{name}{i}' for i in range(1000)]
-                                         for name in 'abcd'}}, 'more than 2000 phrases')])
+                                         for name in 'abcd'}}, '2000 phrases')])
 def test_rules_that_cannot_be_used(rules, message):
     if message is None:
         assert expand_phrases(rules) == ('red',)
@@ -61,7 +61,7 @@ def test_any_class_name_is_described():
     assert 'a red tv monitor with blue stripes' in vocabulary.phrases('tv_monitor')
     assert 'a red colour' in vocabulary.phrases('{colour}')
     assert 'an object' in vocabulary.phrases('_')
-    with pytest.raises(OptionsError, match='more than 200 characters'):
+    with pytest.raises(OptionsError, match='200 characters'):
         vocabulary.phrases('x' * 500)
 
 

@@ -90,11 +90,7 @@ class Comparison(NamedTuple):
     poses: NDArray[np.float64]  #: (m, 4, 4)
     likely: NDArray[np.float64]  #: (m,): probability of each, shared by those that agree
     recognition: Recognition | None  #: What keyframes say
-
-    @property
-    def leading(self) -> NDArray[np.bool_]:
-        """Return which contenders (m,) agree with the leading one."""
-        return SAME_ANSWER.agreeing(self.poses)[0]
+    leading: NDArray[np.bool_]  #: (m,): which contenders agree with the leading one
 
     @property
     def source(self) -> str:
@@ -156,7 +152,8 @@ def compare(joined: JoinedFrames, contenders: list[Contender],
     poses = np.array([one.pose for one in contenders]).reshape(-1, 4, 4)
     return Comparison(contenders, poses, confidences(
         np.array([one.odds for one in contenders]), poses, none_right(joined.setting),
-        prior=np.array([one.prior for one in contenders])), seen)
+        prior=np.array([one.prior for one in contenders])), seen,
+        SAME_ANSWER.agreeing(poses[:1], poses).ravel())
 
 
 def _proposed(joined: JoinedFrames, seen: Recognition, met: Sequence[Contender]
@@ -363,8 +360,7 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
         # as much as if the search had met it, see confidences
         by_objects = (1.0 + CALIBRATION.objects.slope) * (best.odds - rival.odds)
         if row < len(twins):
-            by_objects = lead_over_twin(best.support, rival.support, float(shares[row]),
-                                        bool(rooms[row]))
+            by_objects = lead_over_twin(best.support, rival.support, float(shares[row]))
         leads[number] += best.prior - rival.prior + by_objects
     chance = float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum()))
     return chance, place_of(joined.landmark_map, poses[others][int(np.argmin(leads))])

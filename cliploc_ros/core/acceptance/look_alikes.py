@@ -45,9 +45,8 @@ _NEAR_M = (0.6, 0.45, 0.3)
 # and two halls (seeds 1004 and 1006) that mislead and repeat .39 and .38.
 _LEAST_LANDMARKS, _LEAST_SHARE, _LEAST_MATCHED, _ENOUGH = 4, 0.38, 0.4, 0.48
 # Two places differ where they share less than the first number, and are alike from the second one
-# on: share of the objects that a pose explains, at a room of its own and within one place, and of
-# the landmarks around it. Whoever furnishes rooms repeats them; a place repeats itself by chance.
-_ALIKE, _ALIKE_WITHIN, _ALIKE_AROUND = (0.3, 0.45), (0.45, 0.6), (0.45, 0.6)
+# on: share of the objects that a pose explains, and of the landmarks around it.
+_ALIKE, _ALIKE_AROUND = (0.3, 0.45), (0.45, 0.6)
 # Columns of Support.shown.
 _COUNT, _LIKENESS, _UNLABELLED = 0, 3, 5
 # The share of the matched landmarks that must lie on an axis, and turns about it [rad].
@@ -79,14 +78,8 @@ class Alike(NamedTuple):
 
         Whoever furnished them alike may have hung the same posters, too.
         """
-        return _are_rooms(self.found, self.others, self.landmarks)
-
-
-def _are_rooms(found: NDArray[np.bool_], others: NDArray[np.int64], rows: NDArray[np.int64]
-               ) -> NDArray[np.bool_]:
-    """Return at which places (m,) enough landmarks are found that are not of this place."""
-    elsewhere = found & ~np.isin(others, rows)
-    return np.asarray(elsewhere.sum(axis=1) >= _LEAST_SHARE * len(rows))
+        elsewhere = self.found & ~np.isin(self.others, self.landmarks)
+        return np.asarray(elsewhere.sum(axis=1) >= _LEAST_SHARE * len(self.landmarks))
 
 
 def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
@@ -121,9 +114,9 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
     shares = found.mean(axis=1)
     alike = shares >= _LEAST_SHARE
     if len(matched):
-        # what the image shows may have moved at a room that is alike all around
+        # what the image shows may have moved at a place that is alike all around
         alike &= ((found[:, :len(matched)].mean(axis=1) >= _LEAST_MATCHED)
-                  | (_are_rooms(found, others, rows) & (shares >= _ENOUGH)))
+                  | (shares >= _ENOUGH))
     ends = np.einsum('nij,rj->nri', moves[:, :3, :3], landmark_map.centers[rows])
     misses = np.linalg.norm(ends + moves[:, None, :3, 3] - landmark_map.centers[others], axis=2)
     order = np.lexsort([(misses * found).sum(axis=1), -shares])
@@ -195,20 +188,18 @@ def turned_about_axis(landmark_map: LandmarkMap, map_from_camera: NDArray[np.flo
     return np.concatenate(found) if found else _NOWHERE
 
 
-def lead_over_twin(its: Support, twin: Support, place_share: float = 0.0,
-                   is_room: bool = True) -> float:
+def lead_over_twin(its: Support, twin: Support, place_share: float = 0.0) -> float:
     """Return the log odds by which objects prefer a pose to one at a place that looks alike.
 
     Labels tell objects apart that both poses explain. An object that only one pose explains counts
     as its label says, where the places share few objects. Where they share many, one of both is
-    out of date, or was furnished like the other: that one cause explains all such objects.
+    out of date, or was furnished like the other: that one cause explains all such objects. Labels
+    of things that are alike err alike, so they count less there.
 
     Parameters
     ----------
     place_share : float
         Share of the landmarks around the pose that the other place has, too.
-    is_room : bool
-        Whether the other place is a room of its own.
     """
     terms = CALIBRATION.places
     common = its.shown.keys() & twin.shown.keys()
@@ -221,12 +212,10 @@ def lead_over_twin(its: Support, twin: Support, place_share: float = 0.0,
             else:
                 further, counts = further + said, counts + sign * row[_COUNT]
     share = sum(its.shown[one][_COUNT] for one in common) / max(its.inliers, 1e-9)
-    limits = _ALIKE if is_room else _ALIKE_WITHIN
-    alike = max(float(np.interp(share, limits, (0.0, 1.0))),
+    alike = max(float(np.interp(share, _ALIKE, (0.0, 1.0))),
                 float(np.interp(place_share, _ALIKE_AROUND, (0.0, 1.0))))
     most = min(abs(further), terms.unlabelled * abs(counts), terms.aged)
-    if is_room:  # whoever furnished and labelled them alike erred alike
-        lead *= float(np.interp(alike, (0.0, 1.0), (1.0, terms.rooms)))
+    lead *= 1.0 - (1.0 - terms.labels) * alike
     return lead + (1.0 - alike) * further + alike * math.copysign(most, further)
 
 

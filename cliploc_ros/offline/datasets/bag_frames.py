@@ -25,16 +25,19 @@ from cliploc_ros.messages import (
     faults_of_rectified,
     image_from_msg,
 )
-from cliploc_ros.offline.datasets.bag_messages import stamp_ns
+from cliploc_ros.offline.datasets.bag_messages import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    stamp_ns,
+)
 from cliploc_ros.offline.datasets.bag_poses import ReadPoses
 from cliploc_ros.offline.datasets.bags import BagMessage, BagReader, deserialize
 from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, RawFrame, Wanted
 from cliploc_ros.offline.datasets.poses import Poses, check_clock
 from cliploc_ros.units import NS_PER_S
 
-_IMAGE = 'sensor_msgs/msg/Image'
-_IMAGES = (_IMAGE, 'sensor_msgs/msg/CompressedImage')
-_CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+_IMAGES = (IMAGE, COMPRESSED_IMAGE)
 _COMPRESSED = '/compressed'
 # A depth image belongs to a colour image at most this far away in time.
 _MAX_DEPTH_DELAY_NS = 20_000_000
@@ -71,28 +74,28 @@ def find_topics(bag: Path, image: str | None, camera_info: str | None) -> tuple[
     """Return the topics of image and camera_info; None is found where there is one candidate.
 
     Depth and debug images are no candidates; raw images go before compressed ones of the same
-    camera. DatasetError: there is none, or there are several; names them and the option.
+    camera. DatasetError: there is none, or there are several; names them and the parameter.
     """
     with BagReader(bag) as reader:
         def named(types: Sequence[str]) -> list[str]:
             return [one.name for one in reader.topics.values()
                     if one.msgtype in types and one.message_count]
 
-        def only(candidates: Sequence[str], what: str, option: str) -> str:
+        def only(candidates: Sequence[str], what: str, parameter: str) -> str:
             if len(candidates) == 1:
                 return candidates[0]
             raise DatasetError(f'{bag}: {len(candidates)} topics of {what}'
                                f'{": " if candidates else ""}{", ".join(candidates)}; '
-                               f'{f"give {option} TOPIC" if candidates else "record one"}')
+                               f'{f"give `{parameter}`" if candidates else "record one"}')
         images = [name for name in named(_IMAGES) if 'depth' not in name.lower()
                   and 'debug_image' not in name]
         raw = [name for name in images if name.removesuffix(_COMPRESSED) == name
                or name.removesuffix(_COMPRESSED) not in images]
-        image = image or only(raw, 'colour images', '--image')
+        image = image or only(raw, 'colour images', 'image')
         beside = image.removesuffix(_COMPRESSED).rpartition('/')[0] + '/camera_info'
-        infos = named((_CAMERA_INFO,))
+        infos = named((CAMERA_INFO,))
         return image, camera_info or (
-            beside if beside in infos else only(infos, 'camera_info', '--camera-info'))
+            beside if beside in infos else only(infos, 'camera_info', 'camera_info'))
 
 
 def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
@@ -203,7 +206,7 @@ class BagImages:
 
 
 def _check_topics(reader: BagReader, topics: BagTopics) -> None:
-    for name, types in ((topics.image, _IMAGES), (topics.camera_info, (_CAMERA_INFO,)),
+    for name, types in ((topics.image, _IMAGES), (topics.camera_info, (CAMERA_INFO,)),
                         *([(topics.depth, _IMAGES)] if topics.depth else [])):
         topic = reader.topic(name)
         if topic.msgtype not in types:
@@ -258,7 +261,7 @@ def _decode_color(where: str, info: bytes, rectified: bool, msgtype: str, data: 
     try:
         image = image_from_msg(message)
         size = (image.shape[1], image.shape[0])
-        calibration = deserialize(info, _CAMERA_INFO, where)
+        calibration = deserialize(info, CAMERA_INFO, where)
         camera = camera_from_msg(calibration, size, rectified)
         check_faults(faults_of_camera_info(calibration, camera, rectified))
         return image, camera

@@ -8,7 +8,6 @@ a gap between two samples has a limit.
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,13 +31,6 @@ ReadPoses = Callable[[BagReader, str], Poses]
 GROUND_TRUTH, MAP_FRAME = '/ground_truth', 'map'
 _TF, _TF_STATIC = '/tf', '/tf_static'
 _TF_TYPE = 'tf2_msgs/msg/TFMessage'
-
-
-def pose_sources(bag: Path) -> list[str]:
-    """Return the topics of a recording that may hold poses, /tf among them."""
-    with BagReader(bag) as reader:
-        return [topic.name for topic in reader.topics.values()
-                if (topic.msgtype in _POSE_TYPES or topic.name == _TF) and topic.message_count]
 
 
 def poses_of_topic(name: str, max_gap_ns: int = 0,
@@ -84,8 +76,8 @@ def find_poses(max_gap_ns: int, ground_truth: str = GROUND_TRUTH,
                 problem = str(error).removeprefix(f'{reader.path}: ')
         there = ', '.join(name for name, topic in reader.topics.items()
                           if topic.msgtype in _POSE_TYPES and topic.message_count) or 'none'
-        raise DatasetError(f'{reader.path}: say where the poses are: --pose-topic, --map-frame '
-                           f'(tf) or --trajectory; topics with poses here: {there}; {problem}')
+        raise DatasetError(f'{reader.path}: say where the poses are: `pose_topic`, `map_frame` '
+                           f'(tf) or `trajectory`; topics with poses here: {there}; {problem}')
     return read
 
 

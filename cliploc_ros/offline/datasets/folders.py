@@ -108,7 +108,7 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
     """
     layout = find_layout(folder, options.layout)
     if layout is None:
-        remedy = ('it is a recording: give --bag' if (folder / 'metadata.yaml').is_file()
+        remedy = ('it is a recording: give it as `bag`' if (folder / 'metadata.yaml').is_file()
                   else 'unpack it' if folder.suffix in ('.r3d', '.zip')
                   else 'images alone need poses, as COLMAP makes them')
         raise DatasetError(f'{folder}: has the files of no known layout: '
@@ -116,9 +116,9 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
     if layout.key not in _OPEN and (options.intrinsics or options.trajectory is not None
                                     or options.body_from_camera is not None):
         raise DatasetError(f'{folder}: {layout.name} has its own cameras and poses: '
-                           '--intrinsics, --trajectory and --mount are for TUM RGB-D')
+                           '`intrinsics`, `trajectory` and `mount` are for TUM RGB-D')
     if options.images is not None and layout.key not in ('colmap', 'nerf'):
-        raise DatasetError(f'{folder}: --images is for COLMAP and transforms.json')
+        raise DatasetError(f'{folder}: `images` is for COLMAP and transforms.json')
     try:
         return _placed(folder, layout, layout.read(folder, options), options)
     except OSError as error:
@@ -174,9 +174,9 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
         scale = find_scale(posed, *options.known_distance, str(folder))
         notes.append(f'a unit is {scale:.5g} m, by the known distance')
     if scale is None and not capture.is_metric and not options.any_unit:
-        raise DatasetError(f'{folder}: {layout.name} does not know its unit: give --scale METRES '
-                           'of a unit (1 where they are metres), --known-distance or '
-                           '--object-size')
+        raise DatasetError(f'{folder}: {layout.name} does not know its unit: give the `scale` '
+                           'of a unit (1 where they are metres), a `known_distance` or an '
+                           '`object_size`')
     poses = replace(poses, scale=scale or 1.0, map_from_stored=UP[capture.up or 'z'])
     poses, note = _levelled(folder, poses, files, options.level, bool(capture.up))
     notes.append(note)
@@ -203,17 +203,15 @@ def _levelled(folder: Path, poses: PlacedPoses, files: Sequence[ImageFile], leve
     return poses, '' if is_known else tilt_note(placed)
 
 
-def tum_frames(sequence: TumSequence, camera: Camera, options: FolderOptions = _NO_OPTIONS
-               ) -> Frames:
+def tum_frames(sequence: TumSequence, camera: Camera) -> Frames:
     """Return the frames of a TUM folder, taken by one camera; without depth.
 
     DatasetError: there are no poses, or they are of another time.
     """
     files = [ImageFile(stamp, path, camera) for stamp, path in
              zip(sequence.stamps_ns, sequence.image_paths, strict=True)]
-    poses = _poses(sequence, options)
-    _check_poses(sequence.folder, poses)
-    return folder_frames(sequence.folder, files, poses)
+    _check_poses(sequence.folder, sequence.trajectory)
+    return folder_frames(sequence.folder, files, sequence.trajectory)
 
 
 def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
@@ -223,7 +221,7 @@ def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
     """
     is_tum = (folder / 'rgb.txt').exists()
     if is_tum and not (folder / 'depth.txt').exists():
-        raise DatasetError(f'{folder}: has no depth.txt; map from it with --tum, without depth')
+        raise DatasetError(f'{folder}: has no depth.txt; map from it as `tum`, without depth')
     return read_folder(folder, replace(options, layout='rgbd' if is_tum else '7scenes'))
 
 
@@ -295,7 +293,7 @@ def _poses(sequence: TumSequence, options: FolderOptions) -> Poses:
 def _check_poses(folder: Path, poses: Poses) -> None:
     if poses.span_ns is None:
         raise DatasetError(f'{folder}: there are no poses: no groundtruth.txt here; give '
-                           '--trajectory FILE')
+                           'a `trajectory`')
 
 
 #: The first one whose files are there is read. TUM RGB-D without depth only where asked for.

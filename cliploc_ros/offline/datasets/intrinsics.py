@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Camera intrinsics: those of the TUM sequences, and the user's own in a camera.json."""
 
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.errors import CameraError, DatasetError
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.captures.capture import Fields, camera_of
 
 
 def _tum_camera(fx: float, fy: float, cx: float, cy: float, *distortion: float) -> Camera:
@@ -23,8 +22,6 @@ PRESETS: Mapping[str, Camera] = {
     'fr3': _tum_camera(535.4, 539.2, 320.1, 247.6, 0.0, 0.0, 0.0, 0.0, 0.0),
 }
 
-_REQUIRED = ('width', 'height', 'fx', 'fy', 'cx', 'cy')
-_OPTIONAL = ('distortion_model', 'd')
 _SEQUENCE_NAME = re.compile(r'(?<![a-z])(?:freiburg|fr)([123])(?![0-9])', re.IGNORECASE)
 
 
@@ -50,7 +47,7 @@ def find_camera(choice: str | None, folder: Path) -> tuple[Camera, str]:
     match = _SEQUENCE_NAME.search(folder.resolve().name)
     if match is None:
         raise DatasetError(f'{folder}: the name of the folder contains no TUM camera; give '
-                           '--intrinsics fr1, fr2, fr3 or a camera.json')
+                           '`intrinsics` fr1, fr2, fr3 or a camera.json')
     return PRESETS[f'fr{match[1]}'], f"preset fr{match[1]}, from the folder's name"
 
 
@@ -62,32 +59,13 @@ def read_camera(path: str | Path) -> Camera:
     field is missing, unknown or invalid; the message names file and field.
     """
     path = Path(path)
-    try:
-        values = json.loads(path.read_text(encoding='utf-8'))
-    except FileNotFoundError:
-        raise DatasetError(
-            f'{path}: no such camera file; give fr1, fr2, fr3 or a camera.json') from None
-    except (OSError, ValueError) as error:
-        raise DatasetError(f'{path}: cannot be read as JSON: {error}') from error
-    if not isinstance(values, dict):
-        raise DatasetError(f'{path}: expected a mapping with {", ".join(_REQUIRED)}')
-    if unknown := sorted(set(values) - {*_REQUIRED, *_OPTIONAL}):
+    if not path.is_file():
+        raise DatasetError(f'{path}: no such camera file; give fr1, fr2, fr3 or a camera.json')
+    fields = Fields.of_file(path)
+    numbers = ('fx', 'fy', 'cx', 'cy')
+    if unknown := sorted(set(fields.values) - {
+            'width', 'height', *numbers, 'distortion_model', 'd'}):
         raise DatasetError(f'{path}: unknown field {unknown[0]!r}')
-    if missing := [name for name in _REQUIRED if name not in values]:
-        raise DatasetError(f'{path}: field {missing[0]!r} is missing')
-
-    def check(name: str, value: Any, kind: Any, what: str) -> Any:
-        if isinstance(value, bool) or not isinstance(value, kind):
-            raise DatasetError(f'{path}: {name} is {value!r}, not {what}')
-        return value
-    width, height = (check(name, values[name], int, 'a number of pixels')
-                     for name in _REQUIRED[:2])
-    fx, fy, cx, cy = (float(check(name, values[name], int | float, 'a number'))
-                      for name in _REQUIRED[2:])
-    model = check('distortion_model', values.get('distortion_model', 'plumb_bob'), str, 'a name')
-    coefficients = check('d', values.get('d', []), list, 'a list of numbers')
-    distortion = tuple(float(check('d', value, int | float, 'a number')) for value in coefficients)
-    try:
-        return Camera(width, height, fx, fy, cx, cy, model, distortion)
-    except CameraError as error:
-        raise DatasetError(f'{path}: {error}') from error
+    return camera_of(str(path), *fields.size('width', 'height'), *map(fields.number, numbers),
+                     fields.text('distortion_model', 'plumb_bob'),
+                     tuple(fields.numbers('d', (-1,), []).tolist()))

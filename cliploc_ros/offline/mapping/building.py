@@ -158,7 +158,7 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     options = options or MappingOptions()
     if options.refine_mount and len(detections.cameras) > 1:
         raise MappingError(f'the mounts of {len(detections.cameras)} cameras cannot be corrected '
-                           'together; correct each with a map of --cameras NAME alone')
+                           'together; correct each with a map of that camera alone')
     tell = progress or (lambda stage, share: None)
     given = make_views(detections, options)
     notes = check_input(detections, given, options)
@@ -191,11 +191,15 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     views, draft, errors, pose_notes = _with_poses(given, odometry, draft, options, rng, tell)
     tell('done', 1.0)
     if len(draft.landmarks.centers) == 0:
-        raise NothingFoundError(
-            _why_none(draft.reasons) if draft.reasons else
-            'no boxes of one class meet in space; check that poses and stamps belong to these '
-            'images, that the poses are of the camera (z forward), and the intrinsics',
-            _left_out(detections, draft))
+        why = ('no boxes of one class meet in space; check that poses and stamps belong to these '
+               'images, that the poses are of the camera (z forward), and the intrinsics')
+        if reasons := draft.reasons:
+            kinds = Counter(reason.partition(':')[0] for reason in reasons)
+            counts = ', '.join(f'{count} {kind}' for kind, count in kinds.most_common())
+            why = (f'no landmark is good enough for a map; {len(reasons)} were left out '
+                   f'({counts}), the first one because: {reasons[0]}. Record while the camera '
+                   'moves past the objects, not only turns, or map images with depth')
+        raise NothingFoundError(why, _left_out(detections, draft))
     built = _finish(detections, given, views, draft, errors, options, notes + pose_notes)
     return replace(built, mount=mount)
 
@@ -296,15 +300,6 @@ def _one_of_each(views: Views, landmarks: Landmarks, options: MappingOptions
         landmarks = found.select(is_shown)
         shown = associate(views, landmarks, options.association_iou)
         landmarks = fit_landmarks(views, landmarks, group_boxes(shown, len(landmarks.centers)))
-
-
-def _why_none(reasons: Sequence[str]) -> str:
-    """Return why no landmark is good enough, the commonest reason first, and what to do."""
-    kinds = Counter(reason.partition(':')[0] for reason in reasons)
-    counts = ', '.join(f'{count} {kind}' for kind, count in kinds.most_common())
-    return (f'no landmark is good enough for a map; {len(reasons)} were left out ({counts}), the '
-            f'first one because: {reasons[0]}. Record while the camera moves past the objects, '
-            'not only turns, or map images with depth')
 
 
 def _with_poses(given: Views, odometry: NDArray[np.float64] | None, draft: _Draft,

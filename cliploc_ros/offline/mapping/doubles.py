@@ -35,9 +35,8 @@ _LEAST_LIFT, _LEAST_SHARE = 1 / 3, 0.15
 _LEAST_STEADY = 0.3
 
 
-def close_pairs(landmarks: Landmarks, max_distance: float = STANDS_IN
-                ) -> list[tuple[int, int, float]]:
-    """Return the pairs nearer than a normalized distance, with it, the nearest first."""
+def close_pairs(landmarks: Landmarks) -> list[tuple[int, int, float]]:
+    """Return the pairs that stand in one another with the normalized distance, nearest first."""
     if len(landmarks.centers) < 2:
         return []
     reach = np.linalg.norm(landmarks.bases, axis=(1, 2))
@@ -46,12 +45,12 @@ def close_pairs(landmarks: Landmarks, max_distance: float = STANDS_IN
     pairs = np.array(sorted({
         (min(first, second), max(first, second)) for first in range(len(reach))
         for second in tree.query_ball_point(landmarks.centers[first],
-                                            2.0 * max_distance * reach[first])
+                                            2.0 * STANDS_IN * reach[first])
         if second != first}), dtype=np.int64).reshape(-1, 2)
     shapes = landmarks.bases @ landmarks.bases.transpose(0, 2, 1)
     distances = normalized_lengths(np.diff(landmarks.centers[pairs], axis=1)[:, 0],
                                    shapes[pairs].sum(axis=1))
-    order = np.argsort(distances, kind='stable')[:np.count_nonzero(distances < max_distance)]
+    order = np.argsort(distances, kind='stable')[:np.count_nonzero(distances < STANDS_IN)]
     return [(*pair, distance) for pair, distance in zip(
         pairs[order].tolist(), distances[order].tolist(), strict=True)]
 

@@ -44,9 +44,7 @@ class Evidence(NamedTuple):
 
     def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> 'Evidence':
         """Return the evidence for some of the landmarks."""
-        return Evidence(self.support[rows], self.viewpoints[rows], self.expected[rows],
-                        self.baseline_deg[rows], self.position_sigma[rows],
-                        self.median_iou[rows], self.last_seen[rows])
+        return self._replace(**{name: column[rows] for name, column in self._asdict().items()})
 
     def details(self, row: int, given: LandmarkDetails) -> LandmarkDetails:
         """Return the details of a landmark in a map with this evidence in place of the given."""
@@ -70,26 +68,19 @@ def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
         distances = np.linalg.norm(offsets, axis=1)
         information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
         accumulate(views, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
+        try:
+            variance = np.linalg.eigvalsh(np.linalg.inv(information)[:3, :3])[-1]
+        except np.linalg.LinAlgError:  # boxes that the image cuts on all sides leave it open
+            variance = np.inf
         columns.append((
             len(rows), len(np.unique(views.viewpoints[frames])),
             is_expected(views, cameras, center, basis, REACH * distances.max()).sum(),
-            widest_angle_deg(offsets / distances[:, None]), _position_sigma(information),
+            widest_angle_deg(offsets / distances[:, None]),
+            # rounding makes what no box restrains negative
+            np.sqrt(variance) if variance > 0.0 else np.inf,
             np.median(ious_with(views, rows, center, basis)), views.stamps_s[frames].max()))
     values = np.array(columns, dtype=np.float64).reshape(-1, 7).T
     return Evidence(*values[:3].astype(np.int64), *values[3:])
-
-
-def _position_sigma(information: NDArray[np.float64]) -> float:
-    """Return the deviation [m] of a centre on its worst axis; inf where its boxes leave it open.
-
-    A box that the image cuts on all sides tells nothing about the centre.
-    """
-    try:
-        variance = np.linalg.eigvalsh(np.linalg.inv(information)[:3, :3])[-1]
-    except np.linalg.LinAlgError:
-        return np.inf
-    # rounding makes what no box restrains negative
-    return float(np.sqrt(variance)) if variance > 0.0 else np.inf
 
 
 def best_ious(views: Views, landmarks: Landmarks) -> NDArray[np.float64]:

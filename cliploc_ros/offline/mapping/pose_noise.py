@@ -22,7 +22,6 @@ from scipy.optimize import minimize
 from scipy.sparse import csr_matrix
 
 from cliploc_ros.core.kernels.compiled import compiled
-from cliploc_ros.offline.mapping.fitting import edge_residual, robust_weight
 from cliploc_ros.offline.mapping.joint import (
     Prior,
     Problem,
@@ -31,8 +30,9 @@ from cliploc_ros.offline.mapping.joint import (
     pose_errors,
     refine_jointly,
 )
-from cliploc_ros.offline.mapping.landmarks import POSE_SIZE, Landmarks, group_boxes, project_box
+from cliploc_ros.offline.mapping.landmarks import POSE_SIZE, Landmarks, group_boxes
 from cliploc_ros.offline.mapping.options import INSTANT_S, PoseErrors
+from cliploc_ros.offline.mapping.systematic import linearize_boxes
 from cliploc_ros.offline.mapping.views import Views
 
 # The estimate uses at most this number of frames and landmarks: more add time, hardly precision.
@@ -142,7 +142,9 @@ def _cost_function(given: Views, refined: Views, landmarks: Landmarks, shown: ND
     errors = pose_errors(given, refined)
     _, equations = problem.linearize(State(refined, landmarks, errors))
     joint = problem.coupling(equations.of_boxes, frames, size).toarray()
-    squares, weights = _sum_squares(refined, rows, shown[rows], landmarks.centers, landmarks.bases)
+    linear = linearize_boxes(refined, rows, shown[rows], landmarks)
+    shares = refined.weights[refined.frames[rows], None] * linear.weights
+    squares, weights = float((shares * linear.residuals ** 2).sum()), float(shares.sum())
 
     def cost(logs: NDArray[np.float64]) -> float:
         sigma_m, sigma_deg, correlation_s, scale = np.exp(logs)
@@ -167,26 +169,6 @@ def _cost_function(given: Views, refined: Views, landmarks: Landmarks, shown: ND
                      - 0.5 * prior.log_determinant())
 
     return cost
-
-
-@compiled
-def _sum_squares(views, rows, landmarks, centers, bases):
-    """Return the sum of the weighted squares of all residuals, and the sum of their weights."""
-    squares, weights, box = 0.0, 0.0, np.empty(4)
-    for place in range(len(rows)):
-        row, landmark = rows[place], landmarks[place]
-        frame = views.frames[row]
-        if not project_box(views.rotations[frame], views.translations[frame], centers[landmark],
-                           bases[landmark], box):
-            continue
-        for edge in range(4):
-            if views.is_open[row, edge]:
-                continue
-            residual = edge_residual(views, row, edge, box)
-            weight = views.weights[frame] * robust_weight(residual)
-            squares += weight * residual * residual
-            weights += weight
-    return squares, weights
 
 
 def left_by_poses(views: Views, changes: NDArray[np.float64], shown: NDArray[np.int64],

@@ -206,29 +206,25 @@ def _move_map(views: Views, motions: NDArray[np.float64]) -> Views:
         translations=np.einsum('fij,fj->fi', turns, views.translations) + motions[:, :3])
 
 
-def _only(camera: int, moved: Views, given: Views) -> Views:
-    """Return the views with what was moved of one camera."""
-    frames = given.cameras == camera
-    boxes = frames[given.frames]
-    return given._replace(**{
-        name: np.where(own.reshape(-1, *[1] * (getattr(given, name).ndim - 1)),
-                       getattr(moved, name), getattr(given, name))
-        for name, own in (('rotations', frames), ('translations', frames), ('edges', boxes),
-                          ('stiffness', boxes))})
-
-
 def _fit(cause: _Cause, camera: int, given: Views, landmarks: Landmarks, rows: NDArray[np.int64],
          numbers: NDArray[np.int64]) -> _Fit:
     """Return the numbers of a cause that fit one camera best."""
     values, views = np.zeros(len(cause.names)), given
     viewpoints = given.viewpoints[given.frames[rows]]
-    own = given.cameras[given.frames[rows]] == camera
+    frames = given.cameras == camera
+    boxes = frames[given.frames]
+    own = boxes[rows]
     linear = linearize_boxes(views, rows, numbers, landmarks)
     cost, own_before = _cost_of(linear), _cost_of(linear, own)
     for _ in range(_STEPS):
         step, deviations = _solve(cause.differentiate(views, rows, linear) * own[:, None, None],
                                   linear, numbers, viewpoints)
-        moved = _only(camera, cause.apply(given, values + step), given)
+        applied = cause.apply(given, values + step)
+        moved = given._replace(**{
+            name: np.where(mine.reshape(-1, *[1] * (getattr(given, name).ndim - 1)),
+                           getattr(applied, name), getattr(given, name))
+            for name, mine in (('rotations', frames), ('translations', frames), ('edges', boxes),
+                               ('stiffness', boxes))})
         refitted = _refit(moved, landmarks, rows, numbers)
         trial = linearize_boxes(moved, rows, numbers, refitted)
         if _cost_of(trial) >= cost:

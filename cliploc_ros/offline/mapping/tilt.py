@@ -14,7 +14,7 @@ _LEAST_UPRIGHT = 0.5
 _MOST_TILT_DEG = 5.0
 #: Why a recording cannot be levelled.
 NO_VERTICAL = ('the cameras do not tell the vertical: they turn too little, or were held on their '
-               'side; leave out --level')
+               'side; leave out `level`')
 
 
 def find_vertical(poses: NDArray[np.float64]) -> NDArray[np.float64] | None:

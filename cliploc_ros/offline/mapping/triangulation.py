@@ -138,7 +138,7 @@ def correct_scale(views: Views, detections: PosedDetections, scales: Sequence[fl
         if not 1.0 / _UNIT_FACTOR < scale < _UNIT_FACTOR:
             raise MappingError(
                 f'measured depth{name} is {1.0 / scale:.3g} times what boxes and poses say: wrong '
-                f'unit? multiply --depth-unit by {scale:.3g}, check the poses are in metres, or '
+                f'unit? multiply `depth_unit` by {scale:.3g}, check the poses are in metres, or '
                 'leave depth out')
         kept[number] = scale
         notes.append(f'measured depth{name} is {1.0 / scale:.3f} times what boxes and poses say; '

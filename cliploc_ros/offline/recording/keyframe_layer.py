@@ -109,7 +109,10 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
     """
     seen = [_look(frame, options) for part in frames.each for frame in _chosen(part, options)]
     images = [one.posed for one in seen]
-    points = [_points(images, row, one.depths) for row, one in enumerate(seen)]
+    # of each keyframe (n, 3), in its own coordinate frame; NaN where unknown
+    points = [np.column_stack([one.posed.bearings, np.ones(len(one.depths))]) * one.depths[:, None]
+              if np.isfinite(one.depths).any() else triangulate(images, row)
+              for row, one in enumerate(seen)]
     # the strongest features that have a point
     kept = [np.nonzero(np.isfinite(found).all(axis=1))[0][:options.most_points]
             for found in points]
@@ -182,15 +185,6 @@ def _small_jpeg(frame: PosedImage) -> bytes:
     _, content = cv2.imencode('.jpg', np.ascontiguousarray(image[..., ::-1]),
                               [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return bytes(content)
-
-
-def _points(images: Sequence[PosedFeatures], row: int, depths: NDArray[np.float64]
-            ) -> NDArray[np.float64]:
-    """Return the points (n, 3) of a keyframe in its own coordinate frame; NaN where unknown."""
-    if np.isfinite(depths).any():
-        bearings = images[row].bearings
-        return np.column_stack([bearings, np.ones(len(bearings))]) * depths[:, None]
-    return triangulate(images, row)
 
 
 def _assemble(landmark_map: LandmarkMap, cameras: Sequence[Camera],

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.depth_image import depths_of_boxes
-from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
@@ -108,7 +107,11 @@ class RunNetworks:
         detections = self.detect(frame.image_rgb).usable(camera.width, camera.height,
                                                          MAX_DETECTIONS)
         detected = time.perf_counter()
-        bboxes, open_edges = _undistorted(detections, camera)
+        bboxes, open_edges = detections.bboxes_xyxy, np.empty((0, 4), dtype=np.bool_)
+        if not camera.is_pinhole:
+            open_edges = at_border(bboxes, np.array([camera.width, camera.height] * 2),
+                                   MappingOptions.border_px)
+            bboxes = camera.bboxes_in_pixels(camera.normalize_bboxes(bboxes))
         rows = np.nonzero((bboxes[:, 2:] > bboxes[:, :2]).all(axis=1))[0]  # never true of NaN
         sound = detections.select(rows)
         embeddings = (np.empty((len(rows), 0)) if self.encoder is None
@@ -125,14 +128,3 @@ class RunNetworks:
             np.array(sound.class_ids, dtype=np.str_), sound.scores,
             embeddings.astype(np.float16), depths, spreads,
             (detected - start) * 1e3, (embedded - detected) * 1e3)
-
-
-def _undistorted(detections: Detections, camera: Camera
-                 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return undistorted boxes (n, 4) [px], and which edges lay at the border of the image."""
-    boxes = detections.bboxes_xyxy
-    if camera.is_pinhole:
-        return boxes, np.empty((0, 4), dtype=np.bool_)
-    is_open = at_border(boxes, np.array([camera.width, camera.height] * 2),
-                        MappingOptions.border_px)
-    return camera.bboxes_in_pixels(camera.normalize_bboxes(boxes)), is_open

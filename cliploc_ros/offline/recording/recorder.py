@@ -13,7 +13,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -190,7 +190,7 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
         except DatasetError as error:
             logger.warning('recording again: %s', error)
     with closing(Log(file.with_name(f'.{file.name}.unfinished'), DatasetError,
-                     'make room or name another file with --record-to, then run again: it goes '
+                     'make room or name another file with `record_to`, then run again: it goes '
                      'on from here', _parse_entry)) as log:
         recorded = _with_odometry(_record(frames, options, described, log), odometry)
         save_recorded(file, recorded)
@@ -236,7 +236,10 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log)
                 if result is not None:
                     log.append({'frame': base64.b64encode(result.to_bytes()).decode()})
                     seen[result.place] = result
-                    _judge_depth(seen, frames.source)
+                    # an implausible unit is refused early, before the work of hours is done
+                    if len(seen) <= _FRAMES_FOR_UNIT:
+                        check_depth_unit(np.concatenate([one.depths for one in seen.values()]),
+                                         str(frames.source))
     except BaseException:
         if seen:
             logger.warning('%d frames are kept in %s: run again to go on from there, or delete it',
@@ -270,13 +273,6 @@ def _read_keyframes(frames: Frames, options: KeyframeOptions
                 return filters[part.camera](place, stamp_ns, pose)
             return part.read_raw(is_wanted)
         yield chain.from_iterable(map(wanted_of, frames.each)), filters
-
-
-def _judge_depth(seen: Mapping[int, SeenFrame], source: Path) -> None:
-    """Refuse an implausible unit of depth early, before the work of hours is done."""
-    depths = [one.depths for one in islice(seen.values(), _FRAMES_FOR_UNIT + 1)]
-    if len(depths) <= _FRAMES_FOR_UNIT:
-        check_depth_unit(np.concatenate(depths), str(source))
 
 
 def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, KeyframeFilter],
@@ -348,14 +344,14 @@ def _camera_of(seen: list[SeenFrame], where: str, images: int, varies: bool) -> 
     """
     if not seen:
         raise DatasetError(f'{where} none of {images} images has a pose; interpolate over wider '
-                           'gaps with --max-gap, or record poses with the images')
+                           'gaps with `max_gap`, or record poses with the images')
     first = seen[0]
     for one in seen:
         if not varies and ((one.image_size != first.image_size).any()
                            or (one.intrinsics != first.intrinsics).any()):
             raise DatasetError(f'{where} the camera changes at {one.stamp_ns / NS_PER_S:.6f}, but '
                                'observations of one name have one camera; name several with '
-                               '--cameras')
+                               '`cameras`')
     check_depth_unit(np.concatenate([one.depths for one in seen]), where.removesuffix(':'))
     return camera_from_numbers(first.image_size, first.intrinsics)
 

@@ -89,7 +89,7 @@ def arrange(shots: Sequence[Shot], where: str) -> tuple[tuple[ImageFile, ...], S
     present = [one for one in shots if beside(one.color) is not None]
     if not present:
         raise DatasetError(f'{where}: none of {len(shots)} images is there' + (
-            f', such as {shots[0].color}; give the folder of the images with --images'
+            f', such as {shots[0].color}; give the folder of the images with `images`'
             if shots else ''))
     seen: set[tuple[Path, int | None]] = set()
     for one in present:

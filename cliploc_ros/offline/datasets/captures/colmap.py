@@ -134,12 +134,16 @@ def _cameras(model: Path) -> Iterator[tuple[int, Camera]]:
     """Yield the cameras of a model by their ids."""
     binary = model / 'cameras.bin'
     if not _has(model, 'bin'):
-        for where, cells in _lines(model / 'cameras.txt', 4):
-            number = _BY_NAME.get(cells[1], -1)
-            values = _numbers(cells[4:], where)
-            yield _integer(cells[0], where), _camera(
-                where, number, cells[1], (_integer(cells[2], where), _integer(cells[3], where)),
-                values)
+        path = model / 'cameras.txt'
+        for line_number, line in enumerate(read_text(path).splitlines(), start=1):
+            where, cells = f'{path}:{line_number}', line.split()
+            if not cells or cells[0].startswith('#'):
+                continue
+            if len(cells) < 4:
+                raise DatasetError(f'{where}: expected 4 values, got {line[:60]!r}')
+            camera_id, width, height = (_parsed(cells[place], int, where) for place in (0, 2, 3))
+            yield camera_id, _camera(where, _BY_NAME.get(cells[1], -1), cells[1], (width, height),
+                                     _numbers(cells[4:], where))
         return
     with _Bytes(binary) as data:
         for place in range(data.count(24)):
@@ -190,7 +194,7 @@ def _text_images(path: Path) -> Iterator[_Posed]:
         if len(cells) != 10:
             raise DatasetError(f'{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, '
                                f'got {line[:60]!r}')
-        yield _posed(cells[9], _integer(cells[8], where), _numbers(cells[1:8], where), where)
+        yield _posed(cells[9], _parsed(cells[8], int, where), _numbers(cells[1:8], where), where)
 
 
 def _posed(name: str, camera_id: int, numbers: Sequence[float], where: str) -> _Posed:
@@ -200,22 +204,8 @@ def _posed(name: str, camera_id: int, numbers: Sequence[float], where: str) -> _
                   None if camera_from_map is None else invert_transform(camera_from_map))
 
 
-def _lines(path: Path, least: int) -> Iterator[tuple[str, list[str]]]:
-    """Yield the cells of each line that is no comment."""
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        cells = line.split()
-        if cells and not cells[0].startswith('#'):
-            if len(cells) < least:
-                raise DatasetError(f'{path}:{number}: expected {least} values, got {line[:60]!r}')
-            yield f'{path}:{number}', cells
-
-
 def _numbers(cells: list[str], where: str) -> tuple[float, ...]:
     return tuple(_parsed(cell, float, where) for cell in cells)
-
-
-def _integer(cell: str, where: str) -> int:
-    return _parsed(cell, int, where)
 
 
 def _parsed[T](cell: str, kind: Callable[[str], T], where: str) -> T:

@@ -64,7 +64,11 @@ def read_nerf(folder: Path, images: Path | None) -> Capture:
         frame = Fields(values, f'{path}: frame {place}')
         both = Fields({**{name: value for name, value in meta.values.items() if name != 'frames'},
                        **frame.values}, frame.where)
-        color = _image(path.parent, frame.text('file_path'), images)
+        name = frame.text('file_path')
+        color = path.parent / name if images is None else images / PurePosixPath(name).name
+        # the original NeRF leaves the ending of an image away
+        color = next((found for end in ('', *_ENDINGS)
+                      if (found := beside(color.with_name(color.name + end))) is not None), color)
         shown = repr([both.values.get(name) for name in _INTRINSICS])
         if shown not in cameras:
             cameras[shown] = _camera(both, color)
@@ -79,13 +83,6 @@ def read_nerf(folder: Path, images: Path | None) -> Capture:
     files, poses = arrange(shots, str(path))
     # depth is in metres, and so are the poses that it goes with
     return Capture(files, poses, 'opengl', is_metric=all(one.depth for one in files))
-
-
-def _image(folder: Path, name: str, images: Path | None) -> Path:
-    """Return the file of an image; the original NeRF leaves its ending away."""
-    path = folder / name if images is None else images / PurePosixPath(name).name
-    return next((found for end in ('', *_ENDINGS)
-                 if (found := beside(path.with_name(path.name + end))) is not None), path)
 
 
 def _camera(values: Fields, image: Path) -> Camera:

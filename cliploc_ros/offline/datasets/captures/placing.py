@@ -112,7 +112,7 @@ def check_axes(files: Sequence[ImageFile], stored: Poses, axes: str, where: Path
     if errors[best] < min(_GOOD_PX, _BETTER * errors[axes]):
         raise DatasetError(f'{where}: the images do not fit the poses as {axes} (median epipolar '
                            f'error {errors[axes]:.1f} px), but do as {best} ({errors[best]:.1f} '
-                           f'px): give --axes {best}')
+                           f'px): give `axes` {best}')
     return (f'the images do not fit the poses: median epipolar error {errors[axes]:.1f} px, '
             f'{errors[best]:.1f} px at best ({best})')
 

@@ -224,7 +224,7 @@ def class_name(names: Sequence[str], index: int) -> str:
     """Return the name of a class; DatasetError: the list of names has no such index."""
     if not 0 <= index < len(names):
         raise DatasetError(f'class index {index} is not among {len(names)} names; name the '
-                           'classes that the map was made with: --class-names FILE')
+                           'classes that the map was made with: `class_names`')
     return names[index]
 
 

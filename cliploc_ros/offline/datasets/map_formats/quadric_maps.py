@@ -37,7 +37,7 @@ from cliploc_ros.offline.datasets.map_formats.given_map import (
 _MAX_ASYMMETRY = 1e-3
 _LEAST_SCALE = 1e-9
 _NOTE = ('a monocular map of OA-SLAM has no metric scale, and its axes are those of the first '
-         'camera: give --scale and --transform')
+         'camera: give its scale and transform')
 _NUMBERS_IN_A_LINE = 18
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _MAX_VARINT_BYTES = 10

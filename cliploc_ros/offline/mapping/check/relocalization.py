@@ -7,7 +7,7 @@ recording. Simulated frames have the errors of the recording's detector.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -198,14 +198,9 @@ class Trial:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the trial as plain values, for JSON."""
-        return {
-            'verdict': self.verdict, 'stamp_s': self.stamp_s, 'by_objects': self.by_objects,
-            'is_judged': self.is_judged,
-            'position': self.position.round(4).tolist(),
-            'forward': self.forward.round(4).tolist(), 'detections': self.detections,
-            'landmarks': self.landmarks,
-            'estimate': None if self.estimate is None else self.estimate.round(4).tolist(),
-            'error_m': self.error_m, 'reason': self.reason}
+        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        return {name: value.round(4).tolist() if isinstance(value, np.ndarray) else value
+                for name, value in values.items()}
 
 
 def simulated(detections: PosedDetections, frame: int, shown: NDArray[np.int64],

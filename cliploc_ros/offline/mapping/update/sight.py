@@ -47,8 +47,7 @@ class Sight(NamedTuple):
 
     def select(self, rows: slice | NDArray[np.int64]) -> 'Sight':
         """Return some of the places."""
-        return Sight(self.expected[rows], self.seen[rows], self.expected_frames[rows],
-                     self.seen_frames[rows])
+        return Sight(*(column[rows] for column in self))
 
 
 def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],

@@ -1,26 +1,42 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The entry point of an update: a map and a new recording of its place in, a new map out."""
+"""The entry point of an update: a map and a new recording of its place in, a new map out.
 
-from dataclasses import dataclass
+Landmarks stay, are fitted again, move, come and go. A landmark keeps its id, labels and classes.
+In its place, it also keeps its ellipsoid, unless the recording knows it better: then the centre
+is the mean of both, each weighted by its inverse variance, and the shape is the new one. A centre
+that differs significantly was nudged: the new one counts alone. An ellipsoid without
+position_sigma was made by hand, and stays.
+"""
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.mapping.building import LeftOut, left_out_lines, rounded
+from cliploc_ros.offline.mapping.doubles import find_doubles
+from cliploc_ros.offline.mapping.evidence import Evidence, gather_evidence
+from cliploc_ros.offline.mapping.landmarks import ellipsoid_numbers, landmarks_of_map, unused_ids
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.pose_noise import estimated_note
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.update.alignment import (
+    LEAST_MOVE_SIGMAS,
     MIN_CONFIRMED,
     Aligned,
     OldMap,
     align,
+    deviations,
     known_landmarks,
 )
 from cliploc_ros.offline.mapping.update.identity import (
+    Fates,
     compare_looks,
     decide_fates,
     renew_embeddings,
@@ -29,12 +45,14 @@ from cliploc_ros.offline.mapping.update.identity import (
 from cliploc_ros.offline.mapping.update.judging import (
     LEAST_VIEWS,
     Judgement,
+    Shown,
     gather_objects,
     judge,
 )
-from cliploc_ros.offline.mapping.update.renewal import UpdateReport, describe, one_of_each, renew
-from cliploc_ros.offline.mapping.views import check_input, make_views, map_from_cameras
+from cliploc_ros.offline.mapping.update.sight import Sight
+from cliploc_ros.offline.mapping.views import Views, check_input, make_views, map_from_cameras
 
+_ROWS_SHOWN = 40
 # A larger offset of the recording's coordinate frame from the map's is noted [m] [deg].
 _LEAST_OFFSET_M, _LEAST_OFFSET_DEG = 0.03, 1.0
 # A recording that confirms a smaller share of the landmarks whose place it shows, or fewer than
@@ -44,6 +62,70 @@ _MIN_CONFIRMED_SHARE = 0.3
 # blocks of TUM fr3 (0.96; 0.45 if the map is off by 10 cm on each axis) and a simulated table of
 # which poses are off by 5 cm and a degree (0.28).
 _MIN_WELL_SHARE = 0.35
+
+
+@dataclass(frozen=True)
+class UpdatedLandmark:
+    """What became of one landmark."""
+
+    landmark_id: str
+    label: str
+    class_id: str
+    center: tuple[float, float, float]  #: Where it is now; where it was if it is missing [m]
+    distance_m: float  #: By how much its centre changed [m]
+    evidence: str  #: Why
+    last_seen: float | None = None  #: [s]; None where unknown
+    rivals: tuple[str, ...] = ()  #: Landmarks that this object could be as well
+
+    def line(self) -> str:
+        """Return it as one line of text."""
+        x, y, z = self.center
+        text = f"{self.landmark_id} '{self.label}' at {x:.2f} {y:.2f} {z:.2f}: {self.evidence}"
+        return text + (f'; or it is {", ".join(self.rivals)}: they look alike'
+                       if self.rivals else '')
+
+
+@dataclass(frozen=True)
+class UpdateReport:
+    """The result of an update in numbers and words."""
+
+    #: Of the recording
+    frames: int
+    viewpoints: int
+    #: How far the recording's coordinate frame was off; it is corrected
+    offset_m: float
+    offset_deg: float
+    #: Root mean square by which the poses changed besides
+    pose_change_m: float
+    pose_change_deg: float
+    confirmed: tuple[UpdatedLandmark, ...]
+    moved: tuple[UpdatedLandmark, ...]
+    missing: tuple[UpdatedLandmark, ...]
+    new: tuple[UpdatedLandmark, ...]
+    not_observed: tuple[UpdatedLandmark, ...]
+    #: Those of not_observed that may have gone: hardly seen where their places were in view
+    doubtful: tuple[UpdatedLandmark, ...]
+    left_out: tuple[LeftOut, ...]  #: New objects that are not good enough for the map
+    notes: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as plain values, for JSON."""
+        return asdict(self)
+
+    def lines(self) -> list[str]:
+        """Return the report as text."""
+        rows = [f'{len(self.confirmed)} confirmed, {len(self.moved)} moved, '
+                f'{len(self.missing)} missing, {len(self.new)} new, '
+                f'{len(self.not_observed)} not observed ({len(self.doubtful)} doubtful); '
+                f'{self.frames} frames of '
+                f'{self.viewpoints} viewpoints']
+        rows += [f'note: {note}' for note in self.notes]
+        for name, found in (('moved', self.moved), ('missing', self.missing),
+                            ('doubtful', self.doubtful), ('new', self.new)):
+            rows += [f'{name}: {one.line()}' for one in found[:_ROWS_SHOWN]]
+            if len(found) > _ROWS_SHOWN:
+                rows.append(f'{name}: and {len(found) - _ROWS_SHOWN} more, see the report')
+        return rows + left_out_lines(self.left_out)
 
 
 @dataclass(frozen=True)
@@ -96,16 +178,16 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     elif embeddings is not None:
         looks = compare_looks(embeddings, old.landmark_ids, detections, objects)
     fates = decide_fates(known, judged, objects, looks)
-    updated = renew(old, known, aligned.views, objects, fates, judged, detections.class_names)
+    updated = _renew(old, known, aligned.views, objects, fates, judged, detections.class_names)
     kept = np.setdiff1d(np.arange(len(old)), fates.missing)
     rows_of = np.full(len(objects.owners) + 1, -1, dtype=np.int64)
     has_object = fates.objects[kept] >= 0
     rows_of[fates.objects[kept][has_object]] = np.nonzero(has_object)[0]
     rows_of[fates.new] = len(kept) + np.arange(len(fates.new))
-    without_doubles, shown, first_new, joined = one_of_each(
+    without_doubles, shown, first_new, joined = _one_of_each(
         updated, aligned.views, rows_of[objects.shown], len(kept), detections.class_names)
     notes += _notes(old, known, aligned, detections) + joined
-    lists = describe(old, updated, objects, fates, judged)
+    lists = _describe(old, updated, objects, fates, judged)
     lists['new'] = tuple(one for one in lists['new']
                          if one.landmark_id in without_doubles.landmark_ids)
     report = UpdateReport(
@@ -129,7 +211,7 @@ def _check_belongs(judged: Judgement, well_share: float) -> None:
         raise MappingError(
             f'the recording does not belong to this map: of {in_view} landmarks in view, {there} '
             f'are where the map says, and {well_share:.0%} of their boxes fit; check the map, the '
-            'coordinate frame of the poses and the detector, give --pose-noise if the poses have '
+            'coordinate frame of the poses and the detector, give `pose_noise` if the poses have '
             'errors, or build a new map')
 
 
@@ -151,3 +233,156 @@ def _notes(old: LandmarkMap, known: OldMap, aligned: Aligned, detections: PosedD
         notes.append(f'the recording ends at {detections.stamps_s[-1]:.0f} s, before the map was '
                      f'last seen at {last_seen:.0f} s: an older recording, or another clock')
     return notes
+
+
+def _renew(old: LandmarkMap, known: OldMap, views: Views, objects: Shown, fates: Fates,
+          judged: Judgement, class_names: tuple[str, ...]) -> LandmarkMap:
+    """Return the new map: the old landmarks that are left, in their order, then new ones.
+
+    The class names are those of the recording; the views have its poses in the map.
+    """
+    evidence = gather_evidence(views, objects.landmarks, objects.shown)
+    centers, details = old.centers.copy(), list(known.details)
+    semi_axes, quats = old.semi_axes.copy(), old.quats_xyzw.copy()
+    new_axes, new_quats = ellipsoid_numbers(objects.landmarks.bases)
+    for row in fates.confirmed:
+        number = fates.objects[row]
+        one = _looked_for(details[row], objects.sight, number)
+        details[row] = replace(
+            one, baseline_deg=max(one.baseline_deg or 0.0, float(evidence.baseline_deg[number])),
+            last_seen=max(one.last_seen or 0.0, float(evidence.last_seen[number])))
+    for row in fates.moved:
+        details[row] = _in_new_place(details[row], objects.sight, evidence, fates.objects[row])
+    for row in fates.not_observed[judged.is_doubtful[fates.not_observed]].tolist():
+        details[row] = _looked_for(details[row], judged.sight, row)
+    placed = dict.fromkeys(fates.moved.tolist(), 1.0) | _refitted(known, objects, fates)
+    for row, weight in placed.items():
+        number = fates.objects[row]
+        centers[row] += weight * (objects.landmarks.centers[number] - centers[row])
+        semi_axes[row], quats[row] = new_axes[number], new_quats[number]
+        if row not in fates.moved:
+            sigma = objects.refits.sigmas[number]
+            details[row] = replace(details[row], position_sigma=float(
+                sigma if weight == 1.0 else np.sqrt(weight) * sigma))
+    kept = np.setdiff1d(np.arange(len(old)), fates.missing)
+    names = tuple(class_names[number] for number in objects.landmarks.classes[fates.new])
+    every = [details[row] for row in kept] + [
+        _in_new_place(objects.given[number], objects.sight, evidence, number)
+        for number in fates.new]
+    return LandmarkMap(
+        old.frame_id,
+        tuple(old.landmark_ids[row] for row in kept) + unused_ids(names, old.landmark_ids),
+        tuple(old.labels[row] for row in kept) + names,
+        tuple(old.class_ids[row] for row in kept) + names,
+        np.concatenate([centers[kept], objects.landmarks.centers[fates.new]]),
+        np.concatenate([semi_axes[kept], new_axes[fates.new]]),
+        np.concatenate([quats[kept], new_quats[fates.new]]),
+        tuple(every) if any(one != LandmarkDetails() for one in every) else ())
+
+
+def _one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], first_new: int,
+                class_names: tuple[str, ...]
+                ) -> tuple[LandmarkMap, NDArray[np.int64], int, list[str]]:
+    """Return the new map in which landmarks that are one thing by the recording are one.
+
+    The older landmark keeps its id and gets the labels and classes of the other; the ellipsoid is
+    that with more boxes. Two old landmarks stay if the recording shows only one of them.
+
+    Returns the map, the landmark that each box shows (n,), the row of the first new landmark, and
+    notes.
+    """
+    into, counts = np.arange(len(updated)), np.bincount(shown[shown >= 0], minlength=len(updated))
+    shapes, notes = into.copy(), []
+    for first, second in find_doubles(views, landmarks_of_map(updated, class_names), shown):
+        if (into[[first, second]] == (first, second)).all() and (
+                second >= first_new or counts[[first, second]].all()):
+            into[into == second] = first
+            if counts[shapes[second]] > counts[shapes[first]]:
+                shapes[first] = shapes[second]
+            ids = updated.landmark_ids
+            notes.append(f'{ids[second]} is one thing with {ids[first]}, which has its classes')
+    if not notes:
+        return updated, shown, first_new, notes
+    joined, kept = updated.joined(into), np.unique(into)
+    numbers = np.append(np.searchsorted(kept, into), -1)
+    return replace(
+        joined, centers=updated.centers[shapes], semi_axes=updated.semi_axes[shapes],
+        quats_xyzw=updated.quats_xyzw[shapes],
+        details=tuple(replace(joined.details[shape], labels=one.labels,
+                              class_weights=one.class_weights)
+                      for shape, one in zip(shapes, joined.details, strict=True))
+    ).select(kept.tolist()), numbers[shown], int(np.sum(kept < first_new)), notes
+
+
+def _refitted(known: OldMap, objects: Shown, fates: Fates) -> dict[int, float]:
+    """Return the weight of the new centre for the confirmed landmarks that are fitted again."""
+    rows = np.array([row for row in fates.confirmed
+                     if known.details[row].position_sigma is not None
+                     and objects.refits.is_known[fates.objects[row]]], dtype=np.int64)
+    refits, old_sigmas = objects.refits.select(fates.objects[rows]), known.sigmas[rows]
+    nudged = deviations(known.landmarks.select(rows), old_sigmas, refits
+                        ) > LEAST_MOVE_SIGMAS
+    weights = np.where(nudged, 1.0, old_sigmas ** 2 / (old_sigmas ** 2 + refits.sigmas ** 2))
+    better = nudged | (refits.sigmas < old_sigmas)
+    return dict(zip(rows[better].tolist(), weights[better].tolist(), strict=True))
+
+
+def _looked_for(details: LandmarkDetails, sight: Sight, number: int) -> LandmarkDetails:
+    """Return what is known of a landmark with the frames that should have shown it, too."""
+    support, expected = details.support or 0, int(sight.expected_frames[number])
+    if support and details.seen_ratio:
+        expected += round(support / details.seen_ratio)
+    support += int(sight.seen_frames[number])
+    return replace(details, support=support, seen_ratio=min(1.0, support / max(1, expected)))
+
+
+def _in_new_place(details: LandmarkDetails, sight: Sight, evidence: Evidence, number: int
+                  ) -> LandmarkDetails:
+    """Return what is known of a landmark in a new place: what the recording says."""
+    return replace(evidence.details(number, details),
+                   seen_ratio=float(min(1.0, sight.seen_ratio[number])),
+                   last_seen=max(0.0, float(evidence.last_seen[number])))
+
+
+def _describe(old: LandmarkMap, updated: LandmarkMap, objects: Shown, fates: Fates,
+             judged: Judgement) -> dict[str, tuple[UpdatedLandmark, ...]]:
+    """Return the lists of an UpdateReport."""
+    places = dict(zip(updated.landmark_ids, range(len(updated)), strict=True))
+
+    def seen_in(sight: Sight, number: int) -> str:
+        return f'expected in {sight.expected_frames[number]} frames, seen in ' \
+               f'{sight.seen_frames[number]}'
+
+    def item(row: int, evidence: str) -> UpdatedLandmark:
+        """Return one landmark of the old map."""
+        name, center = old.landmark_ids[row], old.centers[row]
+        now = updated.centers[places[name]] if name in places else center
+        rivals = fates.rivals.get(int(fates.objects[row]), ()) if row in fates.moved else ()
+        return UpdatedLandmark(name, old.labels[row], old.class_ids[row], rounded(now),
+                               round(float(np.linalg.norm(now - center)), 3), evidence,
+                               old.details[row].last_seen if old.details else None,
+                               tuple(old.landmark_ids[rival] for rival in rivals))
+
+    def moved(row: int) -> str:
+        number = fates.objects[row]
+        way = float(np.linalg.norm(objects.landmarks.centers[number] - old.centers[row]))
+        left = ('an object of another look is in its old place' if judged.is_there[row]
+                else f'old place {seen_in(judged.sight, row)}')
+        return (f'moved by {way:.2f} m: {left}; new place seen in '
+                f'{objects.sight.seen_frames[number]} of {objects.sight.expected_frames[number]}')
+
+    return {
+        'confirmed': tuple(item(row, seen_in(objects.sight, fates.objects[row]))
+                           for row in fates.confirmed),
+        'moved': tuple(item(row, moved(row)) for row in fates.moved),
+        'missing': tuple(item(row, seen_in(judged.sight, row)) for row in fates.missing),
+        'not_observed': tuple(item(row, seen_in(judged.sight, row))
+                              for row in fates.not_observed),
+        'doubtful': tuple(item(row, f'{seen_in(judged.sight, row)}: it stays; delete it if it is '
+                               'not there')
+                          for row in fates.not_observed if judged.is_doubtful[row]),
+        'new': tuple(UpdatedLandmark(
+            updated.landmark_ids[place], updated.labels[place], updated.class_ids[place],
+            rounded(updated.centers[place]), 0.0, seen_in(objects.sight, number),
+            updated.details[place].last_seen)
+            for place, number in enumerate(fates.new, len(updated) - len(fates.new)))}
