@@ -90,8 +90,8 @@ def case_arrays(case: Case) -> Arrays:
         images += [cv2.imencode('.png', cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].ravel()
                    for image in query.images]
         # embeddings, or where these are unknown, similarities
-        crops += [one.crops if isinstance(one, CropSimilarities) else one
-                  for one in (frame.similarities for frame in query.frames) if one is not None]
+        crops += [one.similarities.crops if isinstance(one.similarities, CropSimilarities)
+                  else one.similarities for one in query.frames if one.similarities is not None]
     about = {'report': case.report, 'queries': [_fields_of(query) for query in case.queries]}
     return {
         # arrays and numbers of NumPy as JSON has them

@@ -196,7 +196,7 @@ def _fit(options: argparse.Namespace) -> None:
     fitted = fit.fit([one.case for one in searched if one.kind in fit.FITTED_KINDS],
                      'depth' if options.depth else '')
     print('\nfitted on all of them, for calibration.yaml, objects:\n' + ', '.join(
-        f'{name}: {value:.3g}' for name, value in fitted.objects._asdict().items()))
+        f'{name}: {value:.3g}' for name, value in fitted.objects.items()))
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

@@ -53,7 +53,7 @@ def test_folders_without_poses_or_images(shots, tmp_path):
     (tmp_path / 'scan.r3d').touch()
     refuses(tmp_path / 'scan.r3d', 'unpack it')
     (tmp_path / 'photos/metadata.yaml').touch()
-    refuses(tmp_path / 'photos', 'give --bag')
+    refuses(tmp_path / 'photos', '`bag`')
     refuses(tmp_path / 'photos', 'no COLMAP model here', FolderOptions(layout='colmap'))
     folder = write_colmap(tmp_path / 'scan', shots)
     shutil.move(folder / 'images', tmp_path / 'moved')
@@ -66,7 +66,7 @@ def test_folders_without_poses_or_images(shots, tmp_path):
 
 
 def test_the_unit_must_be_known(shots, tmp_path):
-    refuses(write_colmap(tmp_path / 'c', shots), '--scale METRES', FolderOptions())
+    refuses(write_colmap(tmp_path / 'c', shots), '`scale`', FolderOptions())
     refuses(tmp_path / 'c', 'named z.jpg',
             FolderOptions(known_distance=('z.jpg', shots[1].path.name, 1.0)))
     name = shots[0].path.name

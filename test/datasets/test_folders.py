@@ -58,7 +58,7 @@ def test_tum_rgbd(tmp_path):
         cv2.imwrite(str(tmp_path / f'rgb/{name}.png'), np.zeros((480, 640, 3), dtype=np.uint8))
     (tmp_path / 'rgb.txt').write_text('1.0 rgb/a.png\n2.0 rgb/b.png\n')
     (tmp_path / 'groundtruth.txt').write_text('1.0 0 0 0 0 0 0 1\n2.0 1 0 0 0 0 0 1\n')
-    with pytest.raises(DatasetError, match='--tum'):
+    with pytest.raises(DatasetError, match='`tum`'):
         rgbd_frames(tmp_path, FolderOptions('fr3'))
     (tmp_path / 'depth.txt').write_text('0.985 depth/a.png\n')
     first, second = rgbd_frames(tmp_path, FolderOptions('fr3')).read()

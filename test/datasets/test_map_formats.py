@@ -178,7 +178,7 @@ def test_what_no_map_can_hold_is_left_out_with_the_reason(tmp_path):
     (read_msgloc, b'{"nodes": [', 'is no JSON'), (read_msgloc, b'[' * 100_000, 'is no JSON'),
     (read_msgloc, json.dumps({'nodes': [msgloc_node(0, [0] * 3, [1] * 3, [0, 0, 0, 1],
                                                     baseline_label={'812.0': [1.0]})]}).encode(),
-     '812.* --class-names'),
+     '812.* `class_names`'),
     (read_goreloc, goreloc_object(0, SPHERE, [(CUP, 1)])[:-1],
      r'byte \d+'),
     (read_goreloc, b'\xff' * 11, 'more than 10 bytes'),

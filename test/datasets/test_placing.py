@@ -59,7 +59,7 @@ def lru_by_pixels(function):
 
 def test_the_option_mends_it(shots, tmp_path):
     folder = write_nerf(tmp_path, [shot._replace(pose=shot.pose @ FLIP) for shot in shots])
-    with pytest.raises(DatasetError, match='--axes opencv'):
+    with pytest.raises(DatasetError, match='`axes` opencv'):
         read_folder(folder, FolderOptions(scale=1.0))
     found = next(read_folder(folder, FolderOptions(scale=1.0, axes='opencv')).read())
     np.testing.assert_allclose(found.map_from_camera, shots[0].pose, atol=1e-9)

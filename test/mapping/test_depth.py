@@ -54,7 +54,7 @@ def test_with_parallax_boxes_decide_and_an_error_of_scale_is_corrected():
 def test_depth_in_another_unit_is_refused(scale, factor):
     table = make_table()
     boxes = see(table, walk_around(frames=30))
-    with pytest.raises(MappingError, match=rf'depth is {factor}.* --depth-unit'):
+    with pytest.raises(MappingError, match=rf'depth is {factor}.* `depth_unit`'):
         build_map(measure_depth(boxes, table, scale=scale))
 
 

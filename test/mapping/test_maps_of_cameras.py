@@ -222,7 +222,7 @@ def test_a_map_is_updated_from_several_cameras():
 
 
 def test_one_mount_is_corrected_at_a_time():
-    with pytest.raises(MappingError, match='--cameras NAME'):
+    with pytest.raises(MappingError, match='2 cameras'):
         build_map(drive('front', 'left')[0], MappingOptions(refine_mount=True))
 
 

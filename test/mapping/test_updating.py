@@ -195,7 +195,7 @@ def test_noisy_poses_with_gaps_are_refined_against_the_map():
     wrong[:, :3, 3] += rng.normal(scale=0.05, size=(len(POSES), 3))
     kept = np.sort(rng.choice(len(POSES), 40, replace=False))
     detections = see(later, POSES, noise_px=2.0).with_poses(wrong).select_frames(kept)
-    with pytest.raises(MappingError, match='--pose-noise'):
+    with pytest.raises(MappingError, match='`pose_noise`'):
         update_map(things, detections)
     joint = update_map(things, detections,
                        MappingOptions(pose_errors=PoseErrors(0.05, 1.0, 0.0)))
