@@ -17,6 +17,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from cliploc_ros.command import not_negative, positive_int, run_command
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -43,7 +44,8 @@ def _fit(options: argparse.Namespace) -> None:
     fitted = fit.fit([one for one in looks if one.kind in FITTED_KINDS])
     print(fit.report(looks, fitted))
     print('\nfor calibration.yaml, watch:\n' + ', '.join(
-        f'{name}: {getattr(fitted.watch, name):.3g}' for name in fit.TERMS))
+        f'{name}: {value:.3g}' for name, value in fitted.watch.items()
+        if value != CALIBRATION.watch[name]))
 
 
 def _judge(options: argparse.Namespace) -> None:

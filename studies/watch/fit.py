@@ -23,8 +23,6 @@ from studies.watch.localizers import (
     turned_camera,
 )
 
-#: Terms of calibration.yaml that are fitted, in the order of LookEvidence.terms.
-TERMS = ('none', 'utility', 'any', 'unexplained', 'missed', 'away', 'turned', 'crowd')
 _IMAGES = 60
 # Shares of objects that changed since the place was mapped, of one world after the other.
 _CHANGED = (0.0, 0.0, 0.2, 0.4)
@@ -76,7 +74,7 @@ def _wrong(right: NDArray[np.float64], poses: NDArray[np.float64], bounds: NDArr
 def fit(looks: Sequence[Look]) -> Calibration:
     """Return the coefficients of maximum likelihood."""
     seen = [one for one in looks if one.evidence.known]
-    terms = np.array([one.evidence.terms for one in seen])
+    terms = np.array([[*one.evidence.terms.values()] for one in seen])
     signs = np.where([one.is_right for one in seen], 1.0, -1.0)
     scale = np.append(1.0, terms[:, 1:].std(axis=0) + 1e-9)
 
@@ -86,9 +84,10 @@ def fit(looks: Sequence[Look]) -> Calibration:
         return (float(np.logaddexp(0.0, -margins).mean() + _RIDGE * coefficients @ coefficients),
                 (terms / scale).T @ pull + 2.0 * _RIDGE * coefficients)
 
-    solved = minimize(loss, np.zeros(len(TERMS)), jac=True, method='L-BFGS-B')
+    names = [*seen[0].evidence.terms]
+    solved = minimize(loss, np.zeros(len(names)), jac=True, method='L-BFGS-B')
     return CALIBRATION._replace(watch=CALIBRATION.watch._replace(
-        **dict(zip(TERMS, map(float, solved.x / scale), strict=True))))
+        **dict(zip(names, map(float, solved.x / scale), strict=True))))
 
 
 def report(looks: Sequence[Look], calibration: Calibration) -> str:

@@ -18,7 +18,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.alignment import align, look_at
 from cliploc_ros.core.watch.belief import Belief
-from cliploc_ros.core.watch.evidence import by_vertical, measure
+from cliploc_ros.core.watch.evidence import LookEvidence, by_vertical, log_odds, measure
 from cliploc_ros.core.watch.expectation import Expected, expect
 from cliploc_ros.core.watch.missing import Missing, _Record
 from cliploc_ros.core.watch.watch import Watch, WatchState
@@ -28,6 +28,15 @@ from cliploc_ros.units import NS_PER_S
 CAMERA = Camera(640, 480, 400.0, 400.0, 320.0, 240.0)
 SIDE_M, COUNT = 6.0, 40
 TERMS = CALIBRATION.watch
+
+
+@pytest.mark.parametrize(('changed', 'sign'), [
+    ({'utility': 6.0}, 1), ({'unexplained': 2}, -1), ({'missed': 2}, -1), ({'away_m': 0.6}, -1),
+    ({'away_deg': 16.0}, -1), ({'crowd': 3.0}, 1)])
+def test_each_sign_of_a_look_counts_for_or_against_the_pose(changed, sign):
+    look = LookEvidence(known=4, matched=2, unexplained=0, utility=1.0, expected=4, missed=0,
+                        away_m=0.0, away_deg=0.0, crowd=0.0)
+    assert sign * (log_odds(look._replace(**changed), True) - log_odds(look, True)) > 0.3
 
 
 @pytest.fixture(scope='module')

@@ -44,11 +44,13 @@ class LookEvidence(NamedTuple):
         return self.known >= _OBJECTS and (has_jumped or self.expected >= _MAPPED)
 
     @property
-    def terms(self) -> tuple[float, ...]:
-        """Return the terms of the model, in the order of calibration.yaml."""
-        return (1.0, min(self.utility, 12.0), float(self.matched > 0), float(self.unexplained),
-                float(self.missed), math.log1p((self.away_m / 0.3) ** 2),
-                math.log1p((self.away_deg / 8.0) ** 2), self.crowd)
+    def terms(self) -> dict[str, float]:
+        """Return the terms of the model by their names in calibration.yaml."""
+        return {
+            'none': 1.0, 'utility': min(self.utility, 12.0), 'any': float(self.matched > 0),
+            'unexplained': float(self.unexplained), 'missed': float(self.missed),
+            'away': math.log1p((self.away_m / 0.3) ** 2),
+            'turned': math.log1p((self.away_deg / 8.0) ** 2), 'crowd': self.crowd}
 
 
 def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
@@ -81,7 +83,7 @@ def log_odds(evidence: LookEvidence, is_full: bool, calibration: Calibration = C
     terms = calibration.watch
     if not evidence.known:
         return 0.0  # something may hide everything
-    found = float(np.dot([*terms.values()][:len(evidence.terms)], evidence.terms))
+    found = sum(terms[name] * value for name, value in evidence.terms.items())
     return min(max(found, terms.least if is_full else terms.least_unsure), terms.most)
 
 
