@@ -94,7 +94,7 @@ def find_labeller(detections: PosedDetections, clip: Callable[[], ClipOptions] |
     words = load_vocabulary(vocabulary)
     try:
         if clip is None:
-            raise ModelError('CLIP does not run')
+            raise ModelError('`no_clip` was given')
         if not _has_embeddings(detections):
             raise ModelError('the observations have no CLIP embeddings that name their encoder; '
                              'record them again with CLIP')

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration, Terms
+from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.acceptance.confidence import Setting, confidences, none_right, utilities
 from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, pose_error
@@ -168,9 +168,9 @@ def fit(cases: Sequence[Case], only: str = '') -> Calibration:
     if only:
         fitted = float((solved.x / scale)[_TERMS.index(only)])
         return CALIBRATION._replace(objects=CALIBRATION.objects._replace(**{only: fitted}))
+    fitted_terms = dict(zip(_TERMS, map(float, solved.x / scale), strict=True))
     return _levelled(cases, CALIBRATION._replace(
-        objects=Terms(zip(CALIBRATION.objects, map(float, [*solved.x / scale, 0.0, 0.0]),
-                          strict=True))))
+        objects=CALIBRATION.objects._replace(**fitted_terms, knee=0.0, slope=0.0)))
 
 
 class _Arrays(NamedTuple):

@@ -57,7 +57,7 @@ def test_folders_without_poses_or_images(shots, tmp_path):
     refuses(tmp_path / 'photos', 'no COLMAP model here', FolderOptions(layout='colmap'))
     folder = write_colmap(tmp_path / 'scan', shots)
     shutil.move(folder / 'images', tmp_path / 'moved')
-    refuses(folder, 'none of 4 .* --images')
+    refuses(folder, 'none of 4 .* `images`')
     found = read_folder(folder, FolderOptions(scale=1.0, images=tmp_path / 'moved'))
     assert found.count == 4
     (tmp_path / 'moved/walk' / shots[0].path.name).unlink()

@@ -228,5 +228,5 @@ def test_labels_are_class_names_where_clip_is_missing(tmp_path):
     assert 'class names' in find_labeller(detections, None).note
     words = Path(tmp_path / 'our.yaml')
     words.write_text('cup: [our cup]')
-    with pytest.raises(ModelError, match='no-clip'):
+    with pytest.raises(ModelError, match='no_clip'):
         find_labeller(detections, None, words)
