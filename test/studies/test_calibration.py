@@ -30,7 +30,7 @@ MADE_BY = CALIBRATION._replace(objects=MADE_FROM)
 def make_cases(rng, count):
     """Frames of up to four hypotheses; one of them, or none, is right as the model has it.
 
-    Maps of 10 to 100 landmarks; every other frame knows the vertical.
+    Maps of 40 to 400 landmarks; every other frame knows the vertical.
     """
     cases = []
     for number in range(count):
@@ -39,7 +39,7 @@ def make_cases(rng, count):
                                                                        (4, 30, 15, 12)),
                                  0.0, float(rng.integers(0, 4)))
                          for _ in range(some))
-        setting = Setting(int(rng.integers(10, 101)), (np.inf, 1.0)[number % 2])
+        setting = Setting(int(rng.integers(40, 401)), (np.inf, 1.0)[number % 2])
         poses = np.tile(np.eye(4), (some, 1, 1))
         poses[:, 0, 3] = 5.0 * np.arange(some)
         chances = confidences(utilities(supports, MADE_BY), poses,
