@@ -89,6 +89,9 @@ class RelocalizerOptions:
         _check_range('max_tilt_deg', self.max_tilt_deg, 0.0, 180.0)
         _check_range('tilt_deviation_deg', self.tilt_deviation_deg, 0.0, 60.0)
         _check_range('vertical_deviation_deg', self.vertical_deviation_deg, 0.01, 45.0)
+        mounts = self.mount_deviation
+        if len(mounts) != 2 or not all(0.0 <= one < math.inf for one in mounts):
+            raise OptionsError(f'mount_deviation: {list(mounts)} must be two numbers, 0 or more')
         _check_range('min_inliers', self.min_inliers, 3, math.inf)
         _check_range('min_confidence', self.min_confidence, 0.0, 1.0)
 

@@ -8,8 +8,9 @@ the same map and options that answers all of them in their order repeats the ans
 
 import json
 import math
+import struct
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import is_rigid
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings, Similarities
 from cliploc_ros.core.observation import Detections, Observation, Region
 from cliploc_ros.core.options import RelocalizerOptions
@@ -64,15 +66,20 @@ class Case:
     @property
     def options(self) -> RelocalizerOptions:
         """Return the options of the case; no clock cuts the search. DatasetError: bad ones."""
-        known = {field.name for field in fields(RelocalizerOptions)}
+        defaults = vars(RelocalizerOptions())
         try:
             given: dict[str, Any] = {
-                name: tuple(value) if isinstance(value, list) else value
-                for name, value in self.report['options'].items() if name in known}
+                name: tuple(map(float, value)) if isinstance(defaults[name], tuple)
+                else type(defaults[name])(value)
+                for name, value in self.report['options'].items() if name in defaults}
             return RelocalizerOptions(**given | {'time_budget_s': math.inf})
-        except (AttributeError, KeyError, TypeError, CliplocError) as error:
+        except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError,
+                CliplocError) as error:
             raise DatasetError(f'the options of this case are broken: {error}') from error
 
+
+# No coordinate, pixel or time of a case is greater.
+_MOST = 1e9
 
 CASE = Schema('case', {
     'about': Field('uint8', ('t',)),  # JSON: report and queries, without what follows
@@ -113,9 +120,11 @@ def read_case(path: Path) -> Case:
         about = json.loads(arrays['about'].tobytes())
         images, crops = _parts(arrays, 'image'), _parts(arrays, 'crop')
         first, *others = (_query_of(one, images, crops) for one in about['queries'])
-        return Case((first, *others), dict(about['report']))
+        report = dict(about['report'])
+        _expect(isinstance(report.get('parameters', {}), dict), 'parameters')
+        return Case((first, *others), report)
     except (ArithmeticError, AttributeError, LookupError, StopIteration, TypeError, ValueError,
-            cv2.error, CliplocError) as error:
+            RecursionError, cv2.error, CliplocError) as error:
         raise CASE.invalid(path, f'is broken: {error!r}') from error
 
 
@@ -138,32 +147,79 @@ def _fields_of(query: Query) -> dict[str, Any]:
 
 def _query_of(about: Mapping[str, Any], images: Iterator[NDArray[np.uint8]],
               crops: Iterator[NDArray[np.float32]]) -> Query:
+    """Return a query; ValueError, or another error of Python: it is broken."""
     frames = tuple(_frame_of(one, crops) for one in about['frames'])
-    decoded = tuple(np.asarray(cv2.cvtColor(cv2.imdecode(
-        next(images), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), dtype=np.uint8)
-        for _ in frames if about['has_images'])
-    cameras = about['cameras']
-    return Query(frames, decoded, about['run'], about['limit'], about['length_s'],
-                 about['by_keyframes'],
-                 None if cameras is None else CameraCheck.of_fields(cameras),
-                 tuple(about['rooms']))
+    decoded = tuple(_decoded(next(images), one.camera) for one in frames if about['has_images'])
+    run, rooms, cameras = about['run'], tuple(map(_count, about['rooms'])), about['cameras']
+    _expect(bool(frames) and (not rooms or frames[-1].compared is not None), 'frames')
+    return Query(frames, decoded, None if run is None else _count(run), _count(about['limit']),
+                 float(_numbers(about['length_s'])), bool(about['by_keyframes']),
+                 None if cameras is None else CameraCheck.of_fields(cameras), rooms)
 
 
 def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) -> Observation:
+    """Return a frame; ValueError, or another error of Python: it is broken."""
     known = dict(about)
+    camera, seen, region = dict(known['camera']), known['detections'], known['region']
+    camera |= {name: _count(camera[name]) for name in ('width', 'height')}
+    camera['distortion'] = tuple(camera['distortion'])
+    boxes = np.reshape(_numbers(seen['bboxes_xyxy'], None), (-1, 4))
+    count, class_ids = len(boxes), tuple(seen['class_ids'])
+    _expect(all(isinstance(one, str) for one in (known['camera_name'], *class_ids)), 'names')
+    _expect(len(class_ids) == count, 'class_ids')
+    poses = [known['odom_from_camera']]
+    if region is not None:
+        poses.append(region['camera_from_body'])
+        region = Region(region['frame_id'], _numbers(region['mean'], 3),
+                        _numbers(region['covariance'], 3, 3), float(region['probability']),
+                        _numbers(region['camera_from_body'], 4, 4))
+    for pose in poses:
+        _expect(pose is None or is_rigid(_numbers(pose, 4, 4)), 'poses')
+    compared = known['compared']
+    if compared is not None:
+        compared = np.array([*map(_count, compared)], dtype=np.int64)
+        _expect(len({*compared.tolist()}) == len(compared), 'compared')
+        _expect(bool((compared < count).all()), 'compared')
     similarities: Similarities | None = None
     if kind := known.pop('crops'):
         rows = next(crops)
+        _expect(len(rows) == (count if compared is None else len(compared)), 'crops')
+        _expect(bool(np.isfinite(rows).all()), 'crops')
         similarities = rows if kind == 'similarities' else CropSimilarities(rows, LabelEmbeddings(
             np.empty((0, rows.shape[1]), np.float32), np.empty(0, np.int64)))
-    camera, seen, region = known['camera'], known['detections'], known['region']
-    return Observation(**known | {
-        name: None if known[name] is None else np.array(known[name])
-        for name in ('up_in_camera', 'odom_from_camera', 'depths', 'depth_deviations')} | {
-        'camera': Camera(**camera | {'distortion': tuple(camera['distortion'])}),
-        'detections': Detections(np.array(seen['bboxes_xyxy'], np.float64).reshape(-1, 4),
-                                 tuple(seen['class_ids']), np.array(seen['scores'], np.float64)),
-        'similarities': similarities,
-        'compared': None if known['compared'] is None else np.array(known['compared'], np.int64),
-        'region': None if region is None else Region(**region | {
-            name: np.array(region[name]) for name in ('mean', 'covariance', 'camera_from_body')})})
+    up, odom, depths, spreads = (None if known[name] is None else _numbers(
+        known[name], *shape, nan=name.startswith('depth')) for name, shape in (
+            ('up_in_camera', (3,)), ('odom_from_camera', (4, 4)), ('depths', (count,)),
+            ('depth_deviations', (count,))))
+    return Observation(
+        Camera(**camera), Detections(boxes, class_ids, _numbers(seen['scores'], count)),
+        similarities, _count(known['stamp_ns']), known['camera_name'], up, odom,
+        float(_numbers(known['odom_way_m'])), compared, depths, spreads, region)
+
+
+def _decoded(image_png: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+    """Return an image (h, w, 3), red first; ValueError: it is none of its camera."""
+    # a small file may declare any size, and decoding takes the memory of it
+    _expect(image_png[16:24].tobytes() == struct.pack('>II', camera.width, camera.height), 'image')
+    image = cv2.imdecode(image_png, cv2.IMREAD_COLOR)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def _numbers(value: Any, *shape: int | None, nan: bool = False) -> NDArray[np.float64]:
+    """Return numbers of a shape; None for any length. ValueError, TypeError: they are no such."""
+    found = np.array(value, dtype=np.float64)
+    if None not in shape:
+        _expect(found.shape == shape, 'the shape of numbers')
+    _expect(bool((np.abs(found[~np.isnan(found)] if nan else found) < _MOST).all()), 'numbers')
+    return found
+
+
+def _count(value: Any) -> int:
+    """Return a whole number, 0 or more; ValueError: it is none."""
+    _expect(isinstance(value, int) and 0 <= value < 2**63, 'whole numbers')
+    return int(value)
+
+
+def _expect(is_right: bool, what: str) -> None:
+    if not is_right:
+        raise ValueError(f'{what} are out of place')

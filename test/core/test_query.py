@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A case of queries repeats its answer bit by bit from its file; broken files are named."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -135,3 +136,35 @@ def test_a_broken_case_is_named(name, change, tmp_path):
     np.savez(tmp_path / 'case.npz', **arrays)
     with pytest.raises(DatasetError, match=r'case\.npz'):
         read_case(tmp_path / 'case.npz')
+
+
+@pytest.mark.parametrize(('name', 'value'), [
+    ('odom_from_camera', [[0.0] * 4] * 4), ('odom_from_camera', [[1e308]]),
+    ('odom_from_camera', {}),
+    ('class_ids', []), ('class_ids', [[]]), ('scores', 'x'), ('bboxes_xyxy', [[1e308] * 4]),
+    ('depths', [1.0]), ('compared', [99]), ('compared', [1, 1]), ('stamp_ns', -1),
+    ('stamp_ns', 2**70), ('width', 10), ('width', 1.5), ('rooms', [1]), ('limit', 'x'),
+    ('length_s', 1e300), ('run', -1), ('frames', []), ('parameters', []), ('cameras', [1])])
+def test_a_case_with_a_wrong_value_is_named(name, value, tmp_path):
+    arrays = dict(case_arrays(Case((replace(query(), run=1),), {'parameters': {}})))
+
+    def put(node):
+        for key, inner in [*node.items()] if isinstance(node, dict) else enumerate(node):
+            if key == name:
+                node[key] = value
+            elif isinstance(inner, dict | list):
+                put(inner)
+    about = json.loads(arrays['about'].tobytes())
+    put(about)
+    arrays['about'] = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
+    np.savez(tmp_path / 'case.npz', **arrays)
+    with pytest.raises(DatasetError, match=r'case\.npz'):
+        read_case(tmp_path / 'case.npz')
+
+
+@pytest.mark.parametrize('wrong', [
+    {'mount_deviation': []}, {'mount_deviation': [None, 1]}, {'height_range_m': [10**400, 1]},
+    {'k': 'x'}, {'min_confidence': {}}, 'options'])
+def test_options_of_a_case_are_checked(wrong):
+    with pytest.raises(DatasetError, match='options'):
+        _ = Case((query(),), {'options': wrong}).options

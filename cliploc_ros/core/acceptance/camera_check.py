@@ -95,6 +95,8 @@ _BEYOND = 0.01
 _LEAST_SHARE = 0.3
 # Of instants, and of objects in all of them; before, nothing is said.
 _LEAST_INSTANTS, _MOST_INSTANTS, _LEAST_OBJECTS = 5, 20, 15
+# No box that was recorded reaches further.
+_FAR = 1e9
 
 
 class CameraLook(NamedTuple):
@@ -329,9 +331,9 @@ class _Record:
             np.array(part, dtype=empty.dtype).reshape(-1, *empty.shape[1:])
             for part, empty in zip(fields[some], Views(), strict=True))
             for some in ('views', 'since'))
-        if not all(np.isfinite(part).all() for part in (
-                record.extent.boxes, *record.views, *record.since)):
-            raise ValueError('values that are not finite')
+        if not (np.abs(record.extent.boxes) < _FAR).all() or not all(
+                np.isfinite(part).all() for part in (*record.views, *record.since)):
+            raise ValueError('values that are not finite, or boxes far away')
         record.by_extent = record.extent.log_odds(record.camera)
         record.odds = record.views.odds(record.by_extent)
         record.by_looks = record.views.odds().log_odds

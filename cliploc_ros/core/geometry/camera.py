@@ -52,8 +52,8 @@ class Camera:
 
     def __post_init__(self) -> None:
         """Refuse values that no camera can have."""
-        if self.width <= 0 or self.height <= 0:
-            raise CameraError(f'image size {self.width}x{self.height} is not positive')
+        if not (0 < self.width < np.inf and 0 < self.height < np.inf):
+            raise CameraError(f'image size {self.width}x{self.height} is not positive and finite')
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
         if not np.all(np.isfinite(intrinsics)) or self.fx <= 0.0 or self.fy <= 0.0:
             raise CameraError(
