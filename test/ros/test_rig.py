@@ -75,6 +75,7 @@ def ask(rig, cameras, late_s, wait, first_s=10.0, patience_s=30.0):
         cameras(first_s + 0.2 * number, late_s)
         asking.join(0.05)
     wait(lambda: not asking.is_alive(), 'a frame', work)
+    assert time.monotonic() - now < patience_s / 2, 'a camera out of step blocked the request'
     return found[0]
 
 

@@ -130,14 +130,15 @@ class Rig:
         with self._changed:  # subscribed until the last camera's frame is there
             for source in sources:
                 source.want(deadline)
-            frame, left_s = None, deadline - time.monotonic()
+            frame, end = None, deadline
             # messages may be lost: the next instant may have all cameras
-            while left_s > 0.0 and not self.main.is_closed and (
-                    frame is None or (frame.left_out and time.monotonic()
-                                      < frame.received_at + _PATIENCE_S)):
+            while not self.main.is_closed and (frame is None or frame.left_out) and (
+                    left_s := end - time.monotonic()) > 0.0:
                 self._changed.wait(min(left_s, _CHECK_PERIOD_S))
                 self._pass_on()
-                frame, left_s = self._fullest(self._passed, after), deadline - time.monotonic()
+                frame = self._fullest(self._passed, after)
+                if frame is not None:  # of those that follow one another none lasts
+                    end = min(end, frame.received_at + _PATIENCE_S)
             if frame is None:  # the others of an instant cannot come in time
                 frame = self._fullest((one.frames for one in self._pending), after)
             why = '' if frame else '; '.join(one.why_none(after) for one in sources)
