@@ -96,7 +96,7 @@ def run_tasks(make_work: MakeWork, tasks: Iterable[Any], *, workers: int = 1, sc
         yield from _stream(pool, iter(tasks), pool.most, again)
         if again:
             logger.warning('workers died; %d tasks run again', len(again))
-        # a cluster blames all tasks that were at a dead worker, not only the one that killed
+        # a cluster blames every task of a dead worker, whichever of them killed it
         yield from _stream(pool, iter(again), 1, given_up)
     for task in given_up:
         logger.warning('left out: workers died again and again at %.200s', task)

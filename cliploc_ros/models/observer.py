@@ -55,9 +55,9 @@ class CropMemory:
 
     def recall(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
                ) -> dict[int, NDArray[np.float32]]:
-        """Return the embedding of each box, by its row, whose crop has not changed.
+        """Return the embeddings of the boxes whose crops have not changed, by their rows.
 
-        A crop is compared with the one that was embedded, so slow changes do not add up. Each box
+        Each crop is compared with the embedded crop, so slow changes do not add up. Each box
         (n, 4) overlaps the image (h, w, 3) uint8.
         """
         if not self._known:

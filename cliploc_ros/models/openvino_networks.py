@@ -53,7 +53,7 @@ class Conversion(NamedTuple):
     """A network that was converted."""
 
     network: Any
-    #: An input of another shape than the one that the network was traced with
+    #: An input; its shape is not the shape that the network was traced with
     probe: NDArray[Any]
     expected: NDArray[np.float32]  #: What PyTorch makes of the probe
     about: dict[str, Any]  #: What else the user of the network needs, as JSON
@@ -71,8 +71,8 @@ class Network:
                  arrays: Mapping[str, NDArray[Any]] = MappingProxyType({})) -> None:
         self.about = about
         self.arrays = arrays
-        # Threads that are pinned to cores wait there for other processes; as many as PyTorch uses
-        # keep to its limits.
+        # A pinned thread waits for other processes on its core. The number of threads is that of
+        # PyTorch, whose limits apply here, too.
         settings = {'PERFORMANCE_HINT': 'LATENCY', 'NUM_STREAMS': 1, 'ENABLE_CPU_PINNING': False,
                     'INFERENCE_NUM_THREADS': count_threads()}
         if precision is not None:

@@ -74,6 +74,7 @@ def children_cpu_s():
     return used.ru_utime + used.ru_stime
 
 
+@pytest.mark.full
 def test_the_papers_table_on_real_queries(shared_data, tmp_path):
     office = shared_data / 'tum_fr3_office'
     start, used_s = time.monotonic(), children_cpu_s()
@@ -204,8 +205,8 @@ def test_a_map_of_the_same_images_is_noted(walk, evaluated_bag, evaluate_here):
     own = walk / 'own.yaml'
     shutil.copy(ASSETS / 'map.yaml', own)
     cache, = walk.glob('bag.cliploc-*.npz')
-    given = ('--no-clip', '--model', ASSETS / 'yolo.pt', '--map', own, '--methods', 'class_bf',
-             '--trials', 1, '--no-figures')
+    given = ('--no-clip', '--model', ASSETS / 'yolo.pt', '--map', own, '--methods',
+             'class_ransac', '--trials', 1, '--no-figures')
     for source, is_noted in (('bag', True), ('tum', False)):
         save_recording(own, MapRecording(cache, walk / source))
         done = evaluate_here('--bag', walk / 'bag', *given, '--out', walk / f'on_{source}')

@@ -341,8 +341,7 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
                               compared.poses[~compared.leading])
     turned = turned_about_axis(joined.landmark_map, best.pose, best.landmarks)
     found = np.concatenate([twins, turned])
-    none = np.zeros(len(turned))
-    rooms, shares = np.append(alike.are_rooms, none > 0.0), np.append(alike.shares, none)
+    rooms = np.append(alike.are_rooms, np.zeros(len(turned), dtype=np.bool_))
     inside = np.nonzero((low <= found[:, 2, 3]) & (found[:, 2, 3] <= high))[0]
     places = [refined(joined, unrefined(found[row])) for row in inside]
     poses = np.array([best.pose, *(one.map_from_camera for one in places)])
@@ -357,11 +356,11 @@ def _distinct(joined: JoinedFrames, compared: Comparison, recognizer: ImageRecog
     rivals = contenders_of(joined, [places[row - 1] for row in others], [True] * len(others))
     leads = _leads_of_points(compared, poses[others], rooms[rows], recognizer)
     for number, (rival, row) in enumerate(zip(rivals, rows, strict=True)):
-        # as much as if the search had met it, see confidences
-        by_objects = (1.0 + CALIBRATION.objects.slope) * (best.odds - rival.odds)
         if row < len(twins):
-            by_objects = lead_over_twin(best.support, rival.support, float(shares[row]),
+            by_objects = lead_over_twin(best.support, rival.support, float(alike.shares[row]),
                                         bool(rooms[row]))
+        else:  # as much as if the search had met it, see confidences
+            by_objects = (1.0 + CALIBRATION.objects.slope) * (best.odds - rival.odds)
         leads[number] += best.prior - rival.prior + by_objects
     chance = float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum()))
     return chance, place_of(joined.landmark_map, poses[others][int(np.argmin(leads))])

@@ -282,7 +282,7 @@ def _settle(views: Views, landmarks: Landmarks, options: MappingOptions
 
 def _keep(landmarks: Landmarks, into: NDArray[np.int64], shown: NDArray[np.int64]
           ) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Return the landmarks that are no part of another one, and the one that each box shows."""
+    """Return the landmarks that are no part of another, and the landmark of each box."""
     is_kept = into == np.arange(len(into))
     numbers = np.append((np.cumsum(is_kept) - 1)[into], -1)
     return landmarks.select(is_kept), numbers[shown]
@@ -290,7 +290,7 @@ def _keep(landmarks: Landmarks, into: NDArray[np.int64], shown: NDArray[np.int64
 
 def _one_of_each(views: Views, landmarks: Landmarks, options: MappingOptions
                  ) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Return landmarks without doubles, fitted to their boxes, and the one that each box shows."""
+    """Return landmarks without doubles, fitted to their boxes, and the landmark of each box."""
     while True:
         shown = associate(views, landmarks, options.association_iou)
         found, of_found = _keep(*resolve_doubles(views, landmarks, shown, options), shown)

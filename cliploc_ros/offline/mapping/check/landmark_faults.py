@@ -118,7 +118,7 @@ def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views:
 
 def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
                     overlaps: list[Overlap], options: MappingOptions) -> list[LandmarkCheck]:
-    """Return each landmark's check, the worst first; of equal ones, the one that is seen least.
+    """Return each landmark's check, the worst first; among equals, the least seen first.
 
     Without a recording, support comes from the map's own fields. The options have the limits.
     """
