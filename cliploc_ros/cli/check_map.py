@@ -25,7 +25,7 @@ from cliploc_ros.command import (
     within,
 )
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.errors import CliplocError
+from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.units import NS_PER_S
 
@@ -184,6 +184,8 @@ def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Imag
     elif recording is not None:
         print(f'observations: {os.path.relpath(recording.observations)}', flush=True)
         detections, source = recording.load(), None
+    elif options.images is not None:
+        raise OptionsError('--images needs --observations: no recording is known of this map')
     else:
         print('no recording is known of this map: the check is of the map alone, and simulated; '
               'give --observations', flush=True)

@@ -52,6 +52,7 @@ def test_a_doubled_map_fails(check_map, tmp_path):
 @pytest.mark.parametrize(('args', 'named'), [
     (('{folder}/missing.yaml', '--out', '{folder}/out'), 'missing.yaml'),
     (('{room}', '--observations', '{room}', '--out', '{folder}/out'), 'npz'),
+    (('{room}', '--images', '{folder}', '--out', '{folder}/out'), '--observations'),
     (('{room}', '--queries', '{folder}/gone.npz', '--out', '{folder}/out'), 'gone.npz')])
 def test_what_to_correct_is_named(check_map, room_file, tmp_path, args, named):
     done = check_map(*(one.format(folder=tmp_path, room=room_file) for one in args))
