@@ -7,6 +7,8 @@ import importlib.machinery
 import importlib.util
 import json
 import re
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -70,6 +72,13 @@ def test_commands_run_what_there_is(path):
         assert (PROJECT / test).is_file(), test
     for script in re.findall(r'\bscript/([\w.-]+)', text):
         assert (PROJECT / 'script' / script).exists(), script
+
+
+def test_what_draws_the_figures_starts():
+    """No other test imports it, so a name that moves would break it unseen."""
+    done = subprocess.run([sys.executable, PROJECT / 'script/draw_figures', '--help'],
+                          capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_tests_of_the_capabilities_exist():
