@@ -21,6 +21,7 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.offline.recording.keyframe_layer import learn_words
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+#: Looks along the map's z axis, not level: turn room and pose first where a vertical matters.
 MAP_FROM_CAMERA = transform_from_pose(np.array([0.3, -0.2, -0.5]),
                                       np.array([0.02, -0.05, 0.03, 0.99794]))
 

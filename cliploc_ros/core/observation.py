@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One frame of the camera: its detections, and how similar they are to each label."""
+"""One frame of the camera, and what is known at its stamp.
+
+Detections and how similar they are to each label, depth, vertical, odometry, and where the robot
+probably is.
+"""
 
 from dataclasses import dataclass, field
 

@@ -31,7 +31,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
-from cliploc_ros.core.search.scene import Prior
+from cliploc_ros.core.search.scene import Constraint
 from cliploc_ros.files.storage import make_folder, write_file
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
@@ -101,7 +101,8 @@ class StoredRecognizer(ImageRecognizer):
         super().__init__(keyframes, _NO_FEATURES, camera)
         self._seen = seen
 
-    def recognize(self, guesses: Sequence[Floats], prior: Prior = NOTHING_KNOWN) -> Recognition:
+    def recognize(self, guesses: Sequence[Floats], constraint: Constraint = NOTHING_KNOWN
+                  ) -> Recognition:
         """Return what was stored."""
         return self._seen
 

@@ -18,7 +18,7 @@ from cliploc_ros.core.keyframes.features import (
     unit_rows,
 )
 from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, find_pose, free_focal
-from cliploc_ros.core.search.scene import Prior
+from cliploc_ros.core.search.scene import Constraint
 from cliploc_ros.offline.recording.keyframe_layer import PosedFeatures, triangulate
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
@@ -117,20 +117,21 @@ def test_the_place_in_more_parts_of_the_image_leads_before_a_poster_with_more_po
     assert (first.agreed, second.agreed) == (60, 120)
 
 
-def test_a_prior_excludes_by_height_and_tilt_and_tells_how_far_the_vertical_is_off():
+def test_a_constraint_excludes_by_height_and_tilt_and_tells_how_far_the_vertical_is_off():
     def tilted(degrees, height=1.0):
         """Return the pose of a camera that looks along the map's x axis, and leans to the side."""
         level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
         return make_transform(level @ Rotation.from_euler('z', degrees, True).as_matrix(),
                               np.array([5.0, 6.0, height]))
-    prior = Prior(min_height=0.5, max_height=1.5, max_tilt=np.radians(30.0))
-    assert [prior.allows(tilted(0.0, height)) for height in (0.4, 0.6, 1.4, 1.6)] == [
+    constraint = Constraint(min_height=0.5, max_height=1.5, max_tilt=np.radians(30.0))
+    assert [constraint.allows(tilted(0.0, height)) for height in (0.4, 0.6, 1.4, 1.6)] == [
         False, True, True, False]
-    assert [prior.allows(tilted(angle)) for angle in (-31.0, 29.0, 180.0)] == [False, True, False]
-    assert Prior().allows(tilted(180.0, -9.0))
+    assert [constraint.allows(tilted(angle)) for angle in (-31.0, 29.0, 180.0)] == [
+        False, True, False]
+    assert Constraint().allows(tilted(180.0, -9.0))
     covariance = np.diag([1.0, 1.0, 1.0, np.radians(4.0) ** 2, 1.0, 1.0])  # about the x axis
-    assert prior.tilt_error(tilted(20.0), covariance) == 0.0, 'unknown'
-    known = prior._replace(vertical_deviation=np.radians(3.0))
+    assert constraint.tilt_error(tilted(20.0), covariance) == 0.0, 'unknown'
+    known = constraint._replace(vertical_deviation=np.radians(3.0))
     assert known.tilt_error(tilted(20.0), covariance) == pytest.approx(4.0)
     assert known.tilt_error(tilted(-20.0), covariance) == pytest.approx(4.0)
     assert known.tilt_error(tilted(0.0), covariance) == pytest.approx(0.0)

@@ -14,7 +14,7 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from cliploc_ros.core.geometry.ellipse import ellipse_iou, iou_bound
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.search.sampling import compatible_pairs, draw_ransac
-from cliploc_ros.core.search.scene import Prior, make_scene
+from cliploc_ros.core.search.scene import Constraint, make_scene
 from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
 from cliploc_ros.core.search.strategies import (
     Leaders,
@@ -29,7 +29,7 @@ HEIGHT = float(MAP_FROM_CAMERA[:3, 3] @ UP_IN_MAP)
 
 
 def upright(**known):
-    return Prior(tuple(UP_IN_CAMERA), tuple(UP_IN_MAP), **known)
+    return Constraint(tuple(UP_IN_CAMERA), tuple(UP_IN_MAP), **known)
 
 
 @pytest.fixture(scope='module')
@@ -49,10 +49,10 @@ def scene(potential):
 
 
 def test_it_chooses_and_scores_as_the_reference(scene, potential, rng):
-    (candidates, prior, targets, memory, poses, overlaps), compared = set_up(scene), 0
+    (candidates, constraint, targets, memory, poses, overlaps), compared = set_up(scene), 0
     samples = draw_ransac(scene.pairs, 2_000, rng)
     for number, sample in enumerate(samples):
-        which = make_hypothesis(candidates, prior, memory, poses, samples, number, 0.0)
+        which = make_hypothesis(candidates, constraint, memory, poses, samples, number, 0.0)
         expected, total = sample_pose(scene, sample)
         assert (which >= 0) == (expected is not None)
         if expected is None:
@@ -72,10 +72,10 @@ def test_it_chooses_and_scores_as_the_reference(scene, potential, rng):
 
 
 def test_a_least_overlap_drops_what_overlaps_less(scene, rng):
-    (candidates, prior, _, memory, poses, _), dropped = set_up(scene), 0
+    (candidates, constraint, _, memory, poses, _), dropped = set_up(scene), 0
     samples = draw_ransac(scene.pairs, 500, rng)
     for number, sample in enumerate(samples):
-        which = make_hypothesis(candidates, prior, memory, poses, samples, number, 1.0)
+        which = make_hypothesis(candidates, constraint, memory, poses, samples, number, 1.0)
         expected, total = sample_pose(scene, sample)
         assert (which >= 0) == (total >= 1.0)
         if which >= 0:
@@ -109,28 +109,28 @@ def test_leaders_are_those_of_scoring_every_sample(scene, rng):
     assert (samples[leaders.iterations[best] - 1] == leaders.samples[best]).all()
 
 
-@pytest.mark.parametrize(('prior', 'remains'), [
+@pytest.mark.parametrize(('constraint', 'remains'), [
     (upright(min_height=HEIGHT - 0.3, max_height=HEIGHT + 0.3), True),
     (upright(max_tilt=radians(10)), True),
     (upright(min_height=HEIGHT + 0.3), False),
     (upright(max_height=HEIGHT - 0.3), False),
-    (Prior(tuple(-UP_IN_CAMERA), tuple(UP_IN_MAP), max_tilt=radians(10)), False),
+    (Constraint(tuple(-UP_IN_CAMERA), tuple(UP_IN_MAP), max_tilt=radians(10)), False),
 ])
-def test_a_prior_rules_poses_out(scene, prior, remains):
+def test_a_constraint_rules_poses_out(scene, constraint, remains):
     search = (search_exhaustively, lambda *given: search_progressively(
         scene, compatible_pairs(scene), *given[1:]))
     for one in search:
         leaders = Leaders.none_yet()
-        *_, progress = one(scene, leaders, prior)
+        *_, progress = one(scene, leaders, constraint)
         assert progress.coverage == 1.0
         near = False
         for row in leaders.ranked():
             pose = invert_transform(make_transform(leaders.rotations[row],
                                                    leaders.translations[row]))
             height = pose[:3, 3] @ UP_IN_MAP
-            assert prior.min_height <= height <= prior.max_height
-            tilt = (pose[:3, :3] @ np.array(prior.up_in_camera)) @ UP_IN_MAP
-            assert tilt >= np.cos(prior.max_tilt) - 1e-12
+            assert constraint.min_height <= height <= constraint.max_height
+            tilt = (pose[:3, :3] @ np.array(constraint.up_in_camera)) @ UP_IN_MAP
+            assert tilt >= np.cos(constraint.max_tilt) - 1e-12
             near |= pose_error(pose, MAP_FROM_CAMERA)[0] < 0.3
         assert near == remains
 

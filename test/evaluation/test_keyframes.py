@@ -21,7 +21,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.search.frame_search import prior_of
+from cliploc_ros.core.search.frame_search import constraint_of
 from cliploc_ros.core.watch.watch import Watch
 from cliploc_ros.offline.datasets.folders import FolderOptions, rgbd_frames, tum_frames
 from cliploc_ros.offline.datasets.intrinsics import find_camera
@@ -186,7 +186,7 @@ def test_height_and_tilt_exclude_places_and_the_vertical_tells_how_far_they_are_
                                   up_in_camera=None if wrong == 'tilt' else up)
         places = localizer.localize_features(
             query_features(frame.image_rgb), frame.camera,
-            prior=prior_of(observation, options)).places
+            constraint=constraint_of(observation, options)).places
         assert bool(places) == (wrong in ('', 'vertical'))
         assert all((place.tilt_error > 5.0) == (wrong == 'vertical') for place in places)
 

@@ -16,7 +16,7 @@ from disturbed_poses import (
 from walk import look_at, make_table, see, walk_around
 
 from cliploc_ros.offline.mapping.building import build_map
-from cliploc_ros.offline.mapping.joint import Prior, State, pose_bands
+from cliploc_ros.offline.mapping.joint import PosePrior, State, pose_bands
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
 from cliploc_ros.offline.mapping.odometry import link_frames
 from cliploc_ros.offline.mapping.options import MappingOptions, OdometryErrors, PoseErrors
@@ -106,7 +106,7 @@ def test_bands_are_those_of_the_matrix():
     blocks, below = rng.normal(size=(2, frames, 6, 6))
     blocks += blocks.transpose(0, 2, 1)
     below[-1] = 0.0
-    prior = Prior.of(np.arange(5.0), POSE_ERRORS)
+    prior = PosePrior.of(np.arange(5.0), POSE_ERRORS)
     matrix = np.zeros((30, 30))
     for frame in range(frames):
         rows = slice(6 * frame, 6 * frame + 6)

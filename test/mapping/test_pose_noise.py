@@ -10,7 +10,7 @@ from walk import look_at, make_table, nearest_errors, see, walk_around
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.offline.mapping.building import build_map
-from cliploc_ros.offline.mapping.joint import Prior
+from cliploc_ros.offline.mapping.joint import PosePrior
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.pose_noise import (
@@ -78,7 +78,7 @@ def test_too_few_boxes_give_no_estimate():
 
 def test_the_determinant_of_the_prior_is_that_of_its_matrix():
     stamps = np.cumsum(np.random.default_rng(0).uniform(0.1, 2.0, 7))
-    prior = Prior.of(stamps, PoseErrors(0.05, 1.0, 3.0))
+    prior = PosePrior.of(stamps, PoseErrors(0.05, 1.0, 3.0))
     total = 0.0
     for axis in range(6):
         matrix = np.diag(prior.diagonal[:, axis])

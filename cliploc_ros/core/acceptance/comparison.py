@@ -47,7 +47,7 @@ from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, SAME_PLAC
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.map.joined_map import Place, place_of
-from cliploc_ros.core.search.frame_search import coverage_of, prior_of
+from cliploc_ros.core.search.frame_search import constraint_of, coverage_of
 from cliploc_ros.core.search.strategies import MAX_DISTINCT
 
 # The most poses of objects that propose keyframes.
@@ -144,7 +144,7 @@ def compare(joined: JoinedFrames, contenders: list[Contender],
     seen = None
     if recognizer is not None:
         seen = recognizer.recognize([one.pose for one in contenders[:_MOST_GUESSES]],
-                                    prior_of(joined.frames[-1].observation, joined.options))
+                                    constraint_of(joined.frames[-1].observation, joined.options))
         contenders = [one._replace(odds=one.odds + _missed(one.pose, seen, recognizer))
                       for one in contenders]
         contenders += _proposed(joined, seen, contenders)

@@ -77,9 +77,11 @@ class Contender(NamedTuple):
     support: Support  #: By objects
     is_upright: bool  #: Whether it uses the known vertical, or agrees with it
     handicap: float  #: Log odds that its attitude takes from it
-    #: Logarithm of its odds, up to a constant that all contenders share; without the prior
+    #: Logarithm of its odds, up to a constant that all contenders share: the utility of its
+    #: support less the handicap. For poses of keyframes, that of points, objects and handicap.
     odds: float
-    prior: float = 0.0  #: Log odds that a region known before gives it
+    #: Log odds, 0 or less, that a region known before gives it; never steepened
+    prior: float = 0.0
     #: What keyframes show there, where they propose the pose
     recognized: RecognizedPlace | None = None
     #: The odds of a pose that keyframes propose, without what objects say for it

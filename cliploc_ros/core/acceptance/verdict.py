@@ -106,7 +106,7 @@ class Evidence:
     #: Probability that keyframes are wrong which recognize another place only
     uncontradicted: float = 1.0
     recognized: RecognizedPlace | None = None  #: What keyframes show at the pose
-    prior: float = 0.0  #: Log odds that a region known before gives the pose
+    prior: float = 0.0  #: Log odds, 0 or less, that a region known before gives the pose
     #: Confidence of each earlier look in this pose, see cliploc_ros.core.acceptance.looks
     earlier: tuple[float, ...] = ()
     crops_left: int = 0  #: Number of crops that were not compared with labels yet

@@ -16,7 +16,7 @@ from cliploc_ros.core.keyframes.features import Features, extract, match, unit_r
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, agreeing, find_pose, free_focal
-from cliploc_ros.core.search.scene import Prior
+from cliploc_ros.core.search.scene import Constraint
 
 # Most features of a query, and its longest side. At the size of keyframes, features take twice the
 # time at equal success.
@@ -43,7 +43,7 @@ _ITERATIONS, _RIVAL_ITERATIONS = 3000, 1000
 # Points of the inliers and everything near them are removed before a rival is looked for.
 _RIVAL_TOLERANCE = 3.0
 #: Nothing is known of the camera.
-NOTHING_KNOWN = Prior()
+NOTHING_KNOWN = Constraint()
 # Cells of the image (columns, rows). A cell is comparable from so many points of keyframes and
 # features of the image on; an image has half as many features as a keyframe.
 _CELLS = (8, 6)
@@ -87,7 +87,7 @@ class _Look(NamedTuple):
     features: Features
     bearings: NDArray[np.float64]
     camera: Camera
-    prior: Prior = NOTHING_KNOWN
+    constraint: Constraint = NOTHING_KNOWN
 
 
 class _Place(NamedTuple):
@@ -110,7 +110,7 @@ class KeyframeLocalizer:
 
     def localize_features(self, features: Features, camera: Camera,
                           guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
-                          prior: Prior = NOTHING_KNOWN) -> Recognition:
+                          constraint: Constraint = NOTHING_KNOWN) -> Recognition:
         """Find where an image with these features was taken.
 
         Parameters
@@ -121,7 +121,7 @@ class KeyframeLocalizer:
             Poses that objects propose; keyframes near them are matched, too.
         deadline : float
             No further keyframe is matched then (monotonic clock) [s].
-        prior : Prior, optional
+        constraint : Constraint, optional
             Poses that its height range or max_tilt excludes are no places.
         """
         bearings = camera.normalize_points(features.pixels)
@@ -131,7 +131,7 @@ class KeyframeLocalizer:
         if len(features) < LEAST_INLIERS:
             return Recognition()
         descriptors = unit_rows(features.descriptors)
-        look = _Look(features, bearings[known], camera, prior)
+        look = _Look(features, bearings[known], camera, constraint)
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable').tolist()
         chosen = self._choose(ranks, guesses)
         matched = self._match(descriptors, chosen, deadline)
@@ -180,7 +180,7 @@ class KeyframeLocalizer:
         evidence = (*self._confirmed(place, look, used), *_focal(place, look, used))
         return RecognizedPlace(
             pose, covariance, shared, place.agreed, *evidence,
-            look.prior.tilt_error(pose, covariance), tuple(used.tolist()),
+            look.constraint.tilt_error(pose, covariance), tuple(used.tolist()),
             tuple((counts[used] / counts.sum()).tolist()),
             look.features.pixels[place.inliers.features], place.inliers.rows, place.inliers.points)
 
@@ -259,7 +259,7 @@ def _places(first: _Place | None, matched: _Matched, look: _Look) -> list[_Place
     """
     place, found, places = first, 0, list[_Place]()
     while place is not None and (not places or place.agreed >= LEAST_INLIERS):
-        if look.prior.allows(place.map_from_camera):
+        if look.constraint.allows(place.map_from_camera):
             found += 1
             if not any(SAME_ANSWER.agree(place.map_from_camera, one.map_from_camera)
                        for one in places):
@@ -348,8 +348,8 @@ class ImageRecognizer:
         #: Time that it took so far [ms].
         self.spent_ms = 0.0
 
-    def recognize(self, guesses: Sequence[NDArray[np.float64]], prior: Prior = NOTHING_KNOWN
-                  ) -> Recognition:
+    def recognize(self, guesses: Sequence[NDArray[np.float64]],
+                  constraint: Constraint = NOTHING_KNOWN) -> Recognition:
         """Find where the image was taken; again only where guesses propose other keyframes."""
         near = {row for guess in guesses for row in keyframes_near(
             self._keyframes.layer.map_from_camera, guess)[:PROPOSED].tolist()}
@@ -359,7 +359,7 @@ class ImageRecognizer:
             if callable(self._features):
                 self._features = self._features()
             self._known = near, self._keyframes.localize_features(
-                self._features, self._camera, guesses, self._deadline, prior)
+                self._features, self._camera, guesses, self._deadline, constraint)
             self.spent_ms += 1e3 * (time.perf_counter() - begin)
             self._begin_stage('search')
         return self._known[1]

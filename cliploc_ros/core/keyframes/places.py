@@ -33,8 +33,8 @@ class RecognizedPlace(NamedTuple):
     #: The same of the root of its aspect, x to y: a picture that is seen from the side is narrow
     aspect_ratio: float = 1.0
     aspect_deviation: float = np.inf
-    #: Angle off the known vertical in standard deviations, see Prior.tilt_error. It excludes no
-    #: place: the vertical may be wrong, as with a wrong camera mount.
+    #: Angle off the known vertical in standard deviations, see Constraint.tilt_error. It
+    #: excludes no place: the vertical may be wrong, as with a wrong camera mount.
     tilt_error: float = 0.0
     #: Those that points agree with, the most points first, and the share of the points
     keyframes: tuple[int, ...] = ()

@@ -22,7 +22,7 @@ from cliploc_ros.core.search.sampling import (
     draw_prosac,
     draw_ransac,
 )
-from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Prior, Scene
+from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Constraint, Scene
 from cliploc_ros.core.search.strategies import (
     MAX_DISTINCT,
     Leaders,
@@ -88,10 +88,10 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
     leaders = Leaders.none_yet(REFINED if options.refine else MAX_DISTINCT)
     tilted, samples, progress = Leaders.none_yet(), None, Progress(0, 1.0)
     if _has_samples(scene, vertical):
-        prior = prior_of(observation, options)
+        constraint = constraint_of(observation, options)
         if options.algorithm == 'auto':
-            try_all = partial(search_progressively, scene, compatible_pairs(scene), prior=prior,
-                              limit=options.iterations)
+            try_all = partial(search_progressively, scene, compatible_pairs(scene),
+                              constraint=constraint, limit=options.iterations)
             progress = _run(try_all(leaders, size=_sample_size(vertical)), deadline)
             if _is_known(vertical):
                 # The vertical may be wrong, as with a wrong camera mount. Then the pose that the
@@ -99,12 +99,12 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
                 free = _run(try_all(tilted), deadline)
                 progress = progress._replace(tried=progress.tried + free.tried)
         elif options.algorithm == 'bf':
-            progress = _run(search_exhaustively(scene, leaders, prior), deadline)
+            progress = _run(search_exhaustively(scene, leaders, constraint), deadline)
         else:
             draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
             seed = options.random_seed if options.random_seed >= 0 else None
             samples = draw(scene.pairs, options.iterations, np.random.default_rng(seed))
-            progress = _run(search_samples(scene, samples, leaders, prior), deadline)
+            progress = _run(search_samples(scene, samples, leaders, constraint), deadline)
         if left_out:  # the share of all samples that consist of the candidates kept
             kept = comb(len(scene.pairs), SAMPLE_SIZE) / max(
                 comb(len(scene.pairs) + left_out, SAMPLE_SIZE), 1)
@@ -113,11 +113,11 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
                          tuple(part.first for part in parts_of(landmark_map)))
 
 
-def prior_of(observation: Observation, options: RelocalizerOptions) -> Prior:
+def constraint_of(observation: Observation, options: RelocalizerOptions) -> Constraint:
     """Return what is known of the camera of a frame before anything is searched."""
     vertical, (low, high) = vertical_of(observation, options), options.height_range_m
     known = _is_known(vertical)
-    return Prior(tuple(vertical[:3]) if known else _UPRIGHT, _UP_IN_MAP, low, high,
+    return Constraint(tuple(vertical[:3]) if known else _UPRIGHT, _UP_IN_MAP, low, high,
                  np.radians(options.max_tilt_deg), vertical[6] if known else inf)
 
 

@@ -92,8 +92,11 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
                  make_groups(sorted_landmarks, classes, boxes, iou_threshold))
 
 
-class Prior(NamedTuple):
-    """What is known of the camera; by default nothing."""
+class Constraint(NamedTuple):
+    """Vertical and height of the camera, which rule poses out; by default nothing is known.
+
+    Where the robot probably is rules none out, see cliploc_ros.core.acceptance.prior.
+    """
 
     #: The vertical, unit vectors in the camera's optical frame and in the map frame
     up_in_camera: tuple[float, float, float] = (0.0, -1.0, 0.0)

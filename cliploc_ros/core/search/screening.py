@@ -23,7 +23,7 @@ from cliploc_ros.core.geometry.p3p import MAX_SOLUTIONS, p3p
 from cliploc_ros.core.geometry.two_point import two_point
 from cliploc_ros.core.kernels.compiled import ZERO, compiled
 from cliploc_ros.core.map.culling import Groups, project_visible
-from cliploc_ros.core.search.scene import Prior, Scene
+from cliploc_ros.core.search.scene import Constraint, Scene
 
 
 class Targets(NamedTuple):
@@ -79,14 +79,14 @@ class Bench(NamedTuple):
     #: (c, 16): bearing (3,) and box ellipse (4,) of the detection, centre (3,) and shape (6,) of
     #: the landmark of each correspondence candidate
     candidates: NDArray[np.float64]
-    prior: NDArray[np.float64]  #: (9,): see Prior.as_array
+    constraint: NDArray[np.float64]  #: (9,): see Constraint.as_array
     targets: Targets
     sample: Sample
     poses: Poses  #: Those that the sample allows
     overlaps: Overlaps
 
 
-def set_up(scene: Scene, prior: Prior | None = None) -> Bench:
+def set_up(scene: Scene, constraint: Constraint | None = None) -> Bench:
     """Return the bench of a scene."""
     detections, landmarks = scene.pairs[:, 0], scene.pairs[:, 1]
     candidates = np.concatenate([scene.bearings[detections], scene.box_ellipses[detections],
@@ -98,8 +98,8 @@ def set_up(scene: Scene, prior: Prior | None = None) -> Bench:
                       potential.detections, scene.sorted_landmarks.landmarks, scene.groups)
     sample = Sample(np.empty((3, 3)), np.empty((3, 4)), np.empty((3, 9)),
                     np.empty((3 * MAX_SOLUTIONS, 6)), np.empty(MAX_SOLUTIONS))
-    return Bench(candidates, (prior or Prior()).as_array(), targets, sample, Poses.allocate(),
-                 _overlaps(targets))
+    return Bench(candidates, (constraint or Constraint()).as_array(), targets, sample,
+                 Poses.allocate(), _overlaps(targets))
 
 
 def _overlaps(targets: Targets) -> Overlaps:
@@ -116,12 +116,12 @@ def _overlaps(targets: Targets) -> Overlaps:
 
 
 @compiled
-def make_hypothesis(candidates, prior, sample, poses, samples, number, least_iou):
+def make_hypothesis(candidates, constraint, sample, poses, samples, number, least_iou):
     """Write the poses of one of some samples; return which of them to verify, or -1.
 
     Parameters
     ----------
-    candidates, prior, sample, poses
+    candidates, constraint, sample, poses
         Of the bench. A bench as a whole is slow to pass: its arrays are counted at each call.
     samples : ndarray (t, 3) of int
         Three candidates, or two and -1.
@@ -133,9 +133,9 @@ def make_hypothesis(candidates, prior, sample, poses, samples, number, least_iou
     if size == 3:
         count = p3p(sample.bearings, sample.landmarks, poses.rotations, poses.translations)
     else:
-        count = two_point(sample.bearings, sample.landmarks, prior, poses.rotations,
+        count = two_point(sample.bearings, sample.landmarks, constraint, poses.rotations,
                           poses.translations)
-    return _choose_pose(prior, sample, size, poses, count, least_iou)
+    return _choose_pose(constraint, sample, size, poses, count, least_iou)
 
 
 @compiled
@@ -152,17 +152,17 @@ def _load(candidates, samples, number, size, sample):
 
 
 @compiled
-def _choose_pose(prior, sample, size, poses, count, least_iou):
+def _choose_pose(constraint, sample, size, poses, count, least_iou):
     """Return the pose with the greatest sum of IoUs over the sampled pairs; -1 if there is none.
 
-    A pose must have all sampled ellipsoids wholly in front of it, agree with the prior, and reach
-    the least sum.
+    A pose must have all sampled ellipsoids wholly in front of it, agree with the constraint,
+    and reach the least sum.
     """
     boxes, outlines, uppers = sample.boxes, sample.outlines, sample.uppers
     visible, last = 0, -1
     for which in range(count):
         uppers[which] = -1.0
-        if _agrees(prior, poses, which):
+        if _agrees(constraint, poses, which):
             project(sample.landmarks, ZERO, size, poses, which, outlines, 3 * which)
             uppers[which] = _sampled_bound(boxes, size, outlines, 3 * which)
         if uppers[which] >= least_iou:
@@ -186,15 +186,15 @@ def _choose_pose(prior, sample, size, poses, count, least_iou):
 
 
 @compiled
-def _agrees(prior, poses, which):
+def _agrees(constraint, poses, which):
     """Return whether a pose agrees with the known vertical and range of heights."""
     rotations, translations, height, cosine = poses.rotations, poses.translations, 0.0, 0.0
     for axis in range(3):
-        up = (rotations[which, axis, 0] * prior[3] + rotations[which, axis, 1] * prior[4]
-              + rotations[which, axis, 2] * prior[5])
-        cosine += up * prior[axis]
+        up = (rotations[which, axis, 0] * constraint[3] + rotations[which, axis, 1] * constraint[4]
+              + rotations[which, axis, 2] * constraint[5])
+        cosine += up * constraint[axis]
         height -= up * translations[which, axis]
-    return prior[6] <= height <= prior[7] and cosine >= prior[8]
+    return constraint[6] <= height <= constraint[7] and cosine >= constraint[8]
 
 
 @compiled

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which minimal samples a search tries: given ones, all of them, or the likeliest first.
 
-Leaders take the best hypotheses; poses that contradict the prior are not verified. Each search
-yields its progress after each block of samples, and the caller may stop there.
+Leaders take the best hypotheses; poses that contradict the constraint are not verified. Each
+search yields its progress after each block of samples, and the caller may stop there.
 
 Leaders are the best hypotheses of a search, each at a place of its own.
 """
@@ -24,7 +24,7 @@ from cliploc_ros.core.search.sampling import (
     enumerate_compatible_triples,
     enumerate_triples,
 )
-from cliploc_ros.core.search.scene import Prior, Scene
+from cliploc_ros.core.search.scene import Constraint, Scene
 from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
 
 MAX_DISTINCT = 8
@@ -140,7 +140,7 @@ class Progress(NamedTuple):
 
 
 def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
-                   prior: Prior | None = None) -> Iterator[Progress]:
+                   constraint: Constraint | None = None) -> Iterator[Progress]:
     """Try given minimal samples, a block at a time.
 
     Parameters
@@ -148,7 +148,7 @@ def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
     samples : ndarray (t, 3) of int
         Candidate numbers; rows of -1 are skipped.
     """
-    bench = set_up(scene, prior)
+    bench = set_up(scene, constraint)
     tried = 0
     pace, start = _Pace(len(samples)), 0
     while not pace.at_end:
@@ -161,10 +161,10 @@ def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
         yield Progress(tried, start / len(samples))
 
 
-def search_exhaustively(scene: Scene, leaders: Leaders, prior: Prior | None = None
+def search_exhaustively(scene: Scene, leaders: Leaders, constraint: Constraint | None = None
                         ) -> Iterator[Progress]:
     """Try every valid sample, a block at a time, without storing them."""
-    bench = set_up(scene, prior)
+    bench = set_up(scene, constraint)
     count = len(scene.pairs)
     cursor = np.array([0, 1, 2], dtype=np.int64)
     pace, tried = _Pace(), 0
@@ -181,7 +181,7 @@ def search_exhaustively(scene: Scene, leaders: Leaders, prior: Prior | None = No
 
 
 def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: Leaders,
-                         prior: Prior | None = None, limit: float = inf,
+                         constraint: Constraint | None = None, limit: float = inf,
                          size: int = SAMPLE_SIZE) -> Iterator[Progress]:
     """Try every sample of compatible candidates, those of the first candidates first.
 
@@ -193,11 +193,11 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
     compatible : ndarray (c, c) of bool
         See cliploc_ros.core.search.sampling.
     size : int, optional
-        Candidates in a sample: three, or two where the prior's vertical is known (see
+        Candidates in a sample: three, or two where the constraint's vertical is known (see
         cliploc_ros.core.geometry.two_point). With two, the third column of the leaders' samples
         is -1.
     """
-    bench = set_up(scene, prior)
+    bench = set_up(scene, constraint)
     count = len(scene.pairs)
     fill_block, least_iou = _ORDERED[size]
     cursor = np.array([size - 1, *range(size - 1)], dtype=np.int64)  # newest, first, ...
@@ -240,12 +240,12 @@ class _Pace:
 @compiled
 def _try_samples(bench, samples, count, tried_before, least_iou, leaders):
     """Make the hypotheses of the first samples, and remember those that lead."""
-    candidates, prior, targets, sample, poses, overlaps = bench
+    candidates, constraint, targets, sample, poses, overlaps = bench
     floor = worst_score(leaders)
     for number in range(count):
         if samples[number, 0] < 0:
             continue
-        which = make_hypothesis(candidates, prior, sample, poses, samples, number, least_iou)
+        which = make_hypothesis(candidates, constraint, sample, poses, samples, number, least_iou)
         if which < 0:
             continue
         score = verify_beyond(targets, poses, which, overlaps, floor)

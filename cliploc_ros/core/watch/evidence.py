@@ -18,7 +18,7 @@ from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.acceptance.confidence import points_utility, utilities
 from cliploc_ros.core.geometry.transforms import SAME_ANSWER
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
-from cliploc_ros.core.search.frame_search import prior_of
+from cliploc_ros.core.search.frame_search import constraint_of
 from cliploc_ros.core.watch.alignment import Alignment
 from cliploc_ros.core.watch.expectation import Expected, expect
 
@@ -91,7 +91,8 @@ def by_keyframes(recognizer: ImageRecognizer, alignment: Alignment,
                  given: NDArray[np.float64]) -> float:
     """Return the log odds by keyframes that a given pose (4, 4) is right."""
     joined, terms = alignment.joined, CALIBRATION.keyframes
-    seen = recognizer.recognize([given], prior_of(joined.frames[0].observation, joined.options))
+    constraint = constraint_of(joined.frames[0].observation, joined.options)
+    seen = recognizer.recognize([given], constraint)
     here, elsewhere = (max([0.0] + [
         points_utility(one) for one in seen.places
         if SAME_ANSWER.agree(one.map_from_camera, given) == near]) for near in (True, False))

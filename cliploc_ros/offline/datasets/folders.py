@@ -94,6 +94,8 @@ class Layout(NamedTuple):
     #: Returns whether a folder has it, and its images
     is_layout: Callable[[Path], bool]
     read: Callable[[Path, FolderOptions], Capture]
+    #: Which of intrinsics, trajectory, mount and images its reader uses; others are refused
+    takes: tuple[str, ...] = ()
 
 
 def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
@@ -113,12 +115,13 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
                   else 'images alone need poses, as COLMAP makes them')
         raise DatasetError(f'{folder}: has the files of no known layout: '
                            f'{", ".join(sorted({one.name for one in LAYOUTS}))}; {remedy}')
-    if layout.key not in _OPEN and (options.intrinsics or options.trajectory is not None
-                                    or options.body_from_camera is not None):
-        raise DatasetError(f'{folder}: {layout.name} has its own cameras and poses: '
-                           '`intrinsics`, `trajectory` and `mount` are for TUM RGB-D')
-    if options.images is not None and layout.key not in ('colmap', 'nerf'):
-        raise DatasetError(f'{folder}: `images` is for COLMAP and transforms.json')
+    given = {'intrinsics': options.intrinsics, 'trajectory': options.trajectory,
+             'mount': options.body_from_camera, 'images': options.images}
+    for name, value in given.items():
+        if value is not None and name not in layout.takes:
+            able = sorted({one.name for one in LAYOUTS if name in one.takes})
+            raise DatasetError(f'{folder}: {layout.name} takes no `{name}`: it is for '
+                               f'{" and ".join(able)}')
     try:
         return _placed(folder, layout, layout.read(folder, options), options)
     except OSError as error:
@@ -296,11 +299,13 @@ def _check_poses(folder: Path, poses: Poses) -> None:
                            'a `trajectory`')
 
 
+_TUM_TAKES = 'intrinsics', 'trajectory', 'mount'
 #: The first one whose files are there is read. TUM RGB-D without depth only where asked for.
 LAYOUTS = (
-    Layout('rgbd', 'TUM RGB-D', lambda folder: (folder / 'rgb.txt').is_file(), _tum),
+    Layout('rgbd', 'TUM RGB-D', lambda folder: (folder / 'rgb.txt').is_file(), _tum,
+           _TUM_TAKES),
     Layout('7scenes', '7-Scenes', lambda folder: any(folder.glob('frame-*.color.*')),
-           _seven_scenes),
+           _seven_scenes, ('intrinsics',)),
     Layout('polycam', 'Polycam', is_polycam, lambda folder, _: read_polycam(folder)),
     Layout('stray', 'Stray Scanner', is_stray, lambda folder, _: read_stray(folder)),
     Layout('record3d', 'Record3D', is_record3d, lambda folder, _: read_record3d(folder)),
@@ -308,9 +313,8 @@ LAYOUTS = (
            lambda folder, _: read_arkitscenes(folder)),
     Layout('hololens', 'HoloLens 2', is_hololens, lambda folder, _: read_hololens(folder)),
     Layout('nerf', 'transforms.json', is_nerf,
-           lambda folder, options: read_nerf(folder, options.images)),
+           lambda folder, options: read_nerf(folder, options.images), ('images',)),
     Layout('colmap', 'COLMAP model', is_colmap,
-           lambda folder, options: read_colmap(folder, options.images)),
+           lambda folder, options: read_colmap(folder, options.images), ('images',)),
     Layout('tum', 'TUM RGB-D', lambda folder: False,
-           lambda folder, options: _tum(folder, options, with_depth=False)))
-_OPEN = ('rgbd', '7scenes', 'tum')  # layouts that may lack cameras and poses
+           lambda folder, options: _tum(folder, options, with_depth=False), _TUM_TAKES))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refine landmarks and poses together.
 
-A process of errors holds on to the given poses (Prior). Odometry, where there is any, joins
+A process of errors holds on to the given poses (PosePrior). Odometry, where there is any, joins
 successive frames (cliploc_ros.offline.mapping.odometry). Box edges give the same residuals as in
 cliploc_ros.offline.mapping.fitting.
 
@@ -47,14 +47,14 @@ _LEAST_IMPROVEMENT = 1e-3
 _MAX_DAMPING = 1e4
 
 
-class Prior(NamedTuple):
+class PosePrior(NamedTuple):
     """The information of the process of errors: its diagonal and next-to-diagonal (F, 6)."""
 
     diagonal: NDArray[np.float64]
     beside: NDArray[np.float64]
 
     @staticmethod
-    def of(stamps_s: NDArray[np.float64], errors: PoseErrors) -> 'Prior':
+    def of(stamps_s: NDArray[np.float64], errors: PoseErrors) -> 'PosePrior':
         """Return the prior of frames at some times."""
         kept = np.zeros(len(stamps_s))
         kept[:-1] = errors.kept(np.maximum(np.diff(stamps_s), INSTANT_S))
@@ -66,7 +66,7 @@ class Prior(NamedTuple):
         beside = np.zeros(len(stamps_s))
         beside[:-1] = -gain * kept[:-1]
         weights = 1.0 / errors.sigmas ** 2
-        return Prior(diagonal[:, None] * weights, beside[:, None] * weights)
+        return PosePrior(diagonal[:, None] * weights, beside[:, None] * weights)
 
     def log_determinant(self) -> float:
         """Return the logarithm of the determinant of the information."""
@@ -84,7 +84,7 @@ class Prior(NamedTuple):
         return product
 
 
-def pose_bands(of_poses: NDArray[np.float64], prior: Prior,
+def pose_bands(of_poses: NDArray[np.float64], prior: PosePrior,
                of_steps: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """Return the poses' part of the equations with the prior, as lower bands.
 
@@ -132,7 +132,8 @@ def refine_jointly(given: Views, views: Views, landmarks: Landmarks, shown: NDAr
     number of steps of Levenberg and Marquardt.
     """
     rows = np.nonzero(shown >= 0)[0]
-    problem = Problem(views, rows, shown[rows], Prior.of(views.stamps_s, errors), anchors, steps)
+    problem = Problem(views, rows, shown[rows], PosePrior.of(views.stamps_s, errors), anchors,
+                      steps)
     state = State(views, landmarks, pose_errors(given, views))
     cost, equations = problem.linearize(state)
     damping = 1e-4
@@ -200,7 +201,7 @@ class Problem(NamedTuple):
     views: Views
     rows: NDArray[np.int64]
     landmarks: NDArray[np.int64]
-    prior: Prior
+    prior: PosePrior
     anchors: Anchors | None = None
     steps: Steps | None = None
 

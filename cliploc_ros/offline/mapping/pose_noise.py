@@ -23,7 +23,7 @@ from scipy.sparse import csr_matrix
 
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.offline.mapping.joint import (
-    Prior,
+    PosePrior,
     Problem,
     State,
     pose_bands,
@@ -137,7 +137,7 @@ def _cost_function(given: Views, refined: Views, landmarks: Landmarks, shown: ND
     """
     rows = np.nonzero(shown >= 0)[0]
     frames, size = len(given.rotations), len(landmarks.centers)
-    nothing = Prior(np.zeros((frames, POSE_SIZE)), np.zeros((frames, POSE_SIZE)))
+    nothing = PosePrior(np.zeros((frames, POSE_SIZE)), np.zeros((frames, POSE_SIZE)))
     problem = Problem(refined, rows, shown[rows], nothing)
     errors = pose_errors(given, refined)
     _, equations = problem.linearize(State(refined, landmarks, errors))
@@ -148,7 +148,7 @@ def _cost_function(given: Views, refined: Views, landmarks: Landmarks, shown: ND
 
     def cost(logs: NDArray[np.float64]) -> float:
         sigma_m, sigma_deg, correlation_s, scale = np.exp(logs)
-        prior = Prior.of(given.stamps_s, PoseErrors(sigma_m, sigma_deg, correlation_s))
+        prior = PosePrior.of(given.stamps_s, PoseErrors(sigma_m, sigma_deg, correlation_s))
         gain, every = scale ** -2, np.arange(size)
         bands = pose_bands(gain * equations.of_poses, prior)
         of_landmarks = np.zeros((size, 9, size, 9))
