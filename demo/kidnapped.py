@@ -37,7 +37,7 @@ from cliploc_ros.offline.datasets.poses import slerp
 from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_to_msg, pose_with_covariance_msg, stamp_ns
-from cliploc_ros.ros.outputs.visualization import image_to_msg
+from cliploc_ros.ros.visualization import image_to_msg
 from demo.pictures import Moment, Step, draw_kidnapped
 from demo.processes import DemoError, own_ros_domain
 from demo.run import DemoOptions, nodes, prepare

@@ -27,7 +27,7 @@ from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.offline.datasets.tum import parse_stamp_ns, read_image_list, read_tum_trajectory
 from cliploc_ros.offline.mapping.options import OdometryErrors
 from cliploc_ros.ros.inputs.odometry import OdometryWindow
-from cliploc_ros.ros.inputs.vertical import (
+from cliploc_ros.ros.inputs.robot_state import (
     WINDOW_NS,
     NoVerticalError,
     Sample,

@@ -31,7 +31,6 @@ LAYERS = (
     ('ros.node',),
     ('ros.parameters',),
     ('ros.inputs',),
-    ('ros.outputs',),
     ('ros',),
     ('nodes',),
     ('offline.simulation', 'offline.vocabulary'),

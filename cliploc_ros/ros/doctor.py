@@ -41,8 +41,8 @@ from cliploc_ros.ros.frame_localizer import (
     keyframes_path,
     load_localizer,
 )
+from cliploc_ros.ros.handoff import HandOff
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
-from cliploc_ros.ros.inputs.frame_faults import faults_of_axes
 from cliploc_ros.ros.inputs.frame_source import (
     LINGER_S,
     Frame,
@@ -51,15 +51,14 @@ from cliploc_ros.ros.inputs.frame_source import (
     TimedImage,
     of_camera,
 )
-from cliploc_ros.ros.inputs.instants import frame_depths, read_frame
+from cliploc_ros.ros.inputs.instants import faults_of_axes, frame_depths, read_frame
 from cliploc_ros.ros.inputs.rig import frames_of
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.inputs.time_jumps import stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health, StageTimes, in_words
-from cliploc_ros.ros.node.executor import NodeExecutor
 from cliploc_ros.ros.node.lifecycle import ManagedNode
-from cliploc_ros.ros.outputs.handoff import HandOff
+from cliploc_ros.ros.node.threads import NodeExecutor
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 from cliploc_ros.ros.request import time_is_up
 from cliploc_ros.ros.running import NotRunningError, ask, parameters_of_files, whole_name

@@ -43,8 +43,8 @@ from cliploc_ros.ros.inputs.instants import Instants
 from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.map_parameters import load_hashed_map, map_files, path_of
 from cliploc_ros.ros.node.diagnostics import StageTimes
-from cliploc_ros.ros.outputs.debug_image import SeenImage
 from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.ros.visualization import SeenImage
 
 logger = logging.getLogger(__name__)
 

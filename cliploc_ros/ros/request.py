@@ -20,10 +20,10 @@ from cliploc_ros.core.acceptance.verdict import RefusalKind, needed_confidence
 from cliploc_ros.core.geometry.transforms import move_covariance
 from cliploc_ros.errors import CliplocError, TimeUpError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.answer import Answer, Verdict, deviations
-from cliploc_ros.ros.case_recorder import CaseRecorder
+from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict, deviations
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Localized, load_localizer
+from cliploc_ros.ros.handoff import HandOff, HandOffError, MapToOdom, NoLocalizerError
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
 from cliploc_ros.ros.inputs.rig import Rig
@@ -31,10 +31,8 @@ from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.node.diagnostics import StageTimes, in_words
 from cliploc_ros.ros.node.lifecycle import ManagedNode, NotActiveError
-from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError, NoLocalizerError
-from cliploc_ros.ros.outputs.map_to_odom import MapToOdom
-from cliploc_ros.ros.outputs.visualization import Visualization
 from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.ros.visualization import Visualization
 
 _LOG_PERIOD_S = 5.0
 # Every frame that odometry does not link is another chance of a false accept.

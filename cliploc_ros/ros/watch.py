@@ -26,6 +26,7 @@ from cliploc_ros.core.watch.watch import WatchReport, WatchState
 from cliploc_ros.errors import CliplocError, StoppedError, TimeUpError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer
+from cliploc_ros.ros.handoff import HandOff, HandOffError
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
 from cliploc_ros.ros.inputs.localizer_pose import LaterError, LocalizerPose
@@ -33,7 +34,6 @@ from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.node.diagnostics import Health, join_names
 from cliploc_ros.ros.node.lifecycle import ManagedNode
-from cliploc_ros.ros.outputs.handoff import HandOff, HandOffError
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.ros.request import Pipeline, Requests
 

@@ -11,7 +11,7 @@ from std_msgs.msg import Header
 from tester import make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error, transform_from_pose
-from cliploc_ros.ros.outputs.map_to_odom import transform_msg
+from cliploc_ros.ros.handoff import transform_msg
 
 pytestmark = pytest.mark.needs('tf2_ros')
 

@@ -13,8 +13,8 @@ from nav_msgs.msg import Odometry
 from rclpy.callback_groups import ReentrantCallbackGroup
 from std_srvs.srv import Empty
 
+from cliploc_ros.ros.handoff import HandOff
 from cliploc_ros.ros.inputs.odometry import OdometrySource
-from cliploc_ros.ros.outputs.handoff import HandOff
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 PARAMETERS = RelocalizerParameters(base_frame='base_link')

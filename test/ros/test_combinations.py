@@ -23,8 +23,7 @@ from cliploc_ros.core.observation import Region
 from cliploc_ros.core.query import Case, read_case
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.watch import WatchState
-from cliploc_ros.ros.answer import Answer, Verdict
-from cliploc_ros.ros.case_recorder import CaseRecorder
+from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Keyframes
 from cliploc_ros.ros.inputs.frame_source import Frame

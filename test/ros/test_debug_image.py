@@ -11,7 +11,7 @@ from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.ros.outputs.debug_image import SeenImage, draw_debug_image
+from cliploc_ros.ros.visualization import SeenImage, draw_debug_image
 
 BOX, ELLIPSE, UNMATCHED = (86, 180, 233), (230, 159, 0), (255, 255, 255)
 

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from handing_over import ONE_HZ, TEN_HZ, stand, tell
 
-from cliploc_ros.ros.outputs.handoff import HandOffError
+from cliploc_ros.ros.handoff import HandOffError
 
 
 @pytest.fixture

@@ -11,12 +11,12 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from handing_over import PARAMETERS, TEN_HZ, make_pose, tell
 
-from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
-from cliploc_ros.ros.outputs.handoff import (
+from cliploc_ros.ros.handoff import (
     HandOffError,
     NoLocalizerError,
     is_taken,
 )
+from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
 
 
 @pytest.mark.clock

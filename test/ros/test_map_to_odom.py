@@ -13,10 +13,10 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.ros.handoff import MapToOdom, transform_msg
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
-from cliploc_ros.ros.outputs.map_to_odom import MapToOdom, transform_msg
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 PARAMETERS = RelocalizerParameters(publish_tf=True, base_frame='base_link', tf_timeout_s=5.0)

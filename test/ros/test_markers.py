@@ -7,7 +7,7 @@ from scene import make_layer, make_room
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
-from cliploc_ros.ros.outputs.visualization import (
+from cliploc_ros.ros.visualization import (
     class_color,
     landmark_markers,
     match_markers,

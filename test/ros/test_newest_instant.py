@@ -13,7 +13,7 @@ from std_msgs.msg import Header
 
 from cliploc_ros.ros.inputs.frame_source import TimedImage
 from cliploc_ros.ros.inputs.rig import NewestInstant
-from cliploc_ros.ros.node.worker import Worker
+from cliploc_ros.ros.node.threads import Worker
 
 PATIENCE_S = 60.0
 

@@ -14,7 +14,7 @@ from cliploc_ros.core.observation import OPTICAL_FROM_BODY
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.prior import PriorSource
-from cliploc_ros.ros.node.worker import Worker
+from cliploc_ros.ros.node.threads import Worker
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 CAMERA_FROM_BASE = make_transform(OPTICAL_FROM_BODY[:3, :3], np.array([0.0, 0.3, -0.1]))

@@ -22,12 +22,11 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.query import Query
 from cliploc_ros.errors import MapError
-from cliploc_ros.ros.answer import Answer, Verdict
-from cliploc_ros.ros.case_recorder import CaseRecorder
+from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict
+from cliploc_ros.ros.handoff import HandOff
 from cliploc_ros.ros.inputs.frame_source import FrameSource
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.node.lifecycle import ManagedNode
-from cliploc_ros.ros.outputs.handoff import HandOff
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.ros.request import Requests
 

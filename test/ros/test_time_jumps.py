@@ -19,6 +19,7 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.frame_source import FrameSource
 from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometrySource
+from cliploc_ros.ros.inputs.robot_state import NoVerticalError, VerticalSource
 from cliploc_ros.ros.inputs.time_jumps import (
     MessageStamps,
     StampOrder,
@@ -26,7 +27,6 @@ from cliploc_ros.ros.inputs.time_jumps import (
     TimeJumps,
     stamp_problem,
 )
-from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 S = 1_000_000_000

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.time import Time
 
-from cliploc_ros.ros.outputs.handoff import usable_pose
+from cliploc_ros.ros.handoff import usable_pose
 
 # x, xy, yx, y and yaw: all that AMCL reads
 AMCL_READS = [0, 1, 6, 7, 35]

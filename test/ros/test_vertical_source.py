@@ -12,7 +12,7 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
-from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
+from cliploc_ros.ros.inputs.robot_state import NoVerticalError, VerticalSource
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 OPTICAL = [0.3, 0.0, 1.0, -0.5, 0.5, -0.5, 0.5]  # looks along the base's x axis

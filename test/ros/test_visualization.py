@@ -14,7 +14,7 @@ from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.ros.outputs.visualization import Visualization
+from cliploc_ros.ros.visualization import Visualization
 
 ROOM = make_room()
 HEADER = Header(frame_id='map')

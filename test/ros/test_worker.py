@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cliploc_ros.errors import CliplocError, InternalError, StoppedError, TimeUpError
-from cliploc_ros.ros.node.worker import LatestOnly, Worker
+from cliploc_ros.ros.node.threads import LatestOnly, Worker
 
 PATIENCE_S = 60.0
 

@@ -16,7 +16,7 @@ from rclpy.node import Node
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError, TimedImage
 from cliploc_ros.ros.node.diagnostics import Health
-from cliploc_ros.ros.node.worker import LatestOnly, Worker
+from cliploc_ros.ros.node.threads import LatestOnly, Worker
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
 

@@ -3,7 +3,9 @@
 """What the robot knows besides its image: mount, vertical, odometry, and where it was."""
 
 import math
+import threading
 import time
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -12,23 +14,221 @@ from typing import NamedTuple
 import numpy as np
 from builtin_interfaces.msg import Time
 from numpy.typing import NDArray
+from rclpy.node import Node
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import Imu
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.observation import Region
+from cliploc_ros.errors import CliplocError
+from cliploc_ros.ros import qos
+from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometrySource
 from cliploc_ros.ros.inputs.prior import PriorSource
-from cliploc_ros.ros.inputs.vertical import NoVerticalError, VerticalSource
+from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription, Listener
+from cliploc_ros.ros.inputs.time_jumps import StampOrder, stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
+_UP = np.array([0.0, 0.0, 1.0])
+_STANDARD_GRAVITY = 9.80665
+# An acceleration further from gravity than this is one of a moving IMU (a guess) [m/s^2].
+_MAX_ACCELERATION = 0.5
+# An orientation that changes faster than this within the window below is of no use (a guess).
+_MIN_MEAN_LENGTH = 0.95
+# An orientation is refused where gravity contradicts it by more than this (a guess): a cheap
+# accelerometer at rest is off by up to 3 degrees, a wrong or missing orientation mostly by more.
+_MAX_CONTRADICTION_DEG = 5.0
+#: Samples so near an image are averaged [ns]: vibration is faster, and robots turn slowly.
+WINDOW_NS = 100_000_000
+# A second of the fastest usual IMU.
+_MAX_SAMPLES = 1000
+# sensor_msgs/Imu: the first element of the covariance of a field that is not measured.
+_NOT_MEASURED = -1.0
 _LOG_PERIOD_S = 5.0
 _RETRY_S = 0.02
 # Time for a publisher of odometry that has just been discovered to deliver its first message.
 _DISCOVERY_S = 1.0
+
+
+class NoVerticalError(CliplocError):
+    """The vertical is not known now; the message says why."""
+
+
+class Sample(NamedTuple):
+    """What an IMU measured at one instant, in its own coordinate frame; at least one of both."""
+
+    stamp_ns: int
+    #: A unit vector (3,), by the orientation.
+    up: NDArray[np.float64] | None
+    #: (3,) [m/s^2]; at rest it points up (REP 145).
+    acceleration: NDArray[np.float64] | None
+
+
+def sample_from_msg(msg: Imu) -> Sample | None:
+    """Return what a message says about the vertical; None if it says nothing.
+
+    A field is missing if its covariance begins with -1, or if it has its default value: no
+    acceleration at all, or no rotation with a covariance of zeros. The latter may be a
+    measurement, but then the acceleration says the same.
+    """
+    q, a = msg.orientation, msg.linear_acceleration
+    quat_xyzw, acceleration = np.array([q.x, q.y, q.z, q.w]), np.array([a.x, a.y, a.z])
+    is_default = np.array_equal(quat_xyzw, [0.0, 0.0, 0.0, 1.0]) \
+        and not np.any(msg.orientation_covariance)
+    has_up = (msg.orientation_covariance[0] != _NOT_MEASURED and not is_default
+              and abs(np.linalg.norm(quat_xyzw) - 1.0) < 0.01)
+    has_acceleration = (msg.linear_acceleration_covariance[0] != _NOT_MEASURED
+                        and acceleration.any() and np.isfinite(acceleration).all())
+    if not has_up and not has_acceleration:
+        return None
+    return Sample(stamp_ns(msg.header.stamp),
+                  np.asarray(Rotation.from_quat(quat_xyzw).inv().apply(_UP)) if has_up else None,
+                  acceleration if has_acceleration else None)
+
+
+class VerticalSource(Listener):
+    """Knows the vertical in the camera's coordinate frame.
+
+    An IMU's orientation counts more than its acceleration: its filter knows how the robot moves.
+    But many drivers leave the orientation at its default, or fill it wrongly. It has to agree
+    with the acceleration at rest, where the IMU measures both.
+
+    `transforms` knows how the camera and the IMU are mounted.
+    """
+
+    def __init__(self, node: Node, transforms: CoordinateFrames) -> None:
+        self._node = node
+        self._transforms = transforms
+        self._lock = threading.Lock()
+        self._samples: deque[Sample] = deque(maxlen=_MAX_SAMPLES)
+        self._stamps = StampOrder()
+        self._imu_frame = ''
+        self._newest_is_empty = False
+        #: What is wrong with the stamp of the newest message, and what to do; empty if nothing is.
+        self.problem = ''
+
+    def open(self, source: str) -> None:
+        """Listen to the IMU, if the source is 'imu'; does nothing if it already does."""
+        if source == 'imu' and self._subscription is None:
+            self._subscription = AdaptiveSubscription(self._node, Imu, 'imu', self.take, qos.IMU)
+
+    def forget(self) -> None:
+        """Forget all samples: time jumped."""
+        with self._lock:
+            self._samples.clear()
+            self._stamps.clear()
+            self.problem = ''
+
+    def take(self, msg: Imu) -> None:
+        """Take in a message of the IMU."""
+        sample = sample_from_msg(msg)
+        with self._lock:
+            self._newest_is_empty = sample is None
+            why, topic = stamp_problem(msg.header.stamp), self._node.resolve_topic_name('imu')
+            self.problem = why and f'the stamp of {topic} {why}: its driver must stamp each sample'
+            if sample is None or why:
+                return
+            if self._stamps.goes_back('imu', sample.stamp_ns):
+                self._samples.clear()
+            self._samples.append(sample)
+            self._imu_frame = msg.header.frame_id
+
+    def up_in_camera(self, parameters: RelocalizerParameters,
+                     camera_from_base: NDArray[np.float64], camera_frame: str, stamp: Time
+                     ) -> NDArray[np.float64] | None:
+        """Return the vertical (3,), a unit vector in the camera's optical coordinate frame.
+
+        None where gravity is 'none'. `camera_frame` and `stamp` are those of the image.
+
+        Raises
+        ------
+        NoVerticalError
+            The IMU measured nothing at that time, was moving, or contradicts itself.
+        NoTransformError
+            The IMU's mount is unknown.
+        """
+        if parameters.gravity == 'none':
+            return None
+        if parameters.gravity == 'base_frame':
+            return np.asarray(camera_from_base[:3, :3] @ _UP)
+        up_in_imu, imu_frame = self._up_in_imu(stamp_ns(stamp))
+        if imu_frame == camera_frame:
+            return up_in_imu
+        camera_from_imu = camera_from_base if imu_frame == parameters.base_frame else \
+            self._transforms.camera_from_base(imu_frame, [], camera_frame, stamp,
+                                              parameters.tf_timeout_s)
+        return np.asarray(camera_from_imu[:3, :3] @ up_in_imu)
+
+    def _up_in_imu(self, at_ns: int) -> tuple[NDArray[np.float64], str]:
+        """Return the mean vertical about an instant, and the coordinate frame it is in."""
+        with self._lock:
+            frame, samples = self._imu_frame, list(self._samples)
+            newest_is_empty = self._newest_is_empty
+        near = [one for one in samples if abs(one.stamp_ns - at_ns) <= WINDOW_NS]
+        topic = self._node.resolve_topic_name('imu')
+        if not near and self.problem:
+            raise NoVerticalError(self.problem)
+        if not near and newest_is_empty:
+            raise NoVerticalError(f'{topic} has neither an orientation nor an acceleration: fill '
+                                  'at least one')
+        if not near:
+            raise NoVerticalError(f'no message of {topic} is within {WINDOW_NS // 1_000_000} ms '
+                                  'of the image')
+        if not frame:
+            raise NoVerticalError(f'{topic} has no frame_id, so its mount is unknown: fill it')
+        return mean_up(near, samples, topic), frame
+
+
+def mean_up(near: Sequence[Sample], samples: Sequence[Sample], topic: str
+            ) -> NDArray[np.float64]:
+    """Return the mean vertical (3,) of the samples about an image, a unit vector in the IMU.
+
+    By their orientations, if all recent samples of the topic do not contradict them; else by
+    their accelerations. NoVerticalError: see VerticalSource.up_in_camera.
+    """
+    ups = [one.up for one in near if one.up is not None]
+    if not ups:
+        mean = np.mean([one.acceleration for one in near if one.acceleration is not None],
+                       axis=0)
+        if not _is_gravity(mean):
+            raise NoVerticalError(
+                f'the IMU is moving: it measures {np.linalg.norm(mean):.2f} m/s^2, at rest it '
+                f'measures {_STANDARD_GRAVITY:.2f}')
+        return np.asarray(mean / np.linalg.norm(mean))
+    contradiction_deg = _contradiction_deg(samples)
+    if contradiction_deg > _MAX_CONTRADICTION_DEG:
+        raise NoVerticalError(
+            f'the orientation of {topic} is {contradiction_deg:.0f} degrees off gravity '
+            f'(limit {_MAX_CONTRADICTION_DEG:g}): correct it, or set '
+            'orientation_covariance[0] to -1')
+    mean = np.mean(ups, axis=0)
+    length = float(np.linalg.norm(mean))
+    if not length > _MIN_MEAN_LENGTH:
+        raise NoVerticalError(
+            'the IMU turns too fast: its orientations about the image differ')
+    return np.asarray(mean / length)
+
+
+def _is_gravity(acceleration: NDArray[np.float64]) -> bool:
+    return bool(abs(np.linalg.norm(acceleration) - _STANDARD_GRAVITY) <= _MAX_ACCELERATION)
+
+
+def _contradiction_deg(samples: Sequence[Sample]) -> float:
+    """Return the median angle between up by orientation and by acceleration at rest [deg].
+
+    The median over all samples, not those about the image alone: a robot that starts or brakes
+    deflects its accelerometer for a moment. 0 where no sample measures both at rest.
+    """
+    cosines = [float(one.up @ one.acceleration) / float(np.linalg.norm(one.acceleration))
+               for one in samples if one.up is not None and one.acceleration is not None
+               and _is_gravity(one.acceleration)]
+    return float(np.degrees(np.median(np.arccos(np.clip(cosines, -1.0, 1.0))))) \
+        if cosines else 0.0
 
 
 @dataclass(frozen=True)

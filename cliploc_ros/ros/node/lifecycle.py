@@ -23,9 +23,8 @@ from rclpy.node import Node
 from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.models.devices import free_memory
 from cliploc_ros.ros.node.diagnostics import Diagnostics, Health, Stages
-from cliploc_ros.ros.node.executor import BoundedCallbackGroup
 from cliploc_ros.ros.node.parameters import NodeParameters, Parameters
-from cliploc_ros.ros.node.worker import Worker
+from cliploc_ros.ros.node.threads import BoundedCallbackGroup, Worker
 from cliploc_ros.units import NS_PER_S
 
 # Nav2's defaults (nav2_util::LifecycleNode and its parameter bond_heartbeat_period).

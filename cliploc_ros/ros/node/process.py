@@ -15,8 +15,8 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from cliploc_ros.command import Interruption, split_ros_args
-from cliploc_ros.ros.node.executor import NodeExecutor, log_failure
 from cliploc_ros.ros.node.lifecycle import ManagedNode
+from cliploc_ros.ros.node.threads import NodeExecutor, log_failure
 
 _M_ARENA_MAX = -8  # malloc.h
 # Python handles a signal between two waits.
