@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cliploc_ros.files.page import figure, first_screen, fold, page, table, tiles, verdict
 from cliploc_ros.files.storage import write_text
+from cliploc_ros.offline.page import figure, first_screen, fold, page, table, tiles, verdict
 from demo.review import WRONG_M, Judged, Review
 
 TOP_VIEW = 'top_view.png'

@@ -33,7 +33,7 @@ LAYERS = (
     ('ros.inputs',),
     ('ros',),
     ('nodes',),
-    ('offline.simulation', 'offline.vocabulary'),
+    ('offline.simulation', 'offline.vocabulary', 'offline.page'),
     ('offline.mapping',),
     ('offline.datasets',),
     ('offline.recording',),

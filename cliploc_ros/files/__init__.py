@@ -8,8 +8,6 @@ log
     A file to which only is appended, for what a killed run has done.
 storage
     A file in the place of another one in one step, and the cache folder.
-page
-    The style and the parts of all pages of HTML.
 parallel
     Tasks on processes or on a cluster, some of which die.
 """

@@ -12,7 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from cliploc_ros.core.geometry.transforms import RIGHT_M
-from cliploc_ros.files.page import (
+from cliploc_ros.files.storage import write_text
+from cliploc_ros.offline.evaluation.drawing import draw_map, png_of
+from cliploc_ros.offline.page import (
     ACCEPTED,
     FAINT,
     MISLED,
@@ -24,8 +26,6 @@ from cliploc_ros.files.page import (
     side_by_side,
     table,
 )
-from cliploc_ros.files.storage import write_text
-from cliploc_ros.offline.evaluation.drawing import draw_map, png_of
 from studies.rooms.asking import BOTH, KEYFRAMES, KNOWN, NOTHING, OBJECTS, WAYS, Answers, Outcome
 from studies.rooms.rooms import Room
 from studies.rooms.tables import grouped

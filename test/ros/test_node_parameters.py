@@ -3,13 +3,16 @@
 """Parameters of real nodes: given in files, changed at run time, refused."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 from rclpy.parameter import Parameter
 
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.ros.node.parameters import NodeParameters, Parameters, parameter, yaml_defaults
+from cliploc_ros.ros.node.parameters import NodeParameters, Parameters, parameter
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
+
+CONFIG = Path(__file__).resolve().parents[2] / 'config'
 
 
 @dataclass(frozen=True)
@@ -47,9 +50,10 @@ def set_values(node, **values):
         [Parameter(name, value=value) for name, value in values.items()])
 
 
-@pytest.mark.parametrize('kind', [DetectorParameters, RelocalizerParameters])
-def test_a_node_takes_the_generated_file(declare, kind, capfd):
-    _, parameters = declare(yaml_defaults('any', kind.rows()), kind)
+@pytest.mark.parametrize(('name', 'kind'), [
+    ('detector', DetectorParameters), ('relocalizer', RelocalizerParameters)])
+def test_a_node_takes_the_generated_file(declare, name, kind, capfd):
+    _, parameters = declare((CONFIG / f'{name}.yaml').read_text(), kind)
     assert parameters.snapshot() == kind()
     assert 'unknown parameter' not in capfd.readouterr().err
 

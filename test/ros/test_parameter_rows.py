@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import array
 import math
+from pathlib import Path
 
 import pytest
 import yaml
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.messages import parse_class_map
-from cliploc_ros.ros.node.parameters import ParameterRow, markdown_table
+from cliploc_ros.ros.node.parameters import ParameterRow
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
 TEXT = ParameterRow('text', 'a', 'Some text.')
@@ -22,6 +23,7 @@ SWITCH = ParameterRow('switch', False, 'On or off.')
 MOUNT = ParameterRow('mount', [0.0, 0.0], 'Two numbers.', unit='m')
 NAMES = ParameterRow('names', [''], 'Some texts.')
 
+PROJECT = Path(__file__).resolve().parents[2]
 TABLES = {'detector': DetectorParameters.rows(), 'relocalizer': RelocalizerParameters.rows()}
 
 
@@ -66,9 +68,10 @@ def test_whatever_comes_it_is_allowed_or_refused(value):
 
 
 @pytest.mark.parametrize('name', TABLES)
-def test_the_markdown_table_holds_the_defaults(name):
+def test_the_page_holds_the_defaults(name):
+    _, _, page = (PROJECT / 'doc/parameters.md').read_text().partition(f'## {name}')
     rows = [[cell.strip() for cell in line.strip('|').split('|')]
-            for line in markdown_table(TABLES[name]).splitlines()[2:]]
+            for line in page.partition('\n## ')[0].splitlines() if line.startswith('| `')]
     assert all(len(cells) == 6 for cells in rows)
     assert {cells[0].strip('`'): yaml.safe_load(cells[1].strip('`')) for cells in rows} == {
         row.name: row.default for row in TABLES[name]}

@@ -5,7 +5,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from cliploc_ros.files.page import (
+from cliploc_ros.files.storage import write_text
+from cliploc_ros.offline.evaluation.summary import Summary, find_best
+from cliploc_ros.offline.page import (
     figure,
     first_screen,
     fold,
@@ -16,8 +18,6 @@ from cliploc_ros.files.page import (
     tiles,
     verdict,
 )
-from cliploc_ros.files.storage import write_text
-from cliploc_ros.offline.evaluation.summary import Summary, find_best
 
 PAGE = 'report.html'
 _TOP_VIEW = 'top_view'

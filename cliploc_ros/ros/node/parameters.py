@@ -223,35 +223,3 @@ class NodeParameters[P: Parameters]:
         """Return the values of the parameters that the table declares, by name."""
         return {parameter.name: self._rows[parameter.name].validated(parameter.value)
                 for parameter in parameters if parameter.name in self._rows}
-
-
-def markdown_table(table: Iterable[ParameterRow]) -> str:
-    """Return a Markdown table of parameters."""
-    lines = ['| parameter | default | unit | allowed | at run time | what it does |',
-             '|---|---|---|---|---|---|']
-    lines += [f'| `{row.name}` | `{_yaml_value(row.default)}` | {row.unit} | {row.allowed} | '
-              f'{"" if row.read_only else "yes"} | {row.description} |' for row in table]
-    return '\n'.join(lines) + '\n'
-
-
-def yaml_defaults(node_name: str, table: Iterable[ParameterRow]) -> str:
-    """Return a parameter file with every default, each after a comment in prose."""
-    lines = ['# SPDX-FileCopyrightText: 2026 the cliploc_ros authors',
-             '# SPDX-License-Identifier: Apache-2.0',
-             f'# Every parameter of the {node_name} node at its default.',
-             '# Written by script/document from cliploc_ros/ros/parameters.py: '
-             'copy it to change it.',
-             '/**:',
-             '  ros__parameters:']
-    for row in table:
-        unit = f' [{row.unit}]' if row.unit else ''
-        allowed = f' Allowed: {row.allowed}.' if row.allowed else ''
-        lines += [f'    # {row.description}{unit}{allowed}',
-                  f'    {row.name}: {_yaml_value(row.default)}']
-    return '\n'.join(lines) + '\n'
-
-
-def _yaml_value(value: Value) -> str:
-    if isinstance(value, str):
-        return f"'{value}'"
-    return str(value).lower() if isinstance(value, bool) else str(value)

@@ -8,7 +8,20 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from cliploc_ros.files.page import (
+from cliploc_ros.files.storage import write_text
+from cliploc_ros.offline.evaluation.map_check.views import ViewPainter
+from cliploc_ros.offline.mapping.check.landmark_faults import LandmarkCheck
+from cliploc_ros.offline.mapping.check.relocalization import Trial, count_verdicts
+from cliploc_ros.offline.mapping.check.report import (
+    SERIOUS,
+    Advice,
+    CheckReport,
+    Measure,
+    RecordingCheck,
+    count_by_objects,
+    share,
+)
+from cliploc_ros.offline.page import (
     ACCEPTED,
     MISLED,
     REFUSED,
@@ -24,19 +37,6 @@ from cliploc_ros.files.page import (
     table,
     tiles,
     verdict,
-)
-from cliploc_ros.files.storage import write_text
-from cliploc_ros.offline.evaluation.map_check.views import ViewPainter
-from cliploc_ros.offline.mapping.check.landmark_faults import LandmarkCheck
-from cliploc_ros.offline.mapping.check.relocalization import Trial, count_verdicts
-from cliploc_ros.offline.mapping.check.report import (
-    SERIOUS,
-    Advice,
-    CheckReport,
-    Measure,
-    RecordingCheck,
-    count_by_objects,
-    share,
 )
 
 PAGE, DATA = 'check.html', 'check.json'

@@ -17,7 +17,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.files.page import FAINT
 from cliploc_ros.offline.evaluation.drawing import EDGED, draw_outline, png_of, write_name
 from cliploc_ros.offline.evaluation.map_check.page import (
     FIRST_ADVICE,
@@ -31,6 +30,7 @@ from cliploc_ros.offline.evaluation.map_check.page import (
 from cliploc_ros.offline.mapping.check.places import RADIUS_M
 from cliploc_ros.offline.mapping.check.relocalization import Trial, count_verdicts, refused_spans
 from cliploc_ros.offline.mapping.check.report import CheckReport
+from cliploc_ros.offline.page import FAINT
 
 _DPI = 120
 _MARGIN_M = 0.4
