@@ -24,8 +24,7 @@ from cliploc_ros.messages import detections_from_msg
 from cliploc_ros.offline.datasets.bags import BagMessage, BagReader
 from cliploc_ros.offline.replay import create_publisher
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.conversions import stamp_ns
-from cliploc_ros.ros.inputs.frame_source import of_camera
+from cliploc_ros.ros.conversions import of_camera, stamp_ns
 from cliploc_ros.units import NS_PER_S
 from demo.processes import DemoError
 

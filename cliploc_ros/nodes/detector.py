@@ -5,12 +5,15 @@
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.node import Node
+from sensor_msgs.msg import CompressedImage, Image
 from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -20,13 +23,13 @@ from cliploc_ros.models.open_vocabulary import prompts_of_map, prompts_of_names
 from cliploc_ros.models.profiles import load_detector, with_detector
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector, Prompts
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.conversions import detections_to_msg
-from cliploc_ros.ros.inputs.frame_source import ImageSource, TimedImage, of_camera
-from cliploc_ros.ros.inputs.rig import NewestInstant
+from cliploc_ros.ros.conversions import detections_to_msg, of_camera, stamp_ns
+from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.map_parameters import path_of
 from cliploc_ros.ros.node.diagnostics import Health, Rates, StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.process import run_node
+from cliploc_ros.ros.node.threads import LatestOnly, Worker
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
 _LOG_PERIOD_S = 5.0
@@ -36,6 +39,120 @@ Publishes what a network detects in the newest image, while something subscribes
   in    image, image/compressed
   out   detections, /diagnostics
 """
+
+
+class TimedImage(NamedTuple):
+    """An image, and when it arrived (monotonic clock) [s]."""
+
+    msg: Image | CompressedImage
+    received_at: float
+
+
+class ImageSource:
+    """Subscribes to images, 'raw' or 'compressed', while it is open.
+
+    `on_image` takes each TimedImage, in the executor's thread. `camera` is the namespace of the
+    topic.
+    """
+
+    def __init__(self, node: Node, transport: str, on_image: Callable[[TimedImage], None],
+                 camera: str = '') -> None:
+        self._node = node
+        self._type = Image if transport == 'raw' else CompressedImage
+        self._name = of_camera(camera, 'image' if transport == 'raw' else 'image/compressed')
+        self._on_image = on_image
+        self._subscription: AdaptiveSubscription | None = None
+        self._heard_at = 0.0
+        self.received = 0
+
+    @property
+    def is_open(self) -> bool:
+        """Return whether it subscribes."""
+        return self._subscription is not None
+
+    def open(self) -> None:
+        """Subscribe, if it does not yet."""
+        if self._subscription is None:
+            self._heard_at = time.monotonic()  # silence counts from here
+            self._subscription = AdaptiveSubscription(self._node, self._type, self._name,
+                                                      self._take, qos.IMAGE)
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        if self._subscription is not None:
+            self._subscription.destroy()
+            self._subscription = None
+
+    def examine(self, health: Health, stale_after_s: float) -> None:
+        """Report a topic without a publisher, and silence."""
+        topic = self._node.resolve_topic_name(self._name)
+        silent_s = time.monotonic() - self._heard_at
+        if self._node.count_publishers(topic) == 0:
+            health.warn(f'no image: nobody publishes {topic}; remap it, or start its publisher')
+        elif self.is_open and silent_s > stale_after_s:
+            health.warn(f'no image on {topic} for {silent_s:.1f} s')
+
+    def _take(self, msg: Image | CompressedImage) -> None:
+        self.received += 1
+        self._heard_at = time.monotonic()
+        self._on_image(TimedImage(msg, self._heard_at))
+
+
+class NewestInstant:
+    """Passes images of several cameras to a worker: one of each, as near in time as they come.
+
+    While the worker is busy, the two newest images of each camera wait: the newest may be of an
+    instant that other cameras have not delivered yet.
+
+    Parameters
+    ----------
+    work : callable
+        Takes the name of a camera and an image, in the worker's thread.
+    """
+
+    def __init__(self, worker: Worker, work: Callable[[str, TimedImage], None]) -> None:
+        self._work = work
+        self._lock = threading.Lock()
+        self._waiting: dict[str, deque[TimedImage]] = {}
+        self._signal = LatestOnly(worker, self._take)
+        self.dropped = 0
+
+    @property
+    def waiting_since(self) -> float | None:
+        """Return when the oldest image that waits arrived (monotonic clock) [s]."""
+        with self._lock:
+            return min((one.received_at for images in self._waiting.values() for one in images),
+                       default=None)
+
+    def offer(self, camera: str, image: TimedImage) -> None:
+        """Queue an image of a camera."""
+        with self._lock:
+            images = self._waiting.setdefault(camera, deque())
+            images.append(image)
+            if len(images) > 2:
+                images.popleft()
+                self.dropped += 1
+        self._signal.offer(camera)
+
+    def _take(self, camera: str) -> None:
+        """Work on the newest instant that all cameras with an image have."""
+        with self._lock:
+            waiting = {name: images for name, images in self._waiting.items() if images}
+            newest_ns = min(_image_ns(images[-1]) for images in waiting.values())
+            taken = {}
+            for name, images in waiting.items():
+                taken[name] = min(images, key=lambda one: abs(_image_ns(one) - newest_ns))
+                while images.popleft() is not taken[name]:
+                    self.dropped += 1
+            more = any(waiting.values())
+        for name, image in taken.items():
+            self._work(name, image)
+        if more:
+            self._signal.offer(camera)
+
+
+def _image_ns(image: TimedImage) -> int:
+    return stamp_ns(image.msg.header.stamp)
 
 
 class _Camera:

@@ -23,8 +23,8 @@ from cliploc_ros.messages import faults_of_rectified
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, CaseRecorder, RequestCounters, Verdict, answer_msg
 from cliploc_ros.ros.handoff import HandOff
-from cliploc_ros.ros.inputs.frame_source import LINGER_S, Frame
-from cliploc_ros.ros.inputs.rig import frames_of
+from cliploc_ros.ros.inputs.frame_source import Frame
+from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumps
 from cliploc_ros.ros.map_parameters import path_of
@@ -58,25 +58,25 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
     def __init__(self) -> None:
         super().__init__('relocalizer', RelocalizerParameters, DetectorParameters)
         parameters = self.settings.values
-        continuous = parameters.mode == 'continuous'
         self._robot = RobotStateSource(self)
         self._jumps = TimeJumps(self, self._forget)
         self._pipeline = Pipeline(self, self._robot, self._jumps)
         self._newest = LatestOnly(self.worker, self._localize_and_log)
-        linger_s = math.inf if continuous else LINGER_S
-        on_frame = self._newest.offer if continuous else lambda frame: None
-        self._frames = frames_of(self, parameters, linger_s, on_frame)
+        self._frames = CameraRig(self, parameters) if parameters.mode == 'on_request' else \
+            CameraRig(self, parameters, math.inf, self._newest.offer)
+        sources = self._frames.sources.values()
         with suppress(CliplocError):  # a bad name: it will not be configured
             self.settings.snapshot()
             self.facts['topics'] = ' '.join(
                 f'{name}:={self.resolve_topic_name(name)}' for name in (
-                    *self._frames.topics, *_OTHER_TOPICS, parameters.localizer_pose) if name)
+                    *(topic for one in sources for topic in one.topics.values()),
+                    *_OTHER_TOPICS, parameters.localizer_pose) if name)
         self._handoff = HandOff(self, self._robot.odometry)
         self._handoff.on_shown(self._robot.prior.follow)
         self._cases = CaseRecorder(bool(parameters.record_folder))
         self._requests = Requests(self, self._frames, self._robot, self._pipeline, self._cases,
                                   self._handoff)
-        self._watcher = Watcher(self, self._frames.main, self._robot, self._jumps, self._pipeline,
+        self._watcher = Watcher(self, self._frames, self._robot, self._jumps, self._pipeline,
                                 self._requests, self._handoff, self._answer)
         self._counters = RequestCounters()
         self._answers = self.create_publisher(DiagnosticArray, '~/answer', qos.LATCHED)
@@ -108,8 +108,9 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._pipeline.open()
         self._frames.open()
         self._watcher.open()
-        for doubt in faults_of_rectified(self._frames.image_topic, parameters.rectified):
-            self.get_logger().warning(doubt.text)
+        for source in self._frames.sources.values():
+            for doubt in faults_of_rectified(source.image_topic, parameters.rectified):
+                self.get_logger().warning(doubt.text)
 
     def close(self) -> None:
         """Release the request that waits for frames, and unsubscribe."""
@@ -165,7 +166,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
 
     def _missing(self) -> list[str]:
         """Return what a request needs and does not find, one line each."""
-        missing = self._frames.missing()
+        missing = [line for one in self._frames.sources.values() for line in one.missing()]
         if self.settings.values.require_localizer and (localizer := self._handoff.missing()):
             missing.append(localizer)
         return missing

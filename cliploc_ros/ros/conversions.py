@@ -33,6 +33,11 @@ def stamp_ns(stamp: Time) -> int:
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
+def of_camera(camera: str, topic: str) -> str:
+    """Return the topic of one of several cameras; that of the only one has no name."""
+    return f'{camera}/{topic}' if camera else topic
+
+
 def detections_to_msg(detections: Detections, header: Header) -> Detection2DArray:
     """Return detections as a message with the header of their image."""
     msg = Detection2DArray(header=header)

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from rclpy.logging import LoggingSeverity
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from cliploc_ros.core.detector_check import DetectorCheck
 from cliploc_ros.core.geometry.camera_faults import fields_of_view
@@ -33,9 +32,8 @@ from cliploc_ros.messages import (
     image_from_msg,
     parse_class_map,
 )
-from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Verdict
-from cliploc_ros.ros.conversions import stamp_ns
+from cliploc_ros.ros.conversions import of_camera
 from cliploc_ros.ros.frame_localizer import (
     FrameLocalizer,
     keyframes_path,
@@ -43,18 +41,10 @@ from cliploc_ros.ros.frame_localizer import (
 )
 from cliploc_ros.ros.handoff import HandOff
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
-from cliploc_ros.ros.inputs.frame_source import (
-    LINGER_S,
-    Frame,
-    ImageSource,
-    NoFrameError,
-    TimedImage,
-    of_camera,
-)
+from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
 from cliploc_ros.ros.inputs.instants import faults_of_axes, frame_depths, read_frame
-from cliploc_ros.ros.inputs.rig import frames_of
+from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
-from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.inputs.time_jumps import stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health, StageTimes, in_words
 from cliploc_ros.ros.node.lifecycle import ManagedNode
@@ -62,7 +52,6 @@ from cliploc_ros.ros.node.threads import NodeExecutor
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 from cliploc_ros.ros.request import time_is_up
 from cliploc_ros.ros.running import NotRunningError, ask, parameters_of_files, whole_name
-from cliploc_ros.units import NS_PER_S
 
 # Images that come later after their stamps show clocks that differ (a guess).
 _MOST_LAG_S = 1.0
@@ -137,14 +126,8 @@ class Doctor(ManagedNode[RelocalizerParameters]):
                          cli_args=['--ros-args', *rules])
         parameters, self.wrong_cameras = self.settings.values, wrong_cameras
         self.robot = RobotStateSource(self)
-        self.frames = frames_of(self, parameters, LINGER_S)
+        self.frames = CameraRig(self, parameters, math.inf)
         self.handoff = HandOff(self, self.robot.odometry)
-        self.cameras = parameters.camera_names or ('',)
-        #: Of each camera the newest image, and how soon after its stamp one came [s].
-        self.images: dict[str, tuple[Image | CompressedImage, float]] = {}
-        self.infos: dict[str, CameraInfo] = {}
-        self._sources = [ImageSource(self, parameters.image_transport, partial(self._take, name),
-                                     name) for name in self.cameras]
 
     def load(self) -> str:
         """Load nothing: a bad map must not keep the inputs from being checked."""
@@ -159,10 +142,6 @@ class Doctor(ManagedNode[RelocalizerParameters]):
         with suppress(NoTransformError):  # tf2 is not installed; the check of tf says so
             self.robot.open()
         self.frames.open()
-        for name, source in zip(self.cameras, self._sources, strict=True):
-            source.open()
-            AdaptiveSubscription(self, CameraInfo, of_camera(name, 'camera_info'),
-                                 partial(self.infos.__setitem__, name), qos.CAMERA_INFO)
 
     def close(self) -> None:
         """Listen to nothing more."""
@@ -172,12 +151,6 @@ class Doctor(ManagedNode[RelocalizerParameters]):
 
     def examine(self, health: Health) -> None:
         """Report nothing."""
-
-    def _take(self, camera: str, image: TimedImage) -> None:
-        lag_s = (self.get_clock().now().nanoseconds
-                 - stamp_ns(image.msg.header.stamp)) / NS_PER_S
-        _, least_s = self.images.get(camera, (None, math.inf))  # a busy machine takes some late
-        self.images[camera] = image.msg, min(lag_s, least_s, key=abs)
 
 
 def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
@@ -198,21 +171,23 @@ def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
             frame = node.frames.next_frame(time.monotonic(), after + patience_s)
     except NoFrameError as error:
         why = str(error)
-    silent = {name: text for name, text in node.frames.unheard(after).items()
-              if frame is None or name.rpartition('/')[0] in frame.left_out}
-    for name in node.cameras:
-        _check_camera(node, parameters, name, silent, report)
-    name = node.cameras[0] if frame is None else frame.camera
-    if name in node.images:
-        image = node.images[name][0] if frame is None else frame.image
-        _check_place(node, parameters.of_camera(name), image.header, patience_s, report)
+    sources = node.frames.sources
+    silent = {name: source.unheard(after) if frame is None or name in frame.left_out else {}
+              for name, source in sources.items()}
+    for name, source in sources.items():
+        _check_camera(node, parameters, name, source, silent[name], report)
+    name = next(iter(sources)) if frame is None else frame.camera
+    image, _ = sources[name].heard.get('image', (None, 0.0))
+    if image is not None:
+        header = image.header if frame is None else frame.image.header
+        _check_place(node, parameters.of_camera(name), header, patience_s, report)
     else:
         report.skip('tf, odometry', 'need an image')
-    if silent.keys() & {of_camera(name, 'image'), of_camera(name, 'camera_info')}:
+    if silent[name].keys() & {'image', 'camera_info'}:
         report.skip('detector', 'needs an image with camera_info')
     else:
-        _check_detections(parameters, localizer, frame,
-                          silent.get(of_camera(name, 'detections'), why), report)
+        _check_detections(parameters, localizer, frame, silent[name].get('detections', why),
+                          report)
     if parameters.require_localizer:
         report.judge('localizer', node.handoff.missing(), 'it subscribes to initialpose, and '
                      f'publishes {parameters.localizer_pose or "nothing that is checked"}')
@@ -241,14 +216,15 @@ def _check_map(node: Doctor, parameters: RelocalizerParameters, report: Report
 
 
 def _check_camera(node: Doctor, parameters: RelocalizerParameters, name: str,
-                  silent: dict[str, str], report: Report) -> None:
+                  source: FrameSource, silent: dict[str, str], report: Report) -> None:
     """Check images, calibration and clock of a camera."""
     camera, calibration, clock = (of_camera(name, what) for what in (
         'camera', 'calibration', 'clock'))
-    (image, lag_s), info = node.images.get(name, (None, 0.0)), node.infos.get(name)
+    (image, _), (info, _) = (source.heard.get(one, (None, 0.0)) for one in (
+        'image', 'camera_info'))
     size = None
-    if image is None or of_camera(name, 'image') in silent:
-        report.add(camera, State.FAIL, silent.get(of_camera(name, 'image'), 'no image in time'))
+    if image is None or 'image' in silent:
+        report.add(camera, State.FAIL, silent.get('image', 'no image in time'))
         report.skip(clock, 'needs an image')
     else:
         with report.failing(camera):
@@ -257,19 +233,18 @@ def _check_camera(node: Doctor, parameters: RelocalizerParameters, name: str,
                                            f"'{image.header.frame_id}'")
         why = stamp_problem(image.header.stamp)
         report.judge(clock, f"the images' stamp {why}: their driver must stamp each"
-                     if why else _doubt_of_clock(node, lag_s),
-                     f'images come {1e3 * lag_s:.0f} ms after their stamps')
+                     if why else _doubt_of_clock(node, source.least_lag_s),
+                     f'images come {1e3 * source.least_lag_s:.0f} ms after their stamps')
     if info is None:
         return report.add(calibration, State.FAIL,
-                          silent.get(of_camera(name, 'camera_info'), 'no camera_info in time'))
+                          silent.get('camera_info', 'no camera_info in time'))
     with report.failing(calibration):
         found = camera_from_msg(info, size or (info.width, info.height), parameters.rectified)
         lens = 'rectified' if parameters.rectified else info.distortion_model or 'no distortion'
         faults = [*faults_of_camera_info(info, found, parameters.rectified),
                   *faults_of_headers('' if image is None else image.header.frame_id,
                                      info.header.frame_id),
-                  *faults_of_rectified(node.resolve_topic_name(of_camera(name, 'image')),
-                                      parameters.rectified, info)]
+                  *faults_of_rectified(source.image_topic, parameters.rectified, info)]
         report.judge(calibration, '; '.join(fault.text for fault in faults),
                      f'{fields_of_view(found)[0]:.0f} degrees wide, {lens}')
 

@@ -25,8 +25,8 @@ from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Localized, load_localizer
 from cliploc_ros.ros.handoff import HandOff, HandOffError, MapToOdom, NoLocalizerError
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
-from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
-from cliploc_ros.ros.inputs.rig import Rig
+from cliploc_ros.ros.inputs.frame_source import Frame, NoFrameError
+from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.node.diagnostics import StageTimes, in_words
@@ -197,7 +197,7 @@ class Requests:
     Otherwise it looks at fresh frames itself.
     """
 
-    def __init__(self, node: ManagedNode[RelocalizerParameters], frames: FrameSource | Rig,
+    def __init__(self, node: ManagedNode[RelocalizerParameters], frames: CameraRig,
                  robot: RobotStateSource, pipeline: Pipeline, cases: CaseRecorder,
                  handoff: HandOff) -> None:
         self._node = node

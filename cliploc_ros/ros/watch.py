@@ -28,8 +28,9 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer
 from cliploc_ros.ros.handoff import HandOff, HandOffError
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
-from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
+from cliploc_ros.ros.inputs.frame_source import Frame, NoFrameError
 from cliploc_ros.ros.inputs.localizer_pose import LaterError, LocalizerPose
+from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.node.diagnostics import Health, join_names
@@ -68,16 +69,16 @@ class Watcher:
 
     Parameters
     ----------
-    source : FrameSource
-        Of the camera to look with.
+    frames : CameraRig
+        It looks with the first camera.
     relocalize : callable
         Requests a relocalization as a client does, and returns the answer.
     """
 
-    def __init__(self, node: ManagedNode[RelocalizerParameters], source: FrameSource,
+    def __init__(self, node: ManagedNode[RelocalizerParameters], frames: CameraRig,
                  robot: RobotStateSource, jumps: TimeJumps, pipeline: Pipeline,
                  requests: Requests, handoff: HandOff, relocalize: Callable[[], Answer]) -> None:
-        self._node, self._source, self._robot, self._jumps = node, source, robot, jumps
+        self._node, self._frames, self._robot, self._jumps = node, frames, robot, jumps
         self._pipeline, self._requests, self._handoff = pipeline, requests, handoff
         self._relocalize = relocalize
         self.is_on = node.settings.values.watch != 'none'
@@ -188,7 +189,7 @@ class Watcher:
     def _look(self, stopped: threading.Event) -> Time | None:
         """Compare one frame with the localizer's pose; return its stamp, None without a look."""
         begun_at, age = time.monotonic(), self._age
-        frame = self._source.next_frame(begun_at, begun_at + _FRAME_PATIENCE_S, 0.0)
+        frame = self._frames.next_frame(begun_at, begun_at + _FRAME_PATIENCE_S, 0.0, 1)
         localizer = self._pipeline.localizer
         if localizer is None:
             raise StoppedError('the node was deactivated')

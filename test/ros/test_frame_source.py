@@ -3,6 +3,8 @@
 """Frames of one camera from its messages as they come: what waits for a slow detector."""
 
 import copy
+import math
+from functools import partial
 
 import pytest
 from builtin_interfaces.msg import Time
@@ -11,6 +13,7 @@ from std_msgs.msg import Header
 from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.ros.inputs.frame_source import FrameSource
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 PERIOD_NS = 33_333_333
 
@@ -27,10 +30,10 @@ def feed(make_node):
     """Feed a camera at 30 Hz whose detections come some images late; return its frames."""
     def run(images, late, depth_bytes):
         frames = []
-        source = FrameSource(make_node(), 'raw', float('inf'), frames.append, depth='raw',
-                             depth_tolerance_s=0.02)
+        source = FrameSource(make_node(), RelocalizerParameters(depth_transport='raw'), math.inf,
+                             frames.append)
         source.open()
-        receive = {name: source._receiver(name) for name in source._topics}
+        receive = {name: partial(source._receive, name) for name in source.topics}
         depth = Image(data=bytes(depth_bytes))
         for number in range(images):
             receive['depth'](stamped(depth, number))

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from cliploc_ros.ros.inputs.frame_source import TimedImage
-from cliploc_ros.ros.inputs.rig import NewestInstant
+from cliploc_ros.nodes.detector import NewestInstant, TimedImage
 from cliploc_ros.ros.node.threads import Worker
 
 PATIENCE_S = 60.0

@@ -24,7 +24,7 @@ from cliploc_ros.core.query import Query
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict
 from cliploc_ros.ros.handoff import HandOff
-from cliploc_ros.ros.inputs.frame_source import FrameSource
+from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -46,7 +46,7 @@ class Answering(ManagedNode):
         self.localize = lambda frame: Answer(Verdict.REFUSED, 'nothing known',
                                              received_at=frame.received_at)
         self.robot = RobotStateSource(self)
-        self.frames = FrameSource(self, 'raw', 1.0, lambda frame: None)
+        self.frames = CameraRig(self, RelocalizerParameters())
         pipeline = SimpleNamespace(localize=lambda frame, times, deadline: self.localize(frame))
         self.requests = Requests(self, self.frames, self.robot, pipeline, CaseRecorder(False),
                                  HandOff(self, self.robot.odometry))
@@ -171,11 +171,11 @@ def test_4k_images_wait_for_a_slow_detector(node, camera, clients, wait):
     def take(number):
         """Publish an image, and wait until the node has it."""
         header = Header(stamp=Time(sec=number))
-        before = node.frames._pairing.received['image']
+        before = node.frames.sources['']._pairing.received['image']
         infos.publish(CameraInfo(header=header))
         images.publish(Image(header=header, height=2160, width=3840, step=3840 * 3,
                              encoding='rgb8', data=data))
-        wait(lambda: node.frames._pairing.received['image'] > before, 'the image')
+        wait(lambda: node.frames.sources['']._pairing.received['image'] > before, 'the image')
 
     request = clients.submit(node.requests.answer)
     wait(lambda: all(one.get_subscription_count() for one in camera.publishers), 'the node')

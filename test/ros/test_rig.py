@@ -14,8 +14,8 @@ from std_msgs.msg import Header
 from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.errors import StoppedError
-from cliploc_ros.ros.inputs.frame_source import FrameSource, NoFrameError
-from cliploc_ros.ros.inputs.rig import frames_of
+from cliploc_ros.ros.inputs.frame_source import NoFrameError
+from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 NAMES = ('front', 'left', 'back')
@@ -50,7 +50,7 @@ def cameras(make_node):
 def rig(request, make_node, context, heard):
     """A rig whose node is spun by another thread."""
     node = make_node()
-    rig = frames_of(node, PARAMETERS, request.param, heard.append)
+    rig = CameraRig(node, PARAMETERS, request.param, heard.append)
     rig.open()
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
@@ -103,13 +103,13 @@ def test_frames_of_one_instant_come_together(rig, cameras, wait, late_s, togethe
 def test_silent_inputs_are_named_by_camera(rig, cameras, wait):
     since = time.monotonic()
     ask(rig, cameras, {'front': 0.0}, wait)
-    assert set(rig.unheard(since)) == {
-        f'{name}/{topic}' for name in NAMES[1:] for topic in ('image', 'camera_info',
-                                                              'detections')}
-    assert rig.missing() == []  # all are published
-    assert rig.main.image_topic == rig.image_topic == '/front/image'
-    assert [one for one in rig.topics if one.startswith('left')] == [
-        'left/image', 'left/camera_info', 'left/detections']
+    for name, source in rig.sources.items():
+        assert set(source.unheard(since)) == (
+            set() if name == 'front' else {'image', 'camera_info', 'detections'})
+        assert source.missing() == []  # all are published
+        assert source.image_topic == f'/{name}/image'
+        assert [*source.topics.values()] == [
+            f'{name}/image', f'{name}/camera_info', f'{name}/detections']
 
 
 def test_nothing_in_time_and_a_rig_that_is_closed(rig, cameras, wait):
@@ -187,8 +187,7 @@ def test_a_request_stays_subscribed_until_the_last_cameras_detections(rig, camer
     def images():
         cameras(now_s(), ALL, (CameraInfo, Image))
         time.sleep(0.05)
-    wait(lambda: rig.main._pairing.received['image'] >= 5
-         and all(one._pairing.received['image'] >= 5 for one in rig._sources.values()),
+    wait(lambda: all(one._pairing.received['image'] >= 5 for one in rig.sources.values()),
          'images', images)
     at_s = now_s()
     cameras(at_s, ALL, (CameraInfo, Image))
@@ -199,5 +198,13 @@ def test_a_request_stays_subscribed_until_the_last_cameras_detections(rig, camer
     assert names(found[0]) == list(NAMES)
 
 
-def test_one_camera_needs_no_rig(make_node):
-    assert isinstance(frames_of(make_node(), RelocalizerParameters(), 1.0), FrameSource)
+def test_the_first_camera_alone_is_subscribed_where_no_other_is_wanted(rig, cameras, wait):
+    now, found = time.monotonic(), []
+    asking = threading.Thread(
+        target=lambda: found.append(rig.next_frame(now, now + 30.0, 0.0, 1)))
+    asking.start()
+    wait(lambda: not asking.is_alive(), 'a frame',
+         lambda: cameras(now_s(), ALL) or asking.join(0.05))
+    assert names(found[0]) == ['front'] and found[0].left_out == ()
+    assert 'image' in rig.sources['front'].heard
+    assert not any(rig.sources[name].heard for name in NAMES[1:])

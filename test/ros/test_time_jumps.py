@@ -19,9 +19,9 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.frame_source import FrameSource
 from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometrySource
+from cliploc_ros.ros.inputs.pairing import MessageStamps
 from cliploc_ros.ros.inputs.robot_state import NoVerticalError, VerticalSource
 from cliploc_ros.ros.inputs.time_jumps import (
-    MessageStamps,
     StampOrder,
     TimeJumpError,
     TimeJumps,
@@ -144,7 +144,7 @@ class Inputs:
         self.odometry = OdometrySource(node)
         self.vertical = VerticalSource(node, transforms)
         self.complete = []
-        self.frames = FrameSource(node, 'raw', math.inf, self.complete.append)
+        self.frames = FrameSource(node, PARAMETERS, math.inf, self.complete.append)
         self._publishers = {message_type: simulation.world.create_publisher(
             message_type, topic, 10) for message_type, topic in (
                 (Odometry, 'odom'), (Imu, 'imu'), (Image, 'image'), (CameraInfo, 'camera_info'),

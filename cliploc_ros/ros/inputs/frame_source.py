@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Frames from the wire: image, camera_info and detections of one stamp; images alone."""
+"""Frames of one camera from the wire: image, camera_info and detections of one stamp."""
 
 import math
 import threading
@@ -8,28 +8,24 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import numpy as np
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.conversions import detection_type, stamp_ns
-from cliploc_ros.ros.inputs.pairing import ExactPairing
+from cliploc_ros.ros.conversions import detection_type, of_camera, stamp_ns
+from cliploc_ros.ros.inputs.pairing import ExactPairing, MessageStamps
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
-from cliploc_ros.ros.inputs.time_jumps import MessageStamps, stamp_problem
+from cliploc_ros.ros.inputs.time_jumps import stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health, Rates
+from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
 
-#: A robot that is refused retries at once: discovering its publishers again would cost it a tenth
-#: of a second.
-LINGER_S = 1.0
-_CHECK_PERIOD_S = 0.5
 # Messages that may wait for their counterparts: ten seconds of 30 Hz VGA images for a slow
 # detector, and every n-th of larger ones.
 _MAX_WAITING = 2000
@@ -71,6 +67,11 @@ class Frame:
     image_topic: str = ''  #: Resolved name of the topic of the image
 
     @property
+    def stamp_ns(self) -> int:
+        """Return the stamp of its image [ns]."""
+        return stamp_ns(self.image.header.stamp)
+
+    @property
     def depth_frame(self) -> str:
         """Return the coordinate frame of its depth; empty without depth."""
         return '' if self.depth is None else str(self.depth.header.frame_id)
@@ -83,71 +84,55 @@ class FrameSource:
 
     Parameters
     ----------
-    transport : str
-        'raw' or 'compressed'.
     linger_s : float
-        How long the subscriptions outlive the last call of next_frame [s]; inf keeps them for
-        as long as the source is open.
+        How long the subscriptions outlive the wish for a frame [s]; inf keeps them for as long as
+        the source is open.
     on_frame : callable
         Called with each complete frame in the executor's thread.
-    detections : str
-        Package of the type of the detections, see DETECTION_TYPES.
-    depth : str
-        'raw' or 'compressed'; 'none': frames have no depth.
-    depth_tolerance_s : float
-        Depth of a frame is at most this far from its image [s].
     camera : str
         Name of the camera, and the namespace of its topics.
     changed : Condition, optional
-        Notified of each frame; several sources may share it.
+        Notified when the source is closed; several sources may share it.
     """
 
-    def __init__(self, node: Node, transport: str, linger_s: float,
-                 on_frame: Callable[[Frame], None], detections: str = 'vision_msgs',
-                 depth: str = 'none', depth_tolerance_s: float = 0.0, camera: str = '',
+    def __init__(self, node: Node, parameters: RelocalizerParameters, linger_s: float,
+                 on_frame: Callable[[Frame], None], camera: str = '',
                  changed: threading.Condition | None = None) -> None:
-        self._node = node
-        self._image_type = Image if transport == 'raw' else CompressedImage
-        self._topics = {'image': 'image' if transport == 'raw' else 'image/compressed',
-                        'camera_info': 'camera_info', 'detections': 'detections'}
-        if depth != 'none':
-            self._topics |= {'depth': 'depth' if depth == 'raw' else 'depth/compressedDepth',
-                             'depth_camera_info': 'depth_camera_info'}
-        self._topics = {name: of_camera(camera, topic) for name, topic in self._topics.items()}
-        self._camera = camera
+        self._node, self._camera = node, camera
+        self._linger_s, self._on_frame = linger_s, on_frame
+        self._package, self._detections = parameters.detections_type, detection_type('vision_msgs')
+        is_raw, depth = parameters.image_transport == 'raw', parameters.depth_transport
+        self._image_type = Image if is_raw else CompressedImage
         self._depth_type = Image if depth == 'raw' else CompressedImage
-        self._depth_tolerance_ns = round(depth_tolerance_s * NS_PER_S)
+        topics = {'image': 'image' if is_raw else 'image/compressed',
+                  'camera_info': 'camera_info', 'detections': 'detections'}
+        if depth != 'none':
+            topics |= {'depth': 'depth' if depth == 'raw' else 'depth/compressedDepth',
+                       'depth_camera_info': 'depth_camera_info'}
+        #: The relative names of the topics
+        self.topics = {name: of_camera(camera, topic) for name, topic in topics.items()}
+        #: Of each topic the newest message, and when it arrived (monotonic clock) [s]
+        self.heard: dict[str, tuple[Any, float]] = {}
+        #: How long after its stamp the newest image came, and the one that came soonest [s]
+        self.lag_s, self.least_lag_s = math.nan, math.inf
+        self._depth_tolerance_ns = round(parameters.depth_tolerance_s * NS_PER_S)
         self._depths: deque[Image | CompressedImage] = deque()
-        self._depth_camera_info: CameraInfo | None = None
-        self._package = detections
-        self._detections = detection_type('vision_msgs')
-        self._linger_s = linger_s
-        self._on_frame = on_frame
         self._pairing = ExactPairing({'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20,
                                       'detections': _MAX_DETECTIONS_BYTES}, _MAX_WAITING,
                                      'image', 'detections')
         self._stamps = {'image': MessageStamps(), 'detections': MessageStamps()}
         self._static_info: CameraInfo | None = None
         self._unsure: Frame | None = None
-        self._lag_s = math.nan
-        self.changed = changed or threading.Condition()
-        self._heard_at: dict[str, float] = {}
+        # When image and detections of the newest frame arrived (monotonic clock) [s].
+        self._arrived_at = (-math.inf, -math.inf)
+        self._changed = changed or threading.Condition()
         self._subscriptions: list[AdaptiveSubscription] = []
         self._subscribed_at = 0.0
         # Until when it is wanted (monotonic clock) [s]: by those who wait, and after them.
         self._deadlines: list[float] = []
         self._wanted_until = 0.0
         self._rates = Rates()
-        self._newest: Frame | None = None
         self._closed = 'the node is not active'
-        # Simulated time may stand still.
-        node.create_timer(_CHECK_PERIOD_S, self._rest, MutuallyExclusiveCallbackGroup(),
-                          Clock(clock_type=ClockType.STEADY_TIME))
-
-    @property
-    def topics(self) -> list[str]:
-        """Return the relative names of the topics."""
-        return list(self._topics.values())
 
     @property
     def image_topic(self) -> str:
@@ -155,11 +140,11 @@ class FrameSource:
         return self._resolved('image')
 
     def open(self) -> None:
-        """Allow calls of next_frame.
+        """Allow frames to be wanted.
 
         OptionsError: the type of the detections is not installed.
         """
-        with self.changed:
+        with self._changed:
             self._detections = detection_type(self._package)
             self._closed = ''
             if self._linger_s == math.inf:
@@ -167,50 +152,19 @@ class FrameSource:
                 self._subscribe()
 
     def close(self, reason: str) -> None:
-        """Unsubscribe, and let waiting calls of next_frame raise StoppedError with a reason."""
-        with self.changed:
+        """Unsubscribe; to want a frame raises StoppedError with a reason from now on."""
+        with self._changed:
             self._closed = reason
             self._deadlines.clear()
             self._unsubscribe()
-            self.changed.notify_all()
+            self._changed.notify_all()
 
     def forget(self) -> None:
         """Drop the messages received so far."""
-        with self.changed:
+        with self._changed:
             self._drop()
             for stamps in self._stamps.values():
                 stamps.clear()
-
-    @property
-    def main(self) -> 'FrameSource':
-        """Return the source of the first of several cameras; of one camera, this one."""
-        return self
-
-    def next_frame(self, after: float, deadline: float, linger_s: float | None = None) -> Frame:
-        """Return the first complete frame whose image arrived after a moment.
-
-        Both times are of the monotonic clock [s]. `linger_s` takes the place of the source's own.
-
-        Raises
-        ------
-        NoFrameError
-            None arrived before the deadline; the message says what was missing.
-        StoppedError
-            The source was closed; the message gives the reason.
-        """
-        def newest() -> Frame | None:
-            frame = self._newest
-            return frame if frame is not None and frame.received_at >= after else None
-        with self.changed:
-            self.want(deadline)
-            self.changed.wait_for(lambda: self.is_closed or newest() is not None,
-                                  max(0.0, deadline - time.monotonic()))
-            frame = newest()
-            why = '' if frame else self.why_none(after)
-            self.want_no_more(deadline, linger_s)  # which may forget both
-        if frame is None:
-            raise NoFrameError(f'no fresh frame within {deadline - after:.3g} s: {why}')
-        return frame
 
     def want(self, deadline: float) -> None:
         """Subscribe until a deadline (monotonic clock) [s]; want_no_more ends it.
@@ -231,7 +185,17 @@ class FrameSource:
         linger_s = self._linger_s if linger_s is None else linger_s
         self._wanted_until = max(self._wanted_until, time.monotonic() + linger_s)
         if not linger_s:
-            self._rest()
+            self.rest()
+
+    def rest(self) -> bool:
+        """Unsubscribe if no frame has been wanted for a while; return whether it subscribes.
+
+        The caller holds the condition.
+        """
+        if self._subscriptions and time.monotonic() >= max(
+                [self._wanted_until, *self._deadlines]):
+            self._unsubscribe()
+        return bool(self._subscriptions)
 
     @property
     def is_closed(self) -> bool:
@@ -240,17 +204,16 @@ class FrameSource:
 
     def missing(self) -> list[str]:
         """Return for each input that nothing publishes a line that says what to do."""
-        return [self._silence(name) for name in self._topics
-                if name not in _OF_DEPTH
-                and self._node.count_publishers(self._resolved(name)) == 0]
+        return [self._silence(name) for name in self.topics if name not in _OF_DEPTH
+                and not self._node.count_publishers(self._resolved(name))]
 
     def examine(self, health: Health, stale_after_s: float) -> None:
         """Report missing inputs, rates, and what waits or was dropped."""
         now = time.monotonic()
-        with self.changed:
-            for name in self._topics.keys() - {'depth_camera_info'}:
-                silent_s = now - max(self._heard_at.get(name, 0.0), self._subscribed_at)
-                nobody = self._node.count_publishers(self._resolved(name)) == 0
+        with self._changed:
+            for name in self.topics.keys() - {'depth_camera_info'}:
+                silent_s = now - max(self._heard_at(name), self._subscribed_at)
+                nobody = not self._node.count_publishers(self._resolved(name))
                 if nobody or (self._subscriptions and silent_s > stale_after_s):
                     # Without intrinsics there is never a pose; images and detections may pause.
                     report = health.fail if name == 'camera_info' else health.warn
@@ -263,7 +226,7 @@ class FrameSource:
             health.values |= {f'{name} rate [Hz]': f'{rate:.1f}' for name, rate in rates.items()}
             health.values |= {
                 'images dropped unpaired': self._pairing.dropped['image'],
-                'image after its stamp [s]': f'{self._lag_s:.3f}',
+                'image after its stamp [s]': f'{self.lag_s:.3f}',
                 'queue age [s]': f'{now - oldest[1] if oldest else 0.0:.2f}'}
 
     def awaits_detections(self, stamp_ns: int, tolerance_s: float) -> bool:
@@ -271,7 +234,7 @@ class FrameSource:
         return self._pairing.waits_near('image', stamp_ns, tolerance_s * NS_PER_S)
 
     def _subscribe(self) -> None:
-        if len(self._subscriptions) == len(self._topics):
+        if len(self._subscriptions) == len(self.topics):
             return
         self._unsubscribe()  # what a failed attempt left behind
         self._subscribed_at = time.monotonic()
@@ -280,10 +243,10 @@ class FrameSource:
                      'detections': (self._detections.message_type, qos.DETECTIONS_IN),
                      'depth': (self._depth_type, qos.IMAGE),
                      'depth_camera_info': (CameraInfo, qos.CAMERA_INFO)}
-        for name, topic in self._topics.items():
+        for name, topic in self.topics.items():
             message_type, profile = of_topics[name]
             self._subscriptions.append(AdaptiveSubscription(
-                self._node, message_type, topic, self._receiver(name), profile))
+                self._node, message_type, topic, partial(self._receive, name), profile))
 
     def _unsubscribe(self) -> None:
         for subscription in self._subscriptions:
@@ -295,41 +258,39 @@ class FrameSource:
         """Drop the messages received so far."""
         self._pairing.clear()
         self._depths.clear()
-        self._newest = self._unsure = self._static_info = None
+        self._unsure = self._static_info = None
+        self._arrived_at = (-math.inf, -math.inf)
+        self.heard |= {name: (None, self._heard_at(name))  # images are large
+                       for name in self.heard.keys() & {'image', 'depth'}}
 
-    def _rest(self) -> None:
-        """Unsubscribe once no frame has been wanted for a while."""
-        with self.changed:
-            if self._subscriptions and time.monotonic() >= max(
-                    [self._wanted_until, *self._deadlines]):
-                self._unsubscribe()
-
-    def _receiver(self, name: str) -> Callable[[Any], None]:
-        def receive(msg: Any) -> None:
-            if name == 'depth':
-                self._take_depth(msg)
-            elif name == 'depth_camera_info':
-                self._depth_camera_info = msg
-            else:
-                self._take(name, self._detections.converted(msg) if name == 'detections' else msg)
-        return receive
-
-    def _take_depth(self, msg: Image | CompressedImage) -> None:
-        """Keep depth images as long as images wait; of those that do not fit, each n-th."""
-        with self.changed:
+    def _receive(self, name: str, msg: Any) -> None:
+        """Take one message, and pass on the frame that it completes."""
+        with self._changed:
             if not self._subscriptions:
                 return
-            self._heard_at['depth'] = time.monotonic()
-            self._depths.append(msg)
-            oldest = self._pairing.oldest('image')
-            # with no image that waits, the next one is about as new as this
-            useful_ns = (stamp_ns(msg.header.stamp) if oldest is None
-                         else stamp_ns(oldest[0].header.stamp)) - self._depth_tolerance_ns
-            while len(self._depths) > 1 and sum(
-                    len(one.data) for one in self._depths) > _MAX_DEPTH_BYTES:
-                stamps = [stamp_ns(one.header.stamp) for one in self._depths]
-                del self._depths[0 if stamps[0] < useful_ns or len(stamps) < 3 else 1 + min(
-                    range(len(stamps) - 2), key=lambda row: stamps[row + 2] - stamps[row])]
+            if name == 'detections':
+                msg = self._detections.converted(msg)
+            self.heard[name] = msg, time.monotonic()
+            frame = None
+            if name == 'depth':
+                self._keep_depth(msg)
+            elif name != 'depth_camera_info':
+                frame = self._completed(name, *self.heard[name])
+        if frame is not None:
+            self._on_frame(frame)
+
+    def _keep_depth(self, msg: Image | CompressedImage) -> None:
+        """Keep depth images as long as images wait; of those that do not fit, each n-th."""
+        self._depths.append(msg)
+        oldest = self._pairing.oldest('image')
+        # with no image that waits, the next one is about as new as this
+        useful_ns = (stamp_ns(msg.header.stamp) if oldest is None
+                     else stamp_ns(oldest[0].header.stamp)) - self._depth_tolerance_ns
+        while len(self._depths) > 1 and sum(
+                len(one.data) for one in self._depths) > _MAX_DEPTH_BYTES:
+            stamps = [stamp_ns(one.header.stamp) for one in self._depths]
+            del self._depths[0 if stamps[0] < useful_ns or len(stamps) < 3 else 1 + min(
+                range(len(stamps) - 2), key=lambda row: stamps[row + 2] - stamps[row])]
 
     def _depth_at(self, image_ns: int) -> Image | CompressedImage | None:
         """Return the depth image nearest to a time; older ones are of no more use."""
@@ -340,63 +301,51 @@ class FrameSource:
             return None
         return nearest
 
-    def _take(self, name: str, msg: Any) -> None:
-        """Take one message, and pass on the frame that it completes."""
+    def _completed(self, name: str, msg: Any, received_at: float) -> Frame | None:
+        """Return the frame that a message completes, once its stamps are sure; None before."""
+        at_ns = stamp_ns(msg.header.stamp)
         size = {'image': lambda: len(msg.data), 'camera_info': lambda: 1000,
                 'detections': lambda: _DETECTION_BYTES * (1 + len(msg.detections))}[name]()
-        at_ns, received_at = stamp_ns(msg.header.stamp), time.monotonic()
-        with self.changed:
-            if not self._subscriptions:
-                return
-            self._heard_at[name] = received_at
-            if name == 'camera_info':
-                # without a stamp it holds for all images
-                self._static_info = msg if stamp_problem(msg.header.stamp) else None
-                if self._static_info is not None:
-                    return
-            elif not self._is_named(name, msg, received_at):
-                return
-            if name == 'image' and self._static_info is not None:
-                self._pairing.add('camera_info', at_ns, (self._static_info, received_at), 0)
-            complete = self._pairing.add(name, at_ns, (msg, received_at), size)
-            if complete is not None:
-                image, received_at = complete['image']
-                detections, detected_at = complete['detections']
-                self._unsure = Frame(
-                    image, complete['camera_info'][0], detections, received_at,
-                    max(received_at, detected_at), self._depth_at(at_ns),
-                    self._depth_camera_info, self._camera, image_topic=self.image_topic)
-            frame = self._unsure
-            if frame is None or not self._is_sure(stamp_ns(frame.image.header.stamp)):
-                return
-            self._newest, self._unsure = frame, None
-            self.changed.notify_all()
-        self._on_frame(frame)
+        if name == 'camera_info':
+            # without a stamp it holds for all images
+            self._static_info = msg if stamp_problem(msg.header.stamp) else None
+            if self._static_info is not None:
+                return None
+        elif not self._is_named(name, msg, received_at):
+            self._unsure = None
+            return None
+        if name == 'image' and self._static_info is not None:
+            self._pairing.add('camera_info', at_ns, (self._static_info, received_at), 0)
+        complete = self._pairing.add(name, at_ns, (msg, received_at), size)
+        if complete is not None:
+            (image, image_at), (detections, detected_at) = (
+                complete['image'], complete['detections'])
+            self._unsure = Frame(
+                image, complete['camera_info'][0], detections, image_at,
+                max(image_at, detected_at), self._depth_at(at_ns),
+                self.heard.get('depth_camera_info', (None, 0.0))[0], self._camera,
+                image_topic=self.image_topic)
+        frame = self._unsure
+        # a single stamp may be that of the next images, too
+        if frame is None or not (self._stamps['image'].are_own or all(
+                one.is_repeated(frame.stamp_ns) for one in self._stamps.values())):
+            return None
+        self._unsure, self._arrived_at = None, (frame.received_at, frame.detected_at)
+        return frame
 
     def _is_named(self, name: str, msg: Any, received_at: float) -> bool:
         """Return whether an image or detections have a stamp of their own."""
         if name == 'image':
-            self._lag_s = (self._node.get_clock().now().nanoseconds
-                           - stamp_ns(msg.header.stamp)) / NS_PER_S
-            content = msg.header.frame_id, len(msg.data), bytes(
-                memoryview(msg.data)[::1 + len(msg.data) // _SAMPLE])
-            is_named = self._stamps[name].add(msg.header.stamp, content, received_at)
-        else:
-            boxes = [one.bbox for one in msg.detections]
-            is_named = self._stamps[name].add(msg.header.stamp, np.array(
-                [(one.center.position.x, one.center.position.y, one.size_x, one.size_y)
-                 for one in boxes]).tobytes(), received_at)
-        if not is_named:
-            self._unsure = None
-        return is_named
-
-    def _is_sure(self, at_ns: int) -> bool:
-        """Return whether the detections of a stamp are of its image.
-
-        A single stamp may be that of the next images, too.
-        """
-        images = self._stamps['image']
-        return images.are_own or all(one.is_repeated(at_ns) for one in self._stamps.values())
+            self.lag_s = (self._node.get_clock().now().nanoseconds
+                          - stamp_ns(msg.header.stamp)) / NS_PER_S
+            self.least_lag_s = min(self.lag_s, self.least_lag_s, key=abs)
+            return self._stamps[name].add(msg.header.stamp, (
+                msg.header.frame_id, len(msg.data), bytes(
+                    memoryview(msg.data)[::1 + len(msg.data) // _SAMPLE])), received_at)
+        boxes = [one.bbox for one in msg.detections]
+        return self._stamps[name].add(msg.header.stamp, np.array(
+            [(one.center.position.x, one.center.position.y, one.size_x, one.size_y)
+             for one in boxes]).tobytes(), received_at)
 
     def _stamp_problems(self) -> list[str]:
         """Return what is wrong with the stamps of images and detections, and what to do."""
@@ -406,8 +355,8 @@ class FrameSource:
 
     def unheard(self, since: float) -> dict[str, str]:
         """Return the inputs that were silent since a moment of the monotonic clock, and why."""
-        return {of_camera(self._camera, name): self._silence(name) for name in self._topics
-                if name not in _OF_DEPTH and self._heard_at.get(name, -math.inf) < since}
+        return {name: self._silence(name) for name in self.topics
+                if name not in _OF_DEPTH and self._heard_at(name) < since}
 
     def why_none(self, since: float) -> str:
         """Return what was missing since a moment of the monotonic clock."""
@@ -422,11 +371,10 @@ class FrameSource:
             return (f'detections come {self._pairing.outrun} images late, and memory holds '
                     f'{_MAX_IMAGE_BYTES // 2**20} MiB of images: use smaller images, '
                     'image_transport compressed, or a faster detector')
-        newest = self._newest
-        if newest is not None and newest.detected_at >= since:
-            late_s = newest.detected_at - newest.received_at
-            return (f'detections come {late_s:.1f} s after their image: choose a faster profile '
-                    'or a smaller detector, or raise timeout_s')
+        received_at, detected_at = self._arrived_at
+        if detected_at >= since:
+            return (f'detections come {detected_at - received_at:.1f} s after their image: choose '
+                    'a faster profile or a smaller detector, or raise timeout_s')
         stamps = ', '.join(f'{self._resolved(name)} {stamp / NS_PER_S:.6f}'
                            for name, stamp in self._pairing.last_stamp_ns.items())
         return (f'stamps never match (last: {stamps}): camera_info and detections must carry '
@@ -445,66 +393,7 @@ class FrameSource:
         return f'no {name}: nobody publishes {topic}; remap it, or start its publisher'
 
     def _resolved(self, name: str) -> str:
-        return str(self._node.resolve_topic_name(self._topics[name]))
+        return str(self._node.resolve_topic_name(self.topics[name]))
 
-
-def of_camera(camera: str, topic: str) -> str:
-    """Return the topic of one of several cameras; that of the only one has no name."""
-    return f'{camera}/{topic}' if camera else topic
-
-
-class TimedImage(NamedTuple):
-    """An image, and when it arrived (monotonic clock) [s]."""
-
-    msg: Image | CompressedImage
-    received_at: float
-
-
-class ImageSource:
-    """Subscribes to images, 'raw' or 'compressed', while it is open.
-
-    `on_image` takes each TimedImage, in the executor's thread. `camera` is the namespace of the
-    topic.
-    """
-
-    def __init__(self, node: Node, transport: str, on_image: Callable[[TimedImage], None],
-                 camera: str = '') -> None:
-        self._node = node
-        self._type = Image if transport == 'raw' else CompressedImage
-        self._name = of_camera(camera, 'image' if transport == 'raw' else 'image/compressed')
-        self._on_image = on_image
-        self._subscription: AdaptiveSubscription | None = None
-        self._heard_at = 0.0
-        self.received = 0
-
-    @property
-    def is_open(self) -> bool:
-        """Return whether it subscribes."""
-        return self._subscription is not None
-
-    def open(self) -> None:
-        """Subscribe, if it does not yet."""
-        if self._subscription is None:
-            self._heard_at = time.monotonic()  # silence counts from here
-            self._subscription = AdaptiveSubscription(self._node, self._type, self._name,
-                                                      self._take, qos.IMAGE)
-
-    def close(self) -> None:
-        """Unsubscribe."""
-        if self._subscription is not None:
-            self._subscription.destroy()
-            self._subscription = None
-
-    def examine(self, health: Health, stale_after_s: float) -> None:
-        """Report a topic without a publisher, and silence."""
-        topic = self._node.resolve_topic_name(self._name)
-        silent_s = time.monotonic() - self._heard_at
-        if self._node.count_publishers(topic) == 0:
-            health.warn(f'no image: nobody publishes {topic}; remap it, or start its publisher')
-        elif self.is_open and silent_s > stale_after_s:
-            health.warn(f'no image on {topic} for {silent_s:.1f} s')
-
-    def _take(self, msg: Image | CompressedImage) -> None:
-        self.received += 1
-        self._heard_at = time.monotonic()
-        self._on_image(TimedImage(msg, self._heard_at))
+    def _heard_at(self, name: str) -> float:
+        return self.heard.get(name, (None, -math.inf))[1]

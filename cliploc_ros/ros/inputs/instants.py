@@ -30,7 +30,6 @@ from cliploc_ros.messages import (
     image_from_msg,
     parse_class_map,
 )
-from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -121,7 +120,7 @@ class Instants:
         except CliplocError as error:
             self.note(f'localizing without depth: {error}')
         return image, Observation(
-            camera, detections, stamp_ns=stamp_ns(frame.image.header.stamp),
+            camera, detections, stamp_ns=frame.stamp_ns,
             camera_name=frame.camera, up_in_camera=state.up_in_camera, depths=depths,
             odom_from_camera=odom_from_camera, odom_way_m=0.0 if place is None else place.way_m)
 

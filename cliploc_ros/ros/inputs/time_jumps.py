@@ -4,7 +4,7 @@
 
 import math
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from typing import NamedTuple
 
 from builtin_interfaces.msg import Time
@@ -20,14 +20,6 @@ from cliploc_ros.units import NS_PER_S
 _MAX_AHEAD_NS = NS_PER_S // 5
 # DDS keeps the order of a publisher: a stamp that is older by more than this is a jump (a guess).
 _MAX_DISORDER_NS = NS_PER_S
-# So many messages in a row with a stamp of their own show that each has one: stamps in whole
-# seconds differ at times, too. The same message comes again twice, as relays send it, or more.
-_SHOWN, _REPEATED = 3, 2
-# Ten seconds of a camera at 30 Hz.
-_REMEMBERED = 300
-# Messages come so evenly after their stamps, also where a simulation or a bag runs at another
-# rate; what comes otherwise is of another clock (a guess).
-_UNEVEN_S = 5.0
 
 
 class TimeJumpError(CliplocError):
@@ -96,59 +88,6 @@ def stamp_problem(stamp: Time) -> str:
     if stamp.sec < 0:
         return f'is {stamp.sec} s, before 1970'
     return '' if stamp_ns(stamp) else 'is 0'
-
-
-class MessageStamps:
-    """Tells whether the stamps of a topic name its messages, for which each needs its own.
-
-    Detections with a stamp that several images have may be of any of them. The same message may
-    come again.
-    """
-
-    def __init__(self) -> None:
-        self.clear()
-
-    def clear(self) -> None:
-        """Forget all stamps."""
-        #: Why the stamps name no messages, as in "the stamp is 0"; empty if they may.
-        self.problem = ''
-        # Of each stamp the last message, and how often that came.
-        self._known: dict[int, tuple[int, int]] = {}
-        self._own, self._lag_s = 0, math.nan
-
-    @property
-    def are_own(self) -> bool:
-        """Return whether the last messages had each its own stamp."""
-        return self._own >= _SHOWN
-
-    def is_repeated(self, at_ns: int) -> bool:
-        """Return whether the same message came again with a stamp [ns]."""
-        return self._known.get(at_ns, (0, 0))[1] >= _REPEATED
-
-    def add(self, stamp: Time, content: Hashable, received_at: float) -> bool:
-        """Take in a stamp and what tells its message from others; return whether it names it.
-
-        After a stamp that does not, so does none until some in a row are right. The message
-        arrived at `received_at` (monotonic clock) [s].
-        """
-        at_ns, message, why, times = stamp_ns(stamp), hash(content), stamp_problem(stamp), 0
-        if not why:
-            known, times = self._known.pop(at_ns, (message, 0))
-            if known != message:
-                times, why = 0, f'is {at_ns / NS_PER_S:.6f} on several of them'
-            self._known[at_ns] = message, times + 1
-            former_s, self._lag_s = self._lag_s, received_at - at_ns / NS_PER_S
-            is_even = abs(self._lag_s - former_s) <= _UNEVEN_S
-            self._own = (self._own if is_even else 0) + (not times)
-            if len(self._known) > _REMEMBERED:
-                del self._known[next(iter(self._known))]
-        if why or times >= _REPEATED:
-            self._own = 0
-        if why:
-            self.problem = why
-        elif self.are_own or self.is_repeated(at_ns):
-            self.problem = ''
-        return not self.problem
 
 
 class StampOrder:
