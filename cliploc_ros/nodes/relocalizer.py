@@ -7,6 +7,7 @@ import math
 import threading
 import time
 import traceback
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,6 @@ from typing import Any, NoReturn
 
 from diagnostic_msgs.msg import DiagnosticArray
 from diagnostic_msgs.srv import SelfTest
-from rclpy.callback_groups import CallbackGroup
 from rclpy.parameter import Parameter
 from std_srvs.srv import Empty, Trigger
 
@@ -22,7 +22,7 @@ from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.messages import faults_of_rectified
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, CaseRecorder, RequestCounters, Verdict, answer_msg
-from cliploc_ros.ros.handoff import HandOff
+from cliploc_ros.ros.handoff import HandOff, MapToOdom
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
@@ -60,7 +60,9 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         parameters = self.settings.values
         self._robot = RobotStateSource(self)
         self._jumps = TimeJumps(self, self._forget)
-        self._pipeline = Pipeline(self, self._robot, self._jumps)
+        self._map_to_odom = MapToOdom(self, self._robot.transforms)
+        self._robot.odometry.on_restart(self._map_to_odom.forget)
+        self._pipeline = Pipeline(self, self._robot, self._jumps, self._map_to_odom)
         self._newest = LatestOnly(self.worker, self._localize_and_log)
         self._frames = CameraRig(self, parameters) if parameters.mode == 'on_request' else \
             CameraRig(self, parameters, math.inf, self._newest.offer)
@@ -82,15 +84,21 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._answers = self.create_publisher(DiagnosticArray, '~/answer', qos.LATCHED)
         self._last_verdict = 'none yet'
         self._verdicts: dict[str, int] = dict.fromkeys(Verdict, 0)
+        # Between the parameters of a map and its reading, nobody else may set them.
+        self._map_lock = threading.Lock()
+        services: list[tuple[Any, str, Callable[[Any, Any], Any]]] = [
+            (Trigger, '~/relocalize', self._on_relocalize),
+            (SelfTest, '~/relocalize_fields', self._on_relocalize_fields),
+            (Trigger, '~/record', self._on_record),
+            (Trigger, '~/reload_map', self._on_reload_map),
+            (Empty, 'reinitialize_global_localization', self._on_reinitialize)]
+        with suppress(ImportError):  # map_file and reload_map do the same
+            load_map = importlib.import_module('nav2_msgs.srv').LoadMap
+            services.append((load_map, '~/load_map', self._on_load_map))
         group = BoundedCallbackGroup(MAX_REQUESTS)
-        for service_type, name, callback in (
-                (Trigger, '~/relocalize', self._on_relocalize),
-                (SelfTest, '~/relocalize_fields', self._on_relocalize_fields),
-                (Trigger, '~/record', self._on_record),
-                (Empty, 'reinitialize_global_localization', self._on_reinitialize)):
+        for service_type, name, callback in services:
             self.create_service(service_type, name, callback, qos_profile=qos.SERVICE,
                                 callback_group=group)
-        MapServices(self, self._pipeline, group)
 
     def load(self) -> str:
         """Load map and network."""
@@ -105,7 +113,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         parameters = self.settings.values
         self._handoff.open(parameters.localizer_pose)
         self._robot.open()
-        self._pipeline.open()
+        if parameters.publish_tf:
+            self._map_to_odom.open()
         self._frames.open()
         self._watcher.open()
         for source in self._frames.sources.values():
@@ -117,7 +126,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._watcher.close()
         self._handoff.close()
         self._frames.close('the node was deactivated')
-        self._pipeline.close()
+        self._map_to_odom.close()
         self._robot.close()
 
     def release(self) -> None:
@@ -128,13 +137,16 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
 
     def _forget(self) -> None:
         """Forget all input: time jumped."""
-        for part in (self._frames, self._robot, self._pipeline, self._handoff, self._cases,
+        for part in (self._frames, self._robot, self._map_to_odom, self._handoff, self._cases,
                      self._watcher):
             part.forget()
 
     def examine(self, health: Health) -> None:
         """Report the inputs, the last verdict and the device."""
         parameters = self.settings.values
+        missing = [line for one in self._frames.sources.values() for line in one.missing()]
+        if parameters.require_localizer and (no_localizer := self._handoff.missing()):
+            missing.append(no_localizer)
         self._frames.examine(health, parameters.stale_after_s)
         self._robot.examine(health)
         health.values |= {'frames skipped while busy': self._newest.dropped,
@@ -144,32 +156,25 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                               parameters.map_file, *parameters.map_files])),
                           'base frame': parameters.base_frame,
                           'time limit [s]': parameters.timeout_s,
-                          'missing': '; '.join(self._missing())}
+                          'missing': '; '.join(missing)}
         self._watcher.examine(health)
         localizer = self._pipeline.localizer  # once: a cleanup may drop it meanwhile
         if localizer is not None:
-            for fault in localizer.faults:
+            for fault in localizer.instants.faults:
                 (health.fail if fault.is_certain else health.warn)(fault.text)
             keyframes = localizer.keyframes
             if keyframes is not None:
-                health.values |= {'keyframes': len(keyframes.layer),
+                health.values |= {'keyframes': len(keyframes.localizer.layer),
                                   'keyframes file': keyframes.file,
                                   'keyframes hash': keyframes.file_hash}
-            health.values |= localizer.cameras.values
-            health.values['wrong cameras'] = '; '.join(localizer.cameras.faults)
-            for wrong in localizer.cameras.faults:
+            cameras, depth_scale = localizer.localizer.cameras, localizer.localizer.depth_scale
+            health.values |= cameras.values | {'wrong cameras': '; '.join(cameras.faults)}
+            for wrong in cameras.faults:
                 health.fail(f'{wrong}: check camera_info, and the pixels and corners of the boxes')
             if parameters.depth_transport != 'none':
-                health.values['depth scale'] = f'{localizer.depth_scale.ratio:.2f}'
+                health.values['depth scale'] = f'{depth_scale.ratio:.2f}'
             health.values |= {'map': localizer.description, 'map hash': localizer.map_hash,
                               'device': localizer.device}
-
-    def _missing(self) -> list[str]:
-        """Return what a request needs and does not find, one line each."""
-        missing = [line for one in self._frames.sources.values() for line in one.missing()]
-        if self.settings.values.require_localizer and (localizer := self._handoff.missing()):
-            missing.append(localizer)
-        return missing
 
     def _on_relocalize(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         answer = self._answer()
@@ -203,16 +208,47 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self.get_logger().info(f'record: {response.message}')
         return response
 
-    @property
-    def _map_hash(self) -> str:
-        localizer = self._pipeline.localizer
-        return '' if localizer is None else localizer.map_hash
+    def _on_reload_map(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Read the map again, in the worker's thread, never in the middle of a search."""
+        try:
+            with self._map_lock:
+                read = self.worker.run(self._pipeline.reload_map)
+            response.message = f'loaded: {read.description}; map {read.map_hash}'
+            response.success = True
+        except CliplocError as error:
+            response.message = f'not loaded: {error}'
+        self.get_logger().info(f'map {response.message}')
+        return response
+
+    def _on_load_map(self, request: Any, response: Any) -> Any:
+        """Search one map from now on; parameters and maps stay as they were if that fails."""
+        with self._map_lock:
+            values = self.settings.values
+            before = {'map_file': values.map_file, 'map_files': values.map_files}
+            try:
+                self._set(map_file=request.map_url, map_files=[''])
+                read = self.worker.run(self._pipeline.reload_map)
+                self.get_logger().info(f'map loaded: {read.description}')
+                response.result = response.RESULT_SUCCESS
+            except CliplocError as error:
+                self._set(**before)
+                self.get_logger().error(f'map not loaded: {error}')
+                response.result = response.RESULT_MAP_DOES_NOT_EXIST
+                with suppress(MapError):
+                    if Path(path_of(request.map_url)).exists():
+                        response.result = response.RESULT_INVALID_MAP_DATA
+        return response
+
+    def _set(self, **values: Any) -> None:
+        self.set_parameters_atomically(
+            [Parameter(name, value=value) for name, value in values.items()])
 
     def _answer(self) -> Answer:
         began_at = time.monotonic()
         answer = self._requests.answer()
-        if not answer.map_hash:
-            answer = replace(answer, map_hash=self._map_hash)
+        localizer = self._pipeline.localizer
+        if not answer.map_hash and localizer is not None:
+            answer = replace(answer, map_hash=localizer.map_hash)
         self._counters.add(answer, time.monotonic() - began_at)
         self._cases.end(answer)
         if answer.verdict is Verdict.ACCEPTED:
@@ -244,89 +280,3 @@ def main() -> NoReturn:
 
 if __name__ == '__main__':
     main()
-
-
-class MapServices:
-    """Reads maps in the node's worker, never in the middle of a search.
-
-    Parameters
-    ----------
-    group : CallbackGroup
-        Of the services.
-    """
-
-    def __init__(self, node: ManagedNode[RelocalizerParameters], pipeline: Pipeline,
-                 group: CallbackGroup) -> None:
-        self._node = node
-        self._pipeline = pipeline
-        # Between the parameters of a map and its reading, nobody else may set them.
-        self._lock = threading.Lock()
-        node.create_service(Trigger, '~/reload_map', self._on_reload, qos_profile=qos.SERVICE,
-                            callback_group=group)
-        try:
-            load_map = importlib.import_module('nav2_msgs.srv').LoadMap
-        except ImportError:
-            return  # map_file and reload_map do the same
-        node.create_service(load_map, '~/load_map', self._on_load, qos_profile=qos.SERVICE,
-                            callback_group=group)
-
-    def load(self, map_url: str) -> str:
-        """Search one map from now on; return what was loaded, in one line.
-
-        Parameters
-        ----------
-        map_url : str
-            See cliploc_ros.ros.map_parameters.
-
-        Raises
-        ------
-        CliplocError
-            Names what to fix; parameters and maps stay as they were.
-        """
-        with self._lock:
-            before = {name: getattr(self._node.settings.values, name)
-                      for name in ('map_file', 'map_files')}
-            self._set(map_file=map_url, map_files=[''])
-            try:
-                return self._node.worker.run(self._pipeline.reload_map)
-            except CliplocError:
-                self._set(**before)
-                raise
-
-    def _set(self, **values: Any) -> None:
-        self._node.set_parameters_atomically(
-            [Parameter(name, value=value) for name, value in values.items()])
-
-    def _on_reload(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        try:
-            with self._lock:
-                description, map_hash = self._node.worker.run(self._reload)
-            response.message = f'loaded: {description}; map {map_hash}'
-            response.success = True
-        except CliplocError as error:
-            response.message = f'not loaded: {error}'
-        self._node.get_logger().info(f'map {response.message}')
-        return response
-
-    def _reload(self) -> tuple[str, str]:
-        """Read the map again, in the worker's thread; return what was loaded, and its hash."""
-        description = self._pipeline.reload_map()
-        assert self._pipeline.localizer is not None
-        return description, self._pipeline.localizer.map_hash
-
-    def _on_load(self, request: Any, response: Any) -> Any:
-        try:
-            self._node.get_logger().info(f'map loaded: {self.load(request.map_url)}')
-            response.result = response.RESULT_SUCCESS
-        except CliplocError as error:
-            self._node.get_logger().error(f'map not loaded: {error}')
-            response.result = response.RESULT_INVALID_MAP_DATA if _is_there(request.map_url) \
-                else response.RESULT_MAP_DOES_NOT_EXIST
-        return response
-
-
-def _is_there(map_url: str) -> bool:
-    try:
-        return Path(path_of(map_url)).exists()
-    except MapError:
-        return False

@@ -210,7 +210,7 @@ def _check_map(node: Doctor, parameters: RelocalizerParameters, report: Report
         else:
             report.judge('keyframes', '' if keyframes is not None else
                          f'{file} is not used, see the error above: make it again with build_map',
-                         f'{len(keyframes.layer if keyframes else ())} of {file}')
+                         f'{len(keyframes.localizer.layer if keyframes else ())} of {file}')
         return localizer
     return None
 

@@ -12,22 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
-from cliploc_ros.core.acceptance.camera_check import CameraCheck
-from cliploc_ros.core.acceptance.depth_check import DepthScale
-from cliploc_ros.core.geometry.camera_faults import Fault
 from cliploc_ros.core.kernels.compiled import KERNEL_FOLDERS
-from cliploc_ros.core.keyframes.layer import (
-    KeyframeLayer,
-    layer_hash,
-    layer_path,
-    load_layer_of_map,
-)
+from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, load_layer_of_map
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer, by_classes, can_do_without_crops
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import split_similarities
-from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalization import Relocalization, in_its_map
@@ -58,11 +49,6 @@ class Keyframes(NamedTuple):
     localizer: KeyframeLocalizer
     file: str = ''
     file_hash: str = ''
-
-    @property
-    def layer(self) -> KeyframeLayer:
-        """Return the layer."""
-        return self.localizer.layer
 
 
 class Localized(NamedTuple):
@@ -103,72 +89,25 @@ class FrameLocalizer:
     def __init__(self, landmark_map: LandmarkMap, observer: Observer | None,
                  relocalizer: Relocalizer, options: RelocalizerOptions, device: str,
                  map_hash: str, keyframes: Keyframes | None = None) -> None:
-        self.device = device
-        self.map_hash = map_hash
-        self._keyframes = keyframes
-        self._map = landmark_map
-        self._observer = observer
-        self._options = options
-        self._instants = Instants(landmark_map, options.matching != 'clip')
-        self._begin(relocalizer)
+        self.device, self.map_hash, self.keyframes = device, map_hash, keyframes
+        #: The map, or all maps as one, and the coordinate frames of the maps
+        self.landmark_map = landmark_map
+        self.frame_ids = [part.landmark_map.frame_id for part in parts_of(landmark_map)]
+        self.observer = observer
+        self.instants = Instants(landmark_map, options.matching != 'clip')
+        self._begin(relocalizer, options)
         relocalizer.warm_up()
-
-    @property
-    def landmark_map(self) -> LandmarkMap:
-        """Return the map, or all maps as one."""
-        return self._map
-
-    @property
-    def keyframes(self) -> Keyframes | None:
-        """Return the layer of keyframes; None without one."""
-        return self._keyframes
-
-    @property
-    def frame_ids(self) -> list[str]:
-        """Return the coordinate frames of the maps."""
-        return [part.landmark_map.frame_id for part in parts_of(self._map)]
-
-    @property
-    def depth_scale(self) -> DepthScale:
-        """Return what accepted poses say of the scale of depth."""
-        return self._localizer.depth_scale
-
-    @property
-    def faults(self) -> list[Fault]:
-        """Return what is wrong with the newest frames, their cameras and their detector."""
-        return self._instants.faults
-
-    @property
-    def cameras(self) -> CameraCheck:
-        """Return what looks say of the cameras and their boxes."""
-        return self._localizer.cameras
 
     @property
     def description(self) -> str:
         """Return what is loaded, in a line."""
-        frames = [f"'{frame_id}'" for frame_id in self.frame_ids]
-        where = f'frame {frames[0]}' if len(frames) == 1 else \
-            f'{len(frames)} maps, frames {", ".join(frames)}'
-        keyframes = '' if self._keyframes is None else f'{len(self._keyframes.layer)} keyframes, '
-        return (f'{len(self._map)} landmarks in {where}, {keyframes}'
+        frames = ', '.join(f"'{frame_id}'" for frame_id in self.frame_ids)
+        where = f'frame {frames}' if len(self.frame_ids) == 1 else \
+            f'{len(self.frame_ids)} maps, frames {frames}'
+        keyframes = '' if self.keyframes is None else \
+            f'{len(self.keyframes.localizer.layer)} keyframes, '
+        return (f'{len(self.landmark_map)} landmarks in {where}, {keyframes}'
                 f'matching {self._options.matching}, algorithm {self._options.algorithm}')
-
-    def reloaded(self, node: Node, parameters: RelocalizerParameters) -> 'FrameLocalizer':
-        """Return a localizer for the map as it is now; the encoder stays the same.
-
-        CliplocError: names what to fix in the map; this localizer stays as it was.
-        """
-        options = parameters.options()
-        files = map_files(parameters)
-        landmark_map, map_hash = load_hashed_map(node, files)
-        relocalizer = Relocalizer(landmark_map, options)
-        observer = self._observer
-        if observer is not None:
-            from cliploc_ros.models.map_rows import embed_map
-            observer = observer.with_labels(embed_map(
-                clip_options_of(parameters), landmark_map, files, parameters.landmark_embeddings))
-        return FrameLocalizer(landmark_map, observer, relocalizer, options, self.device, map_hash,
-                              load_keyframes(parameters, landmark_map))
 
     def localize(self, frame: Frame, parameters: RelocalizerParameters, known: KnownBefore,
                  times: StageTimes, deadline: float = math.inf) -> Localized:
@@ -180,24 +119,29 @@ class FrameLocalizer:
         CliplocError: names what to fix in the frame or in the parameters.
         """
         times.begin('decoding')
-        query = self._instants.query(frame, parameters, known)
+        query = self.instants.query(frame, parameters, known)
         found = self.answer(query, parameters.options(), times, deadline)
-        localizer = self._localizer
-        assert localizer.query is not None
-        query, seen = localizer.query, localizer.query.newest
+        assert self.localizer.query is not None
+        query, seen = self.localizer.query, self.localizer.query.newest
         if (found.accepted and found.map_from_camera is not None
                 and parameters.base_frame not in ('', frame.image.header.frame_id)):
-            self._instants.check_axes(frame, known.state, found.map_from_camera)
+            self.instants.check_axes(frame, known.state, found.map_from_camera)
         compared = int((seen.similarity_rows >= 0).sum())
-        is_cut = not found.accepted and self._observer is not None \
+        is_cut = not found.accepted and self.observer is not None \
             and compared < len(seen.detections)
-        for_filter = localizer.covariance_for_filter(found) \
+        for_filter = self.localizer.covariance_for_filter(found) \
             if found.accepted and parameters.mode == 'continuous' else found.covariance
-        found, landmark_map, seen = _in_its_map(self._instants.explained(found), self._map, seen)
+        found, own = in_its_map(self.instants.explained(found), self.landmark_map)
+        parts = parts_of(self.landmark_map)
+        if seen.similarities is not None and len(parts) > 1:
+            pieces = split_similarities(seen.similarities, [len(one.landmark_map)
+                                                            for one in parts])
+            which = [one.first for one in parts].index(own.first)
+            seen = replace(seen, similarities=pieces[which])
         names = [one.camera_name for one in query.frames]
-        layer = None if self._keyframes is None else self._keyframes.layer
+        layer = None if self.keyframes is None else self.keyframes.localizer.layer
         return Localized(
-            found, landmark_map, SeenImage(query.images[-1], seen, layer), compared, is_cut,
+            found, own.landmark_map, SeenImage(query.images[-1], seen, layer), compared, is_cut,
             for_filter, (*frame.left_out, *(one.camera for one, _ in known.beside
                                             if one.camera not in names)), query)
 
@@ -205,15 +149,15 @@ class FrameLocalizer:
                deadline: float = math.inf) -> Relocalization:
         """Answer a query with options as they are now; see localize."""
         localizer = self._localizer_for(options)
-        if self._keyframes is not None:
-            self._instants.note(self._keyframes.layer.camera_note(query.newest.camera))
+        if self.keyframes is not None:
+            self.instants.note(self.keyframes.localizer.layer.camera_note(query.newest.camera))
         times.begin('search')
-        found = localizer.answer(query, self._observer, deadline, times.begin)
+        found = localizer.answer(query, self.observer, deadline, times.begin)
         for name in localizer.cameras.wrong_mounts:
-            self._instants.note(f'what {name} sees does not fit the other cameras: check its '
-                                'mount, camera_info and image')
+            self.instants.note(f'what {name} sees does not fit the other cameras: check its '
+                               'mount, camera_info and image')
         if localizer.depth_scale.is_wrong:
-            self._instants.note(
+            self.instants.note(
                 f'depth is {localizer.depth_scale.ratio:.2f} times what boxes and map say, and '
                 'is used no more: check its unit, calibration and registration')
         return found
@@ -226,40 +170,36 @@ class FrameLocalizer:
 
         CliplocError: names what to fix in the frame or in the parameters.
         """
-        shift = next((part.shift for part in parts_of(self._map)
+        shift = next((part.shift for part in parts_of(self.landmark_map)
                       if part.landmark_map.frame_id == frame_id), None)
         if shift is None:
             raise MapError(f"no map is in frame '{frame_id}', but in {', '.join(self.frame_ids)}: "
                            "correct the map's frame_id")
         options = parameters.options()
         localizer = self._localizer_for(options)
-        query = self._instants.query(frame, parameters, KnownBefore(state))
-        observation = localizer.with_free_crops(query, 0, self._observer) \
-            if can_do_without_crops(options) else by_classes(query.newest, len(self._map))
+        query = self.instants.query(frame, parameters, KnownBefore(state))
+        observation = localizer.with_free_crops(query, 0, self.observer) \
+            if can_do_without_crops(options) else by_classes(query.newest, len(self.landmark_map))
         pose = map_from_camera.copy()
         pose[:3, 3] += shift
-        return self._watch.look(observation, pose, query.images[-1], localizer.recognizer(query))
+        return self.watch.look(observation, pose, query.images[-1], localizer.recognizer(query))
 
-    def forget_looks(self) -> None:
-        """Have the watch begin again."""
-        self._watch.forget()
-
-    def _begin(self, relocalizer: Relocalizer) -> None:
-        """Answer and watch with a relocalizer from now on."""
-        self._localizer = Localizer(
-            relocalizer, None if self._keyframes is None else self._keyframes.localizer)
-        self._watch = Watch(relocalizer)
+    def _begin(self, relocalizer: Relocalizer, options: RelocalizerOptions) -> None:
+        """Answer and watch with a relocalizer of some options from now on."""
+        self._options, self.watch = options, Watch(relocalizer)
+        self.localizer = Localizer(
+            relocalizer, None if self.keyframes is None else self.keyframes.localizer)
 
     def _localizer_for(self, options: RelocalizerOptions) -> Localizer:
         """Return the localizer; other options begin a new one, and a new watch."""
         if options != self._options:
-            self._begin(Relocalizer(self._map, options))
-            self._options = options
-        return self._localizer
+            self._begin(Relocalizer(self.landmark_map, options), options)
+        return self.localizer
 
 
-def load_localizer(node: Node, parameters: RelocalizerParameters) -> FrameLocalizer:
-    """Load map and, if the matching type asks for it, CLIP.
+def load_localizer(node: Node, parameters: RelocalizerParameters,
+                   former: FrameLocalizer | None = None) -> FrameLocalizer:
+    """Load map and, if the matching type asks for it, CLIP; that of a former one stays.
 
     CliplocError: names the file, parameter or download to mend.
     """
@@ -271,25 +211,16 @@ def load_localizer(node: Node, parameters: RelocalizerParameters) -> FrameLocali
     relocalizer = Relocalizer(landmark_map, options)  # before what takes long
     observer, device = None, 'cpu'
     if options.needs_similarities:
-        from cliploc_ros.models.map_rows import load_encoder_for_map
-        encoder, embeddings = load_encoder_for_map(
-            clip_options_of(parameters), landmark_map, files, parameters.landmark_embeddings)
-        observer, device = Observer(encoder, embeddings), encoder.device
-        observer.measure()
+        from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
+        asked = (clip_options_of(parameters), landmark_map, files, parameters.landmark_embeddings)
+        if former is not None and former.observer is not None:
+            observer, device = former.observer.with_labels(embed_map(*asked)), former.device
+        else:
+            encoder, embeddings = load_encoder_for_map(*asked)
+            observer, device = Observer(encoder, embeddings), encoder.device
+            observer.measure()
     return FrameLocalizer(landmark_map, observer, relocalizer, options, device, map_hash,
                           load_keyframes(parameters, landmark_map))
-
-
-def _in_its_map(found: Relocalization, landmark_map: LandmarkMap, seen: Observation
-                ) -> tuple[Relocalization, LandmarkMap, Observation]:
-    """Return result, map and observation of the one of several maps that has the best pose."""
-    found, own = in_its_map(found, landmark_map)
-    parts = parts_of(landmark_map)
-    if seen.similarities is None or len(parts) == 1:
-        return found, own.landmark_map, seen
-    pieces = split_similarities(seen.similarities, [len(part.landmark_map) for part in parts])
-    which = [part.first for part in parts].index(own.first)
-    return found, own.landmark_map, replace(seen, similarities=pieces[which])
 
 
 def clip_options_of(parameters: RelocalizerParameters) -> ClipOptions:

@@ -58,49 +58,34 @@ _REMEDIES = {'image': 'raise the rate of the camera or of the detector',
 class Pipeline:
     """Localizes with one frame at a time and publishes the result.
 
-    All methods but open and close run in the node's worker, one after another.
+    All methods run in the node's worker, one after another.
     """
 
     def __init__(self, node: ManagedNode[RelocalizerParameters], robot: RobotStateSource,
-                 jumps: TimeJumps) -> None:
-        self._node = node
-        self._jumps = jumps
-        self._robot = robot
+                 jumps: TimeJumps, map_to_odom: MapToOdom) -> None:
+        self._node, self._robot, self._jumps = node, robot, jumps
+        self._map_to_odom = map_to_odom
         self.localizer: FrameLocalizer | None = None
         #: Called in the worker's thread after another map is searched.
         self.on_map: Callable[[], None] = lambda: None
         self._pose = node.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
-        self._map_to_odom = MapToOdom(node, robot.transforms)
-        robot.odometry.on_restart(self._map_to_odom.forget)
         self._visualization = Visualization(node)
 
     def load(self) -> str:
         """Load map and network; return what was loaded, in one line."""
-        return self._use(load_localizer(self._node, self._node.settings.snapshot()))
+        return self._use(load_localizer(self._node, self._node.settings.snapshot())).description
 
-    def reload_map(self) -> str:
-        """Read the map again; return what was loaded, in one line."""
-        if self.localizer is None:
+    def reload_map(self) -> FrameLocalizer:
+        """Read the map again; return what was loaded."""
+        former = self.localizer
+        if former is None:
             raise NotActiveError(f'the node is {self._node.state}')
-        return self._use(self.localizer.reloaded(self._node, self._node.settings.snapshot()))
+        return self._use(load_localizer(self._node, self._node.settings.snapshot(), former))
 
     def unload(self) -> None:
         """Drop map and network."""
         self.localizer = None
         self._visualization.set_map(None)
-
-    def open(self) -> None:
-        """Begin to broadcast map -> odom where that is asked for."""
-        if self._node.settings.values.publish_tf:
-            self._map_to_odom.open()
-
-    def close(self) -> None:
-        """Stop broadcasting."""
-        self._map_to_odom.close()
-
-    def forget(self) -> None:
-        """Drop map -> odom until the next accepted pose: time jumped."""
-        self._map_to_odom.forget()
 
     def localize(self, frame: Frame, times: StageTimes | None = None,
                  deadline: float = math.inf) -> Answer:
@@ -132,7 +117,7 @@ class Pipeline:
         state = known.state
         stages_ms = times.ms
         self._node.stages.add(stages_ms)
-        if faults := '; '.join(fault.text for fault in localizer.faults):
+        if faults := '; '.join(fault.text for fault in localizer.instants.faults):
             self._node.get_logger().warning(faults, throttle_duration_sec=_LOG_PERIOD_S)
         self._node.check_active()
         self._jumps.check(image.stamp, frame.received_at)
@@ -152,12 +137,12 @@ class Pipeline:
                 localized.landmark_map, found, answer.message))
         return answer
 
-    def _use(self, localizer: FrameLocalizer) -> str:
+    def _use(self, localizer: FrameLocalizer) -> FrameLocalizer:
         self.localizer = localizer
         self._visualization.set_map(localizer.landmark_map, None if localizer.keyframes is None
-                                    else localizer.keyframes.layer)
+                                    else localizer.keyframes.localizer.layer)
         self.on_map()
-        return localizer.description
+        return localizer
 
     def _publish(self, header: Header, localized: Localized, state: RobotState,
                  answer: Answer) -> Answer:
@@ -200,12 +185,8 @@ class Requests:
     def __init__(self, node: ManagedNode[RelocalizerParameters], frames: CameraRig,
                  robot: RobotStateSource, pipeline: Pipeline, cases: CaseRecorder,
                  handoff: HandOff) -> None:
-        self._node = node
-        self._frames = frames
-        self._robot = robot
-        self._pipeline = pipeline
-        self._cases = cases
-        self._handoff = handoff
+        self._node, self._frames, self._robot = node, frames, robot
+        self._pipeline, self._cases, self._handoff = pipeline, cases, handoff
         self._turn = threading.Lock()
         self._numbers = count(1)
         self._previous = Answer(Verdict.FAILED, 'no request yet')

@@ -258,7 +258,7 @@ class Watcher:
 
         def forget() -> None:
             if (localizer := self._pipeline.localizer) is not None:
-                localizer.forget_looks()
+                localizer.watch.forget()
         with suppress(StoppedError):
             self._node.worker.submit(forget)
 

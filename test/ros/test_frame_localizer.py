@@ -100,7 +100,7 @@ def test_a_mount_of_body_axes_is_refused_where_the_pose_contradicts_it(make_node
             localize(localizer, make_frame(), values)
     else:
         assert localize(localizer, make_frame(), values).accepted
-    assert [fault.is_certain for fault in localizer.faults] == [is_level]
+    assert [fault.is_certain for fault in localizer.instants.faults] == [is_level]
 
 
 def test_options_hold_from_the_next_frame_on(localizer, values):
