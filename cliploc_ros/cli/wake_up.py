@@ -65,11 +65,11 @@ def wake_up(options: argparse.Namespace, ros_args: list[str], interrupted: Inter
     """
     with needs_ros('wake_up'):
         from cliploc_ros.ros.running import check_name
-        from cliploc_ros.ros.wake_up import WakeUp, WakeUpOptions
+        from cliploc_ros.ros.wake_up import WakeUp
     check_name(options.relocalizer)
     with running_ros(ros_args):
-        node = WakeUp(WakeUpOptions(options.relocalizer, options.timeout, options.turn_deg,
-                                    options.watch == 'true'), interrupted)
+        node = WakeUp(interrupted, options.relocalizer, options.timeout, options.turn_deg,
+                      options.watch == 'true')
         try:
             return node.run()
         finally:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from rclpy.logging import LoggingSeverity
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from cliploc_ros.core.detector_check import DetectorCheck
@@ -51,7 +52,7 @@ from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.threads import NodeExecutor
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 from cliploc_ros.ros.request import time_is_up
-from cliploc_ros.ros.running import NotRunningError, ask, parameters_of_files, whole_name
+from cliploc_ros.ros.running import NotRunningError, ask, check_name, parameters_of_files
 
 # Images that come later after their stamps show clocks that differ (a guess).
 _MOST_LAG_S = 1.0
@@ -382,23 +383,28 @@ def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) 
 
     CliplocError: a parameter file cannot be read, or no node can have this name.
     """
-    name, wrong_cameras = whole_name(name), ''
-    if files:
-        given, topics = parameters_of_files(files, name), []
-    else:
-        try:
-            running = ask(name, patience_s)
-        except NotRunningError as error:
-            return report.add('relocalizer', State.FAIL, str(error))
-        given, topics = running.parameters, running.topics
-        wrong_cameras = running.values.get('wrong cameras', '')
-        if any(running.values.get(one, '0') != '0' for one in (
-                Verdict.ACCEPTED, Verdict.WITHHELD)):  # it has no use for its last pose any more
-            given = [one for one in given if one.name != 'last_pose_file']
-        # what an active one misses has lines of its own
-        report.judge('relocalizer', running.problem, f'{running.name} is active')
+    check_name(name)
+    asking, values = Node('doctor_asks', start_parameter_services=False), dict[str, str]()
+    try:
+        name = asking.resolve_service_name(name)
+        if files:
+            given = parameters_of_files(files, name)
+        else:
+            status, given = ask(asking, name, patience_s)
+            values = status.values
+            if any(values.get(one, '0') != '0' for one in (
+                    Verdict.ACCEPTED, Verdict.WITHHELD)):  # its last pose is of no more use
+                given = [one for one in given if one.name != 'last_pose_file']
+            # what an active one misses has lines of its own
+            report.judge('relocalizer', '' if values['state'] == 'active' else status.problem(),
+                         f'{name} is active')
+    except NotRunningError as error:
+        return report.add('relocalizer', State.FAIL, str(error))
+    finally:
+        asking.destroy_node()
     executor, ended = NodeExecutor(), threading.Event()
-    node = Doctor(given, [*topics, f'~/prior:={name}/prior'], wrong_cameras)
+    node = Doctor(given, [*values.get('topics', '').split(), f'~/prior:={name}/prior'],
+                  values.get('wrong cameras', ''))
     node.get_logger().set_level(LoggingSeverity.ERROR)
     executor.add_node(node)
 

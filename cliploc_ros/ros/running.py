@@ -6,7 +6,6 @@ import math
 import re
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,15 +26,6 @@ SILENT_S = 5.0
 _SPIN_S = 0.05
 
 
-@dataclass(frozen=True)
-class Report:
-    """One report of the relocalizer."""
-
-    received_at: float = -math.inf  #: Monotonic clock [s]
-    message: str = ''  #: Its problems in one line, or its state
-    values: dict[str, str] = field(default_factory=dict)
-
-
 class RelocalizerStatus:
     """Listens to the diagnostics of one relocalizer.
 
@@ -50,31 +40,29 @@ class RelocalizerStatus:
     def __init__(self, node: Node, name: str) -> None:
         self._name = name
         self._begun_at = time.monotonic()
-        self._report = Report()
+        # When its last report came (monotonic clock) [s], and its problems or its state.
+        self._received_at, self._message = -math.inf, ''
+        #: The values of its last report
+        self.values: dict[str, str] = {}
         node.create_subscription(DiagnosticArray, '/diagnostics', self._take, 10)
 
     @property
     def silent_s(self) -> float:
         """Return how long the relocalizer has been silent [s]."""
-        return time.monotonic() - max(self._report.received_at, self._begun_at)
+        return time.monotonic() - max(self._received_at, self._begun_at)
 
     @property
     def time_limit_s(self) -> float:
         """Return within which time it answers a request [s]; infinite if that is not known."""
-        return float(self._report.values.get('time limit [s]', math.inf))
-
-    @property
-    def values(self) -> dict[str, str]:
-        """Return the values of its last report."""
-        return self._report.values
+        return float(self.values.get('time limit [s]', math.inf))
 
     def has_reported_since(self, moment: float) -> bool:
         """Return whether it was active and reported since a moment (monotonic clock) [s]."""
-        return self._report.received_at > moment and self._report.values.get('state') == 'active'
+        return self._received_at > moment and self.values.get('state') == 'active'
 
     def problem(self) -> str:
         """Return why the relocalizer cannot take a request, and what to do; empty if it can."""
-        state, silent_s = self._report.values.get('state'), self.silent_s
+        state, silent_s = self.values.get('state'), self.silent_s
         if state is None:
             return (f'{self._name} has sent no diagnostics yet: it is starting, or its '
                     '/diagnostics is remapped')
@@ -82,16 +70,16 @@ class RelocalizerStatus:
             return (f'{self._name} has been silent for {silent_s:.0f} s: it died, or its '
                     'machine is overloaded; start it again if it died')
         if state != 'active':
-            reason = self._report.message if self._report.message != state else \
+            reason = self._message if self._message != state else \
                 'it is loading, or its lifecycle manager must configure and activate it'
             return f'{self._name} is {state}: {reason}'
-        return self._report.values.get('missing', '')
+        return self.values.get('missing', '')
 
     def _take(self, msg: DiagnosticArray) -> None:
         for status in msg.status:
             if status.hardware_id == self._name.lstrip('/'):
-                self._report = Report(time.monotonic(), status.message,
-                                      {value.key: value.value for value in status.values})
+                self._received_at, self._message = time.monotonic(), status.message
+                self.values = {value.key: value.value for value in status.values}
 
 
 class NotRunningError(CliplocError):
@@ -106,60 +94,39 @@ def check_name(name: str) -> None:
         raise OptionsError(f'--relocalizer: {error}') from error
 
 
-@dataclass(frozen=True)
-class Running:
-    """A relocalizer that runs."""
+def ask(node: Node, name: str, patience_s: float) -> tuple[RelocalizerStatus, list[Parameter]]:
+    """Return state and parameters of a relocalizer; finding it may take `patience_s`.
 
-    name: str  #: With its namespace
-    problem: str  #: Why it is not active, and what to do; empty if it is
-    parameters: list[Parameter]
-    topics: list[str]  #: Its remappings, NAME:=TOPIC
-    values: dict[str, str]  #: Of its diagnostics
+    Parameters
+    ----------
+    node : Node
+        Asks; nobody else spins it.
+    name : str
+        The relocalizer's name with its namespace.
 
-
-def whole_name(name: str) -> str:
-    """Return the name of a node with its namespace: this program's where it is relative.
-
-    OptionsError: no node can have this name.
+    Raises
+    ------
+    NotRunningError
+        It does not answer.
     """
-    check_name(name)
-    node = Node('doctor_asks', start_parameter_services=False)
-    try:
-        return str(node.resolve_service_name(name))
-    finally:
-        node.destroy_node()
-
-
-def ask(name: str, patience_s: float) -> Running:
-    """Return parameters, topics and state of a relocalizer; finding it may take `patience_s`.
-
-    NotRunningError: it does not answer.
-    """
-    node = Node('doctor_asks', start_parameter_services=False)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     status, client = RelocalizerStatus(node, name), AsyncParameterClient(node, name)
     deadline = time.monotonic() + patience_s
-    try:
-        while not status.values or not client.services_are_ready():
-            if time.monotonic() > deadline:
-                raise NotRunningError(f'{name} is not running: start it, name it with '
-                                      '--relocalizer, or give its --params-file')
-            executor.spin_once(timeout_sec=_SPIN_S)
-        listed = client.list_parameters()
-        executor.spin_until_future_complete(listed, patience_s)
-        names = listed.result().result.names if listed.done() else []
-        got = client.get_parameters(names)
-        executor.spin_until_future_complete(got, patience_s)
-        if not names or not got.done():
-            raise NotRunningError(f'{name} does not answer: restart it')
-        return Running(
-            name, '' if status.values['state'] == 'active' else status.problem(),
-            [Parameter.from_parameter_msg(ParameterMsg(name=one, value=value))
-             for one, value in zip(names, got.result().values, strict=True)],
-            status.values.get('topics', '').split(), status.values)
-    finally:
-        node.destroy_node()
+    while not status.values or not client.services_are_ready():
+        if time.monotonic() > deadline:
+            raise NotRunningError(f'{name} is not running: start it, name it with '
+                                  '--relocalizer, or give its --params-file')
+        executor.spin_once(timeout_sec=_SPIN_S)
+    listed = client.list_parameters()
+    executor.spin_until_future_complete(listed, patience_s)
+    names = listed.result().result.names if listed.done() else []
+    got = client.get_parameters(names)
+    executor.spin_until_future_complete(got, patience_s)
+    if not names or not got.done():
+        raise NotRunningError(f'{name} does not answer: restart it')
+    return status, [Parameter.from_parameter_msg(ParameterMsg(name=one, value=value))
+                    for one, value in zip(names, got.result().values, strict=True)]
 
 
 def parameters_of_files(files: Sequence[Path], name: str) -> list[Parameter]:

@@ -13,9 +13,9 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Duration
@@ -50,18 +50,6 @@ _PAUSE_S = 1.0
 _ON_ITS_WAY_S = 5.0
 
 
-class Turn(NamedTuple):
-    """A turn that was asked for [rad], and why it failed; empty if it did not."""
-
-    step_rad: float
-    problem: str
-
-    def __str__(self) -> str:
-        """Return what was done, in words."""
-        step = f'turned by {math.degrees(self.step_rad):.0f} deg'
-        return f'not {step} ({self.problem})' if self.problem else step
-
-
 class Turning:
     """Turns a robot by a step at a time; to the other side after a turn that failed.
 
@@ -74,8 +62,10 @@ class Turning:
     def __init__(self, node: Node, wait: Wait, step_rad: float) -> None:
         self._wait = wait
         self._step_rad = step_rad
-        self._action = spin_action() if step_rad else None
-        self._client = None if self._action is None else ActionClient(node, self._action, 'spin')
+        self._client: ActionClient | None = None
+        with suppress(ImportError):
+            self._action = importlib.import_module('nav2_msgs.action').Spin
+            self._client = ActionClient(node, self._action, 'spin')
         self._name = node.resolve_topic_name('spin')
         self._goal: Any = None
 
@@ -89,15 +79,16 @@ class Turning:
             return f"nothing serves {self._name}: activate Nav2's behavior_server"
         return ''
 
-    def turn(self) -> Turn:
-        """Turn by a step."""
-        assert self._action is not None
-        step_rad = self._step_rad
+    def turn(self) -> str:
+        """Turn by a step; return what was done, in words."""
+        step = f'turned by {math.degrees(self._step_rad):.0f} deg'
         problem = self._problem_of(self._action.Goal(
-            target_yaw=step_rad, time_allowance=Duration(sec=int(_ALLOWANCE_S))))
-        if problem:
-            self._step_rad = -step_rad
-        return Turn(step_rad, problem)
+            target_yaw=self._step_rad, time_allowance=Duration(sec=int(_ALLOWANCE_S))))
+        if not problem:
+            return step
+        self._step_rad = -self._step_rad
+        self._wait(lambda: False, _PAUSE_S)  # the next turn would fail as well, at once
+        return f'not {step} ({problem})'
 
     def stop(self) -> None:
         """Cancel the turn under way, and wait a moment until the server has taken that."""
@@ -130,24 +121,12 @@ class Turning:
         outcome = result.result()
         if outcome.status == GoalStatus.STATUS_SUCCEEDED:
             return ''
-        return f'{_ENDS.get(outcome.status, "failed")}: {_reason(outcome.result)}'
-
-
-def spin_action() -> Any:
-    """Return the type of Nav2's action Spin; None where nav2_msgs is not installed."""
-    try:
-        return importlib.import_module('nav2_msgs.action').Spin
-    except ImportError:
-        return None
-
-
-def _reason(result: Any) -> str:
-    """Return the error of a turn in words; the field error_msg came with Jazzy."""
-    code = int(result.error_code)
-    names = {getattr(type(result), name): name.lower().replace('_', ' ')
-             for name in ('TIMEOUT', 'TF_ERROR', 'COLLISION_AHEAD')}
-    words = [names.get(code, ''), getattr(result, 'error_msg', '')]
-    return ', '.join([*filter(None, words), f'code {code}'])
+        found, code = outcome.result, int(outcome.result.error_code)
+        names = {getattr(type(found), name): name.lower().replace('_', ' ')
+                 for name in ('TIMEOUT', 'TF_ERROR', 'COLLISION_AHEAD')}
+        # the field error_msg came with Jazzy
+        words = [*filter(None, [names.get(code), getattr(found, 'error_msg', '')]), f'code {code}']
+        return f'{_ENDS.get(outcome.status, "failed")}: {", ".join(words)}'
 
 
 class Outcome(IntEnum):
@@ -158,18 +137,6 @@ class Outcome(IntEnum):
     NOT_READY = 2
 
 
-@dataclass(frozen=True)
-class WakeUpOptions:
-    """Options of a wake-up."""
-
-    #: Name of the relocalizer, relative to the namespace or absolute
-    relocalizer: str = 'relocalizer'
-    timeout_s: float = 60.0  #: No turn begins later; a look does only after a turn
-    turn_deg: float = 45.0  #: Turn by this much between looks; 0: do not turn
-    #: Whether to wait, after an accepted pose, until the robot is lost and stands, and go on
-    watch: bool = False
-
-
 class WakeUp(Node):
     """Requests poses of one relocalizer and prints one line for each look.
 
@@ -178,18 +145,27 @@ class WakeUp(Node):
     interrupted : Interruption
         Set by a signal. Python's own KeyboardInterrupt could come right after a goal was sent,
         and nothing would cancel it.
+    relocalizer : str
+        Its name, relative to the namespace or absolute.
+    timeout_s : float
+        No turn begins later; a look does only after a turn.
+    turn_deg : float
+        Turn by this much between looks; 0: do not turn.
+    watch : bool
+        Whether to wait, after an accepted pose, until the robot is lost and stands, and go on.
     """
 
-    def __init__(self, options: WakeUpOptions, interrupted: Interruption) -> None:
+    def __init__(self, interrupted: Interruption, relocalizer: str, timeout_s: float,
+                 turn_deg: float, watch: bool) -> None:
         super().__init__('wake_up', start_parameter_services=False)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
-        self._service = self.resolve_service_name(f'{options.relocalizer}/{_SERVICE}')
+        self._service = self.resolve_service_name(f'{relocalizer}/{_SERVICE}')
         self._client = self.create_client(SelfTest, self._service)
         self._status = RelocalizerStatus(self, self._service.removesuffix(f'/{_SERVICE}'))
-        self._turning = Turning(self, self._wait, math.radians(options.turn_deg))
+        self._turning = Turning(self, self._wait, math.radians(turn_deg))
         self._began_at = time.monotonic()
-        self._options = options
+        self._timeout_s, self._watches = timeout_s, watch
         self._interrupted = interrupted
         self._said: dict[str, tuple[str, float]] = {}
 
@@ -201,7 +177,7 @@ class WakeUp(Node):
         KeyboardInterrupt: the event is set; no turn is under way.
         """
         try:
-            while (outcome := self._look_about()) is Outcome.ACCEPTED and self._options.watch:
+            while (outcome := self._look_about()) is Outcome.ACCEPTED and self._watches:
                 if problem := self._until_lost():
                     return _end(Outcome.NOT_READY, f'not ready: {problem}')
                 self._began_at = time.monotonic()
@@ -222,7 +198,8 @@ class WakeUp(Node):
             if self._is_time_up:
                 if verdict is Verdict.REFUSED:
                     return _end(Outcome.REFUSED, f'refused: {looks} looks in '
-                                f'{self._elapsed_s:.0f} s: {_in_words(kinds)}')
+                                f'{self._elapsed_s:.0f} s: ' + ', '.join(
+                                    f'{count} {kind}' for kind, count in kinds.most_common()))
                 problem = message
                 break
             turned = self._turn() if verdict is Verdict.REFUSED else self._rest()
@@ -231,7 +208,9 @@ class WakeUp(Node):
     def _until_ready(self) -> str:
         """Wait until the relocalizer can take a request; return what it lacks when time is up."""
         while True:
-            problem = self._problem()
+            problem = self._status.problem() if self._client.service_is_ready() else (
+                f'nothing serves {self._service}: start the relocalizer, or name it with '
+                '--relocalizer or a namespace')
             if self._elapsed_s > _DISCOVERY_S:
                 self._say('waiting', problem, _AGAIN_S)
             if not problem or self._is_time_up:
@@ -253,13 +232,6 @@ class WakeUp(Node):
                       f'{values["watch reason"]}; {values["on lost"]}')
             if values['lost and at rest'] == 'True':
                 return ''
-
-    def _problem(self) -> str:
-        """Return why there can be no request now; empty if there can."""
-        if not self._client.service_is_ready():
-            return (f'nothing serves {self._service}: start the relocalizer, or name it with '
-                    '--relocalizer or a namespace')
-        return self._status.problem()
 
     def _look(self) -> tuple[Verdict, str, str]:
         """Request the pose once; return the verdict, the kind of a refusal, and the answer."""
@@ -283,12 +255,7 @@ class WakeUp(Node):
         """Turn before the next look, where that is possible; return what was done."""
         obstacle = self._turning.obstacle()
         self._say('not turning', obstacle)
-        if obstacle:
-            return self._rest()
-        turn = self._turning.turn()
-        if turn.problem:
-            self._rest()  # the next turn would fail as well, at once
-        return f', {turn}'
+        return self._rest() if obstacle else f', {self._turning.turn()}'
 
     def _rest(self) -> str:
         self._wait(lambda: False, _PAUSE_S)
@@ -300,7 +267,7 @@ class WakeUp(Node):
 
     @property
     def _is_time_up(self) -> bool:
-        return self._elapsed_s > self._options.timeout_s
+        return self._elapsed_s > self._timeout_s
 
     def _say(self, topic: str, text: str, again_s: float = math.inf) -> None:
         """Print a text when it changes, and again after some time."""
@@ -326,10 +293,6 @@ class WakeUp(Node):
         if self._interrupted.is_set():
             raise KeyboardInterrupt
         self._executor.spin_once(timeout_sec=_SPIN_S)
-
-
-def _in_words(kinds: Counter[str]) -> str:
-    return ', '.join(f'{count} {kind}' for kind, count in kinds.most_common())
 
 
 def _end(outcome: Outcome, text: str) -> Outcome:

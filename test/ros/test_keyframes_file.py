@@ -29,12 +29,12 @@ def load(map_file, keyframes_file='auto'):
 
 
 def test_the_layer_next_to_the_map_or_a_named_one_is_read_where_it_is_wanted(room, tmp_path):
-    assert len(load(room).layer) == 6
+    assert len(load(room).localizer.layer) == 6
     assert load(room, '') is load('') is None
     moved = tmp_path / 'other.npz'
     (tmp_path / 'room.keyframes.npz').rename(moved)
     assert load(room) is None
-    assert len(load(room, moved).layer) == len(load('', moved).layer) == 6
+    assert len(load(room, moved).localizer.layer) == len(load('', moved).localizer.layer) == 6
 
 
 @pytest.mark.parametrize('spoil', ['truncated', 'missing'])
