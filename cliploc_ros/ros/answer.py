@@ -21,7 +21,7 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.query import CASE, Case, Query, case_arrays
-from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
+from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # As many frames as acceptance looks back to, see cliploc_ros.core.acceptance.looks.
@@ -144,10 +144,6 @@ class RequestCounters:
                     'requests longest [s]': f'{self._longest_s:.3f}'}
 
 
-class NoCaseError(CliplocError):
-    """There is nothing to record; the message says why."""
-
-
 class CaseRecorder:
     """The last answers to frames of requests, if it keeps any; older ones are forgotten."""
 
@@ -182,10 +178,8 @@ class CaseRecorder:
 
         Raises
         ------
-        NoCaseError
-            No request, or none that saw a frame.
         CliplocError
-            The folder is not given, full, or cannot be written.
+            No request saw a frame, or the folder is not given, full, or cannot be written.
         """
         if not parameters.record_folder:
             raise OptionsError('record_folder is empty: set it at the start, to a folder with '
@@ -218,7 +212,7 @@ class CaseRecorder:
         while seen and seen[-1].received_at != last.received_at:
             seen.pop()
         if not seen:
-            raise NoCaseError(f'nothing to record: the last request saw no frame: {last.message}')
+            raise DatasetError(f'nothing to record: the last request saw no frame: {last.message}')
         linked: list[Query] = []
         for one in reversed(seen):
             assert one.query is not None

@@ -293,8 +293,8 @@ def _check_place(node: Doctor, parameters: RelocalizerParameters, image: Any, pa
             node.handoff.check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s,
                                     time.monotonic() + patience_s)
             body = odometry.pose_at(image.stamp)
-            if mount is not None and body.body_frame not in (image.frame_id, base):
-                robot.transforms.lookup(image.frame_id, body.body_frame, image.stamp,
+            if mount is not None and body.frame not in (image.frame_id, base):
+                robot.transforms.lookup(image.frame_id, body.frame, image.stamp,
                                         parameters.tf_timeout_s, 'correct its child_frame_id')
             report.add('odometry', State.PASS, 'the robot rests, and poses cover the image')
     if parameters.gravity == 'none' or mount is None:

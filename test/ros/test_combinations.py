@@ -28,7 +28,8 @@ from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Keyframes
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.instants import Instants
-from cliploc_ros.ros.inputs.robot_state import CameraPlace, KnownBefore, RobotState
+from cliploc_ros.ros.inputs.odometry import OdometryPlace
+from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -80,7 +81,7 @@ class Drive:
                         MAP, robot @ mount, seen.detections.bboxes_xyxy).tobytes())
                 if self.has_depth else None,
                 camera=name if self.cameras > 1 else ''),
-                RobotState(invert_transform(mount), place=CameraPlace(
+                RobotState(invert_transform(mount), place=OdometryPlace(
                     robot @ mount, 0, 0.05 * number) if self.has_odometry else None)))
         return frames[:self.cameras], robot @ MOUNTS[0]
 

@@ -18,7 +18,8 @@ from cliploc_ros.errors import CameraError, MapError
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import load_localizer
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.robot_state import CameraPlace, KnownBefore, RobotState
+from cliploc_ros.ros.inputs.odometry import OdometryPlace
+from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -58,7 +59,7 @@ def timer():
 
 
 def test_the_observation_has_the_way_driven(localizer, values):
-    state = RobotState(np.eye(4), place=CameraPlace(np.eye(4), 0, 2.5))
+    state = RobotState(np.eye(4), place=OdometryPlace(np.eye(4), 0, 2.5))
     localized = localizer.localize(make_frame(), values, KnownBefore(state), timer())
     assert localized.query.newest.odom_way_m == 2.5
 
@@ -111,7 +112,7 @@ def test_options_hold_from_the_next_frame_on(localizer, values):
 
 
 def test_a_camera_of_another_run_of_odometry_is_left_out_and_named(localizer, values):
-    places = [RobotState(np.eye(4), place=CameraPlace(np.eye(4), run, 0.0)) for run in (1, 1, 2)]
+    places = [RobotState(np.eye(4), place=OdometryPlace(np.eye(4), run, 0.0)) for run in (1, 1, 2)]
     frames = [replace(make_frame(), camera=name) for name in ('front', 'left', 'back')]
     first = replace(frames[0], left_out=('right',))
     found = localizer.localize(first, values, KnownBefore(places[0], list(zip(

@@ -58,7 +58,7 @@ def place(robot, seconds, **values):
 
 def test_the_camera_is_where_its_mount_has_it(robot, source):
     talk(source, 9.9, 10.0, 10.1)
-    np.testing.assert_allclose(place(robot, 10.05).odom_from_camera,
+    np.testing.assert_allclose(place(robot, 10.05).odom_from_frame,
                                odom_from_base(10.05) @ BASE_FROM_CAMERA, atol=1e-9)
 
 
@@ -80,7 +80,7 @@ def test_an_image_waits_for_the_message_after_it(robot, source):
     talk(source, 10.0)
     late = threading.Timer(0.05, talk, (source, 10.1))
     late.start()
-    np.testing.assert_allclose(place(robot, 10.05).odom_from_camera,
+    np.testing.assert_allclose(place(robot, 10.05).odom_from_frame,
                                odom_from_base(10.05) @ BASE_FROM_CAMERA, atol=1e-9)
     late.join()
 
@@ -121,7 +121,7 @@ def test_odometry_that_goes_on_is_no_restart_and_invalid_messages_change_nothing
         broken.pose.pose.position.x = broken.pose.pose.orientation.w = float('nan')
         source.take(broken)
     talk(source, 10.2)
-    np.testing.assert_allclose(place(robot, 10.05).odom_from_camera,
+    np.testing.assert_allclose(place(robot, 10.05).odom_from_frame,
                                odom_from_base(10.05) @ BASE_FROM_CAMERA, atol=1e-9)
     assert place(robot, 10.05).run == run
     assert source.recent(1.0, 1.0).header.stamp == stamp(10.2)

@@ -113,7 +113,7 @@ class Instants:
         if not by_odometry:
             odom_from_camera = invert_transform(state.camera_from_base)
         elif place is not None:
-            odom_from_camera = place.odom_from_camera
+            odom_from_camera = place.odom_from_frame
         depths = None
         try:
             depths = frame_depths(frame, camera, detections, state)

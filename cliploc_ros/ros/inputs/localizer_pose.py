@@ -15,7 +15,8 @@ from cliploc_ros.core.geometry.transforms import invert_transform, is_rigid
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros.conversions import pose_from_msg, stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
-from cliploc_ros.ros.inputs.robot_state import CameraPlace, RobotState, RobotStateSource
+from cliploc_ros.ros.inputs.odometry import OdometryPlace
+from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import stamp_problem
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
@@ -124,10 +125,10 @@ class LocalizerPose:
             raise NoLocalizerPoseError(
                 f'{topic} is silent for {place.way_m - anchor.way_m:.1f} m of way: see whether '
                 'the localizer is active and hears scans')
-        return frame_id, anchor.map_from_odom @ place.odom_from_camera
+        return frame_id, anchor.map_from_odom @ place.odom_from_frame
 
     def _anchored(self, shown: PoseWithCovarianceStamped, pose: NDArray[np.float64],
-                  image: Header, place: CameraPlace, parameters: RelocalizerParameters,
+                  image: Header, place: OdometryPlace, parameters: RelocalizerParameters,
                   topic: str) -> _Anchor:
         """Return odometry's coordinate frame in the map, by the newest pose that was shown."""
         shown_ns, anchor = stamp_ns(shown.header.stamp), self._anchor
@@ -140,7 +141,7 @@ class LocalizerPose:
             map_from_camera = pose @ invert_transform(then.camera_from_base)
             anchor = self._anchor = _Anchor(
                 shown_ns, place.run, then.place.way_m,
-                map_from_camera @ invert_transform(then.place.odom_from_camera))
+                map_from_camera @ invert_transform(then.place.odom_from_frame))
         return anchor
 
 

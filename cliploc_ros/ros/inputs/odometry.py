@@ -335,16 +335,14 @@ def _is_silence(poses: Sequence[_Pose], gap_ns: int) -> bool:
     return gap_ns > _MOST_PERIODS * period_ns
 
 
-class BodyPose(NamedTuple):
-    """Where odometry had the robot at the stamp of an image."""
+class OdometryPlace(NamedTuple):
+    """Where odometry had the robot, or its camera, at the stamp of an image."""
 
-    odom_from_body: NDArray[np.float64]
-    #: The coordinate frame that odometry tracks (child_frame_id).
-    body_frame: str
-    #: Poses of one run share their odometry frame; those of different runs do not compare.
+    odom_from_frame: NDArray[np.float64]  #: (4, 4)
+    #: Places of one run share their odometry frame; those of different runs do not compare.
     run: int
-    #: Driven since the run began.
-    way_m: float
+    way_m: float  #: Driven since the run began
+    frame: str = ''  #: The coordinate frame that odometry tracks (child_frame_id)
 
 
 class OdometrySource(Listener):
@@ -402,10 +400,10 @@ class OdometrySource(Listener):
             if frames != self._frames:
                 self._window.clear()
                 self._frames = frames
-            if why := stamp_problem(msg.header.stamp):
-                self.problem = f'the stamp of {self.topic} {why}: its driver must stamp each pose'
-            else:
-                self.problem = ''
+            why = stamp_problem(msg.header.stamp)
+            self.problem = why and \
+                f'the stamp of {self.topic} {why}: its driver must stamp each pose'
+            if not why:
                 self._window.add(
                     at_ns, np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]),
                     np.array([[v.x, v.y, v.z], [w.x, w.y, w.z]]))
@@ -488,7 +486,7 @@ class OdometrySource(Listener):
                 self._heard.wait_for(lambda: len(self._window), patience_s)
             return self._window.spans(at_ns, _NEARLY_NS)
 
-    def pose_at(self, stamp: Time) -> BodyPose:
+    def pose_at(self, stamp: Time) -> OdometryPlace:
         """Return where odometry had the robot at the stamp of an image.
 
         NoOdometryError: odometry does not cover that time.
@@ -499,9 +497,8 @@ class OdometrySource(Listener):
                 self._heard.wait_for(lambda: not self._window.is_ahead(at_ns), _PATIENCE_S)
             if self.problem:
                 raise NoOdometryError(self.problem)
-            odom_from_body = self._window.pose_at(at_ns)
-            run, body_frame = self._window.run, self._frames[1]
-            way_m = self._window.way_at(at_ns)
-        if not body_frame:
+            place = OdometryPlace(self._window.pose_at(at_ns), self._window.run,
+                                  self._window.way_at(at_ns), self._frames[1])
+        if not place.frame:
             raise NoOdometryError(f'{self.topic} has no child_frame_id')
-        return BodyPose(odom_from_body, body_frame, run, way_m)
+        return place

@@ -24,7 +24,7 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import SAME_SPOT, is_rigid
 from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Region, check_planar
-from cliploc_ros.errors import CliplocError
+from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.files.storage import write_text
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_from_msg, pose_with_covariance_msg
@@ -37,10 +37,6 @@ _LOG_PERIOD_S = 5.0
 _WRITE_PERIOD_S = 1.0
 _PLANAR = np.array([0, 1, 5])  # x, y and yaw in a covariance of ROS
 _LEVEL_COSINE = 0.7
-
-
-class NoPriorError(CliplocError):
-    """A prior is invalid; the message says what to do."""
 
 
 class PriorSource:
@@ -125,17 +121,16 @@ class PriorSource:
             return  # of a foreign localizer
         if self._written is None or not SAME_SPOT.agree(at, self._written):
             self._written, self._written_at = at, time.monotonic()
-            self._node.worker.submit(partial(
-                self._write, Path(parameters.last_pose_file), pose, at, self._map_hash))
+            fields = {'map_hash': self._map_hash, 'frame_id': pose.header.frame_id,
+                      'written': time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime()),
+                      'map_from_robot': at.tolist(),
+                      'covariance': np.reshape(pose.pose.covariance, (6, 6)).tolist()}
+            self._node.worker.submit(partial(self._write, Path(parameters.last_pose_file),
+                                             json.dumps(fields, indent=1)))
 
-    def _write(self, path: Path, pose: PoseWithCovarianceStamped, at: NDArray[np.float64],
-               map_hash: str) -> None:
-        fields = {'map_hash': map_hash, 'frame_id': pose.header.frame_id,
-                  'written': time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime()),
-                  'map_from_robot': at.tolist(),
-                  'covariance': np.reshape(pose.pose.covariance, (6, 6)).tolist()}
+    def _write(self, path: Path, text: str) -> None:
         try:
-            write_text(path, json.dumps(fields, indent=1))
+            write_text(path, text)
         except CliplocError as error:
             self._warn(f'last_pose_file {error}')
 
@@ -194,7 +189,7 @@ def planar_of(msg: PoseWithCovarianceStamped
     pose = pose_from_msg(msg.pose.pose)
     covariance = np.reshape(msg.pose.covariance, (6, 6))[np.ix_(_PLANAR, _PLANAR)]
     if pose is None:
-        raise NoPriorError('a pose with NaN or a quaternion that is not of length 1')
+        raise OptionsError('a pose with NaN or a quaternion that is not of length 1')
     covariance = 0.5 * (covariance + covariance.T)
     covariance[2, :2] = covariance[:2, 2] = 0.0
     check_planar(covariance)

@@ -26,7 +26,11 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometrySource
+from cliploc_ros.ros.inputs.odometry import (
+    NoOdometryError,
+    OdometryPlace,
+    OdometrySource,
+)
 from cliploc_ros.ros.inputs.prior import PriorSource
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription, Listener
 from cliploc_ros.ros.inputs.time_jumps import StampOrder, stamp_problem
@@ -232,17 +236,6 @@ def _contradiction_deg(samples: Sequence[Sample]) -> float:
 
 
 @dataclass(frozen=True)
-class CameraPlace:
-    """Where odometry had the camera."""
-
-    odom_from_camera: NDArray[np.float64]
-    #: Places of one run share their odometry frame.
-    run: int
-    #: Driven since the run began.
-    way_m: float
-
-
-@dataclass(frozen=True)
 class RobotState:
     """The robot at the stamp of one image."""
 
@@ -250,8 +243,8 @@ class RobotState:
     camera_from_base: NDArray[np.float64]
     #: The vertical, a unit vector (3,) in the camera's optical frame; None where it is not known.
     up_in_camera: NDArray[np.float64] | None = None
-    #: None where odometry does not cover the image.
-    place: CameraPlace | None = None
+    #: Of the camera; None where odometry does not cover the image.
+    place: OdometryPlace | None = None
     #: (4, 4): the pose of a depth camera that is not registered; None where tf2 lacks it
     camera_from_depth: NDArray[np.float64] | None = None
 
@@ -376,24 +369,23 @@ class RobotStateSource:
                 time.sleep(_RETRY_S)
 
     def _place(self, image: Header, parameters: RelocalizerParameters,
-               camera_from_base: NDArray[np.float64]) -> CameraPlace | None:
+               camera_from_base: NDArray[np.float64]) -> OdometryPlace | None:
         if parameters.fuse_frames == 1:
             return None
         try:
             body = self.odometry.pose_at(image.stamp)
-            if body.body_frame == image.frame_id:
-                return CameraPlace(body.odom_from_body, body.run, body.way_m)
-            camera_from_body = camera_from_base
-            if body.body_frame != parameters.base_frame:
-                camera_from_body = self._lookup(image, body.body_frame, parameters)
+            if body.frame == image.frame_id:
+                return body
+            camera_from_body = camera_from_base if body.frame == parameters.base_frame else \
+                self._lookup(image, body.frame, parameters)
         except NoOdometryError as error:
             self._node.get_logger().debug(f'one frame alone: {error}')
             return None
         except NoTransformError as error:
             self._warn(f'one frame alone: {error}')
             return None
-        return CameraPlace(body.odom_from_body @ invert_transform(camera_from_body), body.run,
-                           body.way_m)
+        return body._replace(
+            odom_from_frame=body.odom_from_frame @ invert_transform(camera_from_body))
 
     def _lookup(self, image: Header, frame: str, parameters: RelocalizerParameters
                 ) -> NDArray[np.float64]:
