@@ -18,8 +18,8 @@ from test_odometry import (
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
-from cliploc_ros.ros.inputs.localizer_pose import LaterError, LocalizerPose, NoLocalizerPoseError
 from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.ros.watch import LaterError, LocalizerPose, NoLocalizerPoseError
 
 PARAMETERS = RelocalizerParameters(base_frame='base_link', base_from_camera=OPTICAL,
                                    tf_timeout_s=0.0, watch='amcl_pose')
