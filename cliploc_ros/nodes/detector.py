@@ -8,11 +8,9 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple, NoReturn
 
 from rclpy.event_handler import PublisherEventCallbacks
-from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 from vision_msgs.msg import Detection2DArray
 
@@ -46,56 +44,6 @@ class TimedImage(NamedTuple):
 
     msg: Image | CompressedImage
     received_at: float
-
-
-class ImageSource:
-    """Subscribes to images, 'raw' or 'compressed', while it is open.
-
-    `on_image` takes each TimedImage, in the executor's thread. `camera` is the namespace of the
-    topic.
-    """
-
-    def __init__(self, node: Node, transport: str, on_image: Callable[[TimedImage], None],
-                 camera: str = '') -> None:
-        self._node = node
-        self._type = Image if transport == 'raw' else CompressedImage
-        self._name = of_camera(camera, 'image' if transport == 'raw' else 'image/compressed')
-        self._on_image = on_image
-        self._subscription: AdaptiveSubscription | None = None
-        self._heard_at = 0.0
-        self.received = 0
-
-    @property
-    def is_open(self) -> bool:
-        """Return whether it subscribes."""
-        return self._subscription is not None
-
-    def open(self) -> None:
-        """Subscribe, if it does not yet."""
-        if self._subscription is None:
-            self._heard_at = time.monotonic()  # silence counts from here
-            self._subscription = AdaptiveSubscription(self._node, self._type, self._name,
-                                                      self._take, qos.IMAGE)
-
-    def close(self) -> None:
-        """Unsubscribe."""
-        if self._subscription is not None:
-            self._subscription.destroy()
-            self._subscription = None
-
-    def examine(self, health: Health, stale_after_s: float) -> None:
-        """Report a topic without a publisher, and silence."""
-        topic = self._node.resolve_topic_name(self._name)
-        silent_s = time.monotonic() - self._heard_at
-        if self._node.count_publishers(topic) == 0:
-            health.warn(f'no image: nobody publishes {topic}; remap it, or start its publisher')
-        elif self.is_open and silent_s > stale_after_s:
-            health.warn(f'no image on {topic} for {silent_s:.1f} s')
-
-    def _take(self, msg: Image | CompressedImage) -> None:
-        self.received += 1
-        self._heard_at = time.monotonic()
-        self._on_image(TimedImage(msg, self._heard_at))
 
 
 class NewestInstant:
@@ -156,18 +104,63 @@ def _image_ns(image: TimedImage) -> int:
 
 
 class _Camera:
-    """The images of a camera, and what is published of them."""
+    """The images of a camera while its detections have a subscriber, and what is published."""
 
     def __init__(self, node: ManagedNode[DetectorParameters], name: str, newest: NewestInstant,
                  on_match: Callable[[], None]) -> None:
-        self.images = ImageSource(node, node.settings.values.image_transport,
-                                  partial(newest.offer, name), name)
-        self.publisher = node.create_publisher(
+        self._node, self._name, self._newest = node, name, newest
+        is_raw = node.settings.values.image_transport == 'raw'
+        self._type = Image if is_raw else CompressedImage
+        self._topic = of_camera(name, 'image' if is_raw else 'image/compressed')
+        #: None while its images are not wanted
+        self.subscription: AdaptiveSubscription | None = None
+        self._heard_at = 0.0
+        self._counts, self._rates = {'image': 0, 'detections': 0}, Rates()
+        self._publisher = node.create_publisher(
             Detection2DArray, of_camera(name, 'detections'), qos.DETECTIONS_OUT,
             event_callbacks=PublisherEventCallbacks(matched=lambda _: on_match()),
             qos_overriding_options=qos.overridable())
-        self.published = 0
-        self.rates = Rates()
+
+    @property
+    def is_wanted(self) -> bool:
+        """Return whether something subscribes to its detections."""
+        return bool(self._publisher.get_subscription_count() > 0)
+
+    def open(self) -> None:
+        """Subscribe, if it does not yet."""
+        if self.subscription is None:
+            self._heard_at = time.monotonic()  # silence counts from here
+            self.subscription = AdaptiveSubscription(self._node, self._type, self._topic,
+                                                     self._take, qos.IMAGE)
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        if self.subscription is not None:
+            self.subscription.destroy()
+            self.subscription = None
+
+    def publish(self, detections: Detection2DArray) -> None:
+        """Publish the detections of an image."""
+        self._counts['detections'] += 1
+        self._publisher.publish(detections)
+
+    def examine(self, health: Health, stale_after_s: float) -> None:
+        """Report a topic without a publisher, silence, and rates."""
+        own, topic = Health(), self._node.resolve_topic_name(self._topic)
+        silent_s = time.monotonic() - self._heard_at
+        if self._node.count_publishers(topic) == 0:
+            own.warn(f'no image: nobody publishes {topic}; remap it, or start its publisher')
+        elif self.subscription is not None and silent_s > stale_after_s:
+            own.warn(f'no image on {topic} for {silent_s:.1f} s')
+        own.values |= {f'{name} rate [Hz]': f'{rate:.1f}'
+                       for name, rate in self._rates.update(self._counts).items()}
+        own.values['listened to'] = self.subscription is not None
+        health.add(own, self._name)
+
+    def _take(self, msg: Image | CompressedImage) -> None:
+        self._counts['image'] += 1
+        self._heard_at = time.monotonic()
+        self._newest.offer(self._name, TimedImage(msg, self._heard_at))
 
 
 class DetectorNode(ManagedNode[DetectorParameters]):
@@ -190,8 +183,14 @@ class DetectorNode(ManagedNode[DetectorParameters]):
     def load(self) -> str:
         """Load the network."""
         parameters = self.settings.snapshot()
+        prompts: Prompts = ()
+        if parameters.vocabulary == 'map':
+            file = path_of(parameters.map_file)
+            prompts = prompts_of_map(LandmarkMap.from_file(file), file)
+        elif parameters.vocabulary:
+            prompts = prompts_of_names(parameters.vocabulary)
         options = replace(with_detector(detector_options(parameters), parameters.profile),
-                          prompts=_prompts(parameters), text_model=parameters.text_model)
+                          prompts=prompts, text_model=parameters.text_model)
         self._detector = load_detector(options)
         of_texts = f', {len(options.prompts)} texts' if options.prompts else ''
         return f'detector {options.model} ({self._detector.inference}{of_texts})'
@@ -217,14 +216,8 @@ class DetectorNode(ManagedNode[DetectorParameters]):
 
     def examine(self, health: Health) -> None:
         """Report the input, rates, what was dropped, and the device."""
-        for name, camera in self._cameras.items():
-            own = Health()
-            camera.images.examine(own, self.settings.values.stale_after_s)
-            rates = camera.rates.update({'image': camera.images.received,
-                                         'detections': camera.published})
-            own.values |= {f'{topic} rate [Hz]': f'{rate:.1f}' for topic, rate in rates.items()}
-            own.values['listened to'] = camera.images.is_open
-            health.add(own, name)
+        for camera in self._cameras.values():
+            camera.examine(health, self.settings.values.stale_after_s)
         if self._last_error:
             health.warn(self._last_error)
         since = self._newest.waiting_since
@@ -239,17 +232,17 @@ class DetectorNode(ManagedNode[DetectorParameters]):
         """Subscribe to the images of each camera whose detections have a subscriber."""
         with self._lock:
             for camera in self._cameras.values():
-                if self._open and camera.publisher.get_subscription_count() > 0:
-                    if not any(one.images.is_open for one in self._cameras.values()):
+                if self._open and camera.is_wanted:
+                    if not any(one.subscription for one in self._cameras.values()):
                         self._awaited_since = time.monotonic()
-                    camera.images.open()
+                    camera.open()
                 else:
-                    camera.images.close()
+                    camera.close()
 
     def _detect(self, name: str, image: TimedImage) -> None:
         """Detect objects in one image and publish them; in the worker's thread."""
         camera = self._cameras[name]
-        if not self.active or self._detector is None or not camera.images.is_open:
+        if not self.active or self._detector is None or not camera.subscription:
             return  # deactivated, or the last subscriber left, while the image waited
         times = StageTimes('waiting', image.received_at)
         times.begin('decoding')
@@ -265,19 +258,10 @@ class DetectorNode(ManagedNode[DetectorParameters]):
         self._last_error = ''
         self.stages.add(times.ms)
         if self.active:
-            camera.published += 1
-            camera.publisher.publish(detections_to_msg(detections, image.msg.header))
+            camera.publish(detections_to_msg(detections, image.msg.header))
             if self._awaited_since < math.inf:
                 self._first_boxes_s = time.monotonic() - self._awaited_since
                 self._awaited_since = math.inf
-
-
-def _prompts(parameters: DetectorParameters) -> Prompts:
-    """Return what the detector looks for; MapError: the map cannot be read."""
-    if parameters.vocabulary != 'map':
-        return prompts_of_names(parameters.vocabulary) if parameters.vocabulary else ()
-    file = path_of(parameters.map_file)
-    return prompts_of_map(LandmarkMap.from_file(file), file)
 
 
 def detector_options(parameters: DetectorParameters) -> DetectorOptions:

@@ -21,7 +21,8 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.query import CASE, Case, Query, case_arrays
-from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
+from cliploc_ros.files.storage import make_folder
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # As many frames as acceptance looks back to, see cliploc_ros.core.acceptance.looks.
@@ -159,8 +160,9 @@ class CaseRecorder:
             return
         with self._lock:
             self._seen.append(answer)
-            while sum(map(_bytes, self._seen)) > _MAX_BYTES \
-                    and len(self._seen) > 1:
+            while len(self._seen) > 1 and sum(
+                    image.nbytes for one in self._seen if one.query
+                    for image in one.query.images) > _MAX_BYTES:
                 self._seen.popleft()
 
     def end(self, answer: Answer) -> None:
@@ -185,7 +187,12 @@ class CaseRecorder:
             raise OptionsError('record_folder is empty: set it at the start, to a folder with '
                                'room for record_limit_mb')
         queries, found, last = self._linked()
-        folder, versions = _made_folder(parameters.record_folder), {}
+        try:
+            folder = Path(parameters.record_folder).expanduser()
+            make_folder(folder)
+        except (CliplocError, RuntimeError) as error:
+            raise DatasetError(f'record_folder: {error}') from error
+        versions = {}
         for name in _LIBRARIES:
             with suppress(PackageNotFoundError):
                 versions[name] = version(name)
@@ -194,8 +201,15 @@ class CaseRecorder:
             'reason': found.detail, 'map_hash': found.map_hash,
             'parameters': asdict(parameters), 'options': asdict(parameters.options()),
             'versions': versions}))
-        _check_room(folder, sum(one.nbytes for one in arrays.values()),
-                    parameters.record_limit_mb)
+        size, limit_mb, used = sum(one.nbytes for one in arrays.values()), \
+            parameters.record_limit_mb, 0
+        for file in folder.rglob('*'):
+            with suppress(FileNotFoundError):  # moved away meanwhile
+                used += file.stat().st_size if file.is_file() else 0
+        if used + size > limit_mb * _MIB:
+            raise DatasetError(f'{folder} holds {used // _MIB} MiB, this case would take '
+                               f'{max(1, size // _MIB)} MiB more, record_limit_mb is {limit_mb}: '
+                               'move recordings away, or raise it')
         now = datetime.now(UTC).strftime('%Y%m%dT%H%M%S.%f')[:-3]
         path = folder / f'case_{now}_{last.verdict}.npz'
         CASE.write(path, arrays, compress=True)
@@ -220,33 +234,3 @@ class CaseRecorder:
                 break
             linked.insert(0, one.query)
         return tuple(linked), seen[-1], last
-
-
-def _bytes(answer: Answer) -> int:
-    """Return the memory of its images."""
-    return 0 if answer.query is None else sum(one.nbytes for one in answer.query.images)
-
-
-def _made_folder(name: str) -> Path:
-    try:
-        folder = Path(name).expanduser()
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DatasetError(f'record_folder: {name}: {error.strerror}') from error
-    except RuntimeError as error:
-        raise DatasetError(f'record_folder: {name}: {error}') from error
-    return folder
-
-
-def _check_room(folder: Path, size: int, limit_mb: int) -> None:
-    """Raise unless a size [bytes] fits into what the recordings of the folder may take."""
-    # The size of all files; some may be moved away meanwhile.
-    used = 0
-    for parent, _, names in folder.walk():
-        for name in names:
-            with suppress(FileNotFoundError):
-                used += (parent / name).stat().st_size
-    if used + size > limit_mb * _MIB:
-        raise DatasetError(f'{folder} holds {used // _MIB} MiB, this case would take '
-                           f'{max(1, size // _MIB)} MiB more, record_limit_mb is {limit_mb}: move '
-                           'recordings away, or raise it')

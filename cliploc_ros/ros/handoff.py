@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time as Stamp
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
@@ -241,7 +240,8 @@ class HandOff:
         if by_poses is None and left_s < MOMENT_PATIENCE_S:
             raise HandOffError(f'{self._odometry.topic} has just begun, and too little time is '
                                'left to see whether the robot moves: ask again')
-        by_twist = speeds(odometry)
+        v, w = odometry.twist.twist.linear, odometry.twist.twist.angular
+        by_twist = math.hypot(v.x, v.y, v.z), math.hypot(w.x, w.y, w.z)
         if by_poses is None and by_twist == (0.0, 0.0):
             raise HandOffError(f'{self._odometry.topic} shows neither a twist nor poses that tell '
                                'a speed: the robot may be moving; stamp its poses, send at 1 Hz '
@@ -319,12 +319,6 @@ def _planar(msg: PoseWithCovarianceStamped) -> NDArray[np.float64]:
     planar[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
     planar[:2, 3] = p.x, p.y
     return planar
-
-
-def speeds(odometry: Odometry) -> tuple[float, float]:
-    """Return how fast a robot drives [m/s] and turns [rad/s]."""
-    v, w = odometry.twist.twist.linear, odometry.twist.twist.angular
-    return math.hypot(v.x, v.y, v.z), math.hypot(w.x, w.y, w.z)
 
 
 def usable_pose(pose: PoseWithCovarianceStamped, now: Time) -> PoseWithCovarianceStamped:

@@ -14,16 +14,11 @@ IMAGE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
 CAMERA_INFO = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
                          reliability=ReliabilityPolicy.BEST_EFFORT)
 DETECTIONS_IN = CAMERA_INFO
-# What the fastest usual IMU sends while another callback runs.
-IMU = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
-                 reliability=ReliabilityPolicy.BEST_EFFORT)
-# The same for odometry.
-ODOM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
-                  reliability=ReliabilityPolicy.BEST_EFFORT)
-DETECTIONS_OUT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
-                            reliability=ReliabilityPolicy.RELIABLE)
-POSE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
-                  reliability=ReliabilityPolicy.RELIABLE)
+# What the fastest usual IMU, or odometry, sends while another callback runs.
+IMU = ODOM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
+                        reliability=ReliabilityPolicy.BEST_EFFORT)
+DETECTIONS_OUT = POSE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
+                                   reliability=ReliabilityPolicy.RELIABLE)
 # For late subscribers, too.
 LATCHED = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
                      reliability=ReliabilityPolicy.RELIABLE,
