@@ -28,10 +28,9 @@ from cliploc_ros.models.protocols import ObjectDetector
 from cliploc_ros.nodes.detector import DetectorNode
 from cliploc_ros.nodes.relocalizer import RelocalizerNode
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, clip_options_of, load_localizer
-from cliploc_ros.ros.map_parameters import map_files
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
-from cliploc_ros.ros.parameters import CommonParameters, RelocalizerParameters
+from cliploc_ros.ros.parameters import CommonParameters, RelocalizerParameters, map_files
 
 # A request is measured with as many boxes as a picture of a furnished room has.
 _BOXES = 12

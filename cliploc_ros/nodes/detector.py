@@ -23,12 +23,11 @@ from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector, Prompt
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg, of_camera, stamp_ns
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
-from cliploc_ros.ros.map_parameters import path_of
 from cliploc_ros.ros.node.diagnostics import Health, Rates, StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.process import run_node
 from cliploc_ros.ros.node.threads import LatestOnly, Worker
-from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
+from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters, path_of
 
 _LOG_PERIOD_S = 5.0
 ABOUT = """\

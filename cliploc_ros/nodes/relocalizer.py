@@ -27,12 +27,11 @@ from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.time_jumps import TimeJumps
-from cliploc_ros.ros.map_parameters import path_of
 from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.process import run_node
 from cliploc_ros.ros.node.threads import MAX_REQUESTS, BoundedCallbackGroup, LatestOnly
-from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
+from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters, path_of
 from cliploc_ros.ros.request import Pipeline, Requests
 from cliploc_ros.ros.watch import Watcher
 

@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a frame to a relocalization: the map and the network that stay loaded between requests."""
 
+import hashlib
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,7 @@ from cliploc_ros.core.kernels.compiled import KERNEL_FOLDERS
 from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, load_layer_of_map
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer, by_classes, can_do_without_crops
-from cliploc_ros.core.map.joined_map import parts_of
+from cliploc_ros.core.map.joined_map import join_maps, parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import split_similarities
 from cliploc_ros.core.options import RelocalizerOptions
@@ -32,15 +34,17 @@ from cliploc_ros.models.profiles import with_encoder
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.instants import Instants
 from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
-from cliploc_ros.ros.map_parameters import load_hashed_map, map_files, path_of
 from cliploc_ros.ros.node.diagnostics import StageTimes
-from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.ros.parameters import RelocalizerParameters, map_files, path_of
 from cliploc_ros.ros.visualization import SeenImage
 
 logger = logging.getLogger(__name__)
 
 #: Value of keyframes_file for the layer next to the map, if there is one.
 NEXT_TO_MAP = 'auto'
+_DIGITS = 12
+# A file that is replaced while it is read is read again.
+_ATTEMPTS = 3
 
 
 class Keyframes(NamedTuple):
@@ -81,7 +85,7 @@ class FrameLocalizer:
     device : str
         Where the observer's network runs.
     map_hash : str
-        See cliploc_ros.ros.map_parameters.
+        See load_hashed_map.
     keyframes : Keyframes, optional
         The layer of keyframes of the map.
     """
@@ -256,3 +260,66 @@ def load_keyframes(parameters: RelocalizerParameters, landmark_map: LandmarkMap
     except MapError as error:
         logger.error('localizing without keyframes: %s', error)
         return None
+
+
+def load_map(node: Node, files: Sequence[str]) -> LandmarkMap:
+    """Return the map of files, or of the node's own parameters where no file is given.
+
+    MapError: names the source, the landmark and the field to fix.
+    """
+    if files:
+        return join_maps([LandmarkMap.from_file(file) for file in files], files)
+    parameters = node.get_parameters_by_prefix('map')
+    if not parameters:
+        raise MapError('no map: set map_file, or load a map with --params-file')
+    tree: dict[str, Any] = {}
+    for name, parameter in parameters.items():
+        _insert(tree, name.split('.'), parameter.value)
+    return LandmarkMap.from_mapping(tree, 'parameters')
+
+
+def _insert(tree: dict[str, Any], path: list[str], value: Any) -> None:
+    """Insert a value at its dotted name."""
+    for key in path[:-1]:
+        branch = tree.setdefault(key, {})
+        if not isinstance(branch, dict):
+            raise MapError(f"parameters: map.{'.'.join(path)}: '{key}' has both a value "
+                           'and fields')
+        tree = branch
+    tree[path[-1]] = value
+
+
+def load_hashed_map(node: Node, files: Sequence[str]) -> tuple[LandmarkMap, str]:
+    """Load one map or several and return them with their hash.
+
+    The hash is the beginning of what `cat FILE... | sha256sum` prints. A map in parameters has
+    the hash of its landmarks.
+
+    MapError: see load_map; or a file changes again and again.
+    """
+    for _ in range(_ATTEMPTS):
+        before = _hash_of(files)
+        landmark_map = load_map(node, files)
+        if not files:
+            content = b''.join([
+                repr((landmark_map.frame_id, landmark_map.landmark_ids, landmark_map.labels,
+                      landmark_map.class_ids)).encode(),
+                landmark_map.centers.tobytes(), landmark_map.semi_axes.tobytes(),
+                landmark_map.quats_xyzw.tobytes()])
+            return landmark_map, _hash(content)
+        if before == _hash_of(files):
+            return landmark_map, before
+    raise MapError(f'{", ".join(files)}: changes while it is read: write another file and '
+                   'rename it')
+
+
+def _hash_of(files: Sequence[str]) -> str:
+    """Return the hash of files; empty where load_map says what is wrong."""
+    try:
+        return _hash(b''.join(Path(file).read_bytes() for file in files))
+    except (OSError, ValueError):
+        return ''
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:_DIGITS]

@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Every parameter of the two nodes, and the method's options made from them."""
+"""Every parameter of the two nodes; the method's options and the paths of maps made from them."""
 
 import math
 import re
 from dataclasses import dataclass, replace
 from itertools import batched
+from pathlib import Path
 from typing import Any
+
+from ament_index_python.packages import get_package_share_directory
 
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.options import (
@@ -16,7 +19,7 @@ from cliploc_ros.core.options import (
     MATCHINGS,
     RelocalizerOptions,
 )
-from cliploc_ros.errors import OptionsError
+from cliploc_ros.errors import MapError, OptionsError
 from cliploc_ros.messages import parse_class_map
 from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES
@@ -29,6 +32,7 @@ VERTICAL_SOURCES = ('none', 'base_frame', 'imu')
 WATCHES = ('none', 'tf', 'amcl_pose')
 REACTIONS = ('report', 'relocalize')
 
+_FILE, _PACKAGE = 'file://', 'package://'
 # Of timeout_s, for algorithms other than auto.
 _SEARCH_SHARE = 0.5
 
@@ -297,3 +301,46 @@ class RelocalizerParameters(CommonParameters):
             height_range_m=(low, high) if low != high else (-math.inf, math.inf),
             time_budget_s=self.time_budget_ms / 1e3 if self.algorithm == 'auto'
             else _SEARCH_SHARE * self.timeout_s)
+
+
+def path_of(name: str) -> str:
+    """Return the path of a map.
+
+    Parameters
+    ----------
+    name : str
+        A path; ``file:///PATH``; or ``package://PACKAGE/PATH``, a path in the package's share
+        folder, as in URDF files.
+
+    Raises
+    ------
+    MapError
+        The package is not installed, or the URL names no file in it.
+    """
+    if not name.startswith(_PACKAGE):
+        return name.removeprefix(_FILE)
+    package, _, path = name.removeprefix(_PACKAGE).partition('/')
+    if not package or not path:
+        raise MapError(f'{name}: no package://PACKAGE/PATH, such as package://my_maps/office.yaml')
+    try:
+        return str(Path(get_package_share_directory(package)) / path)
+    except (LookupError, ValueError) as error:
+        raise MapError(f"{name}: there is no package '{package}' here: install it, or source "
+                       'the workspace that has it') from error
+
+
+def map_files(parameters: RelocalizerParameters) -> list[str]:
+    """Return the paths of the files that the parameters map_file and map_files name.
+
+    Raises
+    ------
+    OptionsError
+        Both parameters name files.
+    MapError
+        A URL names a package that is not installed.
+    """
+    several = [name for name in parameters.map_files if name]
+    if several and parameters.map_file:
+        raise OptionsError("map_file and map_files both name files: set map_file to '' to search "
+                           'all of map_files')
+    return [path_of(name) for name in several or [parameters.map_file] if name]

@@ -10,7 +10,7 @@ from scene import make_room, write_map
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.answer import Answer, RequestCounters, Verdict
-from cliploc_ros.ros.map_parameters import load_hashed_map
+from cliploc_ros.ros.frame_localizer import load_hashed_map
 
 
 def test_counts_add_up():

@@ -9,7 +9,7 @@ from scene import make_room
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import MapError
-from cliploc_ros.ros.map_parameters import load_map
+from cliploc_ros.ros.frame_localizer import load_map
 
 
 @pytest.fixture

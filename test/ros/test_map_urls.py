@@ -5,8 +5,7 @@
 import pytest
 
 from cliploc_ros.errors import MapError
-from cliploc_ros.ros.map_parameters import map_files, path_of
-from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.ros.parameters import RelocalizerParameters, map_files, path_of
 
 
 @pytest.fixture
