@@ -88,17 +88,21 @@ def _unpacked(msg: ImageMessage) -> NDArray[np.uint8]:
     if msg.encoding not in _CHANNELS:
         raise ImageError(f"image encoding '{msg.encoding}' is none of {', '.join(_CHANNELS)}")
     order, channels = _CHANNELS[msg.encoding]
+    pixels = _rows(msg, msg.width * channels).reshape(msg.height, msg.width, channels)
+    return np.ascontiguousarray(pixels[:, :, order])
+
+
+def _rows(msg: ImageMessage, used: int) -> NDArray[np.uint8]:
+    """Return the rows (h, used) of an image [bytes]. ImageError: a field is invalid."""
     check_size(msg.width, msg.height)
-    if msg.step < msg.width * channels:
+    if msg.step < used:
         raise ImageError(f'image step {msg.step} is shorter than a row of {msg.width} '
                          f'{msg.encoding} pixels')
     if len(msg.data) < msg.step * msg.height:
         raise ImageError(f'image data has {len(msg.data)} bytes, but {msg.height} rows of '
                          f'{msg.step} bytes are {msg.step * msg.height}')
     rows = np.frombuffer(msg.data, dtype=np.uint8, count=msg.step * msg.height)
-    pixels = rows.reshape(msg.height, msg.step)[:, :msg.width * channels]
-    pixels = pixels.reshape(msg.height, msg.width, channels)
-    return np.ascontiguousarray(pixels[:, :, order])
+    return rows.reshape(msg.height, msg.step)[:, :used]
 
 
 def _decoded(msg: CompressedImageMessage) -> NDArray[np.uint8]:
@@ -140,13 +144,7 @@ def depth_counts_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray
     if isinstance(msg, CompressedImageMessage):
         return _decode_depth_png(msg)
     dtype = _depth_type(msg.encoding).newbyteorder('>' if getattr(msg, 'is_bigendian', 0) else '<')
-    check_size(msg.width, msg.height)
-    used = msg.width * dtype.itemsize
-    if msg.step < used or len(msg.data) < msg.step * msg.height:
-        raise ImageError(f'depth image of {msg.width}x{msg.height} px with step {msg.step} has '
-                         f'only {len(msg.data)} bytes')
-    rows = np.frombuffer(msg.data, dtype=np.uint8, count=msg.step * msg.height)
-    pixels = np.ascontiguousarray(rows.reshape(msg.height, msg.step)[:, :used]).view(dtype)
+    pixels = np.ascontiguousarray(_rows(msg, msg.width * dtype.itemsize)).view(dtype)
     return pixels.astype(dtype.newbyteorder('='))
 
 

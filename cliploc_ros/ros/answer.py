@@ -91,9 +91,20 @@ def answer_msg(answer: Answer, node: str) -> DiagnosticArray:
     header, name = answer.header or Header(), node.lstrip('/')
     seen = {} if answer.header is None else {
         'stamp [s]': f'{header.stamp.sec}.{header.stamp.nanosec:09d}', 'frame': header.frame_id}
+    pose: dict[str, object] = {}
+    if answer.pose is not None:
+        of_pose = answer.pose.pose
+        p, q = of_pose.pose.position, of_pose.pose.orientation
+        position_m, turn_deg = deviations(np.reshape(of_pose.covariance, (6, 6)))
+        pose = {'x [m]': p.x, 'y [m]': p.y, 'z [m]': p.z,
+                'orientation xyzw': f'{q.x} {q.y} {q.z} {q.w}',
+                'heading [deg]': f'{answer.heading_deg:.2f}',
+                'position deviation [m]': f'{position_m:.4f}',
+                'heading deviation [deg]': f'{turn_deg:.3f}',
+                'covariance': ' '.join(map(repr, map(float, of_pose.covariance)))}
     values = {'answer': answer.number, 'verdict': answer.verdict, 'kind': answer.kind or '',
               **seen, **answer.figures,
-              **({} if answer.pose is None else _pose_values(answer.pose, answer.heading_deg)),
+              **pose,
               **{f'{stage} [ms]': f'{ms:.1f}' for stage, ms in answer.stages_ms.items()},
               'map hash': answer.map_hash}
     return DiagnosticArray(header=header, status=[DiagnosticStatus(
@@ -105,16 +116,6 @@ def answer_msg(answer: Answer, node: str) -> DiagnosticArray:
 def deviations(covariance: NDArray[np.float64]) -> tuple[float, float]:
     """Return standard deviations by a pose's covariance (6, 6): position [m], heading [deg]."""
     return math.sqrt(np.trace(covariance[:3, :3])), math.degrees(math.sqrt(covariance[5, 5]))
-
-
-def _pose_values(msg: PoseWithCovarianceStamped, heading_deg: float) -> dict[str, object]:
-    p, q = msg.pose.pose.position, msg.pose.pose.orientation
-    position_m, turn_deg = deviations(np.reshape(msg.pose.covariance, (6, 6)))
-    return {'x [m]': p.x, 'y [m]': p.y, 'z [m]': p.z,
-            'orientation xyzw': f'{q.x} {q.y} {q.z} {q.w}', 'heading [deg]': f'{heading_deg:.2f}',
-            'position deviation [m]': f'{position_m:.4f}',
-            'heading deviation [deg]': f'{turn_deg:.3f}',
-            'covariance': ' '.join(map(repr, map(float, msg.pose.covariance)))}
 
 
 class RequestCounters:

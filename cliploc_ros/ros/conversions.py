@@ -110,16 +110,13 @@ def detection_type(package: str) -> DetectionType:
 
 def from_yolo_msg(msg: Any) -> Detection2DArray:
     """Return a yolo_msgs/DetectionArray as the common type: boxes, class names and scores."""
-    return Detection2DArray(header=msg.header, detections=[
-        Detection2D(header=msg.header, id=one.id, bbox=_box(one.bbox), results=[
+    common = Detection2DArray(header=msg.header)
+    for one in msg.detections:
+        size, center = one.bbox.size, one.bbox.center
+        box = BoundingBox2D(size_x=size.x, size_y=size.y)
+        box.center.position.x, box.center.position.y = center.position.x, center.position.y
+        box.center.theta = center.theta
+        common.detections.append(Detection2D(header=msg.header, id=one.id, bbox=box, results=[
             ObjectHypothesisWithPose(hypothesis=ObjectHypothesis(
-                class_id=one.class_name or str(one.class_id), score=one.score))])
-        for one in msg.detections])
-
-
-def _box(bbox: Any) -> BoundingBox2D:
-    box = BoundingBox2D(size_x=bbox.size.x, size_y=bbox.size.y)
-    box.center.position.x = bbox.center.position.x
-    box.center.position.y = bbox.center.position.y
-    box.center.theta = bbox.center.theta
-    return box
+                class_id=one.class_name or str(one.class_id), score=one.score))]))
+    return common

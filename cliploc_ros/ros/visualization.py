@@ -65,7 +65,10 @@ def landmark_markers(landmark_map: LandmarkMap, layer: KeyframeLayer | None = No
     for part in parts_of(landmark_map):
         markers += _markers_of(part.landmark_map, part.first)
     if layer is not None:
-        markers.append(_keyframe_marker(layer))
+        shown = range(0, len(layer), -(-len(layer) // MAX_SHOWN))  # of more, every n-th
+        markers.append(_line_marker(Header(frame_id=layer.frame_id), 'keyframes', _KEYFRAMES, [
+            end for edge in frusta([layer.camera_of(row) for row in shown],
+                                   layer.map_from_camera[shown], _FRUSTUM_M) for end in edge]))
     return MarkerArray(markers=markers)
 
 
@@ -89,19 +92,6 @@ def _markers_of(landmark_map: LandmarkMap, first: int) -> list[Marker]:
         text.scale.z = _TEXT_HEIGHT_M
         markers += [ellipsoid, text]
     return markers
-
-
-def _keyframe_marker(layer: KeyframeLayer) -> Marker:
-    """Return the frusta of keyframes; of more than MAX_SHOWN, every n-th."""
-    shown = range(0, len(layer), -(-len(layer) // MAX_SHOWN))
-    return _line_marker(Header(frame_id=layer.frame_id), 'keyframes', _KEYFRAMES, [
-        end for edge in frusta([layer.camera_of(row) for row in shown],
-                               layer.map_from_camera[shown], _FRUSTUM_M) for end in edge])
-
-
-def no_markers() -> MarkerArray:
-    """Return a message that removes all markers."""
-    return MarkerArray(markers=[Marker(action=Marker.DELETEALL)])
 
 
 def match_markers(header: Header, camera_position: NDArray[np.float64],
@@ -371,6 +361,7 @@ class Visualization:
         with self._lock:
             if self._map is self._shown or self._landmarks.get_subscription_count() == 0:
                 return
-            self._landmarks.publish(no_markers() if self._map is None
-                                    else landmark_markers(self._map, self._layer))
+            self._landmarks.publish(
+                MarkerArray(markers=[Marker(action=Marker.DELETEALL)]) if self._map is None
+                else landmark_markers(self._map, self._layer))
             self._shown = self._map

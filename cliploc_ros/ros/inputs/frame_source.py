@@ -292,15 +292,6 @@ class FrameSource:
             del self._depths[0 if stamps[0] < useful_ns or len(stamps) < 3 else 1 + min(
                 range(len(stamps) - 2), key=lambda row: stamps[row + 2] - stamps[row])]
 
-    def _depth_at(self, image_ns: int) -> Image | CompressedImage | None:
-        """Return the depth image nearest to a time; older ones are of no more use."""
-        def apart(msg: Image | CompressedImage) -> int:
-            return abs(stamp_ns(msg.header.stamp) - image_ns)
-        nearest = min(self._depths, key=apart, default=None)
-        if nearest is None or apart(nearest) > self._depth_tolerance_ns:
-            return None
-        return nearest
-
     def _completed(self, name: str, msg: Any, received_at: float) -> Frame | None:
         """Return the frame that a message completes, once its stamps are sure; None before."""
         at_ns = stamp_ns(msg.header.stamp)
@@ -322,7 +313,10 @@ class FrameSource:
                 complete['image'], complete['detections'])
             self._unsure = Frame(
                 image, complete['camera_info'][0], detections, image_at,
-                max(image_at, detected_at), self._depth_at(at_ns),
+                max(image_at, detected_at), min(
+                    (one for one in self._depths
+                     if abs(stamp_ns(one.header.stamp) - at_ns) <= self._depth_tolerance_ns),
+                    key=lambda one: abs(stamp_ns(one.header.stamp) - at_ns), default=None),
                 self.heard.get('depth_camera_info', (None, 0.0))[0], self._camera,
                 image_topic=self.image_topic)
         frame = self._unsure

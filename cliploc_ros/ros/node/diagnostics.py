@@ -176,8 +176,9 @@ class Diagnostics:
         """Publish the health now."""
         with self._lock:
             state, health = self._state(), self._health()
-        values = {'state': state, **health.values, 'memory [MiB]': f'{_resident_mib():.0f}',
-                  **_gpu_memory()}
+        pages = int(Path('/proc/self/statm').read_text().split()[1])  # that are resident
+        values = {'state': state, **health.values, 'memory [MiB]':
+                  f'{pages * os.sysconf("SC_PAGE_SIZE") / 2**20:.0f}', **_gpu_memory()}
         name = self._node.get_fully_qualified_name().lstrip('/')
         status = DiagnosticStatus(
             level=health.level, name=f'{name}: status', hardware_id=name,
@@ -186,11 +187,6 @@ class Diagnostics:
         msg = DiagnosticArray(status=[status])
         msg.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(msg)
-
-
-def _resident_mib() -> float:
-    pages = int(Path('/proc/self/statm').read_text().split()[1])
-    return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
 
 
 def _gpu_memory() -> dict[str, object]:

@@ -110,11 +110,9 @@ class ParameterRow:
         return value
 
 
-def parameter(default: Value, description: str, unit: str = '', low: float = -math.inf,
-              high: float = math.inf, choices: tuple[str, ...] = (), read_only: bool = False,
-              repeats: bool = False) -> Any:
+def parameter(default: Value, description: str, **row_fields: Any) -> Any:
     """Return the field of a parameter in a subclass of Parameters; see ParameterRow."""
-    row = ParameterRow('', default, description, unit, low, high, choices, read_only, repeats)
+    row = ParameterRow('', default, description, **row_fields)
     if isinstance(default, list):
         return field(default_factory=default.copy, metadata={'row': row})
     return field(default=default, metadata={'row': row})
@@ -158,7 +156,11 @@ class NodeParameters[P: Parameters]:
         self._problems: dict[str, str] = {}
         for row in self._rows.values():
             self._declare(row)
-        self._report_unknown({row.name for row in others.rows()})
+        known = {*self._rows, *(row.name for row in others.rows()), *_FOREIGN_NAMES}
+        for name in node.get_parameters_by_prefix(''):  # most are typing errors
+            if name not in known and not name.startswith(_FOREIGN_PREFIXES):
+                node.get_logger().warning(f"unknown parameter '{name}' has no effect"
+                                          f'{did_you_mean(name, self._rows)}')
         #: The values, which may not fit together. Replaced as a whole: a reader sees all of a
         #: change or none of it.
         self.values: P = kind(**{name: node.get_parameter(name).value for name in self._rows})
@@ -189,15 +191,6 @@ class NodeParameters[P: Parameters]:
                     f'correct it with: ros2 param set {self._node.get_name()} {row.name} VALUE'
                 self._problems[row.name] = f'{error}; {remedy}'
         self._node.declare_parameter(row.name, value, row.descriptor, ignore_override=True)
-
-    def _report_unknown(self, others: set[str]) -> None:
-        """Warn of parameters that no row of any node declares: most are typing errors."""
-        for name in self._node.get_parameters_by_prefix(''):
-            if (name in self._rows or name in others or name in _FOREIGN_NAMES
-                    or name.startswith(_FOREIGN_PREFIXES)):
-                continue
-            self._node.get_logger().warning(f"unknown parameter '{name}' has no effect"
-                                            f'{did_you_mean(name, self._rows)}')
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
         """Allow a change if all values are valid together; another callback may refuse it."""

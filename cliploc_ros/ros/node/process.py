@@ -44,7 +44,10 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoR
     # The networks of both nodes share a robot's cores. PyTorch's threads wait by spinning, which
     # slows the other process tenfold. PyTorch reads this when it is loaded.
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
-    _bound_arenas()
+    # All threads share two heaps: free memory kept in twenty of them adds up.
+    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
+    if mallopt is not None:  # glibc
+        mallopt(_M_ARENA_MAX, 2)
     # Python would raise KeyboardInterrupt anywhere, even in the middle of a callback. rclpy would
     # end its context at once: a request under way could not be answered, nor a bond be ended.
     interrupted = Interruption()
@@ -81,13 +84,6 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoR
             node.destroy_node()
         rclpy.try_shutdown()
     _leave()
-
-
-def _bound_arenas() -> None:
-    """Let all threads share two heaps: free memory kept in twenty of them adds up."""
-    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
-    if mallopt is not None:  # glibc
-        mallopt(_M_ARENA_MAX, 2)
 
 
 def _leave() -> NoReturn:
