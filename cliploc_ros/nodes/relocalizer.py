@@ -26,7 +26,7 @@ from cliploc_ros.ros.handoff import HandOff, MapToOdom
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
-from cliploc_ros.ros.inputs.time_jumps import TimeJumps
+from cliploc_ros.ros.inputs.stamps import TimeJumps
 from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.process import run_node

@@ -46,7 +46,7 @@ from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
 from cliploc_ros.ros.inputs.instants import faults_of_axes, frame_depths, read_frame
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
-from cliploc_ros.ros.inputs.time_jumps import stamp_problem
+from cliploc_ros.ros.inputs.stamps import stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health, StageTimes, in_words
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.threads import NodeExecutor

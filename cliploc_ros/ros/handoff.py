@@ -34,8 +34,8 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_to_msg, stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.odometry import MOMENT_PATIENCE_S, OdometrySource
+from cliploc_ros.ros.inputs.stamps import TimeJumpError
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
-from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # The least variances of x, y, z [m^2] and of the rotations [rad^2]: a centimetre and a sixth of a

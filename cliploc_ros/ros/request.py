@@ -28,7 +28,7 @@ from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame, NoFrameError
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
-from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps
+from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.node.diagnostics import StageTimes, in_words
 from cliploc_ros.ros.node.lifecycle import ManagedNode, NotActiveError
 from cliploc_ros.ros.parameters import RelocalizerParameters

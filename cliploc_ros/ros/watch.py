@@ -36,7 +36,7 @@ from cliploc_ros.ros.inputs.frame_source import Frame, NoFrameError
 from cliploc_ros.ros.inputs.odometry import OdometryPlace
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
-from cliploc_ros.ros.inputs.time_jumps import TimeJumpError, TimeJumps, stamp_problem
+from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps, stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health, join_names
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters

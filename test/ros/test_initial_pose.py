@@ -16,7 +16,7 @@ from cliploc_ros.ros.handoff import (
     NoLocalizerError,
     is_taken,
 )
-from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
+from cliploc_ros.ros.inputs.stamps import TimeJumpError
 
 
 @pytest.mark.clock

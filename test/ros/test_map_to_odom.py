@@ -16,7 +16,7 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.ros.handoff import MapToOdom, transform_msg
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.odometry import OdometrySource
-from cliploc_ros.ros.inputs.time_jumps import TimeJumpError
+from cliploc_ros.ros.inputs.stamps import TimeJumpError
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 PARAMETERS = RelocalizerParameters(publish_tf=True, base_frame='base_link', tf_timeout_s=5.0)

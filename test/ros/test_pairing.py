@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cliploc_ros.ros.inputs.pairing import ExactPairing
+from cliploc_ros.ros.inputs.stamps import ExactPairing
 
 TOPICS = ('image', 'camera_info', 'detections')
 LIMITS = {'image': 100, 'camera_info': 30, 'detections': 50}

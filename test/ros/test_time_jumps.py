@@ -19,9 +19,9 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.frame_source import FrameSource
 from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometrySource
-from cliploc_ros.ros.inputs.pairing import MessageStamps
 from cliploc_ros.ros.inputs.robot_state import NoVerticalError, VerticalSource
-from cliploc_ros.ros.inputs.time_jumps import (
+from cliploc_ros.ros.inputs.stamps import (
+    MessageStamps,
     StampOrder,
     TimeJumpError,
     TimeJumps,

@@ -19,9 +19,8 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detection_type, of_camera, stamp_ns
-from cliploc_ros.ros.inputs.pairing import ExactPairing, MessageStamps
+from cliploc_ros.ros.inputs.stamps import ExactPairing, MessageStamps, stamp_problem
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
-from cliploc_ros.ros.inputs.time_jumps import stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health, Rates
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S

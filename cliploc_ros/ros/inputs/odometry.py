@@ -25,8 +25,8 @@ from cliploc_ros.core.geometry.transforms import (
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
+from cliploc_ros.ros.inputs.stamps import stamp_problem
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription, Listener
-from cliploc_ros.ros.inputs.time_jumps import stamp_problem
 from cliploc_ros.units import NS_PER_S
 
 _UNIT_TOLERANCE = 0.01

@@ -32,8 +32,8 @@ from cliploc_ros.ros.inputs.odometry import (
     OdometrySource,
 )
 from cliploc_ros.ros.inputs.prior import PriorSource
+from cliploc_ros.ros.inputs.stamps import StampOrder, stamp_problem
 from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription, Listener
-from cliploc_ros.ros.inputs.time_jumps import StampOrder, stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters

@@ -7,7 +7,7 @@ from rclpy.node import Node
 from tf2_ros import Buffer, TransformListener
 
 from cliploc_ros.ros.conversions import stamp_ns
-from cliploc_ros.ros.inputs.time_jumps import StampOrder
+from cliploc_ros.ros.inputs.stamps import StampOrder
 
 
 class TransformBuffer(Buffer):
