@@ -3,11 +3,14 @@
 """Profiles: which detector and which encoder suit a device."""
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.devices import resolve_device
-from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
+
+if TYPE_CHECKING:  # nodes know the names of profiles before they load a network
+    from cliploc_ros.models.clip_weights import ClipOptions
+    from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 
 
 @dataclass(frozen=True)
@@ -41,27 +44,28 @@ def resolve_profile(profile: str, device: str) -> Profile:
     return PROFILES[profile]
 
 
-def with_detector(options: DetectorOptions, profile: str) -> DetectorOptions:
+def with_detector(options: 'DetectorOptions', profile: str) -> 'DetectorOptions':
     """Return options that name a detector: that of the profile where the model is ''."""
     if options.model:
         return options
     return replace(options, model=resolve_profile(profile, options.device).detector)
 
 
-def with_encoder(options: ClipOptions, profile: str) -> ClipOptions:
+def with_encoder(options: 'ClipOptions', profile: str) -> 'ClipOptions':
     """Return options that name an encoder: that of the profile where they name none.
 
     Options that name a model, weights or a file keep them, and have the defaults of ClipOptions
     for the rest: weights belong to a model.
     """
     if options.model or options.pretrained or options.checkpoint_path:
-        return replace(options, model=options.model or ClipOptions.model,
-                       pretrained=options.pretrained or ClipOptions.pretrained)
+        defaults = type(options)
+        return replace(options, model=options.model or defaults.model,
+                       pretrained=options.pretrained or defaults.pretrained)
     chosen = resolve_profile(profile, options.device)
     return replace(options, model=chosen.clip_model, pretrained=chosen.clip_pretrained)
 
 
-def load_detector(options: DetectorOptions) -> ObjectDetector:
+def load_detector(options: 'DetectorOptions') -> 'ObjectDetector':
     """Load a detector: the one place that knows which kinds there are.
 
     Raises

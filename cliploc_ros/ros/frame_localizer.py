@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,6 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.watch import Watch, WatchReport
 from cliploc_ros.errors import MapError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.observer import Observer
 from cliploc_ros.models.profiles import with_encoder
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.instants import Instants
@@ -37,6 +35,10 @@ from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters, map_files, path_of
 from cliploc_ros.ros.visualization import SeenImage
+
+if TYPE_CHECKING:  # loaded where crops are compared
+    from cliploc_ros.models.clip_weights import ClipOptions
+    from cliploc_ros.models.observer import Observer
 
 logger = logging.getLogger(__name__)
 
@@ -90,7 +92,7 @@ class FrameLocalizer:
         The layer of keyframes of the map.
     """
 
-    def __init__(self, landmark_map: LandmarkMap, observer: Observer | None,
+    def __init__(self, landmark_map: LandmarkMap, observer: 'Observer | None',
                  relocalizer: Relocalizer, options: RelocalizerOptions, device: str,
                  map_hash: str, keyframes: Keyframes | None = None) -> None:
         self.device, self.map_hash, self.keyframes = device, map_hash, keyframes
@@ -216,6 +218,7 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
     observer, device = None, 'cpu'
     if options.needs_similarities:
         from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
+        from cliploc_ros.models.observer import Observer
         asked = (clip_options_of(parameters), landmark_map, files, parameters.landmark_embeddings)
         if former is not None and former.observer is not None:
             observer, device = former.observer.with_labels(embed_map(*asked)), former.device
@@ -227,8 +230,9 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
                           load_keyframes(parameters, landmark_map))
 
 
-def clip_options_of(parameters: RelocalizerParameters) -> ClipOptions:
+def clip_options_of(parameters: RelocalizerParameters) -> 'ClipOptions':
     """Return the CLIP that parameters name: that of the profile where they name none."""
+    from cliploc_ros.models.clip_weights import ClipOptions
     named = ClipOptions(
         model=parameters.clip_model, pretrained=parameters.clip_pretrained,
         checkpoint_path=parameters.clip_checkpoint_path, device=parameters.device,
