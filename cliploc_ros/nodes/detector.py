@@ -22,7 +22,6 @@ from cliploc_ros.models.profiles import load_detector, with_detector
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector, Prompts
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg, of_camera, stamp_ns
-from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.node.diagnostics import Health, Rates, StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.node.process import run_node
@@ -112,7 +111,7 @@ class _Camera:
         self._type = Image if is_raw else CompressedImage
         self._topic = of_camera(name, 'image' if is_raw else 'image/compressed')
         #: None while its images are not wanted
-        self.subscription: AdaptiveSubscription | None = None
+        self.subscription: qos.AdaptiveSubscription | None = None
         self._heard_at = 0.0
         self._counts, self._rates = {'image': 0, 'detections': 0}, Rates()
         self._publisher = node.create_publisher(
@@ -129,7 +128,7 @@ class _Camera:
         """Subscribe, if it does not yet."""
         if self.subscription is None:
             self._heard_at = time.monotonic()  # silence counts from here
-            self.subscription = AdaptiveSubscription(self._node, self._type, self._topic,
+            self.subscription = qos.AdaptiveSubscription(self._node, self._type, self._topic,
                                                      self._take, qos.IMAGE)
 
     def close(self) -> None:

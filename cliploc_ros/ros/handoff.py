@@ -35,7 +35,6 @@ from cliploc_ros.ros.conversions import pose_to_msg, stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.odometry import MOMENT_PATIENCE_S, OdometrySource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError
-from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # The least variances of x, y, z [m^2] and of the rotations [rad^2]: a centimetre and a sixth of a
@@ -83,7 +82,7 @@ class HandOff:
         self._shown: PoseWithCovarianceStamped | None = None
         self._pose_topic = ''
         self._listeners: list[Callable[[PoseWithCovarianceStamped], None]] = []
-        self._subscription: AdaptiveSubscription | None = None
+        self._subscription: qos.AdaptiveSubscription | None = None
         self._publisher = node.create_publisher(
             PoseWithCovarianceStamped, 'initialpose', qos.POSE,
             event_callbacks=PublisherEventCallbacks(matched=lambda _: self._wake()))
@@ -100,7 +99,7 @@ class HandOff:
         if pose_topic:
             self._pose_topic = str(self._node.resolve_topic_name(pose_topic))
             # Volatile: what a localizer showed before does not come late.
-            self._subscription = AdaptiveSubscription(
+            self._subscription = qos.AdaptiveSubscription(
                 self._node, PoseWithCovarianceStamped, pose_topic, self._hear, qos.POSE)
 
     def close(self) -> None:

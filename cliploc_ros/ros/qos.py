@@ -1,9 +1,21 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Quality of service by name. Parameters ``qos_overrides`` override each of them."""
+"""Quality of service by name, and a subscription that is as reliable as its publishers."""
 
+import math
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
+from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
 
 # Inputs are best effort unless all their publishers are reliable, see AdaptiveSubscription.
 # Only the newest image counts.
@@ -30,9 +42,137 @@ SERVICE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
 
 _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
                 QoSPolicyKind.DURABILITY)
+# Between two subscriptions made because of empty messages [s]: a publisher may send such, too.
+_RENEWAL_PERIOD_S = 1.0
+_LOG_PERIOD_S = 5.0
 
 
 def overridable(*but: QoSPolicyKind) -> QoSOverridingOptions:
     """Return the options that let a user override all policies except some."""
     return QoSOverridingOptions(
         policy_kinds=[kind for kind in _OVERRIDABLE if kind not in but])
+
+
+class AdaptiveSubscription:
+    """Subscribes reliably while all publishers of the topic are reliable, else best effort.
+
+    A best-effort subscription matches every camera, but loses large images even on one machine. A
+    reliable one does not match a best-effort camera. The choice is made again when publishers
+    come or go.
+
+    Messages are taken as bytes and deserialized here. A reliable subscription that joins a stream
+    of images may be left with a message that Fast DDS (2.14) has already freed: one join in fifty,
+    measured on busy cores. Where Fast DDS deserializes, it tries that message for ever and blocks
+    the whole process. As bytes, the message is merely empty and comes again and again; a new
+    subscription ends that.
+
+    Parameters
+    ----------
+    node : Node
+        Made with automatically_declare_parameters_from_overrides=True.
+    callback : callable
+        Takes each message, one at a time except during such a change.
+    profile : QoSProfile
+        All policies except the reliability.
+    """
+
+    def __init__(self, node: Node, message_type: type, topic: str,
+                 callback: Callable[[Any], None], profile: QoSProfile) -> None:
+        self._node = node
+        self._message_type = message_type
+        self._topic = node.resolve_topic_name(topic)
+        self._callback = callback
+        self._profile = profile
+        # A reliability set by the user stays. The parameter is not declared otherwise: a declared
+        # one would stay, too.
+        self._overridden = node.has_parameter(
+            f'qos_overrides.{self._topic}.subscription.reliability')
+        self._renewed_at = -math.inf
+        # Publishers come in one thread, destroy is called in another.
+        self._lock = threading.RLock()
+        self._subscription: Subscription | None = None
+        with self._lock:
+            self._reliability = self._offered()
+            self._subscription = self._create()
+
+    def destroy(self) -> None:
+        """Stop listening."""
+        with self._lock:
+            if self._subscription is not None:
+                self._node.destroy_subscription(self._subscription)
+                self._subscription = None
+
+    def _offered(self) -> ReliabilityPolicy:
+        """Return the most reliable policy that matches all present publishers."""
+        offered = [info.qos_profile.reliability
+                   for info in self._node.get_publishers_info_by_topic(self._topic)]
+        reliable = bool(offered) and all(r == ReliabilityPolicy.RELIABLE for r in offered)
+        return ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+
+    def _create(self) -> Subscription:
+        # A group of its own: if a subscription is destroyed before its event is taken, rclpy
+        # leaves the group busy for ever. Besides, a group keeps a reference to each of its former
+        # members.
+        group = MutuallyExclusiveCallbackGroup()
+        profile = QoSProfile(history=self._profile.history, depth=self._profile.depth,
+                             durability=self._profile.durability, reliability=self._reliability)
+        return self._node.create_subscription(
+            self._message_type, self._topic, self._take, profile, raw=True, callback_group=group,
+            qos_overriding_options=overridable(
+                *(() if self._overridden else (QoSPolicyKind.RELIABILITY,))),
+            event_callbacks=SubscriptionEventCallbacks(
+                matched=self._adapt, incompatible_qos=self._adapt))
+
+    def _adapt(self, _: Any) -> None:
+        """Subscribe again if the present publishers need another reliability."""
+        with self._lock:
+            offered = self._offered()
+            if self._overridden or self._subscription is None or offered == self._reliability:
+                return
+            self._reliability = offered
+            self._renew(self._subscription)
+
+    def _renew(self, former: Subscription) -> None:
+        self._subscription = self._create()
+        self._node.destroy_subscription(former)
+
+    def _take(self, data: bytes) -> None:
+        if not data:
+            self._take_empty()
+            return
+        try:
+            message = deserialize_message(data, self._message_type)
+        except RuntimeError as error:  # RMWError, which rclpy does not export
+            self._node.get_logger().error(
+                f'a message on {self._topic} cannot be read: {str(error).splitlines()[0]}',
+                throttle_duration_sec=_LOG_PERIOD_S)
+            return
+        self._callback(message)
+
+    def _take_empty(self) -> None:
+        """Subscribe again, see the class."""
+        with self._lock:
+            now = time.monotonic()
+            if self._subscription is None or now - self._renewed_at < _RENEWAL_PERIOD_S:
+                return
+            self._renewed_at = now
+            self._renew(self._subscription)
+        self._node.get_logger().warning(
+            f'an empty message on {self._topic}: subscribed again')
+
+
+class Listener(ABC):
+    """Remembers what it hears while its subscription is open, and nothing longer."""
+
+    _subscription: AdaptiveSubscription | None = None
+
+    @abstractmethod
+    def forget(self) -> None:
+        """Forget what was heard: what follows belongs to another time or run."""
+
+    def close(self) -> None:
+        """Unsubscribe, and forget what was heard."""
+        if self._subscription is not None:
+            self._subscription.destroy()
+            self._subscription = None
+        self.forget()

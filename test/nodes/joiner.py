@@ -11,7 +11,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
+from cliploc_ros.ros.qos import AdaptiveSubscription
 
 
 def publish():

@@ -17,7 +17,7 @@ from rclpy.qos import (
 )
 from std_msgs.msg import Header
 
-from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
+from cliploc_ros.ros.qos import AdaptiveSubscription
 
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
 DEPTH_ONE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,

@@ -20,7 +20,6 @@ from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detection_type, of_camera, stamp_ns
 from cliploc_ros.ros.inputs.stamps import ExactPairing, MessageStamps, stamp_problem
-from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription
 from cliploc_ros.ros.node.diagnostics import Health, Rates
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
@@ -125,7 +124,7 @@ class FrameSource:
         # When image and detections of the newest frame arrived (monotonic clock) [s].
         self._arrived_at = (-math.inf, -math.inf)
         self._changed = changed or threading.Condition()
-        self._subscriptions: list[AdaptiveSubscription] = []
+        self._subscriptions: list[qos.AdaptiveSubscription] = []
         self._subscribed_at = 0.0
         # Until when it is wanted (monotonic clock) [s]: by those who wait, and after them.
         self._deadlines: list[float] = []
@@ -244,7 +243,7 @@ class FrameSource:
                      'depth_camera_info': (CameraInfo, qos.CAMERA_INFO)}
         for name, topic in self.topics.items():
             message_type, profile = of_topics[name]
-            self._subscriptions.append(AdaptiveSubscription(
+            self._subscriptions.append(qos.AdaptiveSubscription(
                 self._node, message_type, topic, partial(self._receive, name), profile))
 
     def _unsubscribe(self) -> None:

@@ -26,7 +26,6 @@ from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.stamps import stamp_problem
-from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription, Listener
 from cliploc_ros.units import NS_PER_S
 
 _UNIT_TOLERANCE = 0.01
@@ -345,7 +344,7 @@ class OdometryPlace(NamedTuple):
     frame: str = ''  #: The coordinate frame that odometry tracks (child_frame_id)
 
 
-class OdometrySource(Listener):
+class OdometrySource(qos.Listener):
     """Subscribes to odometry while the node is active: it costs little, and links frames."""
 
     def __init__(self, node: Node) -> None:
@@ -379,7 +378,7 @@ class OdometrySource(Listener):
 
     def open(self) -> None:
         """Subscribe."""
-        self._subscription = AdaptiveSubscription(self._node, Odometry, 'odom', self.take,
+        self._subscription = qos.AdaptiveSubscription(self._node, Odometry, 'odom', self.take,
                                                   qos.ODOM)
 
     def forget(self) -> None:

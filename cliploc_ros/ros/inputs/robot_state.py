@@ -33,7 +33,6 @@ from cliploc_ros.ros.inputs.odometry import (
 )
 from cliploc_ros.ros.inputs.prior import PriorSource
 from cliploc_ros.ros.inputs.stamps import StampOrder, stamp_problem
-from cliploc_ros.ros.inputs.subscription import AdaptiveSubscription, Listener
 from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -95,7 +94,7 @@ def sample_from_msg(msg: Imu) -> Sample | None:
                   acceleration if has_acceleration else None)
 
 
-class VerticalSource(Listener):
+class VerticalSource(qos.Listener):
     """Knows the vertical in the camera's coordinate frame.
 
     An IMU's orientation counts more than its acceleration: its filter knows how the robot moves.
@@ -119,7 +118,8 @@ class VerticalSource(Listener):
     def open(self, source: str) -> None:
         """Listen to the IMU, if the source is 'imu'; does nothing if it already does."""
         if source == 'imu' and self._subscription is None:
-            self._subscription = AdaptiveSubscription(self._node, Imu, 'imu', self.take, qos.IMU)
+            self._subscription = qos.AdaptiveSubscription(
+                self._node, Imu, 'imu', self.take, qos.IMU)
 
     def forget(self) -> None:
         """Forget all samples: time jumped."""
