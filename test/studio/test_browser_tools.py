@@ -32,7 +32,7 @@ def test_coverage_and_look_alikes(chromium, path):
             person.mode(mode)
             wait_for(lambda is_shown=is_shown: tiles.visible == is_shown, 'the tiles')
         with document.lock:
-            document.apply(edits.delete(document.landmarks, ['cup_0']))
+            document.edit(edits.delete, ['cup_0'])
         page.get_by_text('of the map before the last edits').wait_for()
         person.click('Coverage and look-alikes')
         page.get_by_text('(was 1)').wait_for()

@@ -35,8 +35,8 @@ def test_an_edit_changes_the_figures_and_the_positions_stay(studio):
     assert len(before.look_alikes) == 1 and len(before.look_alikes[0].matched) == 5
     assert before.figures['pairs of places that look alike'] == '1'
     second_room = [key for key, one in document.landmarks.items() if one.center[0] > 3.5]
-    document.apply(edits.move(document.landmarks, second_room[1], [8.6, 1.3, 0.2]))
-    document.apply(edits.move(document.landmarks, second_room[2], [6.6, -0.3, 0.9]))
+    document.edit(edits.set_fields, [second_room[1]], center=[8.6, 1.3, 0.2])
+    document.edit(edits.set_fields, [second_room[2]], center=[6.6, -0.3, 0.9])
     after = find_places(document.landmarks, None, before, silent)
     assert not after.look_alikes
     assert np.array_equal(after.grid.positions, before.grid.positions)
@@ -62,18 +62,18 @@ def test_a_search_runs_beside_edits_and_is_stopped(studio):
     with pytest.raises(EditError, match='under way'):
         search.start()
     document = studio.document
-    document.apply(edits.relabel(document.landmarks, ['cup_0'], 'a red cup'))
+    document.edit(edits.set_fields, ['cup_0'], label='a red cup')
     search.stop()
     assert not search.is_running
     assert search.last is None and search.failure == 'stopped'
     search.start()
     search._thread.join()
     assert search.failure == '' and not search.is_stale()
-    document.apply(edits.delete(document.landmarks, ['cup_0']))
+    document.edit(edits.delete, ['cup_0'])
     assert search.is_stale()
     document.undo()
     assert not search.is_stale(), 'the map is as it was'
-    document.apply(edits.mark(document.landmarks, ['cup_0'], 'lock', is_locked=True))
+    document.edit(edits.mark, ['cup_0'], 'lock', is_locked=True)
     assert not search.is_stale(), 'a lock changes nothing'
 
 

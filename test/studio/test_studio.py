@@ -67,7 +67,7 @@ def test_sightings_are_sharp_whole_and_from_several_sides(studio):
 
     assert find_sightings(recording, Blurred(), landmarks, 'mug_1')[0].view != best
     document = studio.document
-    document.apply(edits.move(landmarks, 'mug_1', [0.0, 0.0, 90.0]))
+    document.edit(edits.set_fields, ['mug_1'], center=[0.0, 0.0, 90.0])
     assert find_sightings(recording, studio.images, document.landmarks, 'mug_1') == []
 
 
@@ -76,10 +76,10 @@ def test_moved_landmarks_come_back_by_refitting(office):
     office.refit_all()
     fitted = document.landmarks
     moved = [key for key in ('tv_1', 'keyboard_1', 'book_3') if key in fitted]
-    document.apply(edits.mark(fitted, ['book_1'], 'lock', is_locked=True))
+    document.edit(edits.mark, ['book_1'], 'lock', is_locked=True)
     for key in moved:
         one = document.landmarks[key]
-        document.apply(edits.move(document.landmarks, key, one.center + 0.3 * one.semi_axes))
+        document.edit(edits.set_fields, [key], center=one.center + 0.3 * one.semi_axes)
     document.select(moved)
     office.refit()
     for key in moved:
@@ -93,10 +93,9 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
     """A moved landmark is fixed, a duplicate merged; each decision leads to the next one."""
     document, review = office.document, office.review
     twin, moved = (document.landmarks[key] for key in ('book_2', 'tv_1'))
-    document.apply(edits.create(document.landmarks, 'a twin', 'book', twin.center + 0.01,
-                                twin.basis))
-    document.apply(edits.move(document.landmarks, 'tv_1',
-                              moved.center + 0.4 * moved.semi_axes.max()))
+    document.edit(edits.create, 'a twin', 'book', twin.center + 0.01, twin.basis)
+    document.edit(edits.set_fields, ['tv_1'],
+                  center=moved.center + 0.4 * moved.semi_axes.max())
     assert 'serious' in review.check()
     severities = [row.severity for row in office.rows()]
     assert severities == sorted(severities, reverse=True) and severities[0] > 1.0

@@ -52,14 +52,14 @@ def path(tmp_path, monkeypatch):
 def test_clip_offers_phrases_for_what_the_images_show(path):
     studio = opened(path, '--images', WALK, *CLIP)
     truth = studio.document.landmarks['bowl_1'].label
-    studio.document.apply(edits.relabel(studio.document.landmarks, ['bowl_1'], 'something'))
+    studio.document.edit(edits.set_fields, ['bowl_1'], label='something')
     studio.document.select(['bowl_1'])
     assert studio.phrases()[0] != truth, "the class's labels as long as CLIP loads"
     found, notes = wait_for_phrases(studio)
     print(f'{truth}: {found}')
     assert len(found) == 5 and truth in found
     assert any('CLIP looks' in note for note in notes) and studio.phrase_note == ''
-    studio.document.apply(edits.move(studio.document.landmarks, 'bowl_1', [1, 1, 1]))
+    studio.document.edit(edits.set_fields, ['bowl_1'], center=[1, 1, 1])
     assert studio.phrases() == found, 'a drag asks nothing'
     studio.finder.close()
     studio.document.close()

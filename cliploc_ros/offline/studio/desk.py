@@ -164,23 +164,19 @@ class Desk:
         if document.selected is None:
             raise EditError('select exactly one landmark first')
         key, one = document.selected
-        landmarks, text = document.landmarks, ''
         if field in ('label', 'class_id'):
-            text = str(message['value'])
-            change = (edits.relabel if field == 'label' else edits.reclass)(landmarks, [key], text)
+            values = {field: str(message['value'])}
+        elif field in ('center', 'semi_axes', 'angles', 'by'):
+            numbers = _numbers(message, 'value', 3)
+            values = {'by': lambda: {'center': one.center + numbers},
+                      'angles': lambda: {'orientation': Rotation.from_euler(
+                          'xyz', numbers, degrees=True).as_quat()}}.get(
+                              field, lambda: {field: numbers})()
         else:
-            values = _numbers(message, 'value', 3)
-            makers = {
-                'center': lambda: edits.move(landmarks, key, values),
-                'by': lambda: edits.move(landmarks, key, one.center + values),
-                'angles': lambda: edits.rotate(landmarks, key, Rotation.from_euler(
-                    'xyz', values, degrees=True).as_quat()),
-                'semi_axes': lambda: edits.set_axes(landmarks, key, values)}
-            if field not in makers:
-                raise EditError(f'{field!r:.60} is no field of a landmark')
-            change = makers[field]()
-        document.apply(change, gesture=(field, key, message.get('gesture')))
-        return f'{key}: {change.what}' if text and change.after else None
+            raise EditError(f'{field!r:.60} is no field of a landmark')
+        change = document.edit(edits.set_fields, [key], **values,
+                               gesture=(field, key, message.get('gesture')))
+        return f'{key}: {change.what}' if field in values and change.after else None
 
     def _undo(self) -> str | None:
         what = self._studio.document.to_undo

@@ -7,22 +7,22 @@ once holds it, too.
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 from threading import RLock
 from typing import Any
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import CliplocError, DatasetError, MapError
+from cliploc_ros.errors import CliplocError, DatasetError
 from cliploc_ros.files.log import Log
-from cliploc_ros.offline.studio.edits import Change, EditError, Landmarks, change_from_json
+from cliploc_ros.offline.studio.edits import Change, EditError, change_from_json
 from cliploc_ros.offline.studio.landmark import (
     KNOWN_FIELDS,
-    Encoded,
     Landmark,
+    Landmarks,
     Marks,
-    look_from_json,
+    fields_of,
     map_of,
 )
 from cliploc_ros.offline.studio.map_file import (
@@ -67,7 +67,8 @@ class Document:
         # Edits that the file does not hold yet. Before the map is written, the journal gets the
         # digest of its next content: replay starts at the right edit with either content.
         self._journal = Log(self.path.with_name(f'.{self.path.name}.studio'), DatasetError,
-                            "make room, and the map's folder writable", _parse_entry)
+                            "make room, and the map's folder writable",
+                            lambda line: dict(json.loads(line)))
         try:
             entries, is_damaged = self._journal.read()
             if is_damaged:
@@ -148,6 +149,14 @@ class Document:
             self._do('join' if joins else 'edit', change)
             self._gesture = gesture
 
+    def edit(self, edit: Callable[..., Change], *arguments: Any, gesture: object = None,
+             **values: Any) -> Change:
+        """Make an edit of the landmarks as they are, and return it; errors as of both."""
+        with self.lock:
+            change = edit(self.landmarks, *arguments, **values)
+            self.apply(change, gesture)
+            return change
+
     def undo(self) -> bool:
         """Undo the last edit; return whether there was one."""
         with self.lock:
@@ -182,10 +191,6 @@ class Document:
 
     def _do(self, kind: str, change: Change) -> None:
         landmarks = change.apply(self.landmarks)
-        for one in change.after.values():
-            if one is not None and one.look is not None and one.look.key not in self._kept_looks:
-                self._journal.append(one.look.to_json())
-                self._kept_looks.add(one.look.key)
         self._journal.append({'do': kind, **change.to_json()})
         self._take(kind, change, landmarks)
         self._tell()
@@ -229,13 +234,15 @@ class Document:
             if found not in (NO_FILE, self._file.digest, over):
                 raise ChangedOnDiskError(self.path, found)
             file = self._file.with_landmarks(self.landmarks)
-            self._journal.append({'writing': file.digest, 'looks': self._changed_looks()})
+            # the map comes last: once it has its new content, nothing is left to do
+            self._look_file, fault = self._look_file.write(self.landmarks)
+            self.notes += (fault,) if fault and fault not in self.notes else ()
+            self._journal.append({'writing': file.digest})
             file.write()
             self._file = file
-            self._write_looks()
             self._saved = self.landmarks
             self._gesture = None
-            self._restart_journal()
+            self._journal.restart([self._header()])
             self._tell()
 
     def reload(self) -> None:
@@ -253,7 +260,7 @@ class Document:
             self._take('edit', Change('reload the file', {key: before.get(key) for key in after},
                                       after), found)
             self._saved = found
-            self._restart_journal()
+            self._journal.restart([self._header()])
             self._note_unknown_fields()
             self._tell()
 
@@ -277,25 +284,9 @@ class Document:
     def _read_looks(self) -> LookFile:
         found, fault = read_look_file(self.path)
         self.notes += (fault,) if fault else ()
-        self._kept_looks = {look.key for look in found.looks.values()}
         return found
 
-    def _write_looks(self) -> None:
-        self._look_file, fault = self._look_file.write(self.landmarks)
-        self.notes += (fault,) if fault and fault not in self.notes else ()
-
-    def _changed_looks(self) -> dict[str, str]:
-        """Return the keys of looks that the file holds otherwise, '' for none."""
-        old, new = ({key: '' if one.look is None else one.look.key
-                     for key, one in landmarks.items()}
-                    for landmarks in (self._landmarks_of_file(), self.landmarks))
-        return {key: look for key, look in new.items() if look != old.get(key, '')}
-
     # ---- the journal ----------------------------------------------------------------------------
-
-    def _restart_journal(self) -> None:
-        self._kept_looks = {look.key for look in self._look_file.looks.values()}
-        self._journal.restart([self._header()])
 
     def _header(self) -> dict[str, Any]:
         return {'base': self._file.digest, 'marks': self._marks()}
@@ -309,70 +300,37 @@ class Document:
         digest = self._file.digest
         starts = [row for row, entry in enumerate(entries)
                   if digest in (entry.get('base'), entry.get('writing'))]
-        edits = [entry for entry in entries if 'do' in entry]
-        if not starts:
-            if edits:
-                aside = self._journal.set_aside()
-                self.notes += (f'{len(edits)} edits of an earlier session do not fit the file, '
-                               f'which another program changed; they lie in {aside.name}',)
-            self._journal.restart([self._header()])
-            return
-        kept = [*self._look_file.looks.values(), *map(look_from_json, entries)]
-        looks = {look.key: look for look in kept if look is not None}
-        self._kept_looks = set(looks)
-        start = starts[-1]
-        self._restore_start(entries[:start + 1], looks)
+        start = starts[-1] if starts else -1
         edits = [entry for entry in entries[start + 1:] if 'do' in entry]
-        count = 0
+        header, done = self._header(), list[dict[str, Any]]()
         try:
+            if edits and not starts:
+                raise EditError('they do not fit the file, which another program changed')
+            self._restore_marks(entries[:start + 1])
+            header = self._header()
             for entry in edits:
-                change = change_from_json(entry, looks)
+                change = change_from_json(entry, self.landmarks)
                 self._take(str(entry['do']), change, change.apply(self.landmarks))
-                count += 1
-        except (ValueError, CliplocError) as error:
+                done.append(entry)
+        except (LookupError, TypeError, AttributeError, ValueError, CliplocError) as error:
             aside = self._journal.set_aside()
-            in_file = {look.key for look in self._look_file.looks.values()}
-            self._journal.restart([
-                self._header(), *(look.to_json() for key, look in looks.items()
-                                  if key not in in_file), *edits[:count]])
-            self.notes += (f'the last {len(edits) - count} edits of an earlier session cannot be '
-                           f'restored ({error}); they lie in {aside.name}',)
-        if count and not self.is_saved:
-            self.notes += (f'restored {count} edits that were not saved; undo takes them back',)
+            self.notes += (f'the last {len(edits) - len(done)} edits of an earlier session cannot '
+                           f'be restored ({error}); they lie in {aside.name}',)
+            self._journal.restart([header, *done])
+        if not starts:
+            self._journal.restart([header])
+        if done and not self.is_saved:
+            self.notes += (f'restored {len(done)} edits that were not saved; undo takes them '
+                           'back',)
 
-    def _restore_start(self, entries: list[dict[str, Any]], looks: Mapping[str, Encoded]) -> None:
-        """Restore the state that belongs to the file's content: its marks and looks.
+    def _restore_marks(self, entries: list[dict[str, Any]]) -> None:
+        """Restore the marks that belong to the file's content.
 
-        Marks before a content that was written come from the header and the edits up to it. A
-        save that ended between the map and its image embeddings is finished.
+        They come from the header and, where a content was written since, the edits before it.
         """
         marks: dict[str, Any] = {}
         for entry in entries:
-            if isinstance(kept := entry.get('marks'), dict):
-                marks |= kept
-            if isinstance(after := entry.get('after'), dict):
-                marks |= {key: one.get('marks') for key, one in after.items()
-                          if isinstance(one, dict)}
-        keys = entries[-1].get('looks')
-        keys = keys if isinstance(keys, dict) else {}
-        self.landmarks = self._saved = {
-            key: replace(one, marks=Marks.from_json(marks.get(key)),
-                         look=looks.get(str(keys[key])) if key in keys else one.look)
-            for key, one in self.landmarks.items()}
-        if keys:
-            try:
-                self._write_looks()
-            except MapError as error:
-                self.notes += (str(error),)
-
-
-def fields_of(landmarks: Landmarks) -> dict[str, Mapping[str, Any]]:
-    """Return the fields of landmarks, which tell whether a map was edited; locks do not."""
-    return {key: one.fields for key, one in landmarks.items()}
-
-
-def _parse_entry(line: bytes) -> dict[str, Any]:
-    entry = json.loads(line)
-    if not isinstance(entry, dict):
-        raise ValueError('an entry is a mapping')
-    return entry
+            marks |= entry.get('marks', {})
+            marks |= {key: one['marks'] for key, one in entry.get('after', {}).items() if one}
+        self.landmarks = self._saved = {key: replace(one, marks=Marks(**marks.get(key, {})))
+                                        for key, one in self.landmarks.items()}

@@ -31,7 +31,14 @@ from cliploc_ros.core.map.map_file import quoted
 from cliploc_ros.core.map.parameter_file import parse_parameters, read_text
 from cliploc_ros.errors import MapError
 from cliploc_ros.files.storage import replace_file
-from cliploc_ros.offline.studio.landmark import DECIMALS, Encoded, Landmark, looks_of, map_of
+from cliploc_ros.offline.studio.landmark import (
+    DECIMALS,
+    Encoded,
+    Landmark,
+    Landmarks,
+    looks_of,
+    map_of,
+)
 
 _PARAMETERS = 'ros__parameters'
 _GEOMETRY = ('center', 'semi_axes', 'orientation')
@@ -312,27 +319,25 @@ class LookFile(NamedTuple):
     looks: Mapping[str, Encoded]
     state: tuple[int, int] | None
 
-    def write(self, landmarks: Mapping[str, Landmark]) -> tuple['LookFile', str]:
+    def write(self, landmarks: Landmarks) -> tuple['LookFile', str]:
         """Write the looks of all landmarks of the map in one step.
 
         Those of another encoder are left out. Nothing is written where nothing changed, and
         nothing over the content of another program. Return the file as it is then, and why it
         does not hold these looks, '' if it does. MapError: it cannot be written.
         """
-        looks = {key: one.look for key, one in landmarks.items()}
-        size = next((len(look.mean) for look in (*self.looks.values(), *looks.values())
-                     if look is not None and look.encoder_key == self.encoder_key), 0)
-        known = {key: look for key, look in looks.items() if look is not None
-                 and (look.encoder_key, len(look.mean)) == (self.encoder_key, size)}
-        if not self.encoder_key or _keys_of(known) == _keys_of(self.looks):
+        known = {key: one.look for key, one in landmarks.items()
+                 if one.look is not None and one.look.encoder_key == self.encoder_key}
+        if not self.encoder_key or known == self.looks:
             return self, ''
         if _state_of(self.path) != self.state:
             return self, (f'{self.path.name}: another program changed this file, so the studio '
                           'leaves it as it is; build the map again, or remove the file')
+        size = len(next(iter((*self.looks.values(), *known.values()))).mean)
         nothing = Encoded(np.zeros(size, np.float16), np.empty((0, size), np.float16), '')
-        rows = [known.get(key, nothing) for key in looks]
+        rows = [known.get(key, nothing) for key in landmarks]
         save_landmark_embeddings(self.path, LandmarkEmbeddings(
-            self.encoder_key, tuple(looks), np.array([one.mean for one in rows]),
+            self.encoder_key, tuple(landmarks), np.array([one.mean for one in rows]),
             np.concatenate([one.medoids for one in rows]),
             np.cumsum([0, *(len(one.medoids) for one in rows)])))
         return self._replace(looks=known, state=_state_of(self.path)), ''
@@ -341,18 +346,14 @@ class LookFile(NamedTuple):
 def read_look_file(map_path: Path) -> tuple[LookFile, str]:
     """Return the image embeddings next to a map, and what is wrong with them, or ''."""
     path = embeddings_path(map_path)
-    state = _state_of(path)
-    if state is None:
-        return LookFile(path, '', {}, None), ''
+    nothing = LookFile(path, '', {}, _state_of(path))
+    if nothing.state is None:
+        return nothing, ''
     try:
         embeddings = load_landmark_embeddings(path)
     except MapError as error:
-        return LookFile(path, '', {}, state), f'{error}. The studio leaves this file as it is'
-    return LookFile(path, embeddings.encoder_key, looks_of(embeddings), state), ''
-
-
-def _keys_of(looks: Mapping[str, Encoded]) -> dict[str, str]:
-    return {key: look.key for key, look in looks.items()}
+        return nothing, f'{error}. The studio leaves this file as it is'
+    return nothing._replace(encoder_key=embeddings.encoder_key, looks=looks_of(embeddings)), ''
 
 
 def _state_of(path: Path) -> tuple[int, int] | None:

@@ -129,9 +129,9 @@ class Page:
             document = self._studio.document
             if document.selected is not None:
                 landmark_id, _ = document.selected
-                document.apply(edits.place(document.landmarks, landmark_id, self._gizmo.position,
-                                           np.roll(self._gizmo.wxyz, -1)),
-                               gesture=('gizmo', self._drag, landmark_id))
+                document.edit(edits.set_fields, [landmark_id], center=self._gizmo.position,
+                              orientation=np.roll(self._gizmo.wxyz, -1),
+                              gesture=('gizmo', self._drag, landmark_id))
 
         self._actions.act(take_pose)
 

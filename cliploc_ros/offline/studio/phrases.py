@@ -55,8 +55,7 @@ class Question:
     @property
     def key(self) -> tuple[object, ...]:
         """What the answer depends on; a drag changes none of it."""
-        look = self.landmark.look
-        return self.landmark_id, self.class_names, None if look is None else look.key
+        return self.landmark_id, self.class_names, self.landmark.look
 
 
 class FoundPhrases(NamedTuple):

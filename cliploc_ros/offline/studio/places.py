@@ -28,9 +28,8 @@ from cliploc_ros.offline.mapping.check.relocalization import (
 from cliploc_ros.offline.mapping.check.report import GridCheck
 from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.simulation.detector import DetectorModel, guess_detector
-from cliploc_ros.offline.studio.document import fields_of
-from cliploc_ros.offline.studio.edits import EditError, Landmarks
-from cliploc_ros.offline.studio.landmark import map_of
+from cliploc_ros.offline.studio.edits import EditError
+from cliploc_ros.offline.studio.landmark import Landmarks, fields_of, map_of
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.studio import Studio
 

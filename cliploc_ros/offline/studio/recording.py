@@ -41,8 +41,8 @@ from cliploc_ros.offline.mapping.refit import refit_map
 from cliploc_ros.offline.mapping.views import Views, camera_centers, make_views
 from cliploc_ros.offline.simulation.labels import LabelModel
 from cliploc_ros.offline.studio import edits
-from cliploc_ros.offline.studio.edits import Change, EditError, Landmarks
-from cliploc_ros.offline.studio.landmark import Encoded, looks_of, map_of
+from cliploc_ros.offline.studio.edits import Change, EditError
+from cliploc_ros.offline.studio.landmark import Encoded, Landmarks, looks_of, map_of
 
 #: Fewer boxes leave an ellipsoid open.
 LEAST_BOXES = 3

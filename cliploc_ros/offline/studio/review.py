@@ -73,7 +73,7 @@ class ReviewQueue:
             landmarks = self._document.landmarks
             begins_anew = self._order and all(self.decision(key) for key in landmarks)
             if begins_anew:
-                self._document.apply(edits.mark(landmarks, landmarks, 'review', decision=''))
+                self._document.edit(edits.mark, landmarks, 'review', decision='')
         self._order = tuple(self._checks)
         serious = sum(one.severity >= SERIOUS for one in self._checks.values())
         source = '' if self.has_boxes else ' by the map alone: there are no boxes of a recording'
@@ -89,7 +89,7 @@ class ReviewQueue:
     def delete(self) -> str:
         """Delete the selection, and go on."""
         ids = self._selected()
-        self._document.apply(edits.delete(self._document.landmarks, ids))
+        self._document.edit(edits.delete, ids)
         if self._document.landmarks and any({*pair} & {*ids} for pair in self._duplicates):
             self._judge()  # or else its duplicate would be called one
         return self._go_on(ids[-1], f'deleted {", ".join(ids)}')
@@ -146,8 +146,7 @@ class ReviewQueue:
     def _decide(self, ids: Sequence[str], decision: str, what: str, gesture: object = None
                 ) -> str:
         """Keep a decision, and select the next landmark without one."""
-        self._document.apply(edits.mark(self._document.landmarks, ids, decision,
-                                        decision=decision), gesture)
+        self._document.edit(edits.mark, ids, decision, decision=decision, gesture=gesture)
         return self._go_on(ids[-1], what)
 
     def _go_on(self, last: str, what: str) -> str:

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera, frusta
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.studio.edits import Landmarks
-from cliploc_ros.offline.studio.landmark import Landmark
+from cliploc_ros.offline.studio.landmark import Landmark, Landmarks
 from cliploc_ros.offline.studio.recording import ViewAnswer
 from cliploc_ros.offline.studio.viewpoint import pixels_of, wxyz_of
 

@@ -170,7 +170,7 @@ class Studio:
     def delete(self) -> str:
         """Delete the selection."""
         ids = self._selected()
-        self.document.apply(edits.delete(self.document.landmarks, ids))
+        self.document.edit(edits.delete, ids)
         return f'deleted {", ".join(ids)}'
 
     def toggle_lock(self, landmark_ids: Sequence[str] | None = None) -> str:
@@ -191,7 +191,7 @@ class Studio:
             raise EditError('name a landmark, or select one')
         have_it = all(getattr(landmarks[key].marks, name) for key in ids if key in landmarks)
         verb, past = off if have_it else on
-        self.document.apply(edits.mark(landmarks, ids, verb, **{name: not have_it}))
+        self.document.edit(edits.mark, ids, verb, **{name: not have_it})
         return f'{past} {", ".join(ids)}'
 
     def split(self) -> str:
