@@ -19,8 +19,8 @@ from cliploc_ros.command import needs_ros, run_main, within
 from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:
+    from cliploc_ros.offline.datasets.images import Images
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-    from cliploc_ros.offline.studio.images import Images
     from cliploc_ros.offline.studio.live import LiveRelocalizer
     from cliploc_ros.offline.studio.phrases import PhraseFinder
     from cliploc_ros.offline.studio.recording import Recording
@@ -119,13 +119,17 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     """Return the studio that the command line asks for."""
     from cliploc_ros.offline.datasets.bag_frames import BagTopics
     from cliploc_ros.offline.datasets.folders import find_layout
+    from cliploc_ros.offline.datasets.images import (
+        images_of_recording,
+        open_images,
+        views_of_folder,
+    )
     from cliploc_ros.offline.datasets.map_recording import load_recording
     from cliploc_ros.offline.datasets.observations import load_observations
     from cliploc_ros.offline.studio.document import Document
-    from cliploc_ros.offline.studio.floor import read_occupancy_grid
-    from cliploc_ros.offline.studio.images import images_of_recording, open_images, views_of_folder
     from cliploc_ros.offline.studio.recording import Recording
     from cliploc_ros.offline.studio.studio import Studio
+    from cliploc_ros.offline.studio.walls import read_walls
 
     images = detections = None
     is_folder = options.images is not None and find_layout(options.images) is not None
@@ -153,8 +157,8 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     document = Document(options.map or next(
         path for path in map(Path, names) if not path.exists()))
     layer = read_layer(document.path, document.to_map(), None) if document.landmarks else None
-    grid = None if options.occupancy_grid is None else read_occupancy_grid(options.occupancy_grid)
-    return Studio(document, recording, images, finder, layer, grid)
+    walls = None if options.occupancy_grid is None else read_walls(options.occupancy_grid)
+    return Studio(document, recording, images, finder, layer, walls)
 
 
 def _cameras(options: argparse.Namespace, detections: 'PosedDetections | None') -> list[str]:

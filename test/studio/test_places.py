@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from studio_map import write_two_rooms
 
-from cliploc_ros.errors import MapError
+from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
-from cliploc_ros.offline.studio.edits import EditError
-from cliploc_ros.offline.studio.places import PlacesSearch, find_places
+from cliploc_ros.offline.studio.places import find_places
 from cliploc_ros.offline.studio.studio import Studio
 
 
@@ -54,33 +53,32 @@ def test_the_time_is_bounded(studio):
     assert any(line.startswith('time ran out') for line in places.lines(None))
 
 
-def test_a_search_runs_beside_edits_and_is_stopped(studio):
+def test_a_search_is_stopped_and_grows_old(studio):
     """The first share that is told comes from the search's thread; then it waits for the test."""
-    changed = threading.Event()
-    search = PlacesSearch(studio, changed.set)
-    search.start()
-    with pytest.raises(EditError, match='under way'):
-        search.start()
     document = studio.document
+
+    def search():
+        with pytest.raises(CliplocError, match='stopped'):
+            studio.search_places()
+
+    thread = threading.Thread(target=search)
+    studio.changed.clear()
+    thread.start()
+    studio.changed.wait()
     document.edit(edits.set_fields, ['cup_0'], label='a red cup')
-    search.stop()
-    assert not search.is_running
-    assert search.last is None and search.failure == 'stopped'
-    search.start()
-    search._thread.join()
-    assert search.failure == '' and not search.is_stale()
+    studio.stop_search()
+    thread.join()
+    assert studio.places is None
+    studio.search_places()
+    assert not studio.is_stale and studio.share == 1.0
     document.edit(edits.delete, ['cup_0'])
-    assert search.is_stale()
+    assert studio.is_stale
     document.undo()
-    assert not search.is_stale(), 'the map is as it was'
+    assert not studio.is_stale, 'the map is as it was'
     document.edit(edits.mark, ['cup_0'], 'lock', is_locked=True)
-    assert not search.is_stale(), 'a lock changes nothing'
+    assert not studio.is_stale, 'a lock changes nothing'
 
 
-def test_without_landmarks(tmp_path):
-    studio = Studio(Document(tmp_path / 'none.yaml'))
-    with pytest.raises(EditError, match='empty'):
-        PlacesSearch(studio, lambda: None).start()
+def test_without_landmarks():
     with pytest.raises(MapError):
         find_places({}, None, None, silent)
-    studio.document.close()

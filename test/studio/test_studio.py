@@ -14,9 +14,8 @@ from studio_map import demo_studio, open_page
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
-from cliploc_ros.offline.studio.images import landmark_at
 from cliploc_ros.offline.studio.recording import Recording
-from cliploc_ros.offline.studio.sightings import find_sightings
+from cliploc_ros.offline.studio.sightings import find_sightings, landmark_at
 from cliploc_ros.offline.studio.studio import Studio
 
 
@@ -60,10 +59,9 @@ def test_sightings_are_sharp_whole_and_from_several_sides(studio):
     best = first[0].view
 
     class Blurred:
-        def near(self, stamp_s, *camera):
-            image = studio.images.near(stamp_s, *camera)
-            is_best = stamp_s == recording.detections.stamps_s[best]
-            return cv2.GaussianBlur(image, (0, 0), 8.0) if is_best else image
+        def of(self, detections, view):
+            image = studio.images.of(detections, view)
+            return cv2.GaussianBlur(image, (0, 0), 8.0) if view == best else image
 
     assert find_sightings(recording, Blurred(), landmarks, 'mug_1')[0].view != best
     document = studio.document
@@ -97,7 +95,7 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
     document.edit(edits.set_fields, ['tv_1'],
                   center=moved.center + 0.4 * moved.semi_axes.max())
     assert 'serious' in review.check()
-    severities = [row.severity for row in office.rows()]
+    severities = [review.severity(key) for key in review.order]
     assert severities == sorted(severities, reverse=True) and severities[0] > 1.0
     total = len(document.landmarks)
     document.select(['tv_1'])
@@ -116,17 +114,19 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
 def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
     document = office.document
     before = office.relocalize_all()
-    accepted = sum(one.verdict == 'accepted' for one in office.answers)
+    accepted = sum(one.verdict == 'accepted' for one in office.answers.values())
     assert 'simulated' in before and '(was' not in before and accepted > 10
-    accepted_view = next(one.view for one in office.answers if one.verdict == 'accepted')
+    accepted_view = next(view for view, one in office.answers.items()
+                         if one.verdict == 'accepted')
     office.show_view(accepted_view)
     assert f'view {accepted_view}: accepted' in office.relocalize_here()
-    assert len(office.answers) == 1 and office.answers[0].error_m < 1.0
+    (answer,) = office.answers.values()
+    assert answer.error_m < 1.0
     document.select(list(document.landmarks)[::2])
     office.delete()
     after = office.relocalize_all()
     assert f'(was {accepted})' in after
-    assert sum(one.verdict == 'accepted' for one in office.answers) < accepted
+    assert sum(one.verdict == 'accepted' for one in office.answers.values()) < accepted
     print(f'as given: {before}; every other landmark deleted: {after}')
 
 

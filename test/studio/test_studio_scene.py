@@ -14,11 +14,11 @@ from studio_map import demo_studio
 from cliploc_ros.core.depth_image import DepthImage
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.studio import viewpoint
-from cliploc_ros.offline.studio.context import draw_walls, find_cloud
-from cliploc_ros.offline.studio.floor import OCCUPIED, UNKNOWN, OccupancyGrid
-from cliploc_ros.offline.studio.images import Images
+from cliploc_ros.offline.studio.cloud import find_cloud
+from cliploc_ros.offline.studio.walls import OCCUPIED, UNKNOWN, Walls, draw_walls
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
 UPRIGHT = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # looks along x
@@ -59,10 +59,9 @@ def test_depth_becomes_a_cloud_below_the_ceiling():
 
 @pytest.mark.parametrize('yaw', (0.0, 0.4))
 def test_walls_lie_where_the_grid_has_them(server, yaw):
-    cells = np.full((30, 40), UNKNOWN, dtype=np.int8)
-    cells[4, 33] = cells[20, 7] = OCCUPIED
-    grid = OccupancyGrid(cells, 0.1, (-1.0, 2.0, yaw))
-    handle = draw_walls(server.scene, grid)
+    cells = np.full((30, 40), UNKNOWN, dtype=np.uint8)
+    cells[29 - 4, 33] = cells[29 - 20, 7] = OCCUPIED
+    (handle,) = draw_walls(server.scene, Walls(cells, 0.1, (-1.0, 2.0, yaw)))
     rows, columns = np.nonzero(handle.image[..., 3])
     height, width = handle.image.shape[:2]
     across = np.column_stack([((columns + 0.5) / width - 0.5) * handle.render_width,

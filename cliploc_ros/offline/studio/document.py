@@ -110,6 +110,18 @@ class Document:
                 return None
             return self.selection[0], self.landmarks[self.selection[0]]
 
+    def chosen(self) -> tuple[str, ...]:
+        """Return the selection; EditError: it is empty."""
+        if not self.selection:
+            raise EditError('select a landmark first')
+        return self.selection
+
+    def only_chosen(self) -> tuple[str, Landmark]:
+        """Return id and landmark of a selection of exactly one; EditError: it has others."""
+        if (selected := self.selected) is None:
+            raise EditError('select exactly one landmark first')
+        return selected
+
     @property
     def is_saved(self) -> bool:
         """Whether the file holds all edits."""
