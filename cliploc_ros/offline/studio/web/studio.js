@@ -147,7 +147,7 @@ function setMode(name) {
 
 function resize() {
   $('view').style.flex = shares[mode];
-  $('scene').style.flex = 1 - shares[mode];
+  $('scene').style.flex = $('view').hidden ? 1 : 1 - shares[mode];
   // viser covers a scene that is narrower than this with its panel
   const scale = Math.min(1, $('scene').clientWidth / 620);
   Object.assign($('frame').style, {width: `${100 / scale}%`, height: `${100 / scale}%`,
@@ -169,7 +169,10 @@ function showFile() {
   }
   $('conflict').hidden = !file.conflict;
   fill($('classes'), file.classes.map(value => el('option', {value})));
-  $('view').hidden = $('splitter').hidden = !file.views;
+  if ($('view').hidden === Boolean(file.views)) {
+    $('view').hidden = $('splitter').hidden = !file.views;
+    resize();
+  }
   $('slider').max = Math.max(0, file.views - 1);
 }
 
@@ -636,9 +639,10 @@ window.addEventListener('keydown', keyDown, true);
 $('frame').onload = () => {
   const scene = $('frame').contentWindow;
   scene.addEventListener('keydown', keyDown, true);
-  // the log has what viser's notices would say, and they cover the scene
+  // the log has what viser's notices would say; its panel has switches for developers. Both cover
+  // the scene
   const style = scene.document.createElement('style');
-  style.textContent = '.mantine-Notifications-root { display: none }';
+  style.textContent = '.mantine-Notifications-root, [data-floating-window] { display: none }';
   scene.document.head.append(style);
 };
 $('frame').src = `${base}scene/${person}/`;
