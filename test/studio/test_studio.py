@@ -15,7 +15,7 @@ from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.recording import Recording
-from cliploc_ros.offline.studio.sightings import find_sightings, landmark_at
+from cliploc_ros.offline.studio.sightings import find_sightings
 from cliploc_ros.offline.studio.studio import Studio
 
 
@@ -38,17 +38,13 @@ def office(tmp_path, shared_data):
     studio.document.close()
 
 
-def test_a_pixel_of_the_image_selects_its_landmark(studio):
+def test_outlines_lie_in_the_image(studio):
     studio.show_view(3)
     outlines = studio.outlines()
-    assert outlines and studio.image(3).shape == (480, 640, 3) and studio.image(-1) is None
-    one = outlines[0]
-    assert landmark_at([one], one.ellipse[:2]) == one.landmark_id
-    assert landmark_at([one], one.ellipse[:2] + 1.1 * np.sqrt(one.ellipse[[2, 4]])) is None
-    studio.select_at(one.ellipse[:2])
-    assert studio.document.selection
-    studio.select_at((-50.0, -50.0))
-    assert not studio.document.selection
+    assert studio.image(3).shape == (480, 640, 3) and studio.image(-1) is None
+    assert [one.distance_m for one in outlines] == sorted(one.distance_m for one in outlines)
+    assert all((one.bbox_xyxy[:2] < (640, 480)).all() and (one.bbox_xyxy[2:] > 0).all()
+               for one in outlines)
 
 
 def test_sightings_are_sharp_whole_and_from_several_sides(studio):

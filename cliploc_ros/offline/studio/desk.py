@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Does what the messages of a page say, and keeps the log of what came of it.
 
-A message names an action and its values. An action is a method of the desk, the studio, its review
-or its new landmark, and stands in the ACTIONS of its class. Each change wakes the page's redrawer.
+A message names an action and its values. An action is a method of the desk, the studio, its
+document, its review or its new landmark, and stands in the ACTIONS of its class. Each change wakes
+the page's redrawer.
 """
 
 import logging
@@ -25,7 +26,7 @@ _MAX_LINES = 200
 # How long stopping waits for an action that takes long.
 _GRACE_S = 5.0
 # After these, the camera of the person flies to the selection.
-_BRING_ANOTHER = ('step', 'accept', 'discard', 'create', 'select', 'select_at')
+_BRING_ANOTHER = ('step', 'accept', 'discard', 'create', 'select')
 
 logger = logging.getLogger(__name__)
 
@@ -92,7 +93,8 @@ class Desk:
 
     def _start(self, name: str, values: dict[str, Any]) -> str | None:
         """Do an action; one that takes long goes on in a thread."""
-        owners: tuple[Any, ...] = self, self.studio, self.studio.review, self.studio.new
+        studio = self.studio
+        owners: tuple[Any, ...] = self, studio, studio.document, studio.review, studio.new
         for owner in owners:
             is_slow = name in getattr(owner, 'SLOW_ACTIONS', ())
             if not is_slow and name not in getattr(owner, 'ACTIONS', ()):
@@ -111,7 +113,7 @@ class Desk:
             thread.start()
             return None
         raise EditError(f"the studio cannot '{name:.60}'"
-                        + ('' if self.studio.new else ': there are no views to draw boxes in'))
+                        + ('' if studio.new else ': there are no views to draw boxes in'))
 
     def _run(self, name: str, action: Callable[[], str | None]) -> None:
         self.ask(action)

@@ -10,11 +10,11 @@ import json
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
-from threading import RLock
+from threading import Event, RLock
 from typing import Any
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import CliplocError, DatasetError
+from cliploc_ros.errors import CliplocError, DatasetError, MapError
 from cliploc_ros.files.log import Log
 from cliploc_ros.offline.studio.edits import Change, EditError, change_from_json
 from cliploc_ros.offline.studio.landmark import (
@@ -27,7 +27,6 @@ from cliploc_ros.offline.studio.landmark import (
 )
 from cliploc_ros.offline.studio.map_file import (
     NO_FILE,
-    ChangedOnDiskError,
     LookFile,
     read_look_file,
     read_map_file,
@@ -43,20 +42,24 @@ class Document:
     ----------
     landmarks : mapping of str to Landmark
         By id. An edit makes a new mapping and leaves this one alone.
-    revision : int
-        Counts the changes of map, selection and file.
+    changed : Event
+        Set after each change of map, selection or file.
     notes : tuple of str
         What a person should know of the files.
 
     CliplocError: the file is no map, another studio edits it, or its folder is not writable.
     """
 
+    ACTIONS = ('save', 'overwrite', 'reload', 'undo', 'redo')
+
     def __init__(self, path: Path):
         self.lock = RLock()
-        self.revision = 0
+        self.changed = Event()
         self.notes: tuple[str, ...] = ()
+        #: The digest of a foreign content, of which a person has to decide
+        self.foreign = ''
+        self._accepted = ''
         self.selection: tuple[str, ...] = ()
-        self._listeners: list[Callable[[], None]] = []
         self._done: list[Change] = []
         self._undone: list[Change] = []
         self._gesture: object = None
@@ -169,43 +172,34 @@ class Document:
             self.apply(change, gesture)
             return change
 
-    def undo(self) -> bool:
-        """Undo the last edit; return whether there was one."""
+    def undo(self) -> str | None:
+        """Undo the last edit; return which it was, None for none."""
         with self.lock:
-            if self._done:
-                self._do('undo', self._done[-1].reversed())
-                return True
-            return False
+            if not self._done:
+                return None
+            self._do('undo', self._done[-1].reversed())
+            return f'undid: {self.to_redo}'
 
-    def redo(self) -> bool:
-        """Do again the edit that was undone last; return whether there was one."""
+    def redo(self) -> str | None:
+        """Do again the edit that was undone last; return which it was, None for none."""
         with self.lock:
-            if self._undone:
-                self._do('redo', self._undone[-1])
-                return True
-            return False
+            if not self._undone:
+                return None
+            self._do('redo', self._undone[-1])
+            return f'did again: {self.to_undo}'
 
     def select(self, landmark_ids: Iterable[str]) -> None:
         """Select landmarks; unknown ids are left out."""
         with self.lock:
             self.selection = tuple(dict.fromkeys(
                 key for key in landmark_ids if key in self.landmarks))
-            self._tell()
-
-    def subscribe(self, listener: Callable[[], None]) -> None:
-        """Call a function after each change of map, selection or file, with the lock held."""
-        self._listeners.append(listener)
-
-    def _tell(self) -> None:
-        self.revision += 1
-        for listener in self._listeners:
-            listener()
+            self.changed.set()
 
     def _do(self, kind: str, change: Change) -> None:
         landmarks = change.apply(self.landmarks)
         self._journal.append({'do': kind, **change.to_json()})
         self._take(kind, change, landmarks)
-        self._tell()
+        self.changed.set()
 
     def _take(self, kind: str, change: Change, landmarks: Landmarks) -> None:
         """Take over a change that was applied, and write history."""
@@ -227,15 +221,11 @@ class Document:
 
     # ---- the files ------------------------------------------------------------------------------
 
-    def save(self, over: str = NO_FILE) -> None:
-        """Write the map file in one step, over a foreign content only if ``over`` is its digest.
+    def save(self) -> str:
+        """Write the map file in one step, and what it did; not over a foreign content.
 
-        Raises
-        ------
-        ChangedOnDiskError
-            Another program changed the file.
-        CliplocError
-            The map is empty, or a file cannot be written; that one is as it was.
+        CliplocError: another program changed the file, the map is empty, or a file cannot be
+        written; that one is as it was.
         """
         with self.lock:
             if not self.landmarks:
@@ -243,8 +233,10 @@ class Document:
                                 'or delete the file')
             self.to_map()
             found = self._file.digest_on_disk()
-            if found not in (NO_FILE, self._file.digest, over):
-                raise ChangedOnDiskError(self.path, found)
+            if found not in (NO_FILE, self._file.digest, self._accepted):
+                self.foreign = found
+                raise MapError(f'{self.path}: another program changed this file after the studio '
+                               'read it; overwrite it, or reload it')
             file = self._file.with_landmarks(self.landmarks)
             # the map comes last: once it has its new content, nothing is left to do
             self._look_file, fault = self._look_file.write(self.landmarks)
@@ -254,10 +246,17 @@ class Document:
             self._file = file
             self._saved = self.landmarks
             self._gesture = None
+            self.foreign = self._accepted = ''
             self._journal.restart([self._header()])
-            self._tell()
+            self.changed.set()
+            return f'saved {self.path.name}'
 
-    def reload(self) -> None:
+    def overwrite(self) -> str:
+        """Save the map over the foreign content that saving found."""
+        self._accepted = self.foreign
+        return self.save()
+
+    def reload(self) -> str:
         """Take the map from the file; this is an edit that undo takes back.
 
         CliplocError: the file is no map.
@@ -272,9 +271,11 @@ class Document:
             self._take('edit', Change('reload the file', {key: before.get(key) for key in after},
                                       after), found)
             self._saved = found
+            self.foreign = ''
             self._journal.restart([self._header()])
             self._note_unknown_fields()
-            self._tell()
+            self.changed.set()
+            return f'reloaded {self.path.name}; undo takes it back'
 
     def close(self) -> None:
         """Release the journal, which stays if it holds edits or marks."""

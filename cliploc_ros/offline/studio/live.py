@@ -23,10 +23,10 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_full_topic_name import validate_full_topic_name
 from std_srvs.srv import Trigger
 
-from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.ros import qos
+from cliploc_ros.ros.conversions import pose_from_msg
 from cliploc_ros.ros.node.diagnostics import split_names
 from cliploc_ros.ros.running import RelocalizerStatus
 
@@ -204,17 +204,11 @@ class LiveRelocalizer:
             raise LiveError(f'{self.name} gave no answer within {_PATIENCE_S:.0f} s: see its log')
 
     def _on_pose(self, msg: PoseWithCovarianceStamped) -> None:
-        p, q = msg.pose.pose.position, msg.pose.pose.orientation
-        position, quat = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
+        pose, stamp = pose_from_msg(msg.pose.pose), msg.header.stamp
         covariance = np.array(msg.pose.covariance).reshape(6, 6)[:3, :3]
-        is_valid = np.isfinite(position).all() and np.isfinite(covariance).all() \
-            and abs(np.linalg.norm(quat) - 1.0) < 1e-2
-        if not is_valid:
-            return  # of another program under this name
-        stamp = msg.header.stamp
-        self._pose = LivePose(
-            transform_from_pose(position, quat / np.linalg.norm(quat)), covariance,
-            msg.header.frame_id, stamp.sec + 1e-9 * stamp.nanosec)
+        if pose is not None and np.isfinite(covariance).all():  # else of another program
+            self._pose = LivePose(pose, covariance, msg.header.frame_id,
+                                  stamp.sec + 1e-9 * stamp.nanosec)
 
 
 @contextmanager
@@ -238,21 +232,14 @@ def follow_relocalizer(name: str, ros_args: Sequence[str] = ()) -> Iterator[Live
     live = LiveRelocalizer(node, name)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    is_ending = threading.Event()
-
-    def spin() -> None:
-        while not is_ending.is_set():
-            executor.spin_once(timeout_sec=_POLL_S)
-            live.update()
-
-    thread = threading.Thread(target=spin, name='ros', daemon=True)
+    node.create_timer(_POLL_S, live.update)
+    thread = threading.Thread(target=executor.spin, name='ros', daemon=True)
     thread.start()
     try:
         yield live
     finally:
         live.close()
-        is_ending.set()
-        thread.join()
         executor.shutdown()
+        thread.join()
         node.destroy_node()
         rclpy.shutdown(context=context)

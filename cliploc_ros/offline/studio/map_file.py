@@ -10,7 +10,6 @@ that this module reads and saves in 1.4 s.
 """
 
 import hashlib
-import json
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -32,7 +31,7 @@ from cliploc_ros.core.map.parameter_file import parse_parameters, read_text
 from cliploc_ros.errors import MapError
 from cliploc_ros.files.storage import replace_file
 from cliploc_ros.offline.studio.landmark import (
-    DECIMALS,
+    KNOWN_FIELDS,
     Encoded,
     Landmark,
     Landmarks,
@@ -42,18 +41,10 @@ from cliploc_ros.offline.studio.landmark import (
 
 _PARAMETERS = 'ros__parameters'
 _GEOMETRY = ('center', 'semi_axes', 'orientation')
+_PLAIN = {*KNOWN_FIELDS, 'text', 'weight', '/**', _PARAMETERS, 'map', 'frame_id', 'landmarks'}
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 #: The digest of a file that does not exist.
 NO_FILE = ''
-
-
-class ChangedOnDiskError(MapError):
-    """Another program changed the map file; ``found`` is the digest of its content now."""
-
-    def __init__(self, path: Path, found: str):
-        super().__init__(f'{path}: another program changed this file after the studio read it; '
-                         'overwrite it, or reload it')
-        self.found = found
 
 
 @dataclass(frozen=True)
@@ -100,17 +91,16 @@ class MapFile:
         new = {key: landmarks[key].fields for key in order}
         tree = {**self.tree, self.node: {**self.tree[self.node], _PARAMETERS: {
             **self.tree[self.node][_PARAMETERS], 'map': {**self._map, 'landmarks': new}}}}
+        texts = []
         if self.text:
             with suppress(LookupError, ValueError, yaml.YAMLError):
-                text = patch_landmarks(self.text, (self.node, _PARAMETERS, 'map', 'landmarks'),
-                                       old, new)
-                if _says(text, tree):
-                    return MapFile(self.path, text, self.node, tree)
-        text = ''.join(f'{line}\n' for line in _emit(tree, 0))
-        if not _says(text, tree):
-            raise MapError(f'{self.path}: holds fields that cannot be written again; nothing was '
-                           'changed')
-        return MapFile(self.path, text, self.node, tree)
+                texts.append(patched(self.text, self.tree, tree))
+        texts.append(''.join(f'{line}\n' for line in _emit(tree, 0)))
+        for text in texts:
+            if _says(text, tree):
+                return MapFile(self.path, text, self.node, tree)
+        raise MapError(f'{self.path}: holds fields that cannot be written again; nothing was '
+                       'changed')
 
     def write(self) -> None:
         """Write the file in one step; MapError: it cannot be written, nothing was changed."""
@@ -182,66 +172,47 @@ def _sorted(tree: Any) -> Any:
 
 # ---- the text -----------------------------------------------------------------------------------
 
-def patch_landmarks(text: str, path: tuple[str, ...], old: Mapping[str, Mapping[str, Any]],
-                    new: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a map's text with other landmarks.
+def patched(text: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
+    """Return the text of a tree as that of another one, whose other lines are the same.
 
-    The keys of ``path`` lead to the landmarks. LookupError, ValueError or YAMLError: the text does
-    not have the old landmarks there.
+    LookupError, ValueError or YAMLError: it is not the text of the old tree.
     """
-    node = yaml.compose(text, Loader=_LOADER)
-    for name in path:
-        _, node = _entries(node)[name]
-    entries = _entries(node)
-    # start, end, and the text that takes their place
-    patches: list[tuple[int, int, str]] = []
-    for landmark_id, fields in old.items():
-        key, value = entries[landmark_id]
-        if landmark_id not in new:
-            start = _line_start(text, key)
-            # the comments directly above a landmark are about it
-            while start > 0:
-                above = text.rfind('\n', 0, start - 1) + 1
-                if not text[above:start].startswith(' ' * key.start_mark.column + '#'):
-                    break
-                start = above
-            patches.append((start, _line_end(text, _end(value)), ''))
-        elif new[landmark_id] is not fields and new[landmark_id] != fields:
-            patches += _patch_fields(text, value, fields, new[landmark_id])
-    patches += _append(text, node, {key: one for key, one in new.items() if key not in old})
     pieces, done = [], 0
+    patches = _patches(text, yaml.compose(text, Loader=_LOADER), old, new)
     for start, end, piece in sorted(patches, key=lambda patch: patch[:2]):
         pieces += [text[done:start], piece]
         done = end
     return ''.join([*pieces, text[done:]])
 
 
-def _patch_fields(text: str, node: yaml.Node, old: Mapping[str, Any], new: Mapping[str, Any]
-                  ) -> Iterator[tuple[int, int, str]]:
-    entries = _entries(node)
+def _patches(text: str, node: yaml.Node, old: Mapping[str, Any], new: Mapping[str, Any]
+             ) -> Iterator[tuple[int, int, str]]:
+    """Yield start and end of what changes below a mapping, and the text that takes its place."""
+    entries = {key.value: (key, value) for key, value in node.value}
+    newline = '\r\n' if '\r\n' in text else '\n'
     for name, value in old.items():
         key, written = entries[name]
         if name not in new:
-            yield _line_start(text, key), _line_end(text, _end(written)), ''
-        elif new[name] != value:
-            colon, end = text.index(':', key.end_mark.index) + 1, _end(written)
-            line_end = _newline(text) if text[end - 1] == '\n' else ''  # of a text in a block
-            yield colon, end, f' {_flow(name, new[name])}{line_end}'
-    yield from _append(text, node, {name: one for name, one in new.items() if name not in old})
-
-
-def _append(text: str, node: yaml.Node, added: Mapping[str, Any]
-            ) -> Iterator[tuple[int, int, str]]:
-    """Yield the patch that adds keys to a mapping, on lines of their own."""
-    if added:
-        newline, end = _newline(text), _line_end(text, _end(node))
+            start = text.rfind('\n', 0, key.start_mark.index) + 1
+            above = text.rfind('\n', 0, start - 1) + 1
+            # the comments directly above are about it
+            while start and text.startswith(' ' * key.start_mark.column + '#', above):
+                start, above = above, text.rfind('\n', 0, above - 1) + 1
+            yield start, _line_end(text, _end(written)), ''
+        elif new[name] is value or new[name] == value:
+            continue
+        elif isinstance(new[name], Mapping) and not written.flow_style:
+            yield from _patches(text, written, value, new[name])
+        else:
+            end = _end(written)
+            line_end = newline if text[end - 1] == '\n' else ''  # of a text in a block
+            yield (text.index(':', key.end_mark.index) + 1, end,
+                   f' {_flow(name, new[name])}{line_end}')
+    if added := {name: value for name, value in new.items() if name not in old}:
+        # on lines of their own
+        end = _line_end(text, _end(node))
         lines = [f'{line}{newline}' for line in _emit(added, node.value[0][0].start_mark.column)]
         yield end, end, ('' if text[end - 1] == '\n' else newline) + ''.join(lines)
-
-
-def _entries(node: yaml.Node) -> dict[str, tuple[yaml.Node, yaml.Node]]:
-    """Return key and value of each entry of a mapping, with their places in the text."""
-    return {key.value: (key, value) for key, value in node.value}
 
 
 def _end(node: yaml.Node) -> int:
@@ -249,10 +220,6 @@ def _end(node: yaml.Node) -> int:
     if isinstance(node, yaml.ScalarNode) or node.flow_style:
         return int(node.end_mark.index)
     return _end(node.value[-1][1] if isinstance(node, yaml.MappingNode) else node.value[-1])
-
-
-def _line_start(text: str, key: yaml.Node) -> int:
-    return text.rfind('\n', 0, key.start_mark.index) + 1
 
 
 def _line_end(text: str, index: int) -> int:
@@ -263,17 +230,13 @@ def _line_end(text: str, index: int) -> int:
     return len(text) if found < 0 else found + 1
 
 
-def _newline(text: str) -> str:
-    return '\r\n' if '\r\n' in text else '\n'
-
-
 def _emit(tree: Mapping[str, Any], column: int) -> Iterator[str]:
-    """Yield the lines of a tree in block style; lists and the values of fields are on one line."""
+    """Yield the lines of a tree in block style; lists and the values of fields are on one line.
+
+    Names of fields are plain, ids and classes quoted, as write_map does it.
+    """
     for key, value in tree.items():
-        is_plain = key.isascii() and key.replace('_', 'a').isalnum() and not key[0].isdigit()
-        # YAML 1.1 reads words such as yes and no as booleans
-        is_word = key.lower() in ('y', 'yes', 'n', 'no', 'true', 'false', 'on', 'off', 'null')
-        name = key if is_plain and not is_word else quoted(key)
+        name = key if key in _PLAIN else quoted(key)
         if isinstance(value, Mapping) and value:
             yield f'{" " * column}{name}:'
             yield from _emit(value, column + 2)
@@ -290,19 +253,9 @@ def _flow(name: str, value: Any) -> str:
         return f'[{", ".join(_flow(name, one) for one in value)}]'
     if isinstance(value, str):
         return quoted(value)
-    if isinstance(value, bool) or value is None:
-        return json.dumps(value)
-    if isinstance(value, int) and name not in _GEOMETRY:
-        return str(value)
-    number = float(value)
-    if not math.isfinite(number):
-        return '.nan' if math.isnan(number) else '.inf' if number > 0 else '-.inf'
-    fixed = f'{number:.{DECIMALS}f}'.rstrip('0')
-    fixed += '0' if fixed.endswith('.') else ''
-    # YAML 1.1 takes 1e-07 for text: a float needs its point
-    mantissa, e, exponent = repr(number).partition('e')
-    exact = f'{mantissa}{"" if "." in mantissa else ".0"}{e}{exponent}'
-    return fixed if float(fixed) == number else exact
+    if name in _GEOMETRY or (isinstance(value, float) and math.isfinite(value)):
+        return np.format_float_positional(value, trim='0')
+    return str(yaml.safe_dump(value)).partition('\n')[0]
 
 
 # ---- the image embeddings -----------------------------------------------------------------------

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.offline.mapping.evidence import widest_angle_deg
 from cliploc_ros.offline.mapping.fitting import Fit, fit_ellipsoid
 from cliploc_ros.offline.mapping.options import MappingOptions
@@ -23,7 +22,6 @@ from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.edits import EditError
 from cliploc_ros.offline.studio.recording import LEAST_BOXES, Recording
-from cliploc_ros.offline.studio.sightings import Pixel
 
 #: Views nearer to one another leave the distance of the object open.
 LEAST_ANGLE_DEG = 25.0
@@ -42,7 +40,7 @@ _OTHER_ANGLE_DEG = 10.0
 class NewLandmark:
     """The boxes by view, the class that they suggest, and the ellipsoid that fits them."""
 
-    ACTIONS = ('draw', 'take', 'forget', 'create')
+    ACTIONS = ('draw', 'forget', 'create')
 
     def __init__(self, document: Document, recording: Recording):
         self._document, self._recording = document, recording
@@ -55,7 +53,7 @@ class NewLandmark:
         # the next views since the last box
         self._offered: list[int] = []
 
-    def draw(self, view: int, corner: Pixel, other: Pixel) -> str:
+    def draw(self, view: int, corner: Sequence[float], other: Sequence[float]) -> str:
         """Put a box into a view, between two opposite corners (2,) [px]."""
         camera = self._recording.detections.camera_of(view)
         low, high = np.clip(np.sort([corner, other], axis=0), 0.0, (camera.width, camera.height))
@@ -67,24 +65,10 @@ class NewLandmark:
                           None).prod(axis=1)
         union = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1) + (high - low).prod() - overlap
         ious = np.append(overlap / union, 0.0)
-        same = int(np.argmax(ious))
-        return self._put(view, [*low, *high], same if ious[same] > _SAME_IOU else None)
-
-    def take(self, view: int, pixel: Pixel) -> str:
-        """Take the detector's smallest box around a pixel (2,)."""
-        boxes = self._recording.detections.detections_of(view).bboxes_xyxy
-        areas = np.where((boxes[:, :2] <= pixel).all(axis=1) & (boxes[:, 2:] >= pixel).all(axis=1),
-                         (boxes[:, 2:] - boxes[:, :2]).prod(axis=1), np.inf)
-        if not np.isfinite(areas).any():
-            raise EditError('no box of the detector there; drag to draw one')
-        row = int(np.argmin(areas))
-        return self._put(view, boxes[row], row)
-
-    def _put(self, view: int, box: Sequence[float] | NDArray[np.float64], row: int | None) -> str:
-        what = 'changed' if view in self.boxes else 'drew'
-        self._set({**self.boxes, view: [float(value) for value in box]})
-        if row is not None:
-            self.class_id = self._recording.detections.detections_of(view).class_ids[row]
+        what, same = 'changed' if view in self.boxes else 'drew', int(np.argmax(ious))
+        self._set({**self.boxes, view: [*low.tolist(), *high.tolist()]})
+        if ious[same] > _SAME_IOU:
+            self.class_id = self._recording.detections.detections_of(view).class_ids[same]
         return f'{what} the box of view {view}; ' + '; '.join(
             filter(None, [f'boxes drawn: {len(self.boxes)}', self.doubt]))
 
@@ -137,10 +121,9 @@ class NewLandmark:
         view, box = next(iter(self.boxes.items()))
         detections = self._recording.detections
         camera, pose = detections.camera_of(view), detections.map_from_camera[view]
-        ray = np.array([(0.5 * (box[0] + box[2]) - camera.cx) / camera.fx,
-                        (0.5 * (box[1] + box[3]) - camera.cy) / camera.fy, 1.0])
-        points: NDArray[np.float64] = _DEPTHS_M[:, None] * (pose[:3, :3] @ ray) + pose[:3, 3]
-        return points
+        middle = np.array([[box[0] + box[2], box[1] + box[3]]]) / 2.0
+        ray = pose[:3, :3] @ [*camera.normalize_points(middle)[0], 1.0]
+        return np.asarray(_DEPTHS_M[:, None] * ray + pose[:3, 3])
 
     def guide(self, view: int) -> NDArray[np.float64]:
         """Return the line (n, 2) [px] on which the object of one box lies in another view."""
@@ -189,11 +172,9 @@ class NewLandmark:
 def _project(camera: Camera, map_from_camera: NDArray[np.float64], points: NDArray[np.float64]
              ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the pixels (n, 2) of points (n, 3), and which of them lie in front of the camera."""
-    camera_from_map = invert_transform(map_from_camera)
-    x, y, z = (points @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]).T
-    depth = np.maximum(z, 1e-6)
-    u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
-    return np.column_stack([u, v]), z > 0.05
+    seen = (points - map_from_camera[:3, 3]) @ map_from_camera[:3, :3]
+    pixels = camera.project_normalized(seen[:, :2] / np.maximum(seen[:, 2:], 1e-6))
+    return pixels, seen[:, 2] > 0.05
 
 
 # ---- a landmark from boxes that a person drew ---------------------------------------------------

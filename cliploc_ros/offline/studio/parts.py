@@ -34,7 +34,7 @@ def parts_of(desk: Desk) -> dict[str, Any]:
         'file': {
             'name': document.path.name, 'frame': document.frame_id, 'is_saved': document.is_saved,
             'notes': document.notes, 'undo': document.to_undo, 'redo': document.to_redo,
-            'conflict': bool(studio.foreign), 'views': studio.views, 'step': _film_step(studio),
+            'conflict': bool(document.foreign), 'views': studio.views, 'step': _film_step(studio),
             'has_boxes': review.has_boxes, 'images': studio.images is not None,
             'classes': sorted({one.class_id for one in document.landmarks.values()})},
         'rows': [[key, one.label, one.class_id, one.marks.is_locked, one.marks.is_hidden,

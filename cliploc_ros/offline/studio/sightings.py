@@ -5,7 +5,6 @@
 These are large, whole, sharp, and from different sides.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -24,8 +23,6 @@ from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.studio.landmark import Landmarks
 from cliploc_ros.offline.studio.recording import Recording
 
-#: x and y [px].
-Pixel = Sequence[float] | NDArray[np.float64]
 # A box nearer to the edge of its image may be cut off [px].
 _MARGIN_PX = 3.0
 # Images that are read for a landmark, at most: sharpness needs them.
@@ -63,18 +60,6 @@ def outlines_of(landmarks: Landmarks, camera: Camera, map_from_camera: NDArray[n
     ids = list(landmarks)
     return sorted((Outline(ids[row], ellipses[row], boxes[row], float(distances[row]))
                    for row in np.nonzero(inside)[0]), key=lambda one: one.distance_m)
-
-
-def landmark_at(outlines: Sequence[Outline], pixel: Pixel) -> str | None:
-    """Return the landmark with the smallest outline around a pixel (2,)."""
-    around = []
-    for one in outlines:
-        cx, cy, exx, exy, eyy = one.ellipse
-        x, y = pixel[0] - cx, pixel[1] - cy
-        determinant = exx * eyy - exy * exy
-        if (eyy * x * x - 2.0 * exy * x * y + exx * y * y) <= determinant:
-            around.append((determinant, one.landmark_id))
-    return min(around)[1] if around else None
 
 
 class Sighting(NamedTuple):

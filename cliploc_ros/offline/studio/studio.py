@@ -28,7 +28,6 @@ from cliploc_ros.offline.studio.background import Background
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.edits import EditError
 from cliploc_ros.offline.studio.landmark import Landmark, Landmarks, fields_of
-from cliploc_ros.offline.studio.map_file import ChangedOnDiskError
 from cliploc_ros.offline.studio.new_landmark import NewLandmark
 from cliploc_ros.offline.studio.phrases import FoundPhrases, PhraseFinder
 from cliploc_ros.offline.studio.places import Coverage, find_places
@@ -36,10 +35,8 @@ from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.review import ReviewQueue
 from cliploc_ros.offline.studio.sightings import (
     Outline,
-    Pixel,
     Sighting,
     find_sightings,
-    landmark_at,
     outlines_of,
 )
 from cliploc_ros.offline.studio.walls import Walls
@@ -79,9 +76,8 @@ class Studio:
         How much of a search of places is done, 0 to 1.
     """
 
-    ACTIONS = ('save', 'overwrite', 'reload', 'undo', 'redo', 'select', 'select_at', 'edit',
-               'lock', 'hide', 'delete', 'split', 'merge', 'refit', 'refit_all', 'show_view',
-               'next_view', 'stop_search')
+    ACTIONS = ('select', 'edit', 'lock', 'hide', 'delete', 'split', 'merge', 'refit', 'refit_all',
+               'show_view', 'next_view', 'stop_search')
     #: These take long, and lock the document themselves.
     SLOW_ACTIONS = ('relocalize_here', 'relocalize_all', 'search_places', 'relocalize_robot',
                     'reload_robot')
@@ -92,8 +88,7 @@ class Studio:
         self.document, self.recording, self.images = document, recording, images
         self.finder, self.layer, self.walls = finder, layer, walls
         self.live: LiveRelocalizer | None = None
-        self.changed = threading.Event()
-        document.subscribe(self.changed.set)
+        self.changed = document.changed
         self.review = ReviewQueue(document, recording)
         self.new = None if recording is None else NewLandmark(document, recording)
         self.view = 0
@@ -110,8 +105,6 @@ class Studio:
         self._colors: dict[str, Rgb] = {}
         for class_id in sorted({one.class_id for one in document.landmarks.values()}):
             self.color_of(class_id)
-        # the digest of a foreign content of the file, of which the person has to decide
-        self.foreign = ''
         if recording is not None and recording.detections.encoder_key:
             document.take_encoder(recording.detections.encoder_key)
 
@@ -120,38 +113,6 @@ class Studio:
         self._stopped.set()
         self._found_phrases.stop()
         self._found_sightings.stop()
-
-    # ---- the file -------------------------------------------------------------------------------
-
-    def save(self, over: str = '') -> str:
-        """Save the map; CliplocError: see Document.save."""
-        try:
-            self.document.save(over)
-        except ChangedOnDiskError as error:
-            self.foreign = error.found
-            raise
-        self.foreign = ''
-        return f'saved {self.document.path.name}'
-
-    def overwrite(self) -> str:
-        """Save the map over the content of another program."""
-        return self.save(self.foreign)
-
-    def reload(self) -> str:
-        """Take the map from the file."""
-        self.document.reload()
-        self.foreign = ''
-        return f'reloaded {self.document.path.name}; undo takes it back'
-
-    def undo(self) -> str | None:
-        """Undo the last edit."""
-        what = self.document.to_undo
-        return f'undid: {what}' if self.document.undo() else None
-
-    def redo(self) -> str | None:
-        """Do again the edit that was undone last."""
-        what = self.document.to_redo
-        return f'did again: {what}' if self.document.redo() else None
 
     # ---- views ----------------------------------------------------------------------------------
 
@@ -233,12 +194,6 @@ class Studio:
         others = [key for key in self.document.selection if key != id] if joins else []
         is_chosen = joins and id in self.document.selection
         self.document.select(others if is_chosen else [*others, id])
-
-    def select_at(self, pixel: Pixel) -> str:
-        """Select the landmark whose outline in the view is around a pixel."""
-        found = landmark_at(self.outlines(), pixel)
-        self.document.select([] if found is None else [found])
-        return f'selected {found}' if found else 'nothing there'
 
     def edit(self, field: str, value: str | Sequence[float], gesture: object = None
              ) -> str | None:

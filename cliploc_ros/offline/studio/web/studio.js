@@ -473,10 +473,24 @@ function pointerUp(event) {
     showView();
   } else if (!done.isMoved) {
     const [x, y] = done.start;
-    const isOnBox = state.view.boxes.some(one => x > one[0] && x < one[2] && y > one[1] && y < one[3]);
-    if (mode === 'create' && isOnBox && event.button === 0) send('take', {view: state.view.view, pixel: done.start});
-    else send('select_at', {pixel: done.start});
+    const box = smallest(state.view.boxes.filter(one => x > one[0] && x < one[2] && y > one[1] && y < one[3]),
+                         one => (one[2] - one[0]) * (one[3] - one[1]));
+    if (mode === 'create' && box && event.button === 0) {
+      send('draw', {view: state.view.view, corner: box.slice(0, 2), other: box.slice(2, 4)});
+    } else {
+      const outline = smallest(state.view.outlines.filter(one => isAround(one, x, y)), one => one[3] * one[4]);
+      send('select', {id: outline ? outline[0] : ''});
+    }
   }
+}
+
+const smallest = (found, size) => found.sort((one, other) => size(one) - size(other))[0];
+
+// Whether an outline (id, centre, semi-axes, angle) is around a point.
+function isAround([, cx, cy, rx, ry, turn], x, y) {
+  const angle = turn * Math.PI / 180, dx = x - cx, dy = y - cy;
+  return Math.hypot((dx * Math.cos(angle) + dy * Math.sin(angle)) / rx,
+                    (dy * Math.cos(angle) - dx * Math.sin(angle)) / ry) < 1;
 }
 
 function stepView(count) {
@@ -642,7 +656,7 @@ $('frame').onload = () => {
   // the log has what viser's notices would say; its panel has switches for developers. Both cover
   // the scene
   const style = scene.document.createElement('style');
-  style.textContent = '.mantine-Notifications-root, [data-floating-window] { display: none }';
+  style.textContent = '.mantine-Notifications-root, [data-floating-window] { display: none !important }';
   scene.document.head.append(style);
 };
 $('frame').src = `${base}scene/${person}/`;
