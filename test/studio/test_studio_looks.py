@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The image embeddings next to a map follow their landmarks through edits, undo and a kill."""
 
+import os
+
 import numpy as np
 import pytest
 from studio_map import TEXT
@@ -13,6 +15,7 @@ from cliploc_ros.core.map.landmark_embeddings import (
     load_landmark_embeddings,
     save_landmark_embeddings,
 )
+from cliploc_ros.errors import MapError
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 
@@ -112,14 +115,16 @@ def test_a_killed_studio_restores_them(path, rows):
 
 
 def test_a_save_that_was_cut_off_between_both_files_is_finished(path, rows):
-    killed, old = Document(path), path.read_text()
+    killed = Document(path)
     change_all(killed)
-    kept = killed._journal.path.read_text()
-    killed.save()
+    blocker = path.with_name(f'.{os.getpid()}.{path.name}')
+    blocker.mkdir()
+    with pytest.raises(MapError, match='cannot be written'):
+        killed.save()
+    blocker.rmdir()
     killed._journal.close()
-    # as a kill leaves it before the map was written
-    path.write_text(old)
-    killed._journal.path.write_text(kept)
+    assert 'book_1' in path.read_text()
+    check_all(path, rows)
     document = Document(path)
     for _ in range(3):
         document.undo()

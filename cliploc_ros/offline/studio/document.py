@@ -19,6 +19,7 @@ from cliploc_ros.files.log import Log
 from cliploc_ros.offline.studio.edits import Change, EditError, change_from_json
 from cliploc_ros.offline.studio.landmark import (
     KNOWN_FIELDS,
+    Encoded,
     Landmark,
     Landmarks,
     Marks,
@@ -154,8 +155,7 @@ class Document:
     def apply(self, change: Change, gesture: object = None) -> None:
         """Make a change; successive ones of one gesture, as of a drag, are undone together.
 
-        CliplocError: the landmarks are not those the change starts from, or the journal cannot be
-        written.
+        CliplocError: the journal cannot be written.
         """
         with self.lock:
             if not change.after:
@@ -177,7 +177,7 @@ class Document:
         with self.lock:
             if not self._done:
                 return None
-            self._do('undo', self._done[-1].reversed())
+            self._do('undo', self._done[-1])
             return f'undid: {self.to_redo}'
 
     def redo(self) -> str | None:
@@ -196,28 +196,23 @@ class Document:
             self.changed.set()
 
     def _do(self, kind: str, change: Change) -> None:
-        landmarks = change.apply(self.landmarks)
-        self._journal.append({'do': kind, **change.to_json()})
-        self._take(kind, change, landmarks)
+        self._journal.append({'do': kind, **change.to_json(self.landmarks)})
+        self._take(kind, change)
         self.changed.set()
 
-    def _take(self, kind: str, change: Change, landmarks: Landmarks) -> None:
-        """Take over a change that was applied, and write history."""
-        self.landmarks = landmarks
+    def _take(self, kind: str, change: Change) -> None:
+        """Make a change, and write history."""
+        back, self.landmarks = change.undoing(self.landmarks), change.apply(self.landmarks)
         self._gesture = None
-        if kind == 'join' and self._done:
-            self._done[-1] = self._done[-1].then(change)
-        elif kind == 'undo':
-            self._undone.append(change.reversed())
+        if kind == 'undo':
+            self._undone.append(back)
             del self._done[-1:]
         else:
-            self._done.append(change)
-            del self._done[:-_MAX_HISTORY]
-            if kind == 'redo':
-                del self._undone[-1:]
-        if kind in ('edit', 'join'):
-            self._undone.clear()
-        self.selection = tuple(key for key in self.selection if key in landmarks)
+            if kind == 'join' and self._done:
+                back = back._replace(after={**back.after, **self._done.pop().after})
+            self._done = [*self._done[1 - _MAX_HISTORY:], back]
+            self._undone = self._undone[:-1] if kind == 'redo' else []
+        self.selection = tuple(key for key in self.selection if key in self.landmarks)
 
     # ---- the files ------------------------------------------------------------------------------
 
@@ -238,10 +233,13 @@ class Document:
                 raise MapError(f'{self.path}: another program changed this file after the studio '
                                'read it; overwrite it, or reload it')
             file = self._file.with_landmarks(self.landmarks)
+            looks = self._look_file.looks
+            self._journal.append({'writing': file.digest, 'looks': {
+                key: look.to_json() for key, look in looks.items()
+                if key not in self.landmarks or self.landmarks[key].look is not look}})
             # the map comes last: once it has its new content, nothing is left to do
             self._look_file, fault = self._look_file.write(self.landmarks)
             self.notes += (fault,) if fault and fault not in self.notes else ()
-            self._journal.append({'writing': file.digest})
             file.write()
             self._file = file
             self._saved = self.landmarks
@@ -267,9 +265,7 @@ class Document:
             before = self.landmarks
             found = {key: replace(one, marks=before[key].marks if key in before else Marks())
                      for key, one in self._landmarks_of_file().items()}
-            after = {**dict.fromkeys(before), **found}
-            self._take('edit', Change('reload the file', {key: before.get(key) for key in after},
-                                      after), found)
+            self._take('edit', Change('reload the file', {**dict.fromkeys(before), **found}))
             self._saved = found
             self.foreign = ''
             self._journal.restart([self._header()])
@@ -319,11 +315,10 @@ class Document:
         try:
             if edits and not starts:
                 raise EditError('they do not fit the file, which another program changed')
-            self._restore_marks(entries[:start + 1])
+            self._restore(entries[:start + 1], entries[-1:])
             header = self._header()
             for entry in edits:
-                change = change_from_json(entry, self.landmarks)
-                self._take(str(entry['do']), change, change.apply(self.landmarks))
+                self._take(str(entry['do']), change_from_json(entry, self.landmarks))
                 done.append(entry)
         except (LookupError, TypeError, AttributeError, ValueError, CliplocError) as error:
             aside = self._journal.set_aside()
@@ -336,14 +331,18 @@ class Document:
             self.notes += (f'restored {len(done)} edits that were not saved; undo takes them '
                            'back',)
 
-    def _restore_marks(self, entries: list[dict[str, Any]]) -> None:
-        """Restore the marks that belong to the file's content.
+    def _restore(self, entries: list[dict[str, Any]], last: list[dict[str, Any]]) -> None:
+        """Restore the marks and looks that belong to the file's content.
 
-        They come from the header and, where a content was written since, the edits before it.
+        Marks come from the header and, where a content was written since, the edits before it.
+        Looks that a save replaced before it was cut off come from the last entry.
         """
         marks: dict[str, Any] = {}
         for entry in entries:
             marks |= entry.get('marks', {})
             marks |= {key: one['marks'] for key, one in entry.get('after', {}).items() if one}
-        self.landmarks = self._saved = {key: replace(one, marks=Marks(**marks.get(key, {})))
-                                        for key, one in self.landmarks.items()}
+        looks = {} if last == entries[-1:] else last[0].get('looks', {})
+        self.landmarks = self._saved = {
+            key: replace(one, marks=Marks(**marks.get(key, {})),
+                         look=Encoded.from_json(looks[key]) if key in looks else one.look)
+            for key, one in self.landmarks.items()}

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a person can do to a map. Each edit returns a change as a value and alters nothing.
 
-A change holds landmarks before and after; undo exchanges the two.
+A change holds landmarks as they are after it; the change that undoes it, as they were before.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import asdict, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,70 +41,43 @@ class EditError(CliplocError):
     """An edit that the map does not allow; the message says what to do."""
 
 
-@dataclass(frozen=True)
-class Change:
+class Change(NamedTuple):
     """What an edit does."""
 
     what: str  #: For the person who edits
-    #: By id; None where there is none
-    before: Mapping[str, Landmark | None]
-    after: Mapping[str, Landmark | None]
-
-    def reversed(self) -> 'Change':
-        """Return the change that undoes this one."""
-        return Change(self.what, self.after, self.before)
-
-    def then(self, later: 'Change') -> 'Change':
-        """Return this change and a later one as one."""
-        return Change(later.what, {**later.before, **self.before}, {**self.after, **later.after})
+    after: Mapping[str, Landmark | None]  #: Landmarks by id, None for one that goes
 
     def apply(self, landmarks: Landmarks) -> dict[str, Landmark]:
-        """Return the landmarks after the change.
-
-        EditError: they are not those that the change starts from.
-        """
-        for landmark_id, landmark in self.before.items():
-            if landmarks.get(landmark_id) != landmark:
-                raise EditError(f"{self.what}: landmark '{landmark_id}' is not what it was when "
-                                'the edit was made; nothing was changed')
+        """Return the landmarks after the change."""
         return {**{key: one for key, one in landmarks.items()
                    if self.after.get(key, one) is not None},
                 **{key: one for key, one in self.after.items() if one is not None}}
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the change as JSON holds it; looks only where the change is of them, too."""
-        def side(landmarks: Mapping[str, Landmark | None], others: Mapping[str, Landmark | None]
-                 ) -> dict[str, Any]:
-            return {key: one and {
-                'fields': one.fields, 'marks': asdict(one.marks),
-                **({} if one.look is _look_of(others[key]) else
-                   {'look': one.look and one.look.to_json()})} for key, one in landmarks.items()}
+    def undoing(self, landmarks: Landmarks) -> 'Change':
+        """Return the change that undoes this one of some landmarks."""
+        return Change(self.what, {key: landmarks.get(key) for key in self.after})
 
-        return {'what': self.what, 'before': side(self.before, self.after),
-                'after': side(self.after, self.before)}
+    def to_json(self, landmarks: Landmarks) -> dict[str, Any]:
+        """Return the change of some landmarks as JSON holds it; looks only if it is of them."""
+        return {'what': self.what, 'after': {key: one and {
+            'fields': one.fields, 'marks': asdict(one.marks),
+            **({} if key in landmarks and one.look is landmarks[key].look else
+               {'look': one.look and one.look.to_json()})} for key, one in self.after.items()}}
 
 
 def change_from_json(tree: Mapping[str, Any], landmarks: Landmarks) -> Change:
-    """Return a change of these landmarks from JSON.
+    """Return a change of some landmarks from JSON.
 
     LookupError, TypeError, AttributeError, ValueError or MapError: it is none, or a landmark is
     invalid.
     """
-    before, after = ({
-        key: None if one is None else Landmark(
-            one['fields'], Marks(**one['marks']),
-            _look_of(landmarks.get(key)) if 'look' not in one
-            else one['look'] and Encoded.from_json(one['look']))
-        for key, one in tree[side].items()} for side in ('before', 'after'))
-    if before.keys() != after.keys():
-        raise ValueError('not a change')
+    after = {key: one and Landmark(
+        one['fields'], Marks(**one['marks']),
+        one['look'] and Encoded.from_json(one['look']) if 'look' in one else landmarks[key].look)
+        for key, one in tree['after'].items()}
     if valid := {key: one for key, one in after.items() if one is not None}:
         map_of(valid)
-    return Change(str(tree['what']), before, after)
-
-
-def _look_of(landmark: Landmark | None) -> Encoded | None:
-    return None if landmark is None else landmark.look
+    return Change(str(tree['what']), after)
 
 
 def _change_of(what: str, landmarks: Landmarks, after: Mapping[str, Landmark | None]) -> Change:
@@ -117,7 +90,7 @@ def _change_of(what: str, landmarks: Landmarks, after: Mapping[str, Landmark | N
             raise EditError(f"landmark '{landmark_id}' is locked: unlock it first")
         if landmark is not None:
             map_of({landmark_id: landmark}, source=what)
-    return Change(what[:80], {key: landmarks.get(key) for key in changed}, changed)
+    return Change(what[:80], changed)
 
 
 # ---- edits; EditError: a landmark is unknown or locked; MapError: a value is invalid ------------
