@@ -70,7 +70,7 @@ def demo_studio(path):
     """Return a studio of the demo's map, written to a path, with its walk: images and poses."""
     shutil.copy(ASSETS / 'map.yaml', path)
     folder = ASSETS / 'sequence'
-    return Studio(Document(path), Recording(views_of_folder(folder)), open_images(folder, None))
+    return Studio(Document(path), Recording(views_of_folder(folder), open_images(folder, None)))
 
 
 @contextmanager

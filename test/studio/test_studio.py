@@ -15,7 +15,6 @@ from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.recording import Recording
-from cliploc_ros.offline.studio.sightings import find_sightings
 from cliploc_ros.offline.studio.studio import Studio
 
 
@@ -39,9 +38,9 @@ def office(tmp_path, shared_data):
 
 
 def test_outlines_lie_in_the_image(studio):
-    studio.show_view(3)
-    outlines = studio.outlines()
-    assert studio.image(3).shape == (480, 640, 3) and studio.image(-1) is None
+    recording = studio.recording
+    outlines = recording.outlines(studio.document.landmarks, 3)
+    assert recording.image(3).shape == (480, 640, 3) and recording.image(-1) is None
     assert [one.distance_m for one in outlines] == sorted(one.distance_m for one in outlines)
     assert all((one.bbox_xyxy[:2] < (640, 480)).all() and (one.bbox_xyxy[2:] > 0).all()
                for one in outlines)
@@ -49,20 +48,20 @@ def test_outlines_lie_in_the_image(studio):
 
 def test_sightings_are_sharp_whole_and_from_several_sides(studio):
     """A view that a blur makes useless does not come first."""
-    landmarks, recording = studio.document.landmarks, studio.recording
-    first = find_sightings(recording, studio.images, landmarks, 'mug_1')
+    document, recording = studio.document, studio.recording
+    first = recording.sightings(document.landmarks, 'mug_1')
     assert all(one.is_whole and not one.is_detected for one in first)
-    best = first[0].view
+    best, images = first[0].view, recording.images
 
     class Blurred:
         def of(self, detections, view):
-            image = studio.images.of(detections, view)
+            image = images.of(detections, view)
             return cv2.GaussianBlur(image, (0, 0), 8.0) if view == best else image
 
-    assert find_sightings(recording, Blurred(), landmarks, 'mug_1')[0].view != best
-    document = studio.document
+    recording.images = Blurred()
+    assert recording.sightings(document.landmarks, 'mug_1')[0].view != best
     document.edit(edits.set_fields, ['mug_1'], center=[0.0, 0.0, 90.0])
-    assert find_sightings(recording, studio.images, document.landmarks, 'mug_1') == []
+    assert recording.sightings(document.landmarks, 'mug_1') == []
 
 
 def test_moved_landmarks_come_back_by_refitting(office):

@@ -33,7 +33,7 @@ def wait_for_phrases(studio):
     """Return what is offered in the end, and the notes until then."""
     deadline, notes = time.monotonic() + PATIENCE_S, set()
     while True:
-        found, note = studio.phrases()
+        found, note = studio.phrases('bowl_1')
         if 'CLIP looks' not in note:
             return found, notes
         notes.add(note)
@@ -54,13 +54,13 @@ def test_clip_offers_phrases_for_what_the_images_show(path):
     truth = studio.document.landmarks['bowl_1'].label
     studio.document.edit(edits.set_fields, ['bowl_1'], label='something')
     studio.document.select(['bowl_1'])
-    assert studio.phrases().phrases[0] != truth, "the class's labels as long as CLIP loads"
+    assert studio.phrases('bowl_1').phrases[0] != truth, "the class's labels as long as CLIP loads"
     found, notes = wait_for_phrases(studio)
     print(f'{truth}: {found}')
     assert len(found) == 5 and truth in found
-    assert len(notes) == 1 and studio.phrases().note == ''
+    assert len(notes) == 1 and studio.phrases('bowl_1').note == ''
     studio.document.edit(edits.set_fields, ['bowl_1'], center=[1, 1, 1])
-    assert studio.phrases().phrases == found, 'a drag asks nothing'
+    assert studio.phrases('bowl_1').phrases == found, 'a drag asks nothing'
     studio.stop()
     studio.document.close()
 

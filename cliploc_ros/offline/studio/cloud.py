@@ -16,6 +16,7 @@ from cliploc_ros.core.depth_image import points_in_color
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, KeyframeLayer
 from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.viewpoint import Bounds
 
 #: More points slow the browser down.
@@ -38,13 +39,14 @@ class Cloud(NamedTuple):
     side_m: float  #: One point is left of each cube of this side
 
 
-def find_cloud(detections: PosedDetections | None, images: Images | None,
-               layer: KeyframeLayer | None, extent: Bounds) -> Cloud | None:
+def find_cloud(recording: Recording | None, layer: KeyframeLayer | None, extent: Bounds
+               ) -> Cloud | None:
     """Return the points of a map's surfaces; None where nothing is known of them.
 
     CliplocError: an image or depth image cannot be read.
     """
-    parts = [] if detections is None or images is None else _points_of_depth(detections, images)
+    parts = [] if recording is None or recording.images is None else _points_of_depth(
+        recording.detections, recording.images)
     if not parts and layer is not None:
         parts = [_points_of_keyframe(layer, row) for row in range(len(layer))]
     if not parts:

@@ -99,9 +99,7 @@ class Page:
         """Read the surfaces, which takes seconds, while people use the page."""
         studio = self._studio
         try:
-            self._cloud = find_cloud(
-                None if studio.recording is None else studio.recording.detections, studio.images,
-                studio.layer, extent)
+            self._cloud = find_cloud(studio.recording, studio.layer, extent)
         except CliplocError as error:
             self.desk.log('refused', f'no surfaces: {error}')
         if self._cloud is not None:
@@ -181,7 +179,7 @@ class Page:
     def _draw_image(self, scene: viser.SceneApi, view: int) -> list[Any]:
         camera, image = self._studio.camera, None
         try:
-            image = self._studio.image(view)
+            image = self._studio.seen().image(view)
         except CliplocError as error:
             self.desk.log('refused', str(error))
         if image is None:

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.offline.studio.desk import Desk
 from cliploc_ros.offline.studio.landmark import Landmark, shape_fields
 from cliploc_ros.offline.studio.layers import LEGEND
-from cliploc_ros.offline.studio.sightings import crop_of, outlines_of
 from cliploc_ros.offline.studio.studio import Studio
 from cliploc_ros.offline.studio.web import Content
 
@@ -35,7 +34,8 @@ def parts_of(desk: Desk) -> dict[str, Any]:
             'name': document.path.name, 'frame': document.frame_id, 'is_saved': document.is_saved,
             'notes': document.notes, 'undo': document.to_undo, 'redo': document.to_redo,
             'conflict': bool(document.foreign), 'views': studio.views, 'step': _film_step(studio),
-            'has_boxes': review.has_boxes, 'images': studio.images is not None,
+            'has_boxes': review.has_boxes, 'images': studio.recording is not None
+            and studio.recording.images is not None,
             'classes': sorted({one.class_id for one in document.landmarks.values()})},
         'rows': [[key, one.label, one.class_id, one.marks.is_locked, one.marks.is_hidden,
                   review.severity(key), one.marks.decision,
@@ -70,7 +70,8 @@ def _selected_part(studio: Studio) -> dict[str, Any] | None:
     if studio.document.selected is None:
         return None
     key, one = studio.document.selected
-    check, phrases, sightings = studio.review.check_of(key), studio.phrases(), studio.sightings()
+    check, phrases = studio.review.check_of(key), studio.phrases(key)
+    sightings = studio.sightings(key)
     return {
         'id': key, 'label': one.label, 'class_id': one.class_id,
         'is_locked': one.marks.is_locked, 'decision': one.marks.decision,
@@ -90,7 +91,7 @@ def _view_parts(studio: Studio) -> dict[str, Any]:
     new, recording, view = studio.new, studio.recording, studio.view
     assert recording is not None and new is not None
     selection, seen = studio.document.selection, recording.detections.detections_of(view)
-    shown = [one for number, one in enumerate(studio.outlines())
+    shown = [one for number, one in enumerate(recording.outlines(studio.shown(), view))
              if number < _MAX_OUTLINES or one.landmark_id in selection]
     guess = {} if new.fit is None else {'': Landmark(shape_fields(new.fit.center, new.fit.basis))}
     return {
@@ -100,8 +101,7 @@ def _view_parts(studio: Studio) -> dict[str, Any]:
             'boxes': [[*box, name] for box, name in zip(
                 seen.bboxes_xyxy.round(1).tolist(), seen.class_ids, strict=True)],
             'outlines': [[one.landmark_id, *_axes_of(one.ellipse)] for one in shown],
-            'guess': [_axes_of(one.ellipse) for one in outlines_of(
-                guess, studio.camera, studio.map_from_camera)],
+            'guess': [_axes_of(one.ellipse) for one in recording.outlines(guess, view)],
             'guide': new.guide(view).round(1).tolist()},
         'new': {'boxes': sorted(new.boxes.items()), 'class_id': new.class_id, 'doubt': new.doubt}}
 
@@ -121,12 +121,12 @@ def picture_of(studio: Studio, path: str) -> Content | None:
     CliplocError: an image cannot be read.
     """
     kind, *words = path.strip('/').split('/')
+    if studio.recording is None or kind not in ('image', 'crop'):
+        return None
     try:
         view = int(words[1])
-        image = studio.image(view) if kind in ('image', 'crop') else None
-        if kind == 'crop' and image is not None and studio.recording and studio.images:
-            box = np.array([float(word) for word in words[2].split(',')]).reshape(4)
-            image = crop_of(studio.recording, studio.images, view, box)
+        image = studio.recording.image(view) if kind == 'image' else studio.recording.crop(
+            view, np.array([float(word) for word in words[2].split(',')]).reshape(4))
     except (ValueError, IndexError):
         return None
     if image is None:

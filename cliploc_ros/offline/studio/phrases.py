@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
-from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.labelling import best_phrases
 from cliploc_ros.offline.mapping.landmarks import classes_of
 from cliploc_ros.offline.studio.landmark import Landmarks, map_of
 from cliploc_ros.offline.studio.recording import Recording
-from cliploc_ros.offline.studio.sightings import find_sightings
 from cliploc_ros.offline.vocabulary.phrase_embeddings import phrases_of_classes
 from cliploc_ros.offline.vocabulary.vocabulary import Vocabulary, shipped_phrases
 
@@ -44,10 +42,8 @@ class PhraseFinder:
     Landmarks without a look are looked at in the recording: in its embeddings, or its images.
     """
 
-    def __init__(self, clip: ClipOptions, vocabulary: Vocabulary, recording: Recording | None,
-                 images: Images | None):
-        self._clip, self._vocabulary = clip, vocabulary
-        self._recording, self._images = recording, images
+    def __init__(self, clip: ClipOptions, vocabulary: Vocabulary, recording: Recording | None):
+        self._clip, self._vocabulary, self._recording = clip, vocabulary, recording
 
     def find(self, landmarks: Landmarks, landmark_id: str) -> FoundPhrases:
         """Return the phrases for a landmark, or why there are none."""
@@ -87,11 +83,10 @@ class PhraseFinder:
             look = recording.look_of(recording.boxes_of(landmarks)[landmark_id], key)
         if look is not None and look.encoder_key == key:
             return look.mean.astype(np.float32)
-        if recording is None or self._images is None:
+        if recording is None:
             return None
-        seen = [(self._images.of(recording.detections, one.view), one.bbox_xyxy)
-                for one in find_sightings(recording, self._images, landmarks, landmark_id, _CROPS)
-                if one.is_whole]
+        seen = [(recording.image(one.view), one.bbox_xyxy)
+                for one in recording.sightings(landmarks, landmark_id, _CROPS) if one.is_whole]
         embeddings = [self._encoder.encode_crops(image, box[None])[0] for image, box in seen
                       if image is not None]
         mean = np.sum(embeddings, axis=0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording says of landmarks: its boxes, and relocalizations.
+"""What a recording says of landmarks: its boxes, where they lie in its views, relocalizations.
 
 Relocalizations have the recording's boxes and poses. Similarities are simulated, as check_map does
 it. The views are not held out: a landmark that was fitted to them fits them better than new
@@ -9,11 +9,16 @@ images.
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, shape_matrices
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.check.landmark_faults import Witness, hear_witness
 from cliploc_ros.offline.mapping.check.relocalization import (
@@ -29,6 +34,7 @@ from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map
 from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.refit import refit_map
+from cliploc_ros.offline.mapping.sightings import Sighting, find_sightings, outlines_in_view
 from cliploc_ros.offline.mapping.views import Views, make_views
 from cliploc_ros.offline.simulation.labels import LabelModel
 from cliploc_ros.offline.studio import edits
@@ -37,13 +43,24 @@ from cliploc_ros.offline.studio.landmark import Encoded, Landmarks, looks_of, ma
 
 #: Fewer boxes leave an ellipsoid open.
 LEAST_BOXES = 3
+# What is looked at around a box, as a share of its size.
+_MARGIN = 0.25
+
+
+class Outline(NamedTuple):
+    """The outline of a landmark in a view."""
+
+    landmark_id: str
+    ellipse: NDArray[np.float64]  #: cx, cy, exx, exy, eyy [px]
+    bbox_xyxy: NDArray[np.float64]  #: (4,) [px]
+    distance_m: float
 
 
 class Recording:
-    """Boxes and poses of a recording of the mapped place."""
+    """Boxes and poses of a recording of the mapped place, and its images where they are known."""
 
-    def __init__(self, detections: PosedDetections):
-        self.detections = detections
+    def __init__(self, detections: PosedDetections, images: Images | None = None):
+        self.detections, self.images = detections, images
         self.options = MappingOptions()
 
     @cached_property
@@ -62,6 +79,57 @@ class Recording:
         shown = associate(self.views, landmarks_of_map(
             map_of(landmarks), self.detections.class_names), self.options.association_iou)
         return dict(zip(landmarks, group_boxes(shown, len(landmarks)), strict=True))
+
+    def outlines(self, landmarks: Landmarks, view: int) -> list[Outline]:
+        """Return the outlines of landmarks in a view, the nearest first."""
+        if not landmarks:
+            return []
+        camera, centers = self.detections.camera_of(view), _array(landmarks, 'center')
+        ellipses = outlines_in_view(self.detections, view, centers, shape_matrices(
+            _array(landmarks, 'semi_axes'), _array(landmarks, 'quat_xyzw')))
+        boxes = ellipse_bboxes(ellipses)
+        distances = np.linalg.norm(centers - self.detections.map_from_camera[view, :3, 3], axis=1)
+        with np.errstate(invalid='ignore'):
+            is_inside = (boxes[:, 2:] > 0.0).all(axis=1) & (
+                boxes[:, :2] < (camera.width, camera.height)).all(axis=1)
+        found = [Outline(*one) for one in zip(landmarks, ellipses, boxes, distances.tolist(),
+                                              strict=True)]
+        return sorted((found[row] for row in np.nonzero(is_inside)[0]),
+                      key=lambda one: one.distance_m)
+
+    def sightings(self, landmarks: Landmarks, landmark_id: str, limit: int = 6) -> list[Sighting]:
+        """Return the views that show a landmark best; CliplocError: an image cannot be read."""
+        one = landmarks[landmark_id]
+        return find_sightings(
+            self.detections, self.boxes_of(landmarks)[landmark_id], one.center,
+            shape_matrices(one.semi_axes[None], one.quat_xyzw[None])[0], limit,
+            None if self.images is None else self._sharpness)
+
+    def _sharpness(self, one: Sighting) -> float:
+        """Return the share of fine detail in what the view shows around the landmark."""
+        crop = self.crop(one.view, one.bbox_xyxy)
+        if crop is None:
+            return 0.0
+        grey = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
+        return float(cv2.Laplacian(grey, cv2.CV_64F).var() / max(1.0, float(grey.var())))
+
+    def image(self, view: int) -> NDArray[np.uint8] | None:
+        """Return the undistorted image (h, w, 3) of a view, red first; None without one."""
+        if self.images is None or not 0 <= view < len(self.detections):
+            return None
+        return self.images.of(self.detections, view)
+
+    def crop(self, view: int, box: NDArray[np.float64]) -> NDArray[np.uint8] | None:
+        """Return what a box (4,) [px] and a margin around it show; None without the image."""
+        image = self.image(view)
+        if image is None:
+            return None
+        around = _MARGIN * (box[2:] - box[:2]).max()
+        height, width = image.shape[:2]
+        left, top = np.clip(np.floor(box[:2] - around), 0, (width - 1, height - 1)).astype(int)
+        right, bottom = np.clip(np.ceil(box[2:] + around), (left + 1, top + 1), (width, height)
+                                ).astype(int)
+        return image[top:bottom, left:right]
 
     def look_of(self, rows: NDArray[np.int64], encoder_key: str) -> Encoded | None:
         """Return the look that an encoder has of some boxes; None where it saw none of them."""
@@ -102,11 +170,13 @@ class Recording:
         return edits.merge(landmarks, landmark_ids, (fit.center, fit.basis)), 'by boxes'
 
     def relocalize(self, landmarks: Landmarks, views: Sequence[int],
-                   keyframes: RecordedKeyframes | None = None) -> dict[int, Trial]:
+                   layer: KeyframeLayer | None = None) -> dict[int, Trial]:
         """Return the relocalizer's answers in some views; MapError without landmarks.
 
         Keyframes of a view's time are not used for it.
         """
+        keyframes = None if layer is None or self.images is None else RecordedKeyframes(
+            layer, self.image)
         landmark_map, options, detections = map_of(landmarks), CheckOptions(), self.detections
         relocalizer, labels = make_relocalizer(landmark_map, options), LabelModel.of(landmark_map)
         shown = np.full(len(detections.classes), -1, dtype=np.int64)
@@ -118,3 +188,7 @@ class Recording:
             detections.map_from_camera[view], 0, options, float(detections.stamps_s[view]),
             None if keyframes is None else keyframes.recognizer(detections, view))
             for view in views}
+
+
+def _array(landmarks: Landmarks, name: str) -> NDArray[np.float64]:
+    return np.array([getattr(one, name) for one in landmarks.values()])

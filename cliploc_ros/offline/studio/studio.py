@@ -16,29 +16,18 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.offline.datasets.images import Images
-from cliploc_ros.offline.mapping.check.relocalization import (
-    RecordedKeyframes,
-    Trial,
-    count_verdicts,
-    sample_frames,
-)
+from cliploc_ros.offline.mapping.check.relocalization import Trial, count_verdicts, sample_frames
+from cliploc_ros.offline.mapping.sightings import Sighting
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.background import Background
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.edits import EditError
-from cliploc_ros.offline.studio.landmark import Landmark, Landmarks, fields_of
+from cliploc_ros.offline.studio.landmark import Landmark, fields_of
 from cliploc_ros.offline.studio.new_landmark import NewLandmark
 from cliploc_ros.offline.studio.phrases import FoundPhrases, PhraseFinder
 from cliploc_ros.offline.studio.places import Coverage, find_places
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.review import ReviewQueue
-from cliploc_ros.offline.studio.sightings import (
-    Outline,
-    Sighting,
-    find_sightings,
-    outlines_of,
-)
 from cliploc_ros.offline.studio.walls import Walls
 
 if TYPE_CHECKING:
@@ -59,8 +48,8 @@ _PENDING = FoundPhrases((), 'CLIP looks for phrases; the map offers its own unti
 class Studio:
     """The document and its surroundings, which all people at the page share.
 
-    ``recording`` has views with boxes and poses, ``images`` the images of these views, ``layer``
-    the keyframes next to the map, ``walls`` are to be shown.
+    ``recording`` has views with boxes, poses and images, ``layer`` the keyframes next to the map,
+    ``walls`` are to be shown.
 
     Attributes
     ----------
@@ -83,10 +72,10 @@ class Studio:
                     'reload_robot')
 
     def __init__(self, document: Document, recording: Recording | None = None,
-                 images: Images | None = None, finder: PhraseFinder | None = None,
-                 layer: KeyframeLayer | None = None, walls: Walls | None = None):
-        self.document, self.recording, self.images = document, recording, images
-        self.finder, self.layer, self.walls = finder, layer, walls
+                 finder: PhraseFinder | None = None, layer: KeyframeLayer | None = None,
+                 walls: Walls | None = None):
+        self.document, self.recording, self.finder = document, recording, finder
+        self.layer, self.walls = layer, walls
         self.live: LiveRelocalizer | None = None
         self.changed = document.changed
         self.review = ReviewQueue(document, recording)
@@ -150,32 +139,21 @@ class Studio:
         assert self.new is not None
         self.show_view(self.new.next_view())
 
-    def outlines(self) -> list[Outline]:
-        """Return the shown landmarks' outlines in the selected view, the nearest first."""
-        return outlines_of(self.shown(), self.camera, self.map_from_camera)
-
-    def image(self, view: int) -> NDArray[np.uint8] | None:
-        """Return the undistorted image (h, w, 3) of a view, red first; None without one."""
-        if self.images is None or not 0 <= view < self.views:
-            return None
-        return self.images.of(self.seen().detections, view)
-
-    def sightings(self) -> list[Sighting] | None:
-        """Return the best views of the selected landmark; None until they are found."""
-        selected, recording = self.document.selected, self.recording
-        if selected is None or recording is None:
-            return None
-        (key, one), landmarks = selected, self.document.landmarks
+    def sightings(self, landmark_id: str) -> list[Sighting] | None:
+        """Return the best views of a landmark; None until they are found."""
+        recording, landmarks = self.recording, self.document.landmarks
         # a landmark that is being dragged keeps those that it had
-        if not (self.document.is_in_gesture and key == self._sightings[0]):
+        if recording is not None and not (
+                self.document.is_in_gesture and landmark_id == self._sightings[0]):
 
             def find() -> list[Sighting]:
                 try:
-                    return find_sightings(recording, self.images, landmarks, key)
+                    return recording.sightings(landmarks, landmark_id)
                 except CliplocError:  # an image that cannot be read; the view says so
                     return []
 
-            self._sightings = key, self._found_sightings.ask((key, str(one.fields)), find)
+            self._sightings = landmark_id, self._found_sightings.ask(
+                (landmark_id, str(landmarks[landmark_id].fields)), find)
         return self._sightings[1]
 
     def color_of(self, class_id: str) -> Rgb:
@@ -264,19 +242,11 @@ class Studio:
 
     # ---- the relocalizer ------------------------------------------------------------------------
 
-    def _relocalize(self, views: Sequence[int]) -> Landmarks:
-        """Relocalize in some views, and return the landmarks that were used."""
-        landmarks = self.document.landmarks
-        keyframes = None if self.layer is None or self.images is None else RecordedKeyframes(
-            self.layer, self.image)
-        self.answers = self.seen().relocalize(landmarks, views, keyframes)
-        return landmarks
-
     def relocalize_here(self) -> str:
         """Relocalize in the selected view."""
-        view = self.view
-        ids, trial = list(self._relocalize([view])), self.answers[view]
-        result = trial.result
+        view, landmarks = self.view, self.document.landmarks
+        self.answers = self.seen().relocalize(landmarks, [view], self.layer)
+        ids, trial, result = list(landmarks), self.answers[view], self.answers[view].result
         assert result is not None
         found = ', '.join(ids[match.landmark] for match in result.matches)
         return '; '.join(filter(None, [
@@ -289,7 +259,8 @@ class Studio:
 
     def relocalize_all(self) -> str:
         """Relocalize in views along the trajectory, and compare with the time before."""
-        self._relocalize(sample_frames(self.seen().detections, _MAX_TRIALS).tolist())
+        views = sample_frames(self.seen().detections, _MAX_TRIALS).tolist()
+        self.answers = self.seen().relocalize(self.document.landmarks, views, self.layer)
         before, self._counts = self._counts, count_verdicts(list(self.answers.values()))
         counts = ', '.join(f'{count} {verdict}' + (f' (was {before[verdict]})' if before else '')
                            for verdict, count in self._counts.items())
@@ -335,15 +306,13 @@ class Studio:
         return message if self.document.is_saved else (
             f'{message}; without the edits not saved here')
 
-    def phrases(self) -> FoundPhrases:
-        """Return up to five phrases for the selected landmark: CLIP's, or else the map's."""
-        landmarks, selected, finder = self.document.landmarks, self.document.selected, self.finder
-        if selected is None:
-            return FoundPhrases((), '')
-        key, one = selected
+    def phrases(self, landmark_id: str) -> FoundPhrases:
+        """Return up to five phrases for a landmark: CLIP's, or else the map's."""
+        landmarks, finder = self.document.landmarks, self.finder
+        one = landmarks[landmark_id]
         found = FoundPhrases((), '') if finder is None else self._found_phrases.ask(
-            (key, one.class_id, one.details.class_weights, one.look),
-            lambda: finder.find(landmarks, key)) or _PENDING
+            (landmark_id, one.class_id, one.details.class_weights, one.look),
+            lambda: finder.find(landmarks, landmark_id)) or _PENDING
         own = sorted(one.details.labels or (), key=lambda pair: -pair[1])
         alike = [other.label for other in landmarks.values()
                  if other.class_id == one.class_id and other.label != one.label]
