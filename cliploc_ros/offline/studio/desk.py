@@ -11,7 +11,7 @@ import logging
 import threading
 from collections.abc import Callable
 from inspect import signature
-from typing import Any, NamedTuple
+from typing import Any
 
 import viser
 
@@ -22,7 +22,7 @@ from cliploc_ros.offline.studio.edits import EditError
 from cliploc_ros.offline.studio.studio import Studio
 from cliploc_ros.offline.studio.viewpoint import Bounds, extent_of
 
-_MAX_LINES = 200
+_MAX_LINES = 60
 # How long stopping waits for an action that takes long.
 _GRACE_S = 5.0
 # After these, the camera of the person flies to the selection.
@@ -31,21 +31,13 @@ _BRING_ANOTHER = ('step', 'accept', 'discard', 'create', 'select')
 logger = logging.getLogger(__name__)
 
 
-class Line(NamedTuple):
-    """A line of the log."""
-
-    number: int
-    kind: str  #: done, refused or error
-    text: str
-
-
 class Desk:
     """What the people at the page do.
 
     Attributes
     ----------
-    lines : tuple of Line
-        The log, the newest line last.
+    lines : tuple of tuple of str
+        The log, the newest line last: done, refused or error, and a text.
     running : dict of str to Thread
         The actions that take long and go on.
     layers : dict of str to bool
@@ -59,7 +51,7 @@ class Desk:
 
     def __init__(self, studio: Studio, server: viser.ViserServer):
         self.studio, self.server = studio, server
-        self.lines: tuple[Line, ...] = ()
+        self.lines: tuple[tuple[str, str], ...] = ()
         self.running: dict[str, threading.Thread] = {}
         self.layers: dict[str, bool] = {}
         self.modes: dict[str, str] = {}
@@ -143,8 +135,7 @@ class Desk:
     def log(self, kind: str, text: str) -> None:
         """Add a line to the log."""
         with self._lock:
-            number = self.lines[-1].number + 1 if self.lines else 1
-            self.lines = (*self.lines, Line(number, kind, text))[-_MAX_LINES:]
+            self.lines = (*self.lines, (kind, text))[-_MAX_LINES:]
         self.studio.changed.set()
 
     # ---- the scene ------------------------------------------------------------------------------

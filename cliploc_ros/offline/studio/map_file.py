@@ -26,6 +26,7 @@ from cliploc_ros.core.map.landmark_embeddings import (
     load_landmark_embeddings,
     save_landmark_embeddings,
 )
+from cliploc_ros.core.map.landmark_map import find_map_node
 from cliploc_ros.core.map.map_file import quoted
 from cliploc_ros.core.map.parameter_file import parse_parameters, read_text
 from cliploc_ros.errors import MapError
@@ -132,19 +133,15 @@ def read_map_file(path: Path) -> MapFile:
             'frame_id': 'map', 'landmarks': {}}}}})
     text = read_text(path)
     tree = parse_parameters(text, path)
-    nodes = [name for name, node in tree.items() if isinstance(node, dict)
-             and isinstance(node.get(_PARAMETERS), dict) and 'map' in node[_PARAMETERS]]
-    if len(nodes) != 1:
-        raise MapError(f"{path}: {'no' if not nodes else 'more than one'} map: expected one "
-                       "'map' under '/**: ros__parameters:'")
-    found = tree[nodes[0]][_PARAMETERS]['map']
+    node = find_map_node(tree, path)
+    found = tree[node][_PARAMETERS]['map']
     if not isinstance(found, Mapping) or not isinstance(found.get('landmarks'), Mapping):
         raise MapError(f'{path}: map: expected the fields frame_id, landmarks')
     for landmark_id, fields in found['landmarks'].items():
         if not isinstance(fields, Mapping):
             raise MapError(f"{path}: landmark '{landmark_id}': expected fields, not {fields!r}"
                            [:200])
-    file = MapFile(path, text, nodes[0], tree)
+    file = MapFile(path, text, node, tree)
     map_of(file.landmarks, found.get('frame_id') or '', str(path))
     return file
 

@@ -18,7 +18,6 @@ from cliploc_ros.offline.studio.web import Content
 # More outlines hide the image, and a drag would wait for them.
 _MAX_OUTLINES = 200
 _CROP_PX, _QUALITY = 160, 88
-_MAX_SHOWN = 60
 # Answers that are listed after a run over the recording.
 _MAX_ANSWERS = 100
 # Between the pictures of the film [s].
@@ -43,7 +42,7 @@ def parts_of(desk: Desk) -> dict[str, Any]:
                  for key in review.order if (one := document.landmarks.get(key))],
         'selection': {'ids': document.selection, 'one': _selected_part(studio)},
         'review': {**review.counts(), 'running': list(desk.running)},
-        'log': desk.lines[-_MAX_SHOWN:],
+        'log': desk.lines,
         'layers': desk.layers,
         'test': {
             'share': round(studio.share, 2), 'running': list(desk.running),

@@ -93,19 +93,19 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Cover
 
 def _detector(landmark_map: LandmarkMap, recording: Recording | None
               ) -> tuple[DetectorModel, str]:
+    """Return the detector of a recording, or else a guess, and in words what it is."""
     guess = guess_detector(landmark_map, (_OPTIONS.mapping.edge_sigma_px,
                                           _OPTIONS.mapping.edge_sigma_share))
     if recording is None:
         return guess, 'without a recording, the camera and the detector are guesses'
     detections = recording.detections
-    guess = replace(guess, camera=detections.cameras[0])
-    if len(detections.classes) == 0:
-        return guess, 'without boxes, the detector is a guess'
-    witness = recording.witness(landmark_map)
-    if not (witness.shown >= 0).any():
-        return guess, 'no box of the recording shows a landmark: the detector is a guess'
-    return (measure_detector(landmark_map, detections, recording.views, witness,
-                             recording.options), 'the detector is as in the recording')
+    if len(detections.classes):
+        witness = recording.witness(landmark_map)
+        if (witness.shown >= 0).any():
+            return measure_detector(landmark_map, detections, recording.views, witness,
+                                    recording.options), 'the detector is as in the recording'
+    return (replace(guess, camera=detections.cameras[0]),
+            'no box of the recording shows a landmark: the detector is a guess')
 
 
 def _grid(landmark_map: LandmarkMap, recording: Recording | None, before: Coverage | None) -> Grid:

@@ -550,7 +550,7 @@ function playOrStop() {
 
 function showLog() {
   const lines = [...state.log].reverse();
-  fill($('log'), (lines.length ? lines : [[0, '', 'Ready. Press ? for the keys.']]).map(([, kind, text], row) => el(
+  fill($('log'), (lines.length ? lines : [['', 'Ready. Press ? for the keys.']]).map(([kind, text], row) => el(
     'div', {className: `${kind}${row ? ' old' : ''}`, title: text}, text)));
   $('log').scrollTop = 0;
 }
