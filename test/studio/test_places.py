@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from studio_map import write_two_rooms
 
-from cliploc_ros.errors import CliplocError, MapError
+from cliploc_ros.errors import CliplocError
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.places import find_places
@@ -77,8 +77,3 @@ def test_a_search_is_stopped_and_grows_old(studio):
     assert not studio.is_stale, 'the map is as it was'
     document.edit(edits.mark, ['cup_0'], 'lock', is_locked=True)
     assert not studio.is_stale, 'a lock changes nothing'
-
-
-def test_without_landmarks():
-    with pytest.raises(MapError):
-        find_places({}, None, None, silent)

@@ -95,25 +95,6 @@ def test_rows_follow_their_landmarks(path, rows):
     document.close()
 
 
-def test_a_killed_studio_restores_them(path, rows):
-    killed = Document(path)
-    change_all(killed)
-    killed._journal.close()
-    document = Document(path)
-    assert any('restored 3 edits' in note for note in document.notes)
-    document.save()
-    check_all(path, rows)
-    # what was undone after saving is known after a kill, too
-    document.undo()
-    document.undo()
-    document.undo()
-    document._journal.close()
-    again = Document(path)
-    again.save()
-    again.close()
-    assert all(is_equal(found, rows[key]) for key, found in rows_of(path).items())
-
-
 def test_a_save_that_was_cut_off_between_both_files_is_finished(path, rows):
     killed = Document(path)
     change_all(killed)
