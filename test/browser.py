@@ -78,7 +78,7 @@ class Person:
         wait_for(lambda: document.selection == (landmark_id,), 'the selection')
 
     def show_view(self, studio, view):
-        self.page.evaluate(f"send('view', {{view: {view}}})")
+        self.page.evaluate(f"send('show_view', {{view: {view}}})")
         wait_for(lambda: studio.view == view, 'the view')
         self.page.get_by_text(re.compile(f'^view {view}\\b')).first.wait_for()
 

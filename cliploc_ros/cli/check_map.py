@@ -30,11 +30,9 @@ from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
+    from cliploc_ros.offline.datasets.images import Images
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-    from cliploc_ros.offline.studio.images import Images
 
 _ADVICE_SHOWN = 8
 EPILOG = """\
@@ -145,7 +143,7 @@ def check(options: argparse.Namespace) -> int:
     if detections is not None and images is not None:
         views = ViewPainter(landmark_map, detections, images.near)
         if options.observations is None:  # the layer's own: judged by those of other times
-            image_of = partial(_image_of, detections, images)
+            image_of = partial(images.of, detections)
     if detections is not None and (note := tilt_note(detections.map_from_camera)):
         print(f'note: {note}', flush=True)
     queries = [PosedObservation(one.observation, one.map_from_camera,
@@ -172,10 +170,10 @@ def check(options: argparse.Namespace) -> int:
 def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Images | None] | None':
     """Return the recording of the command line or of the map, and its images where they are."""
     from cliploc_ros.offline.datasets.bag_frames import BagTopics
+    from cliploc_ros.offline.datasets.images import images_of_recording, open_images
     from cliploc_ros.offline.datasets.map_recording import load_recording
     from cliploc_ros.offline.datasets.observations import load_observations
     from cliploc_ros.offline.recording.recorder import source_of
-    from cliploc_ros.offline.studio.images import images_of_recording, open_images
 
     recording = load_recording(options.map) if options.observations is None else None
     if options.observations is not None:
@@ -205,12 +203,6 @@ def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Imag
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
     return detections, images
-
-
-def _image_of(detections: 'PosedDetections', images: 'Images', frame: int
-              ) -> 'NDArray[np.uint8] | None':
-    return images.near(float(detections.stamps_s[frame]), detections.name_of(frame),
-                       detections.camera_of(frame))
 
 
 if __name__ == '__main__':

@@ -20,7 +20,6 @@ from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-    from cliploc_ros.offline.studio.images import Images
     from cliploc_ros.offline.studio.live import LiveRelocalizer
     from cliploc_ros.offline.studio.phrases import PhraseFinder
     from cliploc_ros.offline.studio.recording import Recording
@@ -119,13 +118,17 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     """Return the studio that the command line asks for."""
     from cliploc_ros.offline.datasets.bag_frames import BagTopics
     from cliploc_ros.offline.datasets.folders import find_layout
+    from cliploc_ros.offline.datasets.images import (
+        images_of_recording,
+        open_images,
+        views_of_folder,
+    )
     from cliploc_ros.offline.datasets.map_recording import load_recording
     from cliploc_ros.offline.datasets.observations import load_observations
     from cliploc_ros.offline.studio.document import Document
-    from cliploc_ros.offline.studio.floor import read_occupancy_grid
-    from cliploc_ros.offline.studio.images import images_of_recording, open_images, views_of_folder
     from cliploc_ros.offline.studio.recording import Recording
     from cliploc_ros.offline.studio.studio import Studio
+    from cliploc_ros.offline.studio.walls import read_walls
 
     images = detections = None
     is_folder = options.images is not None and find_layout(options.images) is not None
@@ -146,15 +149,15 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
         images = images_of_recording(built_from, _cameras(options, detections))
     if detections is None and options.images is not None:
         detections = views_of_folder(options.images)
-    recording = None if detections is None else Recording(detections)
-    finder = _phrase_finder(options, recording, images)
+    recording = None if detections is None else Recording(detections, images)
+    finder = _phrase_finder(options, recording)
     # a new map gets the first name that no map has
     names = itertools.chain(['map.yaml'], (f'map-{number}.yaml' for number in itertools.count(2)))
     document = Document(options.map or next(
         path for path in map(Path, names) if not path.exists()))
     layer = read_layer(document.path, document.to_map(), None) if document.landmarks else None
-    grid = None if options.occupancy_grid is None else read_occupancy_grid(options.occupancy_grid)
-    return Studio(document, recording, images, finder, layer, grid)
+    walls = None if options.occupancy_grid is None else read_walls(options.occupancy_grid)
+    return Studio(document, recording, finder, layer, walls)
 
 
 def _cameras(options: argparse.Namespace, detections: 'PosedDetections | None') -> list[str]:
@@ -168,8 +171,8 @@ def _cameras(options: argparse.Namespace, detections: 'PosedDetections | None') 
     return list(dict.fromkeys(options.cameras))
 
 
-def _phrase_finder(options: argparse.Namespace, recording: 'Recording | None',
-                   images: 'Images | None') -> 'PhraseFinder | None':
+def _phrase_finder(options: argparse.Namespace, recording: 'Recording | None'
+                   ) -> 'PhraseFinder | None':
     from cliploc_ros.models.clip_weights import ClipOptions
     from cliploc_ros.offline.studio.phrases import PhraseFinder
     from cliploc_ros.offline.vocabulary.vocabulary import load_vocabulary
@@ -183,7 +186,7 @@ def _phrase_finder(options: argparse.Namespace, recording: 'Recording | None',
         return None
     clip = ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
                        device=options.device)
-    return PhraseFinder(clip, load_vocabulary(options.vocabulary), recording, images)
+    return PhraseFinder(clip, load_vocabulary(options.vocabulary), recording)
 
 
 if __name__ == '__main__':

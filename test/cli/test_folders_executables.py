@@ -14,7 +14,7 @@ from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.studio.images import open_images
+from cliploc_ros.offline.datasets.images import open_images
 
 pytestmark = [pytest.mark.full, pytest.mark.needs('pycolmap')]
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--device', 'cpu')

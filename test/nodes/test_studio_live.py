@@ -57,10 +57,10 @@ def test_a_relocalizer_of_another_name_is_told(own_relocalizer):
 
 def test_answers_one_request_at_a_time(live, own_relocalizer, tester):
     own_relocalizer()
-    wait_for(lambda: '12 landmarks' in live.state.map_text, 'diagnostics')
+    wait_for(lambda: '12 landmarks' in live.state.values.get('map', ''), 'diagnostics')
     assert live.state.is_heard and live.state.base_frame == ''
     with in_a_thread(live.relocalize) as outcome:
-        wait_for(lambda: live.state.is_busy, 'the request')
+        wait_for(lambda: live.is_busy, 'the request')
         with pytest.raises(LiveError, match='a request waits'):
             live.relocalize()
         tester.feed_until(lambda: outcome, make_frame(stamp_s=31.5))

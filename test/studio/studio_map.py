@@ -11,8 +11,8 @@ from browser import Person
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
+from cliploc_ros.offline.datasets.images import open_images, views_of_folder
 from cliploc_ros.offline.studio.document import Document
-from cliploc_ros.offline.studio.images import open_images, views_of_folder
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.studio import Studio
 
@@ -70,7 +70,7 @@ def demo_studio(path):
     """Return a studio of the demo's map, written to a path, with its walk: images and poses."""
     shutil.copy(ASSETS / 'map.yaml', path)
     folder = ASSETS / 'sequence'
-    return Studio(Document(path), Recording(views_of_folder(folder)), open_images(folder, None))
+    return Studio(Document(path), Recording(views_of_folder(folder), open_images(folder, None)))
 
 
 @contextmanager

@@ -32,8 +32,28 @@ def test_coverage_and_look_alikes(chromium, path):
             person.mode(mode)
             wait_for(lambda is_shown=is_shown: tiles.visible == is_shown, 'the tiles')
         with document.lock:
-            document.apply(edits.delete(document.landmarks, ['cup_0']))
+            document.edit(edits.delete, ['cup_0'])
         page.get_by_text('of the map before the last edits').wait_for()
         person.click('Coverage and look-alikes')
         page.get_by_text('(was 1)').wait_for()
         assert page.get_by_text('of the map before the last edits').count() == 0
+
+
+def test_layers_film_and_a_click_on_the_image(person, studio):
+    """The panel of the scene switches layers and plays views; a click takes the outline there."""
+    page, handles = person.page, studio.server.scene._handle_from_node_name
+    page.get_by_text('Layers and viewpoints').click()
+    page.get_by_label('Cameras').click()
+    wait_for(lambda: not handles['/cameras'].visible, 'hidden cameras')
+    page.get_by_label('Follow the view').click()
+    page.get_by_label('Follow the view').click()
+    wait_for(lambda: handles['/cameras'].visible, 'cameras after following')
+    person.click('Play the recording')
+    wait_for(lambda: studio.view >= 3, 'the film')
+    person.click('Stop')
+    person.show_view(studio, 3)
+    outline = studio.recording.outlines(studio.document.landmarks, 3)[0]
+    page.mouse.click(*person.on_image(outline.ellipse[:2]))
+    wait_for(lambda: studio.document.selection, 'the selection')
+    page.mouse.click(*person.on_image((2, 2)))
+    wait_for(lambda: not studio.document.selection, 'nothing there')

@@ -13,7 +13,7 @@ from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map,
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.views import camera_centers, make_views
 from cliploc_ros.offline.studio.edits import EditError
-from cliploc_ros.offline.studio.recording import fit_boxes
+from cliploc_ros.offline.studio.new_landmark import fit_boxes
 
 TRIALS_PER_LANDMARK = 6
 

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from studio_map import write_two_rooms
 
-from cliploc_ros.errors import MapError
+from cliploc_ros.errors import CliplocError
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
-from cliploc_ros.offline.studio.edits import EditError
-from cliploc_ros.offline.studio.places import PlacesSearch, find_places
+from cliploc_ros.offline.studio.places import find_places
 from cliploc_ros.offline.studio.studio import Studio
 
 
@@ -35,8 +34,8 @@ def test_an_edit_changes_the_figures_and_the_positions_stay(studio):
     assert len(before.look_alikes) == 1 and len(before.look_alikes[0].matched) == 5
     assert before.figures['pairs of places that look alike'] == '1'
     second_room = [key for key, one in document.landmarks.items() if one.center[0] > 3.5]
-    document.apply(edits.move(document.landmarks, second_room[1], [8.6, 1.3, 0.2]))
-    document.apply(edits.move(document.landmarks, second_room[2], [6.6, -0.3, 0.9]))
+    document.edit(edits.set_fields, [second_room[1]], center=[8.6, 1.3, 0.2])
+    document.edit(edits.set_fields, [second_room[2]], center=[6.6, -0.3, 0.9])
     after = find_places(document.landmarks, None, before, silent)
     assert not after.look_alikes
     assert np.array_equal(after.grid.positions, before.grid.positions)
@@ -54,33 +53,27 @@ def test_the_time_is_bounded(studio):
     assert any(line.startswith('time ran out') for line in places.lines(None))
 
 
-def test_a_search_runs_beside_edits_and_is_stopped(studio):
+def test_a_search_is_stopped_and_grows_old(studio):
     """The first share that is told comes from the search's thread; then it waits for the test."""
-    changed = threading.Event()
-    search = PlacesSearch(studio, changed.set)
-    search.start()
-    with pytest.raises(EditError, match='under way'):
-        search.start()
     document = studio.document
-    document.apply(edits.relabel(document.landmarks, ['cup_0'], 'a red cup'))
-    search.stop()
-    assert not search.is_running
-    assert search.last is None and search.failure == 'stopped'
-    search.start()
-    search._thread.join()
-    assert search.failure == '' and not search.is_stale()
-    document.apply(edits.delete(document.landmarks, ['cup_0']))
-    assert search.is_stale()
+
+    def search():
+        with pytest.raises(CliplocError, match='stopped'):
+            studio.search_places()
+
+    thread = threading.Thread(target=search)
+    studio.changed.clear()
+    thread.start()
+    studio.changed.wait()
+    document.edit(edits.set_fields, ['cup_0'], label='a red cup')
+    studio.stop_search()
+    thread.join()
+    assert studio.places is None
+    studio.search_places()
+    assert not studio.is_stale and studio.share == 1.0
+    document.edit(edits.delete, ['cup_0'])
+    assert studio.is_stale
     document.undo()
-    assert not search.is_stale(), 'the map is as it was'
-    document.apply(edits.mark(document.landmarks, ['cup_0'], 'lock', is_locked=True))
-    assert not search.is_stale(), 'a lock changes nothing'
-
-
-def test_without_landmarks(tmp_path):
-    studio = Studio(Document(tmp_path / 'none.yaml'))
-    with pytest.raises(EditError, match='empty'):
-        PlacesSearch(studio, lambda: None).start()
-    with pytest.raises(MapError):
-        find_places({}, None, None, silent)
-    studio.document.close()
+    assert not studio.is_stale, 'the map is as it was'
+    document.edit(edits.mark, ['cup_0'], 'lock', is_locked=True)
+    assert not studio.is_stale, 'a lock changes nothing'

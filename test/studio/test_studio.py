@@ -14,9 +14,7 @@ from studio_map import demo_studio, open_page
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
-from cliploc_ros.offline.studio.images import landmark_at
 from cliploc_ros.offline.studio.recording import Recording
-from cliploc_ros.offline.studio.sightings import find_sightings
 from cliploc_ros.offline.studio.studio import Studio
 
 
@@ -39,36 +37,31 @@ def office(tmp_path, shared_data):
     studio.document.close()
 
 
-def test_a_pixel_of_the_image_selects_its_landmark(studio):
-    studio.show_view(3)
-    outlines = studio.outlines()
-    assert outlines and studio.image(3).shape == (480, 640, 3) and studio.image(-1) is None
-    one = outlines[0]
-    assert landmark_at([one], one.ellipse[:2]) == one.landmark_id
-    assert landmark_at([one], one.ellipse[:2] + 1.1 * np.sqrt(one.ellipse[[2, 4]])) is None
-    studio.select_at(one.ellipse[:2])
-    assert studio.document.selection
-    studio.select_at((-50.0, -50.0))
-    assert not studio.document.selection
+def test_outlines_lie_in_the_image(studio):
+    recording = studio.recording
+    outlines = recording.outlines(studio.document.landmarks, 3)
+    assert recording.image(3).shape == (480, 640, 3) and recording.image(-1) is None
+    assert [one.distance_m for one in outlines] == sorted(one.distance_m for one in outlines)
+    assert all((one.bbox_xyxy[:2] < (640, 480)).all() and (one.bbox_xyxy[2:] > 0).all()
+               for one in outlines)
 
 
 def test_sightings_are_sharp_whole_and_from_several_sides(studio):
     """A view that a blur makes useless does not come first."""
-    landmarks, recording = studio.document.landmarks, studio.recording
-    first = find_sightings(recording, studio.images, landmarks, 'mug_1')
+    document, recording = studio.document, studio.recording
+    first = recording.sightings(document.landmarks, 'mug_1')
     assert all(one.is_whole and not one.is_detected for one in first)
-    best = first[0].view
+    best, images = first[0].view, recording.images
 
     class Blurred:
-        def near(self, stamp_s, *camera):
-            image = studio.images.near(stamp_s, *camera)
-            is_best = stamp_s == recording.detections.stamps_s[best]
-            return cv2.GaussianBlur(image, (0, 0), 8.0) if is_best else image
+        def of(self, detections, view):
+            image = images.of(detections, view)
+            return cv2.GaussianBlur(image, (0, 0), 8.0) if view == best else image
 
-    assert find_sightings(recording, Blurred(), landmarks, 'mug_1')[0].view != best
-    document = studio.document
-    document.apply(edits.move(landmarks, 'mug_1', [0.0, 0.0, 90.0]))
-    assert find_sightings(recording, studio.images, document.landmarks, 'mug_1') == []
+    recording.images = Blurred()
+    assert recording.sightings(document.landmarks, 'mug_1')[0].view != best
+    document.edit(edits.set_fields, ['mug_1'], center=[0.0, 0.0, 90.0])
+    assert recording.sightings(document.landmarks, 'mug_1') == []
 
 
 def test_moved_landmarks_come_back_by_refitting(office):
@@ -76,10 +69,10 @@ def test_moved_landmarks_come_back_by_refitting(office):
     office.refit_all()
     fitted = document.landmarks
     moved = [key for key in ('tv_1', 'keyboard_1', 'book_3') if key in fitted]
-    document.apply(edits.mark(fitted, ['book_1'], 'lock', is_locked=True))
+    document.edit(edits.mark, ['book_1'], 'lock', is_locked=True)
     for key in moved:
         one = document.landmarks[key]
-        document.apply(edits.move(document.landmarks, key, one.center + 0.3 * one.semi_axes))
+        document.edit(edits.set_fields, [key], center=one.center + 0.3 * one.semi_axes)
     document.select(moved)
     office.refit()
     for key in moved:
@@ -93,12 +86,11 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
     """A moved landmark is fixed, a duplicate merged; each decision leads to the next one."""
     document, review = office.document, office.review
     twin, moved = (document.landmarks[key] for key in ('book_2', 'tv_1'))
-    document.apply(edits.create(document.landmarks, 'a twin', 'book', twin.center + 0.01,
-                                twin.basis))
-    document.apply(edits.move(document.landmarks, 'tv_1',
-                              moved.center + 0.4 * moved.semi_axes.max()))
+    document.edit(edits.create, 'a twin', 'book', twin.center + 0.01, twin.basis)
+    document.edit(edits.set_fields, ['tv_1'],
+                  center=moved.center + 0.4 * moved.semi_axes.max())
     assert 'serious' in review.check()
-    severities = [row.severity for row in office.rows()]
+    severities = [review.severity(key) for key in review.order]
     assert severities == sorted(severities, reverse=True) and severities[0] > 1.0
     total = len(document.landmarks)
     document.select(['tv_1'])
@@ -117,17 +109,19 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
 def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
     document = office.document
     before = office.relocalize_all()
-    accepted = sum(one.verdict == 'accepted' for one in office.answers)
+    accepted = sum(one.verdict == 'accepted' for one in office.answers.values())
     assert 'simulated' in before and '(was' not in before and accepted > 10
-    accepted_view = next(one.view for one in office.answers if one.verdict == 'accepted')
+    accepted_view = next(view for view, one in office.answers.items()
+                         if one.verdict == 'accepted')
     office.show_view(accepted_view)
     assert f'view {accepted_view}: accepted' in office.relocalize_here()
-    assert len(office.answers) == 1 and office.answers[0].error_m < 1.0
+    (answer,) = office.answers.values()
+    assert answer.error_m < 1.0
     document.select(list(document.landmarks)[::2])
     office.delete()
     after = office.relocalize_all()
     assert f'(was {accepted})' in after
-    assert sum(one.verdict == 'accepted' for one in office.answers) < accepted
+    assert sum(one.verdict == 'accepted' for one in office.answers.values()) < accepted
     print(f'as given: {before}; every other landmark deleted: {after}')
 
 

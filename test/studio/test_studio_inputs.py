@@ -13,7 +13,7 @@ from cliploc_ros.core.keyframes.layer import layer_path, save_layer
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bag_frames import BagTopics
 from cliploc_ros.offline.datasets.bags import BagWriter
-from cliploc_ros.offline.studio.images import open_images
+from cliploc_ros.offline.datasets.images import open_images
 
 BAG_CAMERA = Camera(64, 48, 53.0, 53.0, 32.0, 24.0)
 START_NS = 1_700_000_000_000_000_000

@@ -28,15 +28,15 @@ from pathlib import Path
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 document = Document(Path(sys.argv[1]))
-document.apply(edits.mark(document.landmarks, ['book_1'], 'lock', is_locked=True))
-document.apply(edits.delete(document.landmarks, ['plant_1']))
+document.edit(edits.mark, ['book_1'], 'lock', is_locked=True)
+document.edit(edits.delete, ['plant_1'])
 document.save()
-document.apply(edits.relabel(document.landmarks, ['cup_1'], 'undone'))
+document.edit(edits.set_fields, ['cup_1'], label='undone')
 document.undo()
 x = 0
 while True:
     x += 1
-    document.apply(edits.move(document.landmarks, 'cup_1', [x, 0, 0]), gesture='drag')
+    document.edit(edits.set_fields, ['cup_1'], center=[x, 0, 0], gesture='drag')
     print(x, flush=True)
 """
 
@@ -66,7 +66,7 @@ def journal_of(path):
 def test_replay_between_announcing_and_writing(path):
     """A studio that was killed while it saved: either content has the right edits."""
     document = Document(path)
-    document.apply(edits.relabel(document.landmarks, ['cup_1'], 'first'))
+    document.edit(edits.set_fields, ['cup_1'], label='first')
     document._journal.append({'writing': document._file.with_landmarks(
         document.landmarks).digest})
     written = document._file.with_landmarks(document.landmarks).text
@@ -81,7 +81,7 @@ def test_replay_between_announcing_and_writing(path):
 
 def test_edits_of_another_content_are_set_aside(path):
     document = Document(path)
-    document.apply(edits.relabel(document.landmarks, ['cup_1'], 'mine'))
+    document.edit(edits.set_fields, ['cup_1'], label='mine')
     document.close()
     path.write_text(TEXT.replace('a red cup', 'theirs'))
     document = Document(path)
@@ -97,12 +97,12 @@ def test_edits_of_another_content_are_set_aside(path):
                                   b'"after": {"a": {"fields": {"label": NaN}, "locked": 1}}}\n'])
 def test_a_broken_journal_loses_its_end_only(path, tail):
     document = Document(path)
-    document.apply(edits.relabel(document.landmarks, ['cup_1'], 'mine'))
+    document.edit(edits.set_fields, ['cup_1'], label='mine')
     document.close()
     with journal_of(path).open('ab') as file:
         file.write(tail)
     document = Document(path)
     assert document.landmarks['cup_1'].label == 'mine'
-    document.apply(edits.relabel(document.landmarks, ['cup_1'], 'mine, too'))
+    document.edit(edits.set_fields, ['cup_1'], label='mine, too')
     document.close()
     assert Document(path).landmarks['cup_1'].label == 'mine, too'

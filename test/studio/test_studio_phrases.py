@@ -13,10 +13,10 @@ from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_landmark_embeddings
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.offline.datasets.images import open_images, views_of_folder
 from cliploc_ros.offline.datasets.observations import save_observations
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.studio import edits
-from cliploc_ros.offline.studio.images import open_images, views_of_folder
 from demo.truth import read_frames
 
 WALK = ASSETS / 'mapping'
@@ -33,10 +33,10 @@ def wait_for_phrases(studio):
     """Return what is offered in the end, and the notes until then."""
     deadline, notes = time.monotonic() + PATIENCE_S, set()
     while True:
-        found = studio.phrases()
-        notes.add(studio.phrase_note)
-        if studio.finder._answers:
-            return studio.phrases(), notes
+        found, note = studio.phrases('bowl_1')
+        if 'CLIP looks' not in note:
+            return found, notes
+        notes.add(note)
         assert time.monotonic() < deadline, f'no answer to {found}'
         time.sleep(0.02)
 
@@ -52,16 +52,16 @@ def path(tmp_path, monkeypatch):
 def test_clip_offers_phrases_for_what_the_images_show(path):
     studio = opened(path, '--images', WALK, *CLIP)
     truth = studio.document.landmarks['bowl_1'].label
-    studio.document.apply(edits.relabel(studio.document.landmarks, ['bowl_1'], 'something'))
+    studio.document.edit(edits.set_fields, ['bowl_1'], label='something')
     studio.document.select(['bowl_1'])
-    assert studio.phrases()[0] != truth, "the class's labels as long as CLIP loads"
+    assert studio.phrases('bowl_1').phrases[0] != truth, "the class's labels as long as CLIP loads"
     found, notes = wait_for_phrases(studio)
     print(f'{truth}: {found}')
     assert len(found) == 5 and truth in found
-    assert any('CLIP looks' in note for note in notes) and studio.phrase_note == ''
-    studio.document.apply(edits.move(studio.document.landmarks, 'bowl_1', [1, 1, 1]))
-    assert studio.phrases() == found, 'a drag asks nothing'
-    studio.finder.close()
+    assert len(notes) == 1 and studio.phrases('bowl_1').note == ''
+    studio.document.edit(edits.set_fields, ['bowl_1'], center=[1, 1, 1])
+    assert studio.phrases('bowl_1').phrases == found, 'a drag asks nothing'
+    studio.stop()
     studio.document.close()
 
 
@@ -91,7 +91,7 @@ def test_a_new_landmark_has_the_mean_of_its_boxes(path, tmp_path):
     studio = opened(new, '--observations', file, *CLIP)
     for view in np.flatnonzero(np.diff(studio.recording.detections.frame_offsets)):
         studio.show_view(view)
-        box = studio.recording.boxes_in_view(view)[0]
+        box = studio.recording.detections.detections_of(view).bboxes_xyxy[0]
         studio.new.draw(view, box[:2], box[2:])
     assert studio.new.class_id == 'bowl', 'of the box that the detector has there'
     studio.new.create('something', 'bowl')
@@ -102,5 +102,5 @@ def test_a_new_landmark_has_the_mean_of_its_boxes(path, tmp_path):
     assert stored.landmark_ids == ('bowl_1',) and 1 <= len(stored.medoids) <= 5
     mean = embeddings.astype(float).mean(axis=0)
     assert stored.means[0] @ mean / np.linalg.norm(mean) > 0.99
-    studio.finder.close()
+    studio.stop()
     studio.document.close()

@@ -14,11 +14,12 @@ from studio_map import demo_studio
 from cliploc_ros.core.depth_image import DepthImage
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.studio import viewpoint
-from cliploc_ros.offline.studio.context import draw_walls, find_cloud
-from cliploc_ros.offline.studio.floor import OCCUPIED, UNKNOWN, OccupancyGrid
-from cliploc_ros.offline.studio.images import Images
+from cliploc_ros.offline.studio.cloud import find_cloud
+from cliploc_ros.offline.studio.recording import Recording
+from cliploc_ros.offline.studio.walls import OCCUPIED, UNKNOWN, Walls, draw_walls
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
 UPRIGHT = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # looks along x
@@ -48,21 +49,20 @@ def test_depth_becomes_a_cloud_below_the_ceiling():
     poses = make_transform(UPRIGHT, np.array([3.0, 0.0, 1.0]))[None]
     views = PosedDetections((CAMERA,), poses, np.zeros(1), np.zeros(2, dtype=np.int64),
                             np.empty((0, 4)), (), np.empty(0, dtype=np.int64), np.empty(0))
-    extent = viewpoint.extent_of(np.array([[4.0, 0.0, 0.5]]), poses)
-    points, colors, _ = find_cloud(views, images, None, extent)
+    extent = viewpoint.extent_of([np.array([4.0, 0.0, 0.5])], poses)
+    points, colors, _ = find_cloud(Recording(views, images), None, extent)
     assert len(points) > 50 and np.allclose(points[:, 0], 5.0, atol=1e-5)
     assert 1.0 < points[:, 2].max() < 1.3 < 1.8, 'no camera or landmark is higher than 1 m'
     is_red = colors[:, 0].astype(int) > colors[:, 1].astype(int)
     assert (points[is_red, 1] > -0.02).all() and (points[~is_red, 1] < 0.02).all()
-    assert find_cloud(views, None, None, extent) is None
+    assert find_cloud(Recording(views), None, extent) is None
 
 
 @pytest.mark.parametrize('yaw', (0.0, 0.4))
 def test_walls_lie_where_the_grid_has_them(server, yaw):
-    cells = np.full((30, 40), UNKNOWN, dtype=np.int8)
-    cells[4, 33] = cells[20, 7] = OCCUPIED
-    grid = OccupancyGrid(cells, 0.1, (-1.0, 2.0, yaw))
-    handle = draw_walls(server.scene, grid)
+    cells = np.full((30, 40), UNKNOWN, dtype=np.uint8)
+    cells[29 - 4, 33] = cells[29 - 20, 7] = OCCUPIED
+    (handle,) = draw_walls(server.scene, Walls(cells, 0.1, (-1.0, 2.0, yaw)))
     rows, columns = np.nonzero(handle.image[..., 3])
     height, width = handle.image.shape[:2]
     across = np.column_stack([((columns + 0.5) / width - 0.5) * handle.render_width,

@@ -238,13 +238,8 @@ class LandmarkMap:
         if (written := parse_written_map(text)) is not None and _is_valid(written):
             return LandmarkMap(*written._replace(quats_xyzw=_unit(written.quats_xyzw)))
         tree = parse_parameters(text, path)
-        found = [node['ros__parameters']['map'] for node in tree.values()
-                 if isinstance(node, dict) and isinstance(node.get('ros__parameters'), dict)
-                 and 'map' in node['ros__parameters']]
-        if len(found) != 1:
-            raise MapError(f"{path}: {'no' if not found else 'more than one'} map: expected one "
-                           "'map' under '/**: ros__parameters:'")
-        return LandmarkMap.from_mapping(found[0], str(path))
+        found = tree[find_map_node(tree, path)]['ros__parameters']['map']
+        return LandmarkMap.from_mapping(found, str(path))
 
     @staticmethod
     def from_mapping(tree: Any, source: str) -> 'LandmarkMap':
@@ -266,6 +261,17 @@ class LandmarkMap:
         return LandmarkMap(frame_id, tuple(map(str, landmarks)), labels, class_ids,
                            np.array(centers), np.array(semi_axes), _unit(np.array(quats)),
                            details if any(one != LandmarkDetails() for one in details) else ())
+
+
+def find_map_node(tree: Mapping[str, Any], path: str | os.PathLike[str]) -> str:
+    """Return the key of a parameter file whose parameters hold the map; MapError: not one does."""
+    found = [name for name, node in tree.items()
+             if isinstance(node, dict) and isinstance(node.get('ros__parameters'), dict)
+             and 'map' in node['ros__parameters']]
+    if len(found) != 1:
+        raise MapError(f"{path}: {'no' if not found else 'more than one'} map: expected one "
+                       "'map' under '/**: ros__parameters:'")
+    return found[0]
 
 
 def _unit(quats_xyzw: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,27 +7,27 @@ once holds it, too.
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
-from threading import RLock
+from threading import Event, RLock
 from typing import Any
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError, DatasetError, MapError
 from cliploc_ros.files.log import Log
-from cliploc_ros.offline.studio.edits import Change, EditError, Landmarks, change_from_json
+from cliploc_ros.offline.studio.edits import Change, EditError, change_from_json
 from cliploc_ros.offline.studio.landmark import (
     KNOWN_FIELDS,
     Encoded,
     Landmark,
+    Landmarks,
     Marks,
-    look_from_json,
+    fields_of,
     map_of,
 )
 from cliploc_ros.offline.studio.map_file import (
     NO_FILE,
-    ChangedOnDiskError,
     LookFile,
     read_look_file,
     read_map_file,
@@ -43,20 +43,24 @@ class Document:
     ----------
     landmarks : mapping of str to Landmark
         By id. An edit makes a new mapping and leaves this one alone.
-    revision : int
-        Counts the changes of map, selection and file.
+    changed : Event
+        Set after each change of map, selection or file.
     notes : tuple of str
         What a person should know of the files.
 
     CliplocError: the file is no map, another studio edits it, or its folder is not writable.
     """
 
+    ACTIONS = ('save', 'overwrite', 'reload', 'undo', 'redo')
+
     def __init__(self, path: Path):
         self.lock = RLock()
-        self.revision = 0
+        self.changed = Event()
         self.notes: tuple[str, ...] = ()
+        #: The digest of a foreign content, of which a person has to decide
+        self.foreign = ''
+        self._accepted = ''
         self.selection: tuple[str, ...] = ()
-        self._listeners: list[Callable[[], None]] = []
         self._done: list[Change] = []
         self._undone: list[Change] = []
         self._gesture: object = None
@@ -67,7 +71,8 @@ class Document:
         # Edits that the file does not hold yet. Before the map is written, the journal gets the
         # digest of its next content: replay starts at the right edit with either content.
         self._journal = Log(self.path.with_name(f'.{self.path.name}.studio'), DatasetError,
-                            "make room, and the map's folder writable", _parse_entry)
+                            "make room, and the map's folder writable",
+                            lambda line: dict(json.loads(line)))
         try:
             entries, is_damaged = self._journal.read()
             if is_damaged:
@@ -109,6 +114,18 @@ class Document:
                 return None
             return self.selection[0], self.landmarks[self.selection[0]]
 
+    def chosen(self) -> tuple[str, ...]:
+        """Return the selection; EditError: it is empty."""
+        if not self.selection:
+            raise EditError('select a landmark first')
+        return self.selection
+
+    def only_chosen(self) -> tuple[str, Landmark]:
+        """Return id and landmark of a selection of exactly one; EditError: it has others."""
+        if (selected := self.selected) is None:
+            raise EditError('select exactly one landmark first')
+        return selected
+
     @property
     def is_saved(self) -> bool:
         """Whether the file holds all edits."""
@@ -138,8 +155,7 @@ class Document:
     def apply(self, change: Change, gesture: object = None) -> None:
         """Make a change; successive ones of one gesture, as of a drag, are undone together.
 
-        CliplocError: the landmarks are not those the change starts from, or the journal cannot be
-        written.
+        CliplocError: the journal cannot be written.
         """
         with self.lock:
             if not change.after:
@@ -148,77 +164,63 @@ class Document:
             self._do('join' if joins else 'edit', change)
             self._gesture = gesture
 
-    def undo(self) -> bool:
-        """Undo the last edit; return whether there was one."""
+    def edit(self, edit: Callable[..., Change], *arguments: Any, gesture: object = None,
+             **values: Any) -> Change:
+        """Make an edit of the landmarks as they are, and return it; errors as of both."""
         with self.lock:
-            if self._done:
-                self._do('undo', self._done[-1].reversed())
-                return True
-            return False
+            change = edit(self.landmarks, *arguments, **values)
+            self.apply(change, gesture)
+            return change
 
-    def redo(self) -> bool:
-        """Do again the edit that was undone last; return whether there was one."""
+    def undo(self) -> str | None:
+        """Undo the last edit; return which it was, None for none."""
         with self.lock:
-            if self._undone:
-                self._do('redo', self._undone[-1])
-                return True
-            return False
+            if not self._done:
+                return None
+            self._do('undo', self._done[-1])
+            return f'undid: {self.to_redo}'
+
+    def redo(self) -> str | None:
+        """Do again the edit that was undone last; return which it was, None for none."""
+        with self.lock:
+            if not self._undone:
+                return None
+            self._do('redo', self._undone[-1])
+            return f'did again: {self.to_undo}'
 
     def select(self, landmark_ids: Iterable[str]) -> None:
         """Select landmarks; unknown ids are left out."""
         with self.lock:
             self.selection = tuple(dict.fromkeys(
                 key for key in landmark_ids if key in self.landmarks))
-            self._tell()
-
-    def subscribe(self, listener: Callable[[], None]) -> None:
-        """Call a function after each change of map, selection or file, with the lock held."""
-        self._listeners.append(listener)
-
-    def _tell(self) -> None:
-        self.revision += 1
-        for listener in self._listeners:
-            listener()
+            self.changed.set()
 
     def _do(self, kind: str, change: Change) -> None:
-        landmarks = change.apply(self.landmarks)
-        for one in change.after.values():
-            if one is not None and one.look is not None and one.look.key not in self._kept_looks:
-                self._journal.append(one.look.to_json())
-                self._kept_looks.add(one.look.key)
-        self._journal.append({'do': kind, **change.to_json()})
-        self._take(kind, change, landmarks)
-        self._tell()
+        self._journal.append({'do': kind, **change.to_json(self.landmarks)})
+        self._take(kind, change)
+        self.changed.set()
 
-    def _take(self, kind: str, change: Change, landmarks: Landmarks) -> None:
-        """Take over a change that was applied, and write history."""
-        self.landmarks = landmarks
+    def _take(self, kind: str, change: Change) -> None:
+        """Make a change, and write history."""
+        back, self.landmarks = change.undoing(self.landmarks), change.apply(self.landmarks)
         self._gesture = None
-        if kind == 'join' and self._done:
-            self._done[-1] = self._done[-1].then(change)
-        elif kind == 'undo':
-            self._undone.append(change.reversed())
+        if kind == 'undo':
+            self._undone.append(back)
             del self._done[-1:]
         else:
-            self._done.append(change)
-            del self._done[:-_MAX_HISTORY]
-            if kind == 'redo':
-                del self._undone[-1:]
-        if kind in ('edit', 'join'):
-            self._undone.clear()
-        self.selection = tuple(key for key in self.selection if key in landmarks)
+            if kind == 'join' and self._done:
+                back = back._replace(after={**back.after, **self._done.pop().after})
+            self._done = [*self._done[1 - _MAX_HISTORY:], back]
+            self._undone = self._undone[:-1] if kind == 'redo' else []
+        self.selection = tuple(key for key in self.selection if key in self.landmarks)
 
     # ---- the files ------------------------------------------------------------------------------
 
-    def save(self, over: str = NO_FILE) -> None:
-        """Write the map file in one step, over a foreign content only if ``over`` is its digest.
+    def save(self) -> str:
+        """Write the map file in one step, and what it did; not over a foreign content.
 
-        Raises
-        ------
-        ChangedOnDiskError
-            Another program changed the file.
-        CliplocError
-            The map is empty, or a file cannot be written; that one is as it was.
+        CliplocError: another program changed the file, the map is empty, or a file cannot be
+        written; that one is as it was.
         """
         with self.lock:
             if not self.landmarks:
@@ -226,19 +228,33 @@ class Document:
                                 'or delete the file')
             self.to_map()
             found = self._file.digest_on_disk()
-            if found not in (NO_FILE, self._file.digest, over):
-                raise ChangedOnDiskError(self.path, found)
+            if found not in (NO_FILE, self._file.digest, self._accepted):
+                self.foreign = found
+                raise MapError(f'{self.path}: another program changed this file after the studio '
+                               'read it; overwrite it, or reload it')
             file = self._file.with_landmarks(self.landmarks)
-            self._journal.append({'writing': file.digest, 'looks': self._changed_looks()})
+            looks = self._look_file.looks
+            self._journal.append({'writing': file.digest, 'looks': {
+                key: look.to_json() for key, look in looks.items()
+                if key not in self.landmarks or self.landmarks[key].look is not look}})
+            # the map comes last: once it has its new content, nothing is left to do
+            self._look_file, fault = self._look_file.write(self.landmarks)
+            self.notes += (fault,) if fault and fault not in self.notes else ()
             file.write()
             self._file = file
-            self._write_looks()
             self._saved = self.landmarks
             self._gesture = None
-            self._restart_journal()
-            self._tell()
+            self.foreign = self._accepted = ''
+            self._journal.restart([self._header()])
+            self.changed.set()
+            return f'saved {self.path.name}'
 
-    def reload(self) -> None:
+    def overwrite(self) -> str:
+        """Save the map over the foreign content that saving found."""
+        self._accepted = self.foreign
+        return self.save()
+
+    def reload(self) -> str:
         """Take the map from the file; this is an edit that undo takes back.
 
         CliplocError: the file is no map.
@@ -249,13 +265,13 @@ class Document:
             before = self.landmarks
             found = {key: replace(one, marks=before[key].marks if key in before else Marks())
                      for key, one in self._landmarks_of_file().items()}
-            after = {**dict.fromkeys(before), **found}
-            self._take('edit', Change('reload the file', {key: before.get(key) for key in after},
-                                      after), found)
+            self._take('edit', Change('reload the file', {**dict.fromkeys(before), **found}))
             self._saved = found
-            self._restart_journal()
+            self.foreign = ''
+            self._journal.restart([self._header()])
             self._note_unknown_fields()
-            self._tell()
+            self.changed.set()
+            return f'reloaded {self.path.name}; undo takes it back'
 
     def close(self) -> None:
         """Release the journal, which stays if it holds edits or marks."""
@@ -277,25 +293,9 @@ class Document:
     def _read_looks(self) -> LookFile:
         found, fault = read_look_file(self.path)
         self.notes += (fault,) if fault else ()
-        self._kept_looks = {look.key for look in found.looks.values()}
         return found
 
-    def _write_looks(self) -> None:
-        self._look_file, fault = self._look_file.write(self.landmarks)
-        self.notes += (fault,) if fault and fault not in self.notes else ()
-
-    def _changed_looks(self) -> dict[str, str]:
-        """Return the keys of looks that the file holds otherwise, '' for none."""
-        old, new = ({key: '' if one.look is None else one.look.key
-                     for key, one in landmarks.items()}
-                    for landmarks in (self._landmarks_of_file(), self.landmarks))
-        return {key: look for key, look in new.items() if look != old.get(key, '')}
-
     # ---- the journal ----------------------------------------------------------------------------
-
-    def _restart_journal(self) -> None:
-        self._kept_looks = {look.key for look in self._look_file.looks.values()}
-        self._journal.restart([self._header()])
 
     def _header(self) -> dict[str, Any]:
         return {'base': self._file.digest, 'marks': self._marks()}
@@ -309,70 +309,40 @@ class Document:
         digest = self._file.digest
         starts = [row for row, entry in enumerate(entries)
                   if digest in (entry.get('base'), entry.get('writing'))]
-        edits = [entry for entry in entries if 'do' in entry]
-        if not starts:
-            if edits:
-                aside = self._journal.set_aside()
-                self.notes += (f'{len(edits)} edits of an earlier session do not fit the file, '
-                               f'which another program changed; they lie in {aside.name}',)
-            self._journal.restart([self._header()])
-            return
-        kept = [*self._look_file.looks.values(), *map(look_from_json, entries)]
-        looks = {look.key: look for look in kept if look is not None}
-        self._kept_looks = set(looks)
-        start = starts[-1]
-        self._restore_start(entries[:start + 1], looks)
+        start = starts[-1] if starts else -1
         edits = [entry for entry in entries[start + 1:] if 'do' in entry]
-        count = 0
+        header, done = self._header(), list[dict[str, Any]]()
         try:
+            if edits and not starts:
+                raise EditError('they do not fit the file, which another program changed')
+            self._restore(entries[:start + 1], entries[-1:])
+            header = self._header()
             for entry in edits:
-                change = change_from_json(entry, looks)
-                self._take(str(entry['do']), change, change.apply(self.landmarks))
-                count += 1
-        except (ValueError, CliplocError) as error:
+                self._take(str(entry['do']), change_from_json(entry, self.landmarks))
+                done.append(entry)
+        except (LookupError, TypeError, AttributeError, ValueError, CliplocError) as error:
             aside = self._journal.set_aside()
-            in_file = {look.key for look in self._look_file.looks.values()}
-            self._journal.restart([
-                self._header(), *(look.to_json() for key, look in looks.items()
-                                  if key not in in_file), *edits[:count]])
-            self.notes += (f'the last {len(edits) - count} edits of an earlier session cannot be '
-                           f'restored ({error}); they lie in {aside.name}',)
-        if count and not self.is_saved:
-            self.notes += (f'restored {count} edits that were not saved; undo takes them back',)
+            self.notes += (f'the last {len(edits) - len(done)} edits of an earlier session cannot '
+                           f'be restored ({error}); they lie in {aside.name}',)
+            self._journal.restart([header, *done])
+        if not starts:
+            self._journal.restart([header])
+        if done and not self.is_saved:
+            self.notes += (f'restored {len(done)} edits that were not saved; undo takes them '
+                           'back',)
 
-    def _restore_start(self, entries: list[dict[str, Any]], looks: Mapping[str, Encoded]) -> None:
-        """Restore the state that belongs to the file's content: its marks and looks.
+    def _restore(self, entries: list[dict[str, Any]], last: list[dict[str, Any]]) -> None:
+        """Restore the marks and looks that belong to the file's content.
 
-        Marks before a content that was written come from the header and the edits up to it. A
-        save that ended between the map and its image embeddings is finished.
+        Marks come from the header and, where a content was written since, the edits before it.
+        Looks that a save replaced before it was cut off come from the last entry.
         """
         marks: dict[str, Any] = {}
         for entry in entries:
-            if isinstance(kept := entry.get('marks'), dict):
-                marks |= kept
-            if isinstance(after := entry.get('after'), dict):
-                marks |= {key: one.get('marks') for key, one in after.items()
-                          if isinstance(one, dict)}
-        keys = entries[-1].get('looks')
-        keys = keys if isinstance(keys, dict) else {}
+            marks |= entry.get('marks', {})
+            marks |= {key: one['marks'] for key, one in entry.get('after', {}).items() if one}
+        looks = {} if last == entries[-1:] else last[0].get('looks', {})
         self.landmarks = self._saved = {
-            key: replace(one, marks=Marks.from_json(marks.get(key)),
-                         look=looks.get(str(keys[key])) if key in keys else one.look)
+            key: replace(one, marks=Marks(**marks.get(key, {})),
+                         look=Encoded.from_json(looks[key]) if key in looks else one.look)
             for key, one in self.landmarks.items()}
-        if keys:
-            try:
-                self._write_looks()
-            except MapError as error:
-                self.notes += (str(error),)
-
-
-def fields_of(landmarks: Landmarks) -> dict[str, Mapping[str, Any]]:
-    """Return the fields of landmarks, which tell whether a map was edited; locks do not."""
-    return {key: one.fields for key, one in landmarks.items()}
-
-
-def _parse_entry(line: bytes) -> dict[str, Any]:
-    entry = json.loads(line)
-    if not isinstance(entry, dict):
-        raise ValueError('an entry is a mapping')
-    return entry

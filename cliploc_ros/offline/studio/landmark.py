@@ -10,7 +10,6 @@ landmark through merge, split, delete, undo and redo.
 """
 
 import base64
-import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -24,6 +23,7 @@ from cliploc_ros.core.map.landmark_details import OPTIONAL_FIELDS, LandmarkDetai
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping.labelling import choose_medoids
+from cliploc_ros.offline.mapping.landmarks import ellipsoid_numbers
 
 KNOWN_FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation', *OPTIONAL_FIELDS)
 #: Edited numbers are rounded to these, so that the file holds exactly what the studio shows.
@@ -41,28 +41,18 @@ class Encoded:
     medoids: NDArray[np.float16]
     encoder_key: str
 
-    @cached_property
-    def key(self) -> str:
-        """The digest that tells one look from another."""
-        content = self.encoder_key.encode() + self.mean.tobytes() + self.medoids.tobytes()
-        return hashlib.sha256(content).hexdigest()[:24]
-
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, str]:
         """Return the look as JSON holds it."""
-        return {'look': self.key, 'encoder': self.encoder_key,
+        return {'encoder': self.encoder_key,
                 'mean': base64.b64encode(self.mean.tobytes()).decode(),
                 'medoids': base64.b64encode(self.medoids.tobytes()).decode()}
 
-
-def look_from_json(tree: Mapping[str, Any]) -> Encoded | None:
-    """Return a look from JSON; None where it is damaged."""
-    try:
+    @classmethod
+    def from_json(cls, tree: Mapping[str, str]) -> 'Encoded':
+        """Return a look from JSON; LookupError, TypeError or ValueError: it is damaged."""
         mean, medoids = (np.frombuffer(base64.b64decode(tree[name], validate=True), np.float16)
                          for name in ('mean', 'medoids'))
-        look = Encoded(mean, medoids.reshape(-1, len(mean)), str(tree['encoder']))
-    except (KeyError, TypeError, ValueError):
-        return None
-    return look if look.key == tree.get('look') else None
+        return cls(mean, medoids.reshape(-1, len(mean)), tree['encoder'])
 
 
 def merge_looks(looks: Sequence[Encoded | None], weights: Sequence[float]) -> Encoded | None:
@@ -74,20 +64,16 @@ def merge_looks(looks: Sequence[Encoded | None], weights: Sequence[float]) -> En
     known = [(look, weight) for look, weight in zip(looks, weights, strict=True)
              if look is not None]
     known = [(look, weight) for look, weight in known
-             if (look.encoder_key, len(look.mean)) == (known[0][0].encoder_key,
-                                                       len(known[0][0].mean))]
+             if look.encoder_key == known[0][0].encoder_key]
     if len(known) < 2:
         return known[0][0] if known else None
     mean = np.sum([weight * look.mean.astype(np.float32) for look, weight in known], axis=0)
-    length = float(np.linalg.norm(mean))
-    if not length > 0.0:
-        return None
     crops = np.concatenate([look.medoids for look, _ in known]).astype(np.float32)
     shares = np.concatenate([np.full(len(look.medoids), weight / max(1, len(look.medoids)))
                              for look, weight in known])
-    return Encoded(
-        (mean / length).astype(np.float16),
-        crops[choose_medoids(crops, shares)].astype(np.float16), known[0][0].encoder_key)
+    return Encoded((mean / max(float(np.linalg.norm(mean)), 1e-9)).astype(np.float16),
+                   crops[choose_medoids(crops, shares)].astype(np.float16),
+                   known[0][0].encoder_key)
 
 
 def looks_of(embeddings: LandmarkEmbeddings) -> dict[str, Encoded]:
@@ -107,14 +93,6 @@ class Marks:
     is_locked: bool = False  #: Edits are refused
     is_hidden: bool = False  #: The scene and the views leave it out
     decision: str = ''  #: Of the review: accepted, fixed; '' for none
-
-    @classmethod
-    def from_json(cls, tree: Any) -> 'Marks':
-        """Return marks from JSON; what is none of them is left out."""
-        known = tree if isinstance(tree, dict) else {}
-        decision = known.get('decision')
-        return cls(known.get('is_locked') is True, known.get('is_hidden') is True,
-                   decision if decision in ('accepted', 'fixed') else '')
 
 
 @dataclass(frozen=True)
@@ -145,18 +123,18 @@ class Landmark:
     @cached_property
     def center(self) -> NDArray[np.float64]:
         """The centre (3,) [m]."""
-        return _read_only(np.array(self.fields['center'], dtype=np.float64))
+        return np.array(self.fields['center'], dtype=np.float64)
 
     @cached_property
     def semi_axes(self) -> NDArray[np.float64]:
         """The semi-axes (3,) [m]."""
-        return _read_only(np.array(self.fields['semi_axes'], dtype=np.float64))
+        return np.array(self.fields['semi_axes'], dtype=np.float64)
 
     @cached_property
     def quat_xyzw(self) -> NDArray[np.float64]:
         """The unit quaternion (4,) from landmark axes to map axes."""
         quat_xyzw = np.array(self.fields['orientation'], dtype=np.float64)
-        return _read_only(quat_xyzw / np.linalg.norm(quat_xyzw))
+        return np.asarray(quat_xyzw / np.linalg.norm(quat_xyzw))
 
     @property
     def basis(self) -> NDArray[np.float64]:
@@ -170,12 +148,10 @@ class Landmark:
                                      if value is not None or name not in fields})
 
 
-def _read_only(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    values.setflags(write=False)
-    return values
+Landmarks = Mapping[str, Landmark]
 
 
-def map_of(landmarks: Mapping[str, Landmark], frame_id: Any, source: str) -> LandmarkMap:
+def map_of(landmarks: Landmarks, frame_id: Any = 'map', source: str = 'studio') -> LandmarkMap:
     """Return landmarks as the relocalizer knows them, without unknown fields.
 
     MapError: there are none, or one is invalid. Names the source, the landmark and the field.
@@ -183,6 +159,11 @@ def map_of(landmarks: Mapping[str, Landmark], frame_id: Any, source: str) -> Lan
     known = {landmark_id: {name: value for name, value in one.fields.items()
                            if name in KNOWN_FIELDS} for landmark_id, one in landmarks.items()}
     return LandmarkMap.from_mapping({'frame_id': frame_id, 'landmarks': known}, source)
+
+
+def fields_of(landmarks: Landmarks) -> dict[str, Mapping[str, Any]]:
+    """Return the fields of landmarks, which tell whether a map was edited; locks do not."""
+    return {key: one.fields for key, one in landmarks.items()}
 
 
 def rounded(values: Iterable[float]) -> list[float]:
@@ -195,11 +176,7 @@ def shape_fields(center: NDArray[np.float64], basis: NDArray[np.float64]) -> dic
 
     The basis' columns are orthogonal semi-axes [m].
     """
-    lengths = np.linalg.norm(basis, axis=0)
-    rotation = basis / np.maximum(lengths, 1e-12)
-    if np.linalg.det(rotation) < 0.0:
-        rotation = rotation * (1.0, 1.0, -1.0)
-    quat_xyzw = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    (lengths,), (quat_xyzw,) = ellipsoid_numbers(basis[None])
     return {'center': rounded(center),
             'semi_axes': rounded(np.maximum(lengths, LEAST_SEMI_AXIS_M)),
             'orientation': rounded(quat_xyzw)}

@@ -5,16 +5,15 @@
 The only module of the studio that imports ROS; the studio runs without it.
 """
 
-import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from numpy.typing import NDArray
 from rclpy.context import Context
@@ -24,10 +23,12 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_full_topic_name import validate_full_topic_name
 from std_srvs.srv import Trigger
 
-from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.errors import CliplocError, OptionsError
+from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.ros import qos
+from cliploc_ros.ros.conversions import pose_from_msg
 from cliploc_ros.ros.node.diagnostics import split_names
+from cliploc_ros.ros.running import RelocalizerStatus
 
 # The relocalizer reports once a second. While it loads libraries it may be late (a guess).
 _SILENCE_S = 10.0
@@ -38,6 +39,7 @@ _POLL_S = 0.1
 _GRACE_S = 2.0
 # Answers that are no failure, though no pose was delivered.
 _ANSWERS = ('refused', 'withheld')
+_MAX_TEXT = 600
 
 
 class LiveError(CliplocError):
@@ -55,24 +57,26 @@ class LivePose(NamedTuple):
 
 
 class LiveState(NamedTuple):
-    """The last reports of the running relocalizer.
+    """The last reports of the running relocalizer."""
 
-    ``is_heard``: it reported within the last seconds. ``pose``: the last accepted one.
-    ``verdict``: its last answer in one line. ``is_busy``: a request of this studio waits for its
-    answer. ``watch``: what its watch says; ``missing``: landmarks that this one does not see any
-    more. The others are of its diagnostics; '' where they say nothing.
-    """
+    is_heard: bool  #: It reported within the last seconds
+    values: Mapping[str, str]  #: Of its last diagnostics
+    pose: LivePose | None  #: The last accepted one
 
-    is_heard: bool = False
-    pose: LivePose | None = None
-    verdict: str = ''
-    lifecycle: str = ''
-    map_text: str = ''
-    map_file: str = ''
-    base_frame: str = ''
-    watch: str = ''
-    missing: tuple[str, ...] = ()
-    is_busy: bool = False
+    @property
+    def verdict(self) -> str:
+        """Its last answer in one line; '' for none."""
+        return self.values.get('last verdict', '').removesuffix('none yet')
+
+    @property
+    def base_frame(self) -> str:
+        """The frame of the robot whose pose it gives; '' for the camera."""
+        return self.values.get('base frame', '')
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Landmarks that its watch does not see any more."""
+        return split_names(self.values.get('watch missing', ''))
 
     @property
     def is_current(self) -> bool:
@@ -85,20 +89,53 @@ class LiveRelocalizer:
 
     def __init__(self, node: Node, name: str):
         self.name, self._node = name, node
-        self.state = LiveState()
-        self._heard_at = -math.inf
-        self._turn, self._lock = threading.Lock(), threading.Lock()
-        self._closed = threading.Event()
+        self.state = LiveState(False, {}, None)
+        self._pose: LivePose | None = None
+        self._turn, self._closed = threading.Lock(), threading.Event()
         self._listeners: list[Callable[[], None]] = []
+        self._status = RelocalizerStatus(node, name)
         self._relocalize = node.create_client(Trigger, f'{name}/relocalize')
         self._reload = node.create_client(Trigger, f'{name}/reload_map')
         node.create_subscription(PoseWithCovarianceStamped, f'{name}/pose', self._on_pose,
                                  qos.POSE)
-        node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
 
     def subscribe(self, listener: Callable[[], None]) -> None:
         """Call a function after each change of the state, in any thread."""
         self._listeners.append(listener)
+
+    def update(self) -> None:
+        """Take over what was heard since the last time."""
+        values = self._status.values
+        is_heard = bool(values) and self._status.silent_s <= _SILENCE_S
+        if self._pose is not self.state.pose or (is_heard, values) != self.state[:2]:
+            self.state = LiveState(is_heard, values, self._pose)
+            for listener in self._listeners:
+                listener()
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a request waits for its answer."""
+        return self._turn.locked()
+
+    def lines(self, document: Document) -> list[str]:
+        """Return the state in lines, for a person who edits a map."""
+        state, values, pose = self.state, self.state.values, self.state.pose
+        file, missing = Path(values.get('map file', '')), ', '.join(state.missing)
+        is_other = file.is_absolute() and file.resolve() != document.path.resolve()
+        lines = [f'{self.name}: nothing heard', '', ''] if not state.is_heard else [
+            f'{self.name}: {values.get("state", "")}',
+            f'its map: {values.get("map") or "none loaded"}',
+            f'it reads {file}, which is not the map of this studio' if is_other else '']
+        lines += [f'watch: {values["watch reason"]}' if values.get('watch reason') else '',
+                  f'missing, red in the map: {missing}' if missing else '',
+                  f'last answer: {state.verdict}' if state.verdict else 'no answer yet']
+        if pose is not None:
+            lines.append(f'{"" if state.is_current else "earlier "}pose of '
+                         f'{state.base_frame or "the camera"}, stamp {pose.stamp_s:.2f} s')
+            if pose.frame_id != document.frame_id:
+                lines.append(f'the pose is in {pose.frame_id}, the map in {document.frame_id}: it '
+                             'is not shown')
+        return [line[:_MAX_TEXT] for line in lines if line]
 
     def relocalize(self) -> str:
         """Request a relocalization; return the answer.
@@ -106,7 +143,6 @@ class LiveRelocalizer:
         LiveError: there is no relocalizer, it fails or ends, or another request waits.
         """
         answer = self._request(self._relocalize)
-        self._change(verdict=answer.message)
         if answer.success or answer.message.startswith(_ANSWERS):
             return str(answer.message)
         raise LiveError(f'the relocalizer gave no answer: {answer.message}')
@@ -120,11 +156,6 @@ class LiveRelocalizer:
         if answer.success:
             return str(answer.message)
         raise LiveError(f'{answer.message}; the relocalizer keeps its map')
-
-    def check_silence(self) -> None:
-        """Notice when the relocalizer has stopped reporting."""
-        if self.state.is_heard and time.monotonic() - self._heard_at > _SILENCE_S:
-            self._change(is_heard=False)
 
     def close(self) -> None:
         """Release the request that waits, and return when it is gone."""
@@ -147,7 +178,6 @@ class LiveRelocalizer:
                     f'no relocalizer found at {self.name}: start it with ros2 run cliploc_ros '
                     'relocalizer --ros-args -p map_file:=MAP, in the ROS domain of the studio'
                     f'{hint}')
-            self._change(is_busy=True)
             answered, begin = threading.Event(), time.monotonic()
             future = client.call_async(Trigger.Request())
             future.add_done_callback(lambda _: answered.set())
@@ -159,7 +189,6 @@ class LiveRelocalizer:
                     client.remove_pending_request(future)
             return future.result()
         finally:
-            self._change(is_busy=False)
             self._turn.release()
 
     def _check_alive(self, client: Any, begin: float) -> None:
@@ -168,48 +197,18 @@ class LiveRelocalizer:
             raise LiveError('the studio ends: the answer is not waited for')
         if not client.service_is_ready():
             raise LiveError(f'{self.name} ended before it answered: start it again')
-        if (silence_s := now - max(self._heard_at, begin)) > _SILENCE_S:
+        if (silence_s := min(self._status.silent_s, now - begin)) > _SILENCE_S:
             raise LiveError(f'{self.name} has not reported for {silence_s:.0f} s and gave no '
                             'answer: see whether it still runs')
         if now - begin > _PATIENCE_S:
             raise LiveError(f'{self.name} gave no answer within {_PATIENCE_S:.0f} s: see its log')
 
     def _on_pose(self, msg: PoseWithCovarianceStamped) -> None:
-        p, q = msg.pose.pose.position, msg.pose.pose.orientation
-        position, quat = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
+        pose, stamp = pose_from_msg(msg.pose.pose), msg.header.stamp
         covariance = np.array(msg.pose.covariance).reshape(6, 6)[:3, :3]
-        is_valid = np.isfinite(position).all() and np.isfinite(covariance).all() \
-            and abs(np.linalg.norm(quat) - 1.0) < 1e-2
-        if not is_valid:
-            return  # of another program under this name
-        stamp = msg.header.stamp
-        self._change(pose=LivePose(
-            transform_from_pose(position, quat / np.linalg.norm(quat)), covariance,
-            msg.header.frame_id, stamp.sec + 1e-9 * stamp.nanosec))
-
-    def _on_diagnostics(self, msg: DiagnosticArray) -> None:
-        for status in msg.status:
-            if status.name != f'{self.name.lstrip("/")}: status':
-                continue
-            values = {pair.key: pair.value for pair in status.values}
-            verdict = values.get('last verdict', '')
-            self._heard_at = time.monotonic()
-            self._change(is_heard=True, verdict='' if verdict == 'none yet' else verdict,
-                         lifecycle=values.get('state', ''), map_text=values.get('map', ''),
-                         map_file=values.get('map file', ''),
-                         base_frame=values.get('base frame', ''),
-                         watch=values.get('watch reason', ''),
-                         missing=split_names(values.get('watch missing', '')))
-
-    def _change(self, **values: Any) -> None:
-        with self._lock:
-            before = self.state
-            self.state = before._replace(**values)
-            # a new pose is another tuple, whose arrays have no truth value
-            is_equal = self.state.pose is before.pose and self.state == before
-        if not is_equal:
-            for listener in self._listeners:
-                listener()
+        if pose is not None and np.isfinite(covariance).all():  # else of another program
+            self._pose = LivePose(pose, covariance, msg.header.frame_id,
+                                  stamp.sec + 1e-9 * stamp.nanosec)
 
 
 @contextmanager
@@ -233,21 +232,14 @@ def follow_relocalizer(name: str, ros_args: Sequence[str] = ()) -> Iterator[Live
     live = LiveRelocalizer(node, name)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    is_ending = threading.Event()
-
-    def spin() -> None:
-        while not is_ending.is_set():
-            executor.spin_once(timeout_sec=_POLL_S)
-            live.check_silence()
-
-    thread = threading.Thread(target=spin, name='ros', daemon=True)
+    node.create_timer(_POLL_S, live.update)
+    thread = threading.Thread(target=executor.spin, name='ros', daemon=True)
     thread.start()
     try:
         yield live
     finally:
         live.close()
-        is_ending.set()
-        thread.join()
         executor.shutdown()
+        thread.join()
         node.destroy_node()
         rclpy.shutdown(context=context)

@@ -10,7 +10,6 @@ that this module reads and saves in 1.4 s.
 """
 
 import hashlib
-import json
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -27,26 +26,26 @@ from cliploc_ros.core.map.landmark_embeddings import (
     load_landmark_embeddings,
     save_landmark_embeddings,
 )
+from cliploc_ros.core.map.landmark_map import find_map_node
 from cliploc_ros.core.map.map_file import quoted
 from cliploc_ros.core.map.parameter_file import parse_parameters, read_text
 from cliploc_ros.errors import MapError
 from cliploc_ros.files.storage import replace_file
-from cliploc_ros.offline.studio.landmark import DECIMALS, Encoded, Landmark, looks_of, map_of
+from cliploc_ros.offline.studio.landmark import (
+    KNOWN_FIELDS,
+    Encoded,
+    Landmark,
+    Landmarks,
+    looks_of,
+    map_of,
+)
 
 _PARAMETERS = 'ros__parameters'
 _GEOMETRY = ('center', 'semi_axes', 'orientation')
+_PLAIN = {*KNOWN_FIELDS, 'text', 'weight', '/**', _PARAMETERS, 'map', 'frame_id', 'landmarks'}
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 #: The digest of a file that does not exist.
 NO_FILE = ''
-
-
-class ChangedOnDiskError(MapError):
-    """Another program changed the map file; ``found`` is the digest of its content now."""
-
-    def __init__(self, path: Path, found: str):
-        super().__init__(f'{path}: another program changed this file after the studio read it; '
-                         'overwrite it, or reload it')
-        self.found = found
 
 
 @dataclass(frozen=True)
@@ -93,17 +92,16 @@ class MapFile:
         new = {key: landmarks[key].fields for key in order}
         tree = {**self.tree, self.node: {**self.tree[self.node], _PARAMETERS: {
             **self.tree[self.node][_PARAMETERS], 'map': {**self._map, 'landmarks': new}}}}
+        texts = []
         if self.text:
             with suppress(LookupError, ValueError, yaml.YAMLError):
-                text = patch_landmarks(self.text, (self.node, _PARAMETERS, 'map', 'landmarks'),
-                                       old, new)
-                if _says(text, tree):
-                    return MapFile(self.path, text, self.node, tree)
-        text = ''.join(f'{line}\n' for line in _emit(tree, 0))
-        if not _says(text, tree):
-            raise MapError(f'{self.path}: holds fields that cannot be written again; nothing was '
-                           'changed')
-        return MapFile(self.path, text, self.node, tree)
+                texts.append(patched(self.text, self.tree, tree))
+        texts.append(''.join(f'{line}\n' for line in _emit(tree, 0)))
+        for text in texts:
+            if _says(text, tree):
+                return MapFile(self.path, text, self.node, tree)
+        raise MapError(f'{self.path}: holds fields that cannot be written again; nothing was '
+                       'changed')
 
     def write(self) -> None:
         """Write the file in one step; MapError: it cannot be written, nothing was changed."""
@@ -135,19 +133,15 @@ def read_map_file(path: Path) -> MapFile:
             'frame_id': 'map', 'landmarks': {}}}}})
     text = read_text(path)
     tree = parse_parameters(text, path)
-    nodes = [name for name, node in tree.items() if isinstance(node, dict)
-             and isinstance(node.get(_PARAMETERS), dict) and 'map' in node[_PARAMETERS]]
-    if len(nodes) != 1:
-        raise MapError(f"{path}: {'no' if not nodes else 'more than one'} map: expected one "
-                       "'map' under '/**: ros__parameters:'")
-    found = tree[nodes[0]][_PARAMETERS]['map']
+    node = find_map_node(tree, path)
+    found = tree[node][_PARAMETERS]['map']
     if not isinstance(found, Mapping) or not isinstance(found.get('landmarks'), Mapping):
         raise MapError(f'{path}: map: expected the fields frame_id, landmarks')
     for landmark_id, fields in found['landmarks'].items():
         if not isinstance(fields, Mapping):
             raise MapError(f"{path}: landmark '{landmark_id}': expected fields, not {fields!r}"
                            [:200])
-    file = MapFile(path, text, nodes[0], tree)
+    file = MapFile(path, text, node, tree)
     map_of(file.landmarks, found.get('frame_id') or '', str(path))
     return file
 
@@ -175,66 +169,47 @@ def _sorted(tree: Any) -> Any:
 
 # ---- the text -----------------------------------------------------------------------------------
 
-def patch_landmarks(text: str, path: tuple[str, ...], old: Mapping[str, Mapping[str, Any]],
-                    new: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a map's text with other landmarks.
+def patched(text: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
+    """Return the text of a tree as that of another one, whose other lines are the same.
 
-    The keys of ``path`` lead to the landmarks. LookupError, ValueError or YAMLError: the text does
-    not have the old landmarks there.
+    LookupError, ValueError or YAMLError: it is not the text of the old tree.
     """
-    node = yaml.compose(text, Loader=_LOADER)
-    for name in path:
-        _, node = _entries(node)[name]
-    entries = _entries(node)
-    # start, end, and the text that takes their place
-    patches: list[tuple[int, int, str]] = []
-    for landmark_id, fields in old.items():
-        key, value = entries[landmark_id]
-        if landmark_id not in new:
-            start = _line_start(text, key)
-            # the comments directly above a landmark are about it
-            while start > 0:
-                above = text.rfind('\n', 0, start - 1) + 1
-                if not text[above:start].startswith(' ' * key.start_mark.column + '#'):
-                    break
-                start = above
-            patches.append((start, _line_end(text, _end(value)), ''))
-        elif new[landmark_id] is not fields and new[landmark_id] != fields:
-            patches += _patch_fields(text, value, fields, new[landmark_id])
-    patches += _append(text, node, {key: one for key, one in new.items() if key not in old})
     pieces, done = [], 0
+    patches = _patches(text, yaml.compose(text, Loader=_LOADER), old, new)
     for start, end, piece in sorted(patches, key=lambda patch: patch[:2]):
         pieces += [text[done:start], piece]
         done = end
     return ''.join([*pieces, text[done:]])
 
 
-def _patch_fields(text: str, node: yaml.Node, old: Mapping[str, Any], new: Mapping[str, Any]
-                  ) -> Iterator[tuple[int, int, str]]:
-    entries = _entries(node)
+def _patches(text: str, node: yaml.Node, old: Mapping[str, Any], new: Mapping[str, Any]
+             ) -> Iterator[tuple[int, int, str]]:
+    """Yield start and end of what changes below a mapping, and the text that takes its place."""
+    entries = {key.value: (key, value) for key, value in node.value}
+    newline = '\r\n' if '\r\n' in text else '\n'
     for name, value in old.items():
         key, written = entries[name]
         if name not in new:
-            yield _line_start(text, key), _line_end(text, _end(written)), ''
-        elif new[name] != value:
-            colon, end = text.index(':', key.end_mark.index) + 1, _end(written)
-            line_end = _newline(text) if text[end - 1] == '\n' else ''  # of a text in a block
-            yield colon, end, f' {_flow(name, new[name])}{line_end}'
-    yield from _append(text, node, {name: one for name, one in new.items() if name not in old})
-
-
-def _append(text: str, node: yaml.Node, added: Mapping[str, Any]
-            ) -> Iterator[tuple[int, int, str]]:
-    """Yield the patch that adds keys to a mapping, on lines of their own."""
-    if added:
-        newline, end = _newline(text), _line_end(text, _end(node))
+            start = text.rfind('\n', 0, key.start_mark.index) + 1
+            above = text.rfind('\n', 0, start - 1) + 1
+            # the comments directly above are about it
+            while start and text.startswith(' ' * key.start_mark.column + '#', above):
+                start, above = above, text.rfind('\n', 0, above - 1) + 1
+            yield start, _line_end(text, _end(written)), ''
+        elif new[name] is value or new[name] == value:
+            continue
+        elif isinstance(new[name], Mapping) and not written.flow_style:
+            yield from _patches(text, written, value, new[name])
+        else:
+            end = _end(written)
+            line_end = newline if text[end - 1] == '\n' else ''  # of a text in a block
+            yield (text.index(':', key.end_mark.index) + 1, end,
+                   f' {_flow(name, new[name])}{line_end}')
+    if added := {name: value for name, value in new.items() if name not in old}:
+        # on lines of their own
+        end = _line_end(text, _end(node))
         lines = [f'{line}{newline}' for line in _emit(added, node.value[0][0].start_mark.column)]
         yield end, end, ('' if text[end - 1] == '\n' else newline) + ''.join(lines)
-
-
-def _entries(node: yaml.Node) -> dict[str, tuple[yaml.Node, yaml.Node]]:
-    """Return key and value of each entry of a mapping, with their places in the text."""
-    return {key.value: (key, value) for key, value in node.value}
 
 
 def _end(node: yaml.Node) -> int:
@@ -242,10 +217,6 @@ def _end(node: yaml.Node) -> int:
     if isinstance(node, yaml.ScalarNode) or node.flow_style:
         return int(node.end_mark.index)
     return _end(node.value[-1][1] if isinstance(node, yaml.MappingNode) else node.value[-1])
-
-
-def _line_start(text: str, key: yaml.Node) -> int:
-    return text.rfind('\n', 0, key.start_mark.index) + 1
 
 
 def _line_end(text: str, index: int) -> int:
@@ -256,17 +227,13 @@ def _line_end(text: str, index: int) -> int:
     return len(text) if found < 0 else found + 1
 
 
-def _newline(text: str) -> str:
-    return '\r\n' if '\r\n' in text else '\n'
-
-
 def _emit(tree: Mapping[str, Any], column: int) -> Iterator[str]:
-    """Yield the lines of a tree in block style; lists and the values of fields are on one line."""
+    """Yield the lines of a tree in block style; lists and the values of fields are on one line.
+
+    Names of fields are plain, ids and classes quoted, as write_map does it.
+    """
     for key, value in tree.items():
-        is_plain = key.isascii() and key.replace('_', 'a').isalnum() and not key[0].isdigit()
-        # YAML 1.1 reads words such as yes and no as booleans
-        is_word = key.lower() in ('y', 'yes', 'n', 'no', 'true', 'false', 'on', 'off', 'null')
-        name = key if is_plain and not is_word else quoted(key)
+        name = key if key in _PLAIN else quoted(key)
         if isinstance(value, Mapping) and value:
             yield f'{" " * column}{name}:'
             yield from _emit(value, column + 2)
@@ -283,19 +250,9 @@ def _flow(name: str, value: Any) -> str:
         return f'[{", ".join(_flow(name, one) for one in value)}]'
     if isinstance(value, str):
         return quoted(value)
-    if isinstance(value, bool) or value is None:
-        return json.dumps(value)
-    if isinstance(value, int) and name not in _GEOMETRY:
-        return str(value)
-    number = float(value)
-    if not math.isfinite(number):
-        return '.nan' if math.isnan(number) else '.inf' if number > 0 else '-.inf'
-    fixed = f'{number:.{DECIMALS}f}'.rstrip('0')
-    fixed += '0' if fixed.endswith('.') else ''
-    # YAML 1.1 takes 1e-07 for text: a float needs its point
-    mantissa, e, exponent = repr(number).partition('e')
-    exact = f'{mantissa}{"" if "." in mantissa else ".0"}{e}{exponent}'
-    return fixed if float(fixed) == number else exact
+    if name in _GEOMETRY or (isinstance(value, float) and math.isfinite(value)):
+        return np.format_float_positional(value, trim='0')
+    return str(yaml.safe_dump(value)).partition('\n')[0]
 
 
 # ---- the image embeddings -----------------------------------------------------------------------
@@ -312,27 +269,25 @@ class LookFile(NamedTuple):
     looks: Mapping[str, Encoded]
     state: tuple[int, int] | None
 
-    def write(self, landmarks: Mapping[str, Landmark]) -> tuple['LookFile', str]:
+    def write(self, landmarks: Landmarks) -> tuple['LookFile', str]:
         """Write the looks of all landmarks of the map in one step.
 
         Those of another encoder are left out. Nothing is written where nothing changed, and
         nothing over the content of another program. Return the file as it is then, and why it
         does not hold these looks, '' if it does. MapError: it cannot be written.
         """
-        looks = {key: one.look for key, one in landmarks.items()}
-        size = next((len(look.mean) for look in (*self.looks.values(), *looks.values())
-                     if look is not None and look.encoder_key == self.encoder_key), 0)
-        known = {key: look for key, look in looks.items() if look is not None
-                 and (look.encoder_key, len(look.mean)) == (self.encoder_key, size)}
-        if not self.encoder_key or _keys_of(known) == _keys_of(self.looks):
+        known = {key: one.look for key, one in landmarks.items()
+                 if one.look is not None and one.look.encoder_key == self.encoder_key}
+        if not self.encoder_key or known == self.looks:
             return self, ''
         if _state_of(self.path) != self.state:
             return self, (f'{self.path.name}: another program changed this file, so the studio '
                           'leaves it as it is; build the map again, or remove the file')
+        size = len(next(iter((*self.looks.values(), *known.values()))).mean)
         nothing = Encoded(np.zeros(size, np.float16), np.empty((0, size), np.float16), '')
-        rows = [known.get(key, nothing) for key in looks]
+        rows = [known.get(key, nothing) for key in landmarks]
         save_landmark_embeddings(self.path, LandmarkEmbeddings(
-            self.encoder_key, tuple(looks), np.array([one.mean for one in rows]),
+            self.encoder_key, tuple(landmarks), np.array([one.mean for one in rows]),
             np.concatenate([one.medoids for one in rows]),
             np.cumsum([0, *(len(one.medoids) for one in rows)])))
         return self._replace(looks=known, state=_state_of(self.path)), ''
@@ -341,18 +296,14 @@ class LookFile(NamedTuple):
 def read_look_file(map_path: Path) -> tuple[LookFile, str]:
     """Return the image embeddings next to a map, and what is wrong with them, or ''."""
     path = embeddings_path(map_path)
-    state = _state_of(path)
-    if state is None:
-        return LookFile(path, '', {}, None), ''
+    nothing = LookFile(path, '', {}, _state_of(path))
+    if nothing.state is None:
+        return nothing, ''
     try:
         embeddings = load_landmark_embeddings(path)
     except MapError as error:
-        return LookFile(path, '', {}, state), f'{error}. The studio leaves this file as it is'
-    return LookFile(path, embeddings.encoder_key, looks_of(embeddings), state), ''
-
-
-def _keys_of(looks: Mapping[str, Encoded]) -> dict[str, str]:
-    return {key: look.key for key, look in looks.items()}
+        return nothing, f'{error}. The studio leaves this file as it is'
+    return nothing._replace(encoder_key=embeddings.encoder_key, looks=looks_of(embeddings)), ''
 
 
 def _state_of(path: Path) -> tuple[int, int] | None:

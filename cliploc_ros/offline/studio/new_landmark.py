@@ -6,19 +6,27 @@ The boxes of the other views show where the object lies in a view without one: o
 box, or where the ellipsoid that fits two or more projects to.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.offline.mapping.fitting import Fit
+from cliploc_ros.offline.mapping.evidence import widest_angle_deg
+from cliploc_ros.offline.mapping.fitting import Fit, fit_ellipsoid
+from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.views import Views, camera_centers, make_views
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.edits import EditError
-from cliploc_ros.offline.studio.images import Pixel, box_at
-from cliploc_ros.offline.studio.recording import LEAST_BOXES, MIN_BOX_PX, Recording, fit_boxes
+from cliploc_ros.offline.studio.recording import LEAST_BOXES, Recording
 
-Box = tuple[float, float, float, float]
+#: Views nearer to one another leave the distance of the object open.
+LEAST_ANGLE_DEG = 25.0
+MIN_BOX_PX = 4.0
+_STRETCH = 2.0
 # The object of one box may lie between these distances [m].
 _DEPTHS_M = np.geomspace(0.4, 12.0, 24)
 # A drawn box that overlaps a detector's box by more than this has its class.
@@ -32,72 +40,54 @@ _OTHER_ANGLE_DEG = 10.0
 class NewLandmark:
     """The boxes by view, the class that they suggest, and the ellipsoid that fits them."""
 
+    ACTIONS = ('draw', 'forget', 'create')
+
     def __init__(self, document: Document, recording: Recording):
         self._document, self._recording = document, recording
-        self.boxes: dict[int, Box] = {}
+        self.boxes: dict[int, list[float]] = {}
         #: Of the detector's boxes that were taken or drawn over; '' for none
         self.class_id = ''
-        self._fitted: tuple[dict[int, Box], Fit | None, str] = ({}, None, '')
+        #: The ellipsoid that fits the boxes, if there is one, and what is doubtful about it
+        self.fit: Fit | None = None
+        self.doubt = ''
         # the next views since the last box
         self._offered: list[int] = []
 
-    def draw(self, view: int, corner: Pixel, other: Pixel) -> str:
+    def draw(self, view: int, corner: Sequence[float], other: Sequence[float]) -> str:
         """Put a box into a view, between two opposite corners (2,) [px]."""
         camera = self._recording.detections.camera_of(view)
-        size = np.array([camera.width, camera.height], dtype=np.float64)
-        low, high = (np.clip(select(np.asarray(corner), np.asarray(other)), 0.0, size)
-                     for select in (np.minimum, np.maximum))
+        low, high = np.clip(np.sort([corner, other], axis=0), 0.0, (camera.width, camera.height))
         if not (high - low).min() >= MIN_BOX_PX:
             raise EditError(f'the box is smaller than {MIN_BOX_PX:g} pixels; drag from corner to '
                             'corner')
-        boxes = self._recording.boxes_in_view(view)
+        boxes = self._recording.detections.detections_of(view).bboxes_xyxy
         overlap = np.clip(np.minimum(boxes[:, 2:], high) - np.maximum(boxes[:, :2], low), 0.0,
                           None).prod(axis=1)
         union = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1) + (high - low).prod() - overlap
-        row = int(np.argmax(overlap / union)) if len(boxes) else -1
-        is_same = row >= 0 and overlap[row] > _SAME_IOU * union[row]
-        return self._put(view, np.concatenate([low, high]), row if is_same else -1)
+        ious = np.append(overlap / union, 0.0)
+        what, same = 'changed' if view in self.boxes else 'drew', int(np.argmax(ious))
+        self._set({**self.boxes, view: [*low.tolist(), *high.tolist()]})
+        if ious[same] > _SAME_IOU:
+            self.class_id = self._recording.detections.detections_of(view).class_ids[same]
+        return f'{what} the box of view {view}; ' + '; '.join(
+            filter(None, [f'boxes drawn: {len(self.boxes)}', self.doubt]))
 
-    def take(self, view: int, pixel: Pixel) -> str:
-        """Take the detector's smallest box around a pixel (2,)."""
-        boxes = self._recording.boxes_in_view(view)
-        row = box_at(boxes, pixel)
-        if row is None:
-            raise EditError('no box of the detector there; drag to draw one')
-        return self._put(view, boxes[row], row)
-
-    def _put(self, view: int, box: NDArray[np.float64], row: int) -> str:
-        left, top, right, bottom = (float(value) for value in box)
-        what = 'changed' if view in self.boxes else 'drew'
-        self.boxes, self._offered = {**self.boxes, view: (left, top, right, bottom)}, []
-        detections = self._recording.detections
-        if row >= 0:
-            number = detections.classes[detections.frame_offsets[view] + row]
-            self.class_id = detections.class_names[number]
-        _, doubt = self.fit()
-        return (f'{what} the box of view {view}; boxes drawn: {len(self.boxes)}'
-                + (f'; {doubt}' if doubt else ''))
-
-    def forget(self, view: int | None) -> str:
+    def forget(self, view: int | None = None) -> str:
         """Forget the box of a view, or all of them."""
-        self.boxes = {key: box for key, box in self.boxes.items()
-                      if view is not None and key != view}
-        self._offered = []
+        self._set({key: box for key, box in self.boxes.items()
+                   if view is not None and key != view})
         if not self.boxes:
             self.class_id = ''
         return f'boxes drawn: {len(self.boxes)}'
 
-    def fit(self) -> tuple[Fit | None, str]:
-        """Return the ellipsoid that fits the boxes, if there is one, and what is doubtful."""
-        if self._fitted[0] is not self.boxes:
-            fit, doubt = None, ''
-            if len(self.boxes) > 1:
-                try:
-                    fit, doubt = self._fit()
-                except EditError as error:
-                    doubt = str(error)
-            self._fitted = self.boxes, fit, doubt
-        return self._fitted[1:]
+    def _set(self, boxes: dict[int, list[float]]) -> None:
+        """Take over other boxes, and fit an ellipsoid to two or more."""
+        self.boxes, self._offered, self.fit, self.doubt = boxes, [], None, ''
+        if len(boxes) > 1:
+            try:
+                self.fit, self.doubt = self._fit()
+            except EditError as error:
+                self.doubt = str(error)
 
     def _fit(self) -> tuple[Fit, str]:
         detections, views = self._recording.detections, sorted(self.boxes)
@@ -108,15 +98,14 @@ class NewLandmark:
     def create(self, label: str, class_id: str) -> str:
         """Create a landmark from the boxes, and select it."""
         document, recording = self._document, self._recording
-        landmarks = document.landmarks
         fit, warning = self._fit()
-        change = edits.create(landmarks, label, class_id, fit.center, fit.basis)
+        of = label, class_id, fit.center, fit.basis
+        change = edits.create(document.landmarks, *of)
         (landmark_id,) = change.after
-        rows = recording.boxes_of(change.apply(landmarks))[landmark_id]
-        look = recording.look_of(rows, document.encoder_key)
-        document.apply(edits.create(landmarks, label, class_id, fit.center, fit.basis, look))
+        rows = recording.boxes_of(change.apply(document.landmarks))[landmark_id]
+        document.edit(edits.create, *of, recording.look_of(rows, document.encoder_key))
         document.select([landmark_id])
-        self.forget(None)
+        self.forget()
         hint = (f'{len(rows)} boxes of the recording show it: Refit fits it to them'
                 if len(rows) >= LEAST_BOXES else '')
         return '; '.join(filter(None, [f'created {landmark_id}', warning, hint]))
@@ -125,18 +114,16 @@ class NewLandmark:
 
     def _places(self) -> NDArray[np.float64]:
         """Return points (n, 3) in the map where the object may be."""
-        fit, _ = self.fit()
-        if fit is not None:
-            return fit.center[None]
+        if self.fit is not None:
+            return self.fit.center[None]
         if not self.boxes:
             return np.empty((0, 3))
         view, box = next(iter(self.boxes.items()))
         detections = self._recording.detections
         camera, pose = detections.camera_of(view), detections.map_from_camera[view]
-        ray = np.array([(0.5 * (box[0] + box[2]) - camera.cx) / camera.fx,
-                        (0.5 * (box[1] + box[3]) - camera.cy) / camera.fy, 1.0])
-        points: NDArray[np.float64] = _DEPTHS_M[:, None] * (pose[:3, :3] @ ray) + pose[:3, 3]
-        return points
+        middle = np.array([[box[0] + box[2], box[1] + box[3]]]) / 2.0
+        ray = pose[:3, :3] @ [*camera.normalize_points(middle)[0], 1.0]
+        return np.asarray(_DEPTHS_M[:, None] * ray + pose[:3, 3])
 
     def guide(self, view: int) -> NDArray[np.float64]:
         """Return the line (n, 2) [px] on which the object of one box lies in another view."""
@@ -185,8 +172,69 @@ class NewLandmark:
 def _project(camera: Camera, map_from_camera: NDArray[np.float64], points: NDArray[np.float64]
              ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the pixels (n, 2) of points (n, 3), and which of them lie in front of the camera."""
-    camera_from_map = invert_transform(map_from_camera)
-    x, y, z = (points @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]).T
-    depth = np.maximum(z, 1e-6)
-    u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
-    return np.column_stack([u, v]), z > 0.05
+    seen = (points - map_from_camera[:3, 3]) @ map_from_camera[:3, :3]
+    pixels = camera.project_normalized(seen[:, :2] / np.maximum(seen[:, 2:], 1e-6))
+    return pixels, seen[:, 2] > 0.05
+
+
+# ---- a landmark from boxes that a person drew ---------------------------------------------------
+
+def fit_boxes(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64],
+              bboxes_xyxy: NDArray[np.float64]) -> tuple[Fit, str]:
+    """Return the ellipsoid that fits boxes of one object, and what is doubtful about it, or ''.
+
+    The boxes (n, 4) lie in undistorted images [px] of n cameras with poses (n, 4, 4).
+
+    EditError: there are fewer than two boxes, one is too small, or their rays do not meet in front
+    of the cameras.
+    """
+    count = len(bboxes_xyxy)
+    if count < 2:
+        raise EditError(f'create: boxes drawn: {count}; draw one in each of two images or more, '
+                        'best three')
+    if small := [box.tolist() for box in bboxes_xyxy if (box[2:] - box[:2]).min() < MIN_BOX_PX]:
+        raise EditError(f'create: the box {small[0]} is smaller than {MIN_BOX_PX:g} pixels; draw '
+                        'it around the whole object')
+    views = make_views(PosedDetections(
+        cameras=tuple(cameras), map_from_camera=map_from_camera,
+        stamps_s=np.arange(count, dtype=np.float64), frame_offsets=np.arange(count + 1),
+        bboxes_xyxy=bboxes_xyxy, class_names=('drawn',), classes=np.zeros(count, dtype=np.int64),
+        scores=np.ones(count), camera_rows=np.arange(count)), MappingOptions())
+    # each box was drawn for itself: none shares the error of a detector that stood still
+    views = views._replace(weights=np.ones(count))
+    origins = camera_centers(views)
+    start, radius = _meeting_point(views, origins)
+    # a sphere, one stretched along each axis of the map, and one along a diagonal
+    sphere = radius * np.eye(3)
+    bases = [sphere, *(sphere * np.where(np.arange(3) == axis, _STRETCH, 1.0 / np.sqrt(_STRETCH))
+                       for axis in range(3)),
+             Rotation.from_euler('z', 45, degrees=True).as_matrix()
+             @ (sphere * (_STRETCH, 1.0 / _STRETCH, 1.0))]
+    fit = min((fit_ellipsoid(views, np.arange(count), start, basis) for basis in bases),
+              key=lambda one: one.cost)
+    offsets = fit.center - origins
+    angle_deg = widest_angle_deg(offsets / np.linalg.norm(offsets, axis=1, keepdims=True))
+    return fit, ('' if angle_deg >= LEAST_ANGLE_DEG else (
+        f'the views are only {angle_deg:.0f} degrees apart, expected {LEAST_ANGLE_DEG:.0f} or '
+        'more: distance and depth are uncertain; draw a box in a view from another side'))
+
+
+def _meeting_point(views: Views, origins: NDArray[np.float64]
+                   ) -> tuple[NDArray[np.float64], float]:
+    """Return the point nearest to the rays of all boxes' centres, and the radius they suggest."""
+    middles = 0.5 * (views.edges[:, :2] + views.edges[:, 2:])
+    rays = np.column_stack([middles, np.ones(len(middles))])
+    rays = np.einsum('fji,fj->fi', views.rotations, rays)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    try:
+        point = np.linalg.solve(across.sum(axis=0), np.einsum('fij,fj->i', across, origins))
+    except np.linalg.LinAlgError:
+        raise EditError('create: the views look along one line; draw a box in a view from '
+                        'another side') from None
+    depths = np.einsum('fij,j->fi', views.rotations, point)[:, 2] + views.translations[:, 2]
+    if not depths.min() > 0.05:
+        raise EditError('create: the boxes do not show one object: their rays meet behind a '
+                        'camera; draw the same object in all views')
+    extents = views.edges[:, 2:] - views.edges[:, :2]
+    return point, float(np.median(0.5 * np.sqrt(extents.prod(axis=1)) * depths))

@@ -1,33 +1,41 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page: the scene in three dimensions, and the one loop that redraws it and the desk.
+"""The page: the scene in three dimensions, and the one loop that redraws it and the parts.
 
 viser shows the scene, in a frame of our own page: its widgets have no image to zoom and draw on,
-no rows with buttons, and no place for them but one column. The pages send messages, viser calls
-back from many threads. Each holds the document's lock for its action. One thread redraws, at most
-20 times a second, and reads the studio under the same lock. So all browsers show the same state,
-and a slow one delays no edit.
+no rows with buttons, and no place for them but one column. Data moves one way: the pages send
+messages, viser calls back from many threads, and the desk does what they say with the document's
+lock held. One thread redraws, at most 20 times a second, and reads the studio under the same lock.
+So all browsers show the same state, and a slow one delays no edit.
 """
 
 import io
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.offline.studio import edits, viewpoint
-from cliploc_ros.offline.studio.context import draw_lines
+from cliploc_ros.offline.studio.cloud import Cloud, draw_cloud, find_cloud
 from cliploc_ros.offline.studio.desk import Desk
-from cliploc_ros.offline.studio.panels import Actions
-from cliploc_ros.offline.studio.scene import Answers, Ellipsoids, Labels, ViewImage, draw_recording
-from cliploc_ros.offline.studio.scene_panel import ScenePanel
-from cliploc_ros.offline.studio.studio import SELECTED_RGB, Studio
+from cliploc_ros.offline.studio.layers import (
+    Layers,
+    draw_answers,
+    draw_cameras,
+    draw_coverage,
+    draw_keyframes,
+    draw_look_alikes,
+    draw_robot,
+)
+from cliploc_ros.offline.studio.parts import parts_of, picture_of
+from cliploc_ros.offline.studio.scene import Ellipsoids, Gizmo, Labels, draw_floor, draw_image
+from cliploc_ros.offline.studio.studio import Rgb, Studio
+from cliploc_ros.offline.studio.walls import draw_walls
 from cliploc_ros.offline.studio.web import Board, Content, Gate
 
 if TYPE_CHECKING:
@@ -35,90 +43,81 @@ if TYPE_CHECKING:
 
 _REDRAW_INTERVAL_S = 0.05
 _BLANK = 70
-_GIZMO_PX = 90.0
-# The selection is drawn around its landmarks, so much larger.
+# The selection is drawn around its landmarks, so much larger; a missing one shines through.
+_SELECTED_RGB: Rgb = (255, 220, 0)
 _AROUND = 1.03
+_MISSING_RGB: Rgb = (220, 0, 0)
+_MISSING_SCALE = 1.3
+# Between the clicks of a double click [s].
+_DOUBLE_CLICK_S = 0.6
 
 
 class Page:
     """The studio in the browser."""
 
-    def __init__(self, studio: Studio, server: viser.ViserServer,
-                 live: 'LiveRelocalizer | None' = None):
+    def __init__(self, studio: Studio, server: viser.ViserServer):
         self._studio, self._server = studio, server
-        self._actions = Actions(studio, server)
+        self.desk, self.board = Desk(studio, server), Board()
         self._stopped = threading.Event()
         self._drag = 0
-        self._shown_view = -1
-        self._recorded: list[Any] = []
-        self._build_scene()
-        for note in studio.document.notes:
-            self._actions.log('done', note)
-        self.board = Board()
-        self.desk = Desk(self._actions, self._client_of, live)
-        self._redrawer = threading.Thread(target=self._redraw_always, daemon=True)
-        self._redrawer.start()
-        self._actions.changed.set()
-
-    def stop(self) -> None:
-        """Stop the searches, the film, and redrawing."""
-        self.desk.stop()
-        self._scene_panel.stop()
-        self._stopped.set()
-        self._actions.changed.set()
-        self._redrawer.join()
-
-    def _client_of(self, person: str) -> viser.ClientHandle | None:
-        """Return the scene's client of a person, whom the path of its connection names."""
-        connections = self._server._websock_server._live_connections
-        for number, client in self._server.get_clients().items():
-            one = connections.get(number)
-            if one is not None and one.request is not None and one.request.path.strip(
-                    '/') == f'scene/{person}':
-                return client
-        return None
-
-    # ---- building -------------------------------------------------------------------------------
-
-    def _build_scene(self) -> None:
-        scene, recording = self._server.scene, self._studio.recording
-        extent = self._studio.extent()
+        self._clicked: tuple[object, float] = None, 0.0
+        self._cloud: Cloud | None = None
+        scene, extent = server.scene, self.desk.extent()
         scene.set_up_direction(extent.up)
-        draw_lines(scene, extent)
-        self._all = Ellipsoids(scene, '/landmarks', self._clicked_landmark, 0.2,
-                               has_outlines=True)
-        self._selected = Ellipsoids(scene, '/selection', self._clicked_landmark, 0.6, _AROUND)
-        self._labels = Labels(self._server, extent.up)
-        # of the same size at any distance, and visible inside large landmarks
-        self._gizmo = scene.add_transform_controls('/gizmo', scale=_GIZMO_PX, fixed=True,
-                                                   depth_test=False, visible=False)
-        self._gizmo.on_update(self._dragged_gizmo)
-        if recording is not None:
-            self._recorded = draw_recording(
-                scene, recording.detections,
-                lambda event, view: self._actions.act(lambda: self._studio.show_view(view)))
-            self._answers = Answers(scene, recording.detections)
-            self._image = ViewImage(scene)
-        camera = self._server.initial_camera
+        draw_floor(scene, extent)
+        self._layers = Layers(scene)
+        self._all = Ellipsoids(scene, '/landmarks', self._click, 0.2, has_outlines=True)
+        self._selected = Ellipsoids(scene, '/selection', self._click, 0.6, _AROUND)
+        self._missing = Ellipsoids(scene, '/live/missing', self._click, 0.5, _MISSING_SCALE)
+        self._labels = Labels(server, extent.up)
+        self._gizmo = Gizmo(scene, self._drag_gizmo)
+        camera = server.initial_camera
         camera.fov, camera.up = viewpoint.FOV_RAD, tuple(extent.up)
         camera.look_at = tuple(extent.middle)
         camera.position = tuple(viewpoint.overview(extent, viewpoint.USUAL_ASPECT))
-        self._server.gui.configure_theme(show_logo=False, show_share_button=False)
-        self._server.gui.set_panel_label('Layers and viewpoints')
-        self._server.gui.main_panel.minimize()
-        self._scene_panel = ScenePanel(self._actions, self._labels, self._recorded)
+        self.desk.layers = {'Labels': True} | {
+            name: is_shown for name, what, is_shown in (
+                ('Cameras', studio.recording, True), ('Keyframes', studio.layer, False),
+                ('Walls', studio.walls, True)) if what is not None}
+        for note in studio.document.notes:
+            self.desk.log('done', note)
+        self._draw_cameras = draw_cameras(lambda view: self.desk.act(
+            lambda: studio.show_view(view)))
+        self._draw_coverage = draw_coverage(lambda text: self.desk.log('done', text))
+        self._redrawer = threading.Thread(target=self._redraw_always, daemon=True)
+        self._redrawer.start()
+        threading.Thread(target=self._load_cloud, args=(extent,), daemon=True).start()
+
+    def stop(self) -> None:
+        """Stop the searches and redrawing."""
+        self.desk.stop()
+        self._stopped.set()
+        self._studio.changed.set()
+        self._redrawer.join()
+
+    def _load_cloud(self, extent: viewpoint.Bounds) -> None:
+        """Read the surfaces, which takes seconds, while people use the page."""
+        studio = self._studio
+        try:
+            self._cloud = find_cloud(studio.recording, studio.layer, extent)
+        except CliplocError as error:
+            self.desk.log('refused', f'no surfaces: {error}')
+        if self._cloud is not None:
+            self.desk.show_layer('Surfaces', True)
+            studio.changed.set()
 
     # ---- what a person does in the scene --------------------------------------------------------
 
-    def _clicked_landmark(self, event: Any, landmark_id: str) -> None:
-        if self._scene_panel.is_double(event, landmark_id):
-            self._actions.look_at_selection(event.client)
-        elif event.modifier == 'shift':
-            self._actions.act(lambda: self._studio.toggle(landmark_id))
+    def _click(self, event: Any, landmark_id: str) -> None:
+        """Select a landmark; the second click of a double click flies to it."""
+        key, now = (event.client_id, landmark_id), time.monotonic()
+        before, self._clicked = self._clicked, (key, now)
+        if before[0] == key and now - before[1] < _DOUBLE_CLICK_S:
+            self.desk.look(event.client, 'fly')
         else:
-            self._actions.act(lambda: self._studio.document.select([landmark_id]))
+            self.desk.act(lambda: self._studio.select(landmark_id, event.modifier == 'shift'))
 
-    def _dragged_gizmo(self, event: Any) -> None:
+    def _drag_gizmo(self, event: Any) -> None:
         # Callbacks may overtake one another: each takes the gizmo's present pose, not its own.
         if event.client is None:
             return
@@ -126,71 +125,74 @@ class Page:
             self._drag += 1
 
         def take_pose() -> None:
-            document = self._studio.document
+            document, handle = self._studio.document, self._gizmo.handle
             if document.selected is not None:
-                landmark_id, _ = document.selected
-                document.apply(edits.place(document.landmarks, landmark_id, self._gizmo.position,
-                                           np.roll(self._gizmo.wxyz, -1)),
-                               gesture=('gizmo', self._drag, landmark_id))
+                key, _ = document.selected
+                document.edit(edits.set_fields, [key], center=handle.position,
+                              orientation=np.roll(handle.wxyz, -1),
+                              gesture=('gizmo', self._drag, key))
 
-        self._actions.act(take_pose)
+        self.desk.act(take_pose)
 
     # ---- redrawing ------------------------------------------------------------------------------
 
     def _redraw_always(self) -> None:
         while not self._stopped.is_set():
-            self._actions.changed.wait()
-            self._actions.changed.clear()
             with self._studio.document.lock, self._server.atomic():
                 self._redraw()
             self._stopped.wait(_REDRAW_INTERVAL_S)
+            self._studio.changed.wait()
+            self._studio.changed.clear()
 
     def _redraw(self) -> None:
-        document = self._studio.document
-        shown = self._studio.shown()
-        chosen = [key for key in document.selection if key in shown]
+        studio, show, is_on = self._studio, self._layers.show, self.desk.layers.get
+        document, shown = studio.document, studio.shown()
+        chosen = {key: shown[key] for key in document.selection if key in shown}
         # all of them: a second click comes with the number that the first one's picture has
-        self._all.show(list(shown.items()), self._studio.color_of)
-        self._selected.show([(key, shown[key]) for key in chosen], lambda class_id: SELECTED_RGB)
-        self._labels.show(shown, chosen)
-        self._show_gizmo()
-        self._scene_panel.show()
-        self.desk.places.show()
-        if self.desk.robot is not None:
-            self.desk.robot.show()
-        self.board.show(self.desk.parts())
-        if self._studio.recording is not None:
-            self._answers.show(self._studio.answers)
-            self._show_view()
+        self._all.show(shown, studio.color_of)
+        self._selected.show(chosen, lambda class_id: _SELECTED_RGB)
+        self._labels.show(shown if is_on('Labels') else {}, list(chosen))
+        selected = None if document.selected is None else document.selected[1]
+        self._gizmo.show(None if selected is None or selected.marks.is_locked else selected)
+        recording = None if studio.recording is None else studio.recording.detections
+        show('Surfaces', self._cloud, draw_cloud, is_on('Surfaces', True))
+        show('Walls', studio.walls, draw_walls, is_on('Walls', True))
+        show('Cameras', recording, self._draw_cameras, is_on('Cameras', True))
+        show('Keyframes', studio.layer, draw_keyframes, is_on('Keyframes', True))
+        show('Answers', studio.answers or None, draw_answers)
+        # only the mode test shows these
+        is_testing = 'test' in self.desk.modes.values()
+        if studio.places is not None:
+            self.desk.layers = {'Coverage': True, 'Look-alikes': True} | self.desk.layers
+        for name, draw in (('Coverage', self._draw_coverage), ('Look-alikes', draw_look_alikes)):
+            show(name, studio.places, draw, is_testing and is_on(name, True))
+        if studio.live is not None:
+            state = studio.live.state
+            self._missing.show({key: document.landmarks[key] for key in state.missing
+                                if key in document.landmarks}, lambda class_id: _MISSING_RGB)
+            is_here = state.pose is not None and state.pose.frame_id == document.frame_id
+            show('Robot', state if is_here else None, draw_robot)
+        if recording is not None:
+            show('Image', studio.view, self._draw_image)
+        self.board.show(parts_of(self.desk))
 
-    def _show_gizmo(self) -> None:
-        selected = self._studio.document.selected
-        is_shown = selected is not None and not selected[1].marks.is_locked
-        if self._gizmo.visible != is_shown:
-            self._gizmo.visible = is_shown
-        if selected is None:
-            return
-        _, one = selected
-        if np.abs(self._gizmo.position - one.center).max() > 1e-5:
-            self._gizmo.position = one.center
-        turned = Rotation.from_quat(np.roll(self._gizmo.wxyz, -1)).inv() * Rotation.from_quat(
-            one.quat_xyzw)
-        if turned.magnitude() > 1e-4:
-            self._gizmo.wxyz = np.roll(one.quat_xyzw, 1)
-
-    def _show_view(self) -> None:
-        studio = self._studio
-        if studio.view == self._shown_view:
-            return
-        self._shown_view = studio.view
-        image: NDArray[np.uint8] | None = None
+    def _draw_image(self, scene: viser.SceneApi, view: int) -> list[Any]:
+        camera, image = self._studio.camera, None
         try:
-            image = studio.image(studio.view)
+            image = self._studio.seen().image(view)
         except CliplocError as error:
-            self._actions.log('refused', str(error))
-        camera = studio.camera
-        self._image.show(np.full((camera.height, camera.width, 3), _BLANK, dtype=np.uint8)
-                         if image is None else image, camera, studio.map_from_camera)
+            self.desk.log('refused', str(error))
+        if image is None:
+            image = np.full((camera.height, camera.width, 3), _BLANK, dtype=np.uint8)
+        return draw_image(scene, image, camera, self._studio.map_from_camera)
+
+    def picture(self, path: str) -> Content | None:
+        """Return the picture of a path; None where there is none."""
+        try:
+            return picture_of(self._studio, path)
+        except CliplocError as error:
+            self.desk.log('refused', str(error))
+            return None
 
 
 @contextmanager
@@ -204,7 +206,7 @@ def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | 
     gate, pages = Gate(host), list[Page]()
 
     def answer(path: str) -> Content | None:
-        return pages[0].desk.picture(path) if pages else None
+        return pages[0].picture(path) if pages else None
 
     async def talk(connection: Any, person: str) -> None:
         if not pages:
@@ -219,7 +221,11 @@ def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | 
         server = viser.ViserServer(host, port, verbose=False)
     # viser would open a tunnel to a server on the Internet for any browser that asks
     server.request_share_url = lambda *args, **options: None  # type: ignore[method-assign]
-    pages.append(page := Page(studio, server, live))
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    if live is not None:
+        studio.live = live
+        live.subscribe(studio.changed.set)
+    pages.append(page := Page(studio, server))
     try:
         shown_host = f'[{host}]' if ':' in host else host
         yield f'http://{shown_host}:{server.get_port()}{gate.path}', server

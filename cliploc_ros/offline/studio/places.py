@@ -6,7 +6,6 @@ Both are check_map's. The positions are fewer, in an order that spreads them: wh
 those that were tried lie all over the map.
 """
 
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,9 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import CliplocError
 from cliploc_ros.offline.mapping.check.checking import judge_grid
-from cliploc_ros.offline.mapping.check.landmark_faults import hear_witness
 from cliploc_ros.offline.mapping.check.places import Grid, LookAlike, find_look_alikes, make_grid
 from cliploc_ros.offline.mapping.check.relocalization import (
     Trial,
@@ -28,11 +25,8 @@ from cliploc_ros.offline.mapping.check.relocalization import (
 from cliploc_ros.offline.mapping.check.report import GridCheck
 from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.simulation.detector import DetectorModel, guess_detector
-from cliploc_ros.offline.studio.document import fields_of
-from cliploc_ros.offline.studio.edits import EditError, Landmarks
-from cliploc_ros.offline.studio.landmark import map_of
+from cliploc_ros.offline.studio.landmark import Landmarks, map_of
 from cliploc_ros.offline.studio.recording import Recording
-from cliploc_ros.offline.studio.studio import Studio
 
 #: No position is begun after this [s].
 LIMIT_S = 60.0
@@ -79,7 +73,7 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Cover
     begun after the limit. MapError: there are no landmarks.
     """
     tell(0.0)
-    landmark_map = map_of(landmarks, 'map', 'studio')
+    landmark_map = map_of(landmarks)
     model, detector = _detector(landmark_map, recording)
     grid = _grid(landmark_map, recording, before)
     trials: list[Trial] = []
@@ -99,20 +93,19 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Cover
 
 def _detector(landmark_map: LandmarkMap, recording: Recording | None
               ) -> tuple[DetectorModel, str]:
+    """Return the detector of a recording, or else a guess, and in words what it is."""
     guess = guess_detector(landmark_map, (_OPTIONS.mapping.edge_sigma_px,
                                           _OPTIONS.mapping.edge_sigma_share))
     if recording is None:
         return guess, 'without a recording, the camera and the detector are guesses'
     detections = recording.detections
-    guess = replace(guess, camera=detections.cameras[0])
-    if len(detections.classes) == 0:
-        return guess, 'without boxes, the detector is a guess'
-    witness = hear_witness(recording.views, landmark_map, detections.class_names,
-                           recording.options)
-    if not (witness.shown >= 0).any():
-        return guess, 'no box of the recording shows a landmark: the detector is a guess'
-    return (measure_detector(landmark_map, detections, recording.views, witness,
-                             recording.options), 'the detector is as in the recording')
+    if len(detections.classes):
+        witness = recording.witness(landmark_map)
+        if (witness.shown >= 0).any():
+            return measure_detector(landmark_map, detections, recording.views, witness,
+                                    recording.options), 'the detector is as in the recording'
+    return (replace(guess, camera=detections.cameras[0]),
+            'no box of the recording shows a landmark: the detector is a guess')
 
 
 def _grid(landmark_map: LandmarkMap, recording: Recording | None, before: Coverage | None) -> Grid:
@@ -129,75 +122,3 @@ def _grid(landmark_map: LandmarkMap, recording: Recording | None, before: Covera
     by_position = grid.poses.reshape(len(order), _OPTIONS.headings, 4, 4)
     return Grid(grid.positions[order], grid.is_near[order],
                 by_position[order].reshape(-1, 4, 4), grid.spacing_m)
-
-
-class PlacesSearch:
-    """A search in a thread of its own, one at a time.
-
-    ``on_change`` is called in any thread when there is something new to show.
-    """
-
-    def __init__(self, studio: Studio, on_change: Callable[[], None]):
-        self._studio, self._on_change = studio, on_change
-        self._thread: threading.Thread | None = None
-        self._stopped = threading.Event()
-        self._lock = threading.Lock()
-        self.share = 0.0
-        # the last two results, and why the last search found nothing
-        self.before: Coverage | None = None
-        self.last: Coverage | None = None
-        self.failure = ''
-
-    @property
-    def is_running(self) -> bool:
-        """Whether a search is under way."""
-        return self._thread is not None and self._thread.is_alive()
-
-    def start(self) -> None:
-        """Begin a search in the map as it is; EditError: one is under way, or the map is empty."""
-        with self._lock:
-            if self.is_running:
-                raise EditError('a search of places is under way: wait for it, or stop it')
-            landmarks = self._studio.document.landmarks
-            if not landmarks:
-                raise EditError('the map is empty: create a landmark first')
-            self._stopped.clear()
-            self.share, self.failure = 0.0, ''
-            self._thread = threading.Thread(target=self._run, args=(landmarks,), daemon=True,
-                                            name='places')
-            self._thread.start()
-        self._on_change()
-
-    def stop(self) -> None:
-        """Stop the search, and wait until it has stopped; the last result stays."""
-        self._stopped.set()
-        if (thread := self._thread) is not None:
-            thread.join()
-        self._on_change()
-
-    def is_stale(self) -> bool:
-        """Return whether the map was edited since the last result."""
-        last, landmarks = self.last, self._studio.document.landmarks
-        return last is not None and last.landmarks is not landmarks \
-            and fields_of(last.landmarks) != fields_of(landmarks)
-
-    def _run(self, landmarks: Landmarks) -> None:
-        try:
-            found = find_places(landmarks, self._studio.recording, self.last, self._tell)
-            self.before, self.last = self.last, found
-        except CliplocError as error:
-            self.failure = str(error)
-        except Exception as error:  # a thread that dies silently would leave the page waiting
-            self.failure = f'internal error: {error}'
-            raise
-        finally:
-            self._thread = None
-            self._on_change()
-
-    def _tell(self, share: float) -> None:
-        if self._stopped.is_set():
-            raise CliplocError('stopped')
-        if share - self.share >= 0.01:
-            self.share = share
-            self._on_change()
-

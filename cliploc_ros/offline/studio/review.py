@@ -26,6 +26,9 @@ from cliploc_ros.offline.studio.recording import Recording
 class ReviewQueue:
     """The queue of landmarks, and the decisions on them."""
 
+    ACTIONS = ('accept', 'fix', 'discard', 'step')
+    SLOW_ACTIONS = ('check',)
+
     def __init__(self, document: Document, recording: Recording | None):
         self._document, self._recording = document, recording
         self._checks: dict[str, LandmarkCheck] = {}
@@ -73,7 +76,7 @@ class ReviewQueue:
             landmarks = self._document.landmarks
             begins_anew = self._order and all(self.decision(key) for key in landmarks)
             if begins_anew:
-                self._document.apply(edits.mark(landmarks, landmarks, 'review', decision=''))
+                self._document.edit(edits.mark, landmarks, 'review', decision='')
         self._order = tuple(self._checks)
         serious = sum(one.severity >= SERIOUS for one in self._checks.values())
         source = '' if self.has_boxes else ' by the map alone: there are no boxes of a recording'
@@ -83,13 +86,13 @@ class ReviewQueue:
 
     def accept(self) -> str:
         """Accept the selection as it is, whatever the check says, and go on."""
-        ids = self._selected()
+        ids = self._document.chosen()
         return self._decide(ids, 'accepted', f'accepted {", ".join(ids)}')
 
-    def delete(self) -> str:
+    def discard(self) -> str:
         """Delete the selection, and go on."""
-        ids = self._selected()
-        self._document.apply(edits.delete(self._document.landmarks, ids))
+        ids = self._document.chosen()
+        self._document.edit(edits.delete, ids)
         if self._document.landmarks and any({*pair} & {*ids} for pair in self._duplicates):
             self._judge()  # or else its duplicate would be called one
         return self._go_on(ids[-1], f'deleted {", ".join(ids)}')
@@ -100,7 +103,7 @@ class ReviewQueue:
         The landmark is checked once more; the review goes on if no serious fault is left. The
         boxes of a moved object may still lie where it was: look at the result.
         """
-        landmark_id = self._selected()[0]
+        landmark_id = self._document.chosen()[0]
         if self._recording is None or not self.has_boxes:
             raise EditError(f'{landmark_id}: there are no boxes to fit it to: edit, accept or '
                             'delete it')
@@ -126,7 +129,7 @@ class ReviewQueue:
             return f'{what}; it still {left.faults[0]}'
         return self._decide([landmark_id], 'fixed', what, gesture)
 
-    def step(self, count: int) -> str | None:
+    def step(self, count: int) -> None:
         """Select the landmark that lies some places farther in the queue."""
         ids = [key for key in self.order if key in self._document.landmarks]
         if not ids:
@@ -134,20 +137,13 @@ class ReviewQueue:
         selection = self._document.selection
         place = ids.index(selection[0]) + count if selection else 0
         self._document.select([ids[place % len(ids)]])
-        return None
 
     # ---------------------------------------------------------------------------------------------
-
-    def _selected(self) -> tuple[str, ...]:
-        if not self._document.selection:
-            raise EditError('select a landmark first')
-        return self._document.selection
 
     def _decide(self, ids: Sequence[str], decision: str, what: str, gesture: object = None
                 ) -> str:
         """Keep a decision, and select the next landmark without one."""
-        self._document.apply(edits.mark(self._document.landmarks, ids, decision,
-                                        decision=decision), gesture)
+        self._document.edit(edits.mark, ids, decision, decision=decision, gesture=gesture)
         return self._go_on(ids[-1], what)
 
     def _go_on(self, last: str, what: str) -> str:
@@ -160,15 +156,14 @@ class ReviewQueue:
         return what
 
     def _judge(self) -> None:
-        landmarks = self._document.landmarks
+        landmarks, recording = self._document.landmarks, self._recording
         if not landmarks:
             raise EditError('there are no landmarks to review: create one first')
-        if self._recording is not None and self.has_boxes:
-            found, overlaps = self._recording.check(landmarks)
-        else:
-            landmark_map = map_of(landmarks, 'map', 'studio')
-            overlaps = find_map_overlaps(landmark_map, None, None)
-            found = check_landmarks(landmark_map, None, overlaps, MappingOptions())
+        landmark_map, views, witness = map_of(landmarks), None, None
+        if recording is not None and self.has_boxes:
+            views, witness = recording.views, recording.witness(landmark_map)
+        overlaps = find_map_overlaps(landmark_map, witness, views)
+        found = check_landmarks(landmark_map, witness, overlaps, MappingOptions())
         ids = list(landmarks)
         self._checks = {one.landmark_id: one for one in found}
         self._duplicates = [(ids[one.first], ids[one.second]) for one in overlaps

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The three-dimensional view: ellipsoids, labels, cameras, the selected image and the gizmo."""
+"""The landmarks in three dimensions: ellipsoids, labels, the gizmo; and the selected image."""
 
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -8,31 +8,24 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import trimesh.creation
 import viser
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.camera import Camera, frusta
-from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.studio.edits import Landmarks
-from cliploc_ros.offline.studio.landmark import Landmark
-from cliploc_ros.offline.studio.recording import ViewAnswer
-from cliploc_ros.offline.studio.viewpoint import pixels_of, wxyz_of
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.offline.studio.landmark import Landmark, Landmarks, fields_of
+from cliploc_ros.offline.studio.layers import SPHERE, linear
+from cliploc_ros.offline.studio.viewpoint import Bounds, pixels_of, wxyz_of
 
 # More labels than these hide the map.
 _MAX_LABELS = 60
 _MAX_LABEL_LENGTH, _SHORT_LABEL_LENGTH = 60, 24
 # Size of a letter and of a line with its margins, in a label of scale 1 [px].
 _LETTER_PX, _LINE_PX = 6.5, 28.0
-_MAX_CAMERAS = 300
-_FRUSTUM_M = 0.08
-_KEYFRAME_RGB = (0, 150, 136)
-_VERDICT_RGB = {'accepted': (30, 170, 60), 'refused': (150, 150, 150), 'wrong': (220, 0, 0)}
 # The image of the selected view lies this far in front of its camera [m].
 _IMAGE_DEPTH_M = 0.1
-_SPHERE = trimesh.creation.icosphere(subdivisions=2)
 _RING_POINTS = 40
+_GIZMO_PX = 90.0
 
 
 def _make_rings() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -59,61 +52,45 @@ class Ellipsoids:
                  opacity: float | None = None, scale: float = 1.0, has_outlines: bool = False):
         self._scene, self._name, self._on_click = scene, name, on_click
         self._opacity, self._scale, self._has_outlines = opacity, scale, has_outlines
-        self._shown: tuple[tuple[str, Landmark], ...] = ()
+        self._shown: Landmarks = {}
         self._handles: list[Any] = []
 
-    def show(self, landmarks: Sequence[tuple[str, Landmark]],
-             rgb_of: Callable[[str], tuple[int, int, int]]) -> None:
+    def show(self, landmarks: Landmarks, rgb_of: Callable[[str], tuple[int, int, int]]) -> None:
         """Show these landmarks, in the colours of their classes."""
-        landmarks = tuple(landmarks)
-        if _fields_of(landmarks) == _fields_of(self._shown):
+        if list(fields_of(landmarks).items()) == list(fields_of(self._shown).items()):
             return
-        count_changed = len(landmarks) != len(self._shown)
-        self._shown = landmarks
-        if count_changed:
+        before, self._shown = self._shown, landmarks
+        shown = list(landmarks.values())
+        colors = np.array([rgb_of(one.class_id) for one in shown], dtype=np.uint8)
+        arrays: dict[str, Any] = {
+            'batched_wxyzs': np.array([np.roll(one.quat_xyzw, 1) for one in shown], np.float32),
+            'batched_positions': np.array([one.center for one in shown], np.float32),
+            'batched_scales': np.array([self._scale * one.semi_axes for one in shown],
+                                       np.float32)}
+        if len(shown) != len(before):
             for handle in self._handles:
                 handle.remove()
-            self._handles = []
-        if not landmarks:
+            self._handles = self._added(arrays, colors) if shown else []
             return
-        arrays: dict[str, Any] = {
-            'batched_wxyzs': np.array([np.roll(one.quat_xyzw, 1) for _, one in landmarks],
-                                      dtype=np.float32),
-            'batched_positions': np.array([one.center for _, one in landmarks], dtype=np.float32),
-            'batched_scales': np.array([self._scale * one.semi_axes for _, one in landmarks],
-                                       dtype=np.float32)}
-        colors = np.array([rgb_of(one.class_id) for _, one in landmarks], dtype=np.uint8)
-        if not self._handles:
-            self._add(arrays, colors)
-        else:
-            for handle in self._handles:
-                for key, value in arrays.items():
-                    setattr(handle, key, value)
-            self._handles[0].batched_colors = linear(colors)
-            if self._has_outlines:
-                self._handles[1].batched_colors = colors
+        for handle, its in zip(self._handles, (linear(colors), colors), strict=False):
+            for key, value in (arrays | {'batched_colors': its}).items():
+                setattr(handle, key, value)
 
-    def _add(self, arrays: dict[str, Any], colors: NDArray[np.uint8]) -> None:
+    def _added(self, arrays: dict[str, Any], colors: NDArray[np.uint8]) -> list[Any]:
         add: Any = partial(self._scene.add_batched_meshes_simple, cast_shadow=False,
                            receive_shadow=False, **arrays)
-        body = add(self._name, _SPHERE.vertices, _SPHERE.faces, opacity=self._opacity,
+        body = add(self._name, SPHERE.vertices, SPHERE.faces, opacity=self._opacity,
                    batched_colors=linear(colors))
         for modifier in (None, 'shift'):
             body.on_click(modifier=modifier)(self._clicked)
-        self._handles = [body]
-        if self._has_outlines:
-            # edges of empty triangles: a mesh of lines, one pixel wide at any scale, and dark
-            self._handles.append(add(f'{self._name}_outlines', *_RINGS, wireframe=True,
-                                     lod='off', batched_colors=colors))
+        # edges of empty triangles: a mesh of lines, one pixel wide at any scale, and dark
+        return [body] + ([add(f'{self._name}_outlines', *_RINGS, wireframe=True, lod='off',
+                              batched_colors=colors)] if self._has_outlines else [])
 
     def _clicked(self, event: Any) -> None:
-        shown = self._shown
-        if event.instance_index is not None and event.instance_index < len(shown):
-            self._on_click(event, shown[event.instance_index][0])
-
-
-def _fields_of(landmarks: Sequence[tuple[str, Landmark]]) -> list[tuple[str, object]]:
-    return [(key, one.fields) for key, one in landmarks]
+        ids = list(self._shown)
+        if event.instance_index is not None and event.instance_index < len(ids):
+            self._on_click(event, ids[event.instance_index])
 
 
 class Labels:
@@ -124,14 +101,11 @@ class Labels:
 
     def __init__(self, server: viser.ViserServer, up: NDArray[np.float64]):
         self._server, self._up = server, up
-        self._handles: dict[str, tuple[Landmark, Any]] = {}
+        self._handles: dict[str, Any] = {}
         self._count = 0
-        # landmarks, selection, where the labels begin, their texts
-        self._shown: tuple[Landmarks, Sequence[str], NDArray[np.float64], list[str]] = (
-            {}, (), np.empty((0, 3)), [])
+        self._shown: tuple[Landmarks, Sequence[str]] = {}, ()
         self._camera: Any = None
         self._lock, self._is_stale = threading.Lock(), False
-        self.is_shown = True
 
         @server.on_client_connect
         def _(client: viser.ClientHandle) -> None:
@@ -140,10 +114,7 @@ class Labels:
 
     def show(self, landmarks: Landmarks, selection: Sequence[str]) -> None:
         """Show the labels of these landmarks; those of the selection come first."""
-        tops = np.array([one.center + float(np.linalg.norm(one.basis.T @ self._up)) * self._up
-                         for one in landmarks.values()]).reshape(-1, 3)
-        self._shown = landmarks, selection, tops, [
-            _shortened(one.label, key in selection) for key, one in landmarks.items()]
+        self._shown = landmarks, selection
         self._lay_out()
 
     def _moved(self, camera: Any) -> None:
@@ -185,31 +156,31 @@ class Labels:
             if len(taken) >= _MAX_LABELS:
                 return
 
-    def _set(self, landmarks: Landmarks, selection: Sequence[str], tops: NDArray[np.float64],
-             texts: Sequence[str]) -> None:
-        keys = list(landmarks)
-        rows = dict(self._with_room(tops, texts, np.isin(keys, selection))
-                    if self.is_shown and keys else ())
+    def _set(self, landmarks: Landmarks, selection: Sequence[str]) -> None:
+        tops = np.array([one.center + float(np.linalg.norm(one.basis.T @ self._up)) * self._up
+                         for one in landmarks.values()]).reshape(-1, 3)
+        keys, texts = list(landmarks), [
+            _shortened(one.label, key in selection) for key, one in landmarks.items()]
+        rows = dict(self._with_room(tops, texts, np.isin(keys, selection)) if keys else ())
         for key in self._handles.keys() - landmarks.keys():
-            self._handles.pop(key)[1].remove()
+            self._handles.pop(key).remove()
         for key in self._handles.keys() - {keys[row] for row in rows}:
-            if self._handles[key][1].visible:
-                self._handles[key][1].visible = False
+            _set_props(self._handles[key], visible=False)
         for row, scale in rows.items():
-            key, text = keys[row], texts[row]
-            one = landmarks[key]
-            old, handle = self._handles.get(key, (None, None))
-            if handle is None:
+            if keys[row] not in self._handles:
                 # ids may hold any characters, names of nodes not
-                handle = self._server.scene.add_label(f'/labels/{self._count}', text,
-                                                      anchor='bottom-center')
+                self._handles[keys[row]] = self._server.scene.add_label(
+                    f'/labels/{self._count}', texts[row], anchor='bottom-center')
                 self._count += 1
-            if old is not one:
-                handle.position = tops[row]
-            for name, value in (('text', text), ('font_screen_scale', scale), ('visible', True)):
-                if getattr(handle, name) != value:
-                    setattr(handle, name, value)
-            self._handles[key] = (one, handle)
+            _set_props(self._handles[keys[row]], position=tops[row], text=texts[row],
+                       font_screen_scale=scale, visible=True)
+
+
+def _set_props(handle: Any, **props: Any) -> None:
+    """Set properties that differ: viser sends each that is set to all browsers."""
+    for name, value in props.items():
+        if not np.array_equal(getattr(handle, name), value):
+            setattr(handle, name, value)
 
 
 def _shortened(label: str, is_selected: bool) -> str:
@@ -217,107 +188,44 @@ def _shortened(label: str, is_selected: bool) -> str:
     return label if len(label) <= length else f'{label[:length - 1]}…'
 
 
-class ViewImage:
-    """The image of the selected view, in the scene in front of its camera."""
+class Gizmo:
+    """The handles that move and turn the selected landmark."""
 
-    def __init__(self, scene: viser.SceneApi):
-        self._scene = scene
-        self._camera: Camera | None = None
-        self.handle: Any = None
-        self.pose = np.eye(4)
+    def __init__(self, scene: viser.SceneApi, on_drag: Callable[[Any], None]):
+        # of the same size at any distance, and visible inside large landmarks
+        self.handle = scene.add_transform_controls('/gizmo', scale=_GIZMO_PX, fixed=True,
+                                                   depth_test=False, visible=False)
+        self.handle.on_update(on_drag)
 
-    def _take(self, camera: Camera, picture: NDArray[np.uint8]) -> None:
-        """Show the pictures of this camera from now on, as large as its view."""
-        self._camera, self.pose = camera, np.eye(4)
-        half = (camera.width / 2.0, camera.height / 2.0)
-        self._middle = np.array([(half[0] - camera.cx) / camera.fx,
-                                 (half[1] - camera.cy) / camera.fy, 1.0]) * _IMAGE_DEPTH_M
-        self.handle = self._scene.add_image(
-            '/view/image', picture, camera.width / camera.fx * _IMAGE_DEPTH_M,
-            camera.height / camera.fy * _IMAGE_DEPTH_M, format='jpeg', cast_shadow=False,
-            receive_shadow=False)
-
-    def show(self, picture: NDArray[np.uint8], camera: Camera,
-             map_from_camera: NDArray[np.float64]) -> None:
-        """Show a picture of a camera at a pose (4, 4)."""
-        if camera != self._camera:
-            self._take(camera, picture)
-        self.handle.image = picture
-        if not np.array_equal(self.pose, map_from_camera):
-            self.pose = map_from_camera
-            self.handle.wxyz = wxyz_of(map_from_camera)
-            self.handle.position = map_from_camera[:3, :3] @ self._middle + map_from_camera[:3, 3]
-
-
-class Answers:
-    """The relocalizer's answers: a sphere where it was asked, a line to the pose it found."""
-
-    def __init__(self, scene: viser.SceneApi, detections: PosedDetections):
-        self._scene, self._poses = scene, detections.map_from_camera
-        self._shown: tuple[ViewAnswer, ...] = ()
-
-    def show(self, answers: tuple[ViewAnswer, ...]) -> None:
-        """Show these answers instead of the last ones."""
-        if answers is self._shown:
+    def show(self, landmark: Landmark | None) -> None:
+        """Put the gizmo to a landmark, or hide it."""
+        _set_props(self.handle, visible=landmark is not None)
+        if landmark is None:
             return
-        self._shown = answers
-        asked = np.array([self._poses[one.view, :3, 3] for one in answers])
-        colors = np.array([_VERDICT_RGB[one.verdict] for one in answers], dtype=np.uint8)
-        self._scene.add_batched_meshes_simple(
-            '/answers', _SPHERE.vertices * 0.03, _SPHERE.faces,
-            np.tile([1.0, 0.0, 0.0, 0.0], (len(answers), 1)), asked, batched_colors=linear(colors),
-            cast_shadow=False, receive_shadow=False)
-        pairs = [(asked[row], one.result.map_from_camera[:3, 3], colors[row])
-                 for row, one in enumerate(answers) if one.result.map_from_camera is not None]
-        points = np.array([pair[:2] for pair in pairs]).reshape(-1, 2, 3)
-        line_colors = np.array([[pair[2]] * 2 for pair in pairs], dtype=np.uint8)
-        self._scene.add_line_segments('/answers/lines', points, line_colors.reshape(-1, 2, 3),
-                                      thickness=2.0, thickness_units='screen')
+        if np.abs(self.handle.position - landmark.center).max() > 1e-5:
+            self.handle.position = landmark.center
+        turned = Rotation.from_quat(np.roll(self.handle.wxyz, -1)).inv() * Rotation.from_quat(
+            landmark.quat_xyzw)
+        if turned.magnitude() > 1e-4:
+            self.handle.wxyz = np.roll(landmark.quat_xyzw, 1)
 
 
-def linear(rgb: Any) -> NDArray[np.uint8]:
-    """Return colours (n, 3) as viser takes those of instances: for linear light."""
-    return np.asarray(255.0 * (np.asarray(rgb) / 255.0) ** 2.2, dtype=np.uint8)
+def draw_image(scene: viser.SceneApi, picture: NDArray[np.uint8], camera: Camera,
+               map_from_camera: NDArray[np.float64]) -> list[Any]:
+    """Draw an image in front of its camera, at a pose (4, 4)."""
+    middle = _IMAGE_DEPTH_M * np.array([(camera.width / 2.0 - camera.cx) / camera.fx,
+                                        (camera.height / 2.0 - camera.cy) / camera.fy, 1.0])
+    return [scene.add_image(
+        '/view/image', picture, camera.width / camera.fx * _IMAGE_DEPTH_M,
+        camera.height / camera.fy * _IMAGE_DEPTH_M, format='jpeg', cast_shadow=False,
+        receive_shadow=False, wxyz=wxyz_of(map_from_camera),
+        position=map_from_camera[:3, :3] @ middle + map_from_camera[:3, 3])]
 
 
-def some_cameras(count: int) -> NDArray[np.int64]:
-    """Return the rows of the cameras to draw: all, or every n-th of many."""
-    return np.arange(0, count, max(1, -(-count // _MAX_CAMERAS)))
-
-
-def draw_recording(scene: viser.SceneApi, detections: PosedDetections,
-                   on_click: Callable[[Any, int], None]) -> list[Any]:
-    """Draw the trajectory and the cameras, all of them or every n-th; a click chooses a view."""
-    handles: list[Any] = []
-    poses, order = detections.map_from_camera, detections.by_camera
-    is_way = np.diff(detections.frame_cameras[order]) == 0
-    if is_way.any():
-        path = np.stack([poses[order[:-1][is_way], :3, 3], poses[order[1:][is_way], :3, 3]],
-                        axis=1)
-        handles.append(scene.add_line_segments('/trajectory', path, (90, 90, 90), thickness=1.5,
-                                               thickness_units='screen'))
-    shown = order[some_cameras(len(poses))]
-    handles.append(scene.add_line_segments(
-        '/cameras', frusta([detections.camera_of(row) for row in shown], poses[shown],
-                           _FRUSTUM_M),
-        (120, 120, 200), thickness=1.0, thickness_units='screen'))
-    handle = scene.add_batched_meshes_simple(
-        '/camera_centers', _SPHERE.vertices * 0.012, _SPHERE.faces,
-        np.tile([1.0, 0.0, 0.0, 0.0], (len(shown), 1)), poses[shown, :3, 3],
-        batched_colors=linear((120, 120, 200)), cast_shadow=False, receive_shadow=False)
-
-    @handle.on_click
-    def _(event: Any) -> None:
-        if event.instance_index is not None:
-            on_click(event, int(shown[event.instance_index]))
-
-    return [*handles, handle]
-
-
-def draw_keyframes(scene: viser.SceneApi, layer: KeyframeLayer) -> list[Any]:
-    """Draw the cameras of the keyframes, all of them or every n-th."""
-    shown = some_cameras(len(layer))
-    return [scene.add_line_segments(
-        '/keyframes', frusta([layer.camera_of(row) for row in shown],
-                             layer.map_from_camera[shown], 1.5 * _FRUSTUM_M),
-        _KEYFRAME_RGB, thickness=1.5, thickness_units='screen')]
+def draw_floor(scene: viser.SceneApi, extent: Bounds) -> None:
+    """Draw the lines of the floor, half a metre apart."""
+    side = 2.0 * float(np.ceil(1.3 * extent.radius_m)) + 2.0
+    below = extent.middle - (extent.middle @ extent.up - extent.floor_m) * extent.up
+    scene.add_grid('/floor', width=side, height=side, cell_size=0.5, fade_strength=2.0,
+                   cell_color=(225, 225, 225), section_color=(190, 190, 190), position=below,
+                   wxyz=wxyz_of(extent.upright))

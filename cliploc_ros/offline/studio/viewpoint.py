@@ -61,8 +61,11 @@ def up_direction(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return z if found is None or found[1] < _SAME_UP_DEG else np.asarray(found[0].T @ z)
 
 
-def extent_of(centers: NDArray[np.float64], poses: NDArray[np.float64]) -> Bounds:
+def extent_of(landmarks: Sequence[NDArray[np.float64]], poses: NDArray[np.float64] | None
+              ) -> Bounds:
     """Return the extent of landmarks (n, 3) and the cameras (m, 4, 4) that saw them [m]."""
+    centers = np.reshape(landmarks, (-1, 3))
+    poses = np.empty((0, 4, 4)) if poses is None else poses
     up = up_direction(poses)
     points = np.concatenate([centers, poses[:, :3, 3]])
     if not len(points):

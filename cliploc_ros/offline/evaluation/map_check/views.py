@@ -3,6 +3,7 @@
 """The room's own images beside an advice: a landmark in its best view, or the nearest view."""
 
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -10,25 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.ellipsoid import (
-    ellipse_bboxes,
-    ellipses_in_pixels,
-    outline_points,
-    project_ellipsoids,
-)
-from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, outline_points
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.check.relocalization import Trial
 from cliploc_ros.offline.mapping.check.report import Advice
-from cliploc_ros.offline.mapping.landmarks import box_iou
+from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map
+from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.sightings import find_sightings, outlines_in_view
+from cliploc_ros.offline.mapping.views import make_views
 
 #: Returns the image (h, w, 3), red first, of a time [s] and a camera, as a pinhole shows it.
 ReadImage = Callable[[float, str, Camera], NDArray[np.uint8] | None]
-_MOST_FRAMES = 600
-# A landmark that fills this share of the image is large enough.
-_LARGE = 0.04
-_OWN_IOU = 0.3
 # A picture of a landmark is this many times as large as it.
 _AROUND = 3.0
 # An angle that makes a view as different as a metre does [deg]; what is the same view, and a view
@@ -55,9 +50,12 @@ class ViewPainter:
         """Return the view that shows best what an advice is about; None where there is none."""
         if advice.landmarks:
             rows = [self._map.landmark_ids.index(one) for one in advice.landmarks]
-            found = self._showing(rows[0], 'outlined: ' + ' and '.join(advice.landmarks))
+            words = 'outlined: ' + ' and '.join(advice.landmarks)
+            found = [(one.view, words) for one in find_sightings(
+                self._detections, self._shown[rows[0]], self._map.centers[rows[0]],
+                self._map.shapes[rows[0]], len(self._detections))]
         elif advice.view is not None:
-            rows, found = [], self._near(advice.view)
+            rows, found = [], list(self._near(advice.view))
         else:
             return None
         for frame, words in found:
@@ -66,23 +64,14 @@ class ViewPainter:
                 return Picture(picture, f'{words}; image at {seconds:.0f} s')
         return None
 
-    def _showing(self, row: int, words: str) -> Iterator[tuple[int, str]]:
-        """Yield the frames that show a landmark: whole, large, in a box of it first."""
-        worths = []
-        for frame in self._detections.every(max(1, len(self._detections) // _MOST_FRAMES)):
-            outline = self._outlines(frame, [row])
-            if not np.isfinite(outline).all():
-                continue
-            camera, box = self._detections.camera_of(frame), ellipse_bboxes(outline)
-            bounds = np.array([0.0, 0.0, camera.width, camera.height])
-            inside = np.clip(box, 0.0, np.tile(bounds[2:], 2))
-            area, seen = (float(np.prod(one[0, 2:] - one[0, :2])) for one in (box, inside))
-            worth = seen / area * min(1.0, seen / (_LARGE * camera.width * camera.height))
-            if any(box_iou(box[0], one, bounds) > _OWN_IOU for one in self._boxes(frame)):
-                worth += 1.0
-            if seen > 0.0:
-                worths.append((-worth, int(frame)))
-        yield from ((frame, words) for _, frame in sorted(worths))
+    @cached_property
+    def _shown(self) -> list[NDArray[np.int64]]:
+        """Return the boxes that show each landmark."""
+        options = MappingOptions()
+        return group_boxes(associate(
+            make_views(self._detections, options),
+            landmarks_of_map(self._map, self._detections.class_names), options.association_iou),
+            len(self._map))
 
     def _near(self, view: Trial) -> Iterator[tuple[int, str]]:
         """Yield the frames near to a view, the nearest first, and how far they are off."""
@@ -99,12 +88,6 @@ class ViewPainter:
         return self._detections.bboxes_xyxy[slice(
             *self._detections.frame_offsets[frame:frame + 2])]
 
-    def _outlines(self, frame: int, rows: list[int]) -> NDArray[np.float64]:
-        """Return the outlines (n, 5) of landmarks in a frame [px]; NaN behind the camera."""
-        return ellipses_in_pixels(project_ellipsoids(
-            invert_transform(self._detections.map_from_camera[frame]), self._map.centers[rows],
-            self._map.shapes[rows]), self._detections.camera_of(frame))
-
     def _draw(self, frame: int, rows: list[int]) -> bytes | None:
         """Return a JPEG with the boxes of a frame, and with outlines; None without its image."""
         camera = self._detections.camera_of(frame)
@@ -112,7 +95,8 @@ class ViewPainter:
                            self._detections.name_of(frame), camera)
         if image is None:
             return None
-        outlines = self._outlines(frame, rows)
+        outlines = outlines_in_view(self._detections, frame, self._map.centers[rows],
+                                    self._map.shapes[rows])
         corner, size = np.zeros(2), np.array([camera.width, camera.height], dtype=np.float64)
         if rows:
             # a part of the image, in which a small landmark is to be seen

@@ -24,6 +24,7 @@ from cliploc_ros.core.keyframes.localization import (
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.offline.mapping.check.landmark_faults import Witness
 from cliploc_ros.offline.mapping.evidence import REACH, best_ious, explained, is_expected
@@ -195,10 +196,12 @@ class Trial:
     #: other frames show enough of its objects to judge the map by it, whatever the verdict
     by_objects: Verdict | None = None
     is_judged: bool = True
+    result: Relocalization | None = None  #: The whole answer
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the trial as plain values, for JSON."""
-        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        """Return the trial as plain values, for JSON, without the whole answer."""
+        values = {one.name: getattr(self, one.name) for one in fields(self)
+                  if one.name != 'result'}
         return {name: value.round(4).tolist() if isinstance(value, np.ndarray) else value
                 for name, value in values.items()}
 
@@ -234,7 +237,7 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
         relocalizer = None
         if len(fold.rows):
             semi_axes, quats_xyzw = ellipsoid_numbers(fold.landmarks.bases)
-            relocalizer = _relocalizer(replace(
+            relocalizer = make_relocalizer(replace(
                 landmark_map.select(fold.rows.tolist()), centers=fold.landmarks.centers,
                 semi_axes=semi_axes, quats_xyzw=quats_xyzw), options)
         localizer = None
@@ -252,7 +255,7 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
                                     None, 'the other parts show no landmark', stamp_s,
                                     is_judged=is_judged))
                 continue
-            judge = partial(_try, relocalizer, replace(
+            judge = partial(try_view, relocalizer, replace(
                 observation, similarities=np.asarray(observation.similarities)[:, fold.rows]),
                 pose, int((seen >= 0).sum()), options, stamp_s)
             trial = replace(judge(), is_judged=is_judged)
@@ -296,23 +299,23 @@ def each_pose(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np
     The model has what there is to see, the map what the relocalizer knows; poses (k, 4, 4) are
     the true map_from_camera.
     """
-    labels, relocalizer = LabelModel.of(landmark_map), _relocalizer(landmark_map, options)
+    labels, relocalizer = LabelModel.of(landmark_map), make_relocalizer(landmark_map, options)
     for number, pose in enumerate(poses):
         rng = np.random.default_rng([options.random_seed, number])
         detections, shown = model.detect(pose, rng)
         similarities = labels.similarities(shown, detections.class_ids, detections.bboxes_xyxy,
                                            rng)
-        yield _try(relocalizer, Observation(model.camera, detections, similarities), pose,
-                   int((shown >= 0).sum()), options)
+        yield try_view(relocalizer, Observation(model.camera, detections, similarities), pose,
+                       int((shown >= 0).sum()), options)
 
 
 def try_observations(landmark_map: LandmarkMap, observations: Sequence[PosedObservation],
                      options: CheckOptions, tell: Tell) -> list[Trial]:
     """Relocalize observations with recorded similarities."""
-    relocalizer = _relocalizer(landmark_map, options)
+    relocalizer = make_relocalizer(landmark_map, options)
     trials = []
     for number, (one, pose, stamp_s) in enumerate(observations, start=1):
-        trials.append(_try(relocalizer, one, pose, len(one.detections), options, stamp_s))
+        trials.append(try_view(relocalizer, one, pose, len(one.detections), options, stamp_s))
         tell(number / len(observations))
     return trials
 
@@ -337,14 +340,16 @@ def refused_spans(trials: Sequence[Trial]) -> Iterator[list[Trial]]:
     yield from sorted((run for run in runs if run), key=len, reverse=True)
 
 
-def _relocalizer(landmark_map: LandmarkMap, options: CheckOptions) -> Relocalizer:
+def make_relocalizer(landmark_map: LandmarkMap, options: CheckOptions) -> Relocalizer:
+    """Return the relocalizer of a check."""
     k = min(options.relocalizer.k, len(landmark_map))
     return Relocalizer(landmark_map, replace(options.relocalizer, k=k))
 
 
-def _try(relocalizer: Relocalizer, observation: Observation, map_from_camera: NDArray[np.float64],
-         landmarks: int, options: CheckOptions, stamp_s: float | None = None,
-         recognizer: ImageRecognizer | None = None) -> Trial:
+def try_view(relocalizer: Relocalizer, observation: Observation,
+             map_from_camera: NDArray[np.float64], landmarks: int, options: CheckOptions,
+             stamp_s: float | None = None, recognizer: ImageRecognizer | None = None) -> Trial:
+    """Relocalize in one view whose pose is known, with so many landmarks of the map in it."""
     up = map_from_camera[2, :3] if options.use_vertical else None  # the map's z in the camera
     result = relocalizer.relocalize([replace(observation, up_in_camera=up)], recognizer)
     estimate, error_m = result.map_from_camera, None
@@ -355,4 +360,5 @@ def _try(relocalizer: Relocalizer, observation: Observation, map_from_camera: ND
         verdict = 'misled' if error_m > options.wrong_m else 'accepted'
     return Trial(verdict, map_from_camera[:3, 3], map_from_camera[:3, 2],
                  len(observation.detections), landmarks,
-                 None if estimate is None else estimate[:3, 3], error_m, result.reason, stamp_s)
+                 None if estimate is None else estimate[:3, 3], error_m, result.reason, stamp_s,
+                 result=result)

@@ -9,13 +9,15 @@ const SVG = 'http://www.w3.org/2000/svg';
 const MODES = ['review', 'edit', 'create', 'test'];
 // Rows that the browser lays out at once; a search finds the others.
 const MOST_ROWS = 300;
+// Between the pictures of the film; the server knows how many views these are.
+const PICTURE_MS = 200;
 const STEPS_M = [0.01, 0.05, 0.1, 0.5];
 const person = Array.from(crypto.getRandomValues(new Uint8Array(12)),
                           byte => byte.toString(16).padStart(2, '0')).join('');
 const base = location.pathname.replace(/[^/]*$/, '');
-const state = {file: {}, rows: [], selection: {ids: [], one: null}, review: {}, log: [], test: {},
+const state = {file: {}, rows: [], selection: {ids: [], one: null}, review: {}, log: [], test: {}, layers: {},
                view: null, new: null};
-let mode = 'review', socket = null, followed = null, step = 0.1, gesture = 0, wantsCheck = true;
+let mode = 'review', socket = null, followed = null, step = 0.1, gesture = 0, wantsCheck = true, follows = false, film = null, isFlat = false;
 // What the image shows, in its pixels; null: all of it. A goal waits for its view.
 let zoom = null, goal = null, shownView = -1, drag = null, typedNew = {};
 const shares = {review: 0.6, edit: 0.5, create: 0.72, test: 0.5};
@@ -24,7 +26,7 @@ const shares = {review: 0.6, edit: 0.5, create: 0.72, test: 0.5};
 
 function send(name, values = {}) {
   // A view that a person chooses stays when the selection's views are found later.
-  if (name === 'view' && state.selection?.one) followed = state.selection.one.id;
+  if (name === 'show_view' && state.selection?.one) followed = state.selection.one.id;
   if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify({do: name, ...values}));
 }
 
@@ -113,10 +115,12 @@ function show(changed) {
   if (has('file')) showFile();
   if (has('selection')) follow();
   if (has('selection', 'file')) showCard();
-  if (has('selection', 'review', 'new', 'test', 'file', 'view')) showPanel();
+  if (has('selection', 'review', 'new', 'test', 'file', 'view', 'layers')) showPanel();
   if (has('rows', 'selection')) showRows();
   if (has('view', 'selection', 'new', 'file', 'rows')) showView();
   if (has('selection', 'view')) showStrip();
+  if (has('layers', 'file')) showLayers();
+  if (follows && has('view')) send('look_through');
   if (has('log')) showLog();
   if (has('review')) {
     $('busy').textContent = (state.review.running || []).map(
@@ -143,7 +147,7 @@ function setMode(name) {
 
 function resize() {
   $('view').style.flex = shares[mode];
-  $('scene').style.flex = 1 - shares[mode];
+  $('scene').style.flex = $('view').hidden ? 1 : 1 - shares[mode];
   // viser covers a scene that is narrower than this with its panel
   const scale = Math.min(1, $('scene').clientWidth / 620);
   Object.assign($('frame').style, {width: `${100 / scale}%`, height: `${100 / scale}%`,
@@ -165,7 +169,10 @@ function showFile() {
   }
   $('conflict').hidden = !file.conflict;
   fill($('classes'), file.classes.map(value => el('option', {value})));
-  $('view').hidden = $('splitter').hidden = !file.views;
+  if ($('view').hidden === Boolean(file.views)) {
+    $('view').hidden = $('splitter').hidden = !file.views;
+    resize();
+  }
   $('slider').max = Math.max(0, file.views - 1);
 }
 
@@ -186,7 +193,7 @@ function lookAt([view, left, top, right, bottom]) {
   const within = (middle, size, whole) => size > whole ? (whole - size) / 2
     : Math.max(0, Math.min(whole - size, middle - size / 2));
   goal = {view, x: within((left + right) / 2, w, width), y: within((top + bottom) / 2, h, height), w, h};
-  send('view', {view});
+  send('show_view', {view});
   if (state.view.view === view) showView();
 }
 
@@ -237,8 +244,8 @@ const PANELS = {
       buttons(button('Accept', doing('accept'), {key: 'A', kind: 'main', off: !one}),
               button('Fix', doing('fix'), {key: 'F', off: !one || !state.file.has_boxes,
                                            hint: 'merge a duplicate, fit others to their boxes'}),
-              button('Delete', doing('review_delete'), {key: 'D', kind: 'danger', off: !one}),
-              button('Skip', doing('next'), {key: 'N'})),
+              button('Delete', doing('discard'), {key: 'D', kind: 'danger', off: !one}),
+              button('Skip', doing('step', {count: 1}), {key: 'N'})),
       one && one.decision ? el('p', {className: 'note done'}, one.decision) : null,
       one && one.is_checked ? (one.faults.length
         ? el('ul', {className: 'faults'}, ...one.faults.map(text => el('li', {}, text)))
@@ -275,7 +282,7 @@ const PANELS = {
             'The dashed ellipse is the fit. A third box makes it better.'][Math.min(count, 2)]),
       made.doubt ? el('p', {className: 'note', style: 'color:var(--bad)'}, made.doubt) : null,
       el('div', {className: 'chips'}, ...made.boxes.map(([view]) => button(
-        `view ${view}`, doing('view', {view}), {hint: 'show it'}))),
+        `view ${view}`, doing('show_view', {view}), {hint: 'show it'}))),
       input('label', 'Label'), input('class_id', 'Class', 'classes'),
       buttons(button('Create', create, {key: '↵', kind: 'main', off: count < 2}),
               button('Next view', doing('next_view'), {key: 'C', off: !count, hint: 'a view from another side'}),
@@ -283,26 +290,23 @@ const PANELS = {
               button('Forget all', doing('forget'), {off: !count}))];
   },
   test() {
-    const test = state.test, is = name => test.running.includes(name), views = state.file.views;
-    const check = (text, name, isOn) => el('label', {className: 'note'}, el('input', {
-      type: 'checkbox', checked: isOn, style: 'width:auto', onchange: doing(name)}), ` ${text}`);
+    const test = state.test, is = name => test.running.includes(name), views = state.file.views,
+      isAsked = is('relocalize_robot') || is('reload_robot');
     return [
       buttons(button('Relocalize the recording', doing('relocalize_all'), {kind: 'main', off: !views || is('relocalize_all')}),
               button('Relocalize here', doing('relocalize_here'), {off: !views}),
-              test.is_searching ? button('Stop', doing('places_stop'), {kind: 'danger'})
-                : button('Coverage and look-alikes', doing('places'), {hint: 'simulated views all over the map, up to a minute'})),
-      test.is_searching ? el('progress', {max: 1, value: test.share}) : null,
-      test.failure ? note(test.failure) : null,
+              is('search_places') ? button('Stop', doing('stop_search'), {kind: 'danger'})
+                : button('Coverage and look-alikes', doing('search_places'), {hint: 'simulated views all over the map, up to a minute'})),
+      is('search_places') ? el('progress', {max: 1, value: test.share}) : null,
       test.is_stale ? note('of the map before the last edits: search again') : null,
       ...test.lines.map(note),
       ...test.legend.map(([color, text]) => el('div', {}, el('span', {style: `color:${color}`}, '■ '), text)),
-      test.lines.length ? check('Show coverage', 'show_coverage', test.coverage) : null,
-      test.lines.length ? check('Show look-alikes', 'show_links', test.links) : null,
+      ...['Coverage', 'Look-alikes'].filter(name => name in state.layers).map(layerBox),
       test.answers.length ? el('div', {className: 'answers'}, ...test.answers.map(([view, verdict, error, reason]) =>
-        button(`view ${view}: ${verdict}${error === null ? '' : `, off by ${error} m`}${reason ? `; ${reason}` : ''}`, doing('view', {view})))) : null,
-      ...(test.robot ? [el('hr'), ...test.robot.lines.map(note),
-        buttons(button('Relocalize the robot', doing('relocalize_robot'), {off: test.robot.is_busy}),
-                button('Let it reload its map', doing('reload_robot'), {off: test.robot.is_busy}),
+        button(`view ${view}: ${verdict}${error === null ? '' : `, off by ${error} m`}${reason ? `; ${reason}` : ''}`, doing('show_view', {view})))) : null,
+      ...(test.robot ? [el('hr'), ...test.robot.map(note),
+        buttons(button('Relocalize the robot', doing('relocalize_robot'), {off: isAsked}),
+                button('Let it reload its map', doing('reload_robot'), {off: isAsked}),
                 button('Look at its pose', doing('look_at_robot')))] : [])];
   }};
 
@@ -463,20 +467,35 @@ function pointerUp(event) {
   drag = null;
   if (!done) return;
   if (done.box) {
-    send('draw', {corner: done.box.slice(0, 2), other: done.box.slice(2)});
+    send('draw', {view: state.view.view, corner: done.box.slice(0, 2), other: done.box.slice(2)});
     const own = state.new.boxes.find(([view]) => view === state.view.view);
     if (own) own[1] = done.box; else state.new.boxes.push([state.view.view, done.box]);
     showView();
   } else if (!done.isMoved) {
     const [x, y] = done.start;
-    const isOnBox = state.view.boxes.some(one => x > one[0] && x < one[2] && y > one[1] && y < one[3]);
-    send(mode === 'create' && isOnBox && event.button === 0 ? 'take' : 'select_at', {pixel: done.start});
+    const box = smallest(state.view.boxes.filter(one => x > one[0] && x < one[2] && y > one[1] && y < one[3]),
+                         one => (one[2] - one[0]) * (one[3] - one[1]));
+    if (mode === 'create' && box && event.button === 0) {
+      send('draw', {view: state.view.view, corner: box.slice(0, 2), other: box.slice(2, 4)});
+    } else {
+      const outline = smallest(state.view.outlines.filter(one => isAround(one, x, y)), one => one[3] * one[4]);
+      send('select', {id: outline ? outline[0] : ''});
+    }
   }
+}
+
+const smallest = (found, size) => found.sort((one, other) => size(one) - size(other))[0];
+
+// Whether an outline (id, centre, semi-axes, angle) is around a point.
+function isAround([, cx, cy, rx, ry, turn], x, y) {
+  const angle = turn * Math.PI / 180, dx = x - cx, dy = y - cy;
+  return Math.hypot((dx * Math.cos(angle) + dy * Math.sin(angle)) / rx,
+                    (dy * Math.cos(angle) - dx * Math.sin(angle)) / ry) < 1;
 }
 
 function stepView(count) {
   if (!state.view) return;
-  send('view', {view: Math.max(0, Math.min(state.file.views - 1, state.view.view + count))});
+  send('show_view', {view: Math.max(0, Math.min(state.file.views - 1, state.view.view + count))});
 }
 
 function bestView() {
@@ -496,9 +515,42 @@ function showStrip() {
     el('small', {}, `${one[0]}${one[5] ? '' : ' ?'}`))));
 }
 
+// ---- the panel of the scene: its layers, where a person looks from, the recording as a film
+
+const box = (text, isOn, apply) => el('label', {}, el('input', {
+  type: 'checkbox', checked: isOn, onchange: event => apply(event.target.checked)}), ` ${text}`);
+const layerBox = name => box(name, state.layers[name], is_shown => send('show_layer', {name, is_shown}));
+
+function showLayers() {
+  fill($('layers'), [
+    buttons(button('Everything', doing('overview'), {key: 'O'}),
+            button('From above', doing('from_above'), {key: 'B'}),
+            button('Selection', doing('fly'), {key: 'G'})),
+    box('Without perspective', isFlat, is_flat => { isFlat = is_flat; send('flatten', {is_flat}); }),
+    ...Object.keys(state.layers).map(layerBox),
+    ...(state.file.views ? [box('Follow the view', follows, followView),
+                            button(film ? 'Stop' : 'Play the recording', playOrStop)] : [])]);
+}
+
+// The cameras nearby would be in the way.
+function followView(isOn) {
+  follows = isOn;
+  send('show_layer', {name: 'Cameras', is_shown: !isOn});
+  if (isOn) send('look_through');
+}
+
+function playOrStop() {
+  if (film) { clearInterval(film); film = null; } else {
+    film = setInterval(() => {
+      if (state.view.view >= state.file.views - 1) playOrStop(); else stepView(state.file.step);
+    }, PICTURE_MS);
+  }
+  showLayers();
+}
+
 function showLog() {
   const lines = [...state.log].reverse();
-  fill($('log'), (lines.length ? lines : [[0, '', 'Ready. Press ? for the keys.']]).map(([, kind, text], row) => el(
+  fill($('log'), (lines.length ? lines : [['', 'Ready. Press ? for the keys.']]).map(([kind, text], row) => el(
     'div', {className: `${kind}${row ? ' old' : ''}`, title: text}, text)));
   $('log').scrollTop = 0;
 }
@@ -512,11 +564,11 @@ const KEYS = {
         g: ['fly to the landmark', doing('fly')], o: ['see everything', doing('overview')],
         b: ['see the map from above', doing('from_above')], l: ['lock, unlock', () => send('lock')],
         h: ['hide, show', () => send('hide', {ids: state.selection.ids})], 0: ['whole image', () => { zoom = null; showView(); }],
-        '/': ['find', () => $('find').focus()], '?': ['keys', () => showKeys()], n: ['next landmark', doing('next')],
-        p: ['previous landmark', doing('previous')],
+        '/': ['find', () => $('find').focus()], '?': ['keys', () => showKeys()], n: ['next landmark', doing('step', {count: 1})],
+        p: ['previous landmark', doing('step', {count: -1})],
         ...Object.fromEntries(MODES.map((name, row) => [row + 1, [name, () => setMode(name)]]))},
   review: {a: ['accept, and go on', doing('accept')], f: ['fix: merge a duplicate, fit others', doing('fix')],
-           d: ['delete, and go on', doing('review_delete')], delete: ['delete, and go on', doing('review_delete')],
+           d: ['delete, and go on', doing('discard')], delete: ['delete, and go on', doing('discard')],
            e: ['type a label', () => focusLabel()], arrowleft: ['previous view', () => stepView(-1)], arrowright: ['next view', () => stepView(1)]},
   edit: {delete: ['delete', doing('delete')], r: ['refit to boxes', doing('refit')], m: ['merge', doing('merge')],
          e: ['type a label', () => focusLabel()],
@@ -576,7 +628,7 @@ $('keys').onclick = () => $('keys').close();
 $('find').oninput = showRows;
 $('before').onclick = () => stepView(-1);
 $('after').onclick = () => stepView(1);
-$('slider').oninput = event => send('view', {view: Number(event.target.value)});
+$('slider').oninput = event => send('show_view', {view: Number(event.target.value)});
 $('slider').onchange = event => event.target.blur();
 $('best').onclick = bestView;
 $('whole').onclick = () => { zoom = null; showView(); };
@@ -601,9 +653,10 @@ window.addEventListener('keydown', keyDown, true);
 $('frame').onload = () => {
   const scene = $('frame').contentWindow;
   scene.addEventListener('keydown', keyDown, true);
-  // the log has what viser's notices would say, and they cover the scene
+  // the log has what viser's notices would say; its panel has switches for developers. Both cover
+  // the scene
   const style = scene.document.createElement('style');
-  style.textContent = '.mantine-Notifications-root { display: none }';
+  style.textContent = '.mantine-Notifications-root, [data-floating-window] { display: none !important }';
   scene.document.head.append(style);
 };
 $('frame').src = `${base}scene/${person}/`;

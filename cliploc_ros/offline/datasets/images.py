@@ -1,24 +1,17 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The images of a recording, and where landmarks lie in its views."""
+"""The images of a recording: a folder, or the cameras of a rosbag2 recording."""
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.depth_image import DepthImage
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.ellipsoid import (
-    ellipses_in_pixels,
-    project_ellipsoids,
-    shape_matrices,
-)
-from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_images
 from cliploc_ros.offline.datasets.folders import FolderOptions, find_layout, read_folder
@@ -29,16 +22,12 @@ from cliploc_ros.offline.mapping.posed_detections import (
     group_cameras,
     names_of_group,
 )
-from cliploc_ros.offline.studio.landmark import Landmark
 from cliploc_ros.units import NS_PER_S
 
 # A view and its image have the same stamp; files hold it to a microsecond or so.
 _MAX_DELAY_NS = 20_000_000
 _IMAGES_KEPT = 32
 _NO_OPTIONS = FolderOptions()
-
-#: x and y [px].
-Pixel = Sequence[float] | NDArray[np.float64]
 
 
 class Images:
@@ -69,6 +58,11 @@ class Images:
         place = self._place(stamp_s, camera)
         with self._lock:
             return None if place is None else self._read(place, pinhole)
+
+    def of(self, detections: PosedDetections, view: int) -> NDArray[np.uint8] | None:
+        """Return the undistorted image of a view of a recording, red first; None without one."""
+        return self.near(float(detections.stamps_s[view]), detections.name_of(view),
+                         detections.camera_of(view))
 
     def depth_near(self, stamp_s: float, camera: str = ''
                    ) -> tuple[NDArray[np.uint8], Camera, DepthImage] | None:
@@ -142,52 +136,3 @@ def views_of_folder(path: Path) -> PosedDetections:
         frame_offsets=np.zeros(len(posed) + 1, dtype=np.int64), bboxes_xyxy=np.empty((0, 4)),
         class_names=(), classes=np.empty(0, dtype=np.int64), scores=np.empty(0),
         camera_rows=None if names == ('',) else rows, camera_names=names)
-
-
-class Outline(NamedTuple):
-    """The outline of a landmark in a view: cx, cy, exx, exy, eyy [px]."""
-
-    landmark_id: str
-    ellipse: NDArray[np.float64]
-    distance_m: float
-
-
-def outlines_of(landmarks: Mapping[str, Landmark], camera: Camera,
-                map_from_camera: NDArray[np.float64]) -> list[Outline]:
-    """Return the outlines of the landmarks in a view, the nearest first."""
-    if not landmarks:
-        return []
-    centers = np.array([one.center for one in landmarks.values()])
-    shapes = shape_matrices(np.array([one.semi_axes for one in landmarks.values()]),
-                            np.array([one.quat_xyzw for one in landmarks.values()]))
-    camera_from_map = invert_transform(map_from_camera)
-    ellipses = ellipses_in_pixels(project_ellipsoids(camera_from_map, centers, shapes), camera)
-    distances = np.linalg.norm(centers - map_from_camera[:3, 3], axis=1)
-    half = np.sqrt(ellipses[:, [2, 4]])
-    with np.errstate(invalid='ignore'):
-        inside = ((ellipses[:, :2] + half > 0.0).all(axis=1)
-                  & (ellipses[:, :2] - half < (camera.width, camera.height)).all(axis=1))
-    ids = list(landmarks)
-    return sorted((Outline(ids[row], ellipses[row], float(distances[row]))
-                   for row in np.nonzero(inside)[0]), key=lambda one: one.distance_m)
-
-
-def landmark_at(outlines: Sequence[Outline], pixel: Pixel) -> str | None:
-    """Return the landmark with the smallest outline around a pixel (2,)."""
-    around = []
-    for one in outlines:
-        cx, cy, exx, exy, eyy = one.ellipse
-        x, y = pixel[0] - cx, pixel[1] - cy
-        determinant = exx * eyy - exy * exy
-        if (eyy * x * x - 2.0 * exy * x * y + exx * y * y) <= determinant:
-            around.append((determinant, one.landmark_id))
-    return min(around)[1] if around else None
-
-
-def box_at(boxes_xyxy: NDArray[np.float64], pixel: Pixel) -> int | None:
-    """Return the row of the smallest box (n, 4) around a pixel (2,)."""
-    x, y = pixel
-    left, top, right, bottom = boxes_xyxy.T
-    rows = np.nonzero((left <= x) & (x <= right) & (top <= y) & (y <= bottom))[0]
-    areas = (right - left) * (bottom - top)
-    return int(rows[np.argmin(areas[rows])]) if len(rows) else None

@@ -1,24 +1,23 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is around the landmarks: surfaces as a coloured cloud, the walls of an occupancy grid.
+"""The surfaces around the landmarks, as a coloured cloud.
 
 The cloud is the recording's depth, or else the points of the keyframes. Both are thinned, and end
 where neither a camera nor a landmark is: a ceiling would hide the room from above.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.depth_image import points_in_color
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, KeyframeLayer
+from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.studio.floor import FREE, OCCUPIED, OccupancyGrid
-from cliploc_ros.offline.studio.images import Images
-from cliploc_ros.offline.studio.viewpoint import Bounds, wxyz_of
+from cliploc_ros.offline.studio.recording import Recording
+from cliploc_ros.offline.studio.viewpoint import Bounds
 
 #: More points slow the browser down.
 MAX_POINTS = 100_000
@@ -30,11 +29,6 @@ _MOST_DEPTH_M = 8.0
 _LEAST_SIDE_M, _GROWTH = 0.02, 1.25
 _HEADROOM_M = 0.2
 _PALE, _POINT_RGB = 0.25, (110, 120, 135)
-# A larger image of a grid slows the browser down [px].
-_MOST_PIXELS = 2048
-_WALL_RGBA, _FREE_RGBA = (70, 80, 100, 255), (225, 232, 240, 150)
-# Below the lines of the floor, which would flicker through.
-_BELOW_M = 0.01
 
 
 class Cloud(NamedTuple):
@@ -45,13 +39,14 @@ class Cloud(NamedTuple):
     side_m: float  #: One point is left of each cube of this side
 
 
-def find_cloud(detections: PosedDetections | None, images: Images | None,
-               layer: KeyframeLayer | None, extent: Bounds) -> Cloud | None:
+def find_cloud(recording: Recording | None, layer: KeyframeLayer | None, extent: Bounds
+               ) -> Cloud | None:
     """Return the points of a map's surfaces; None where nothing is known of them.
 
     CliplocError: an image or depth image cannot be read.
     """
-    parts = [] if detections is None or images is None else _points_of_depth(detections, images)
+    parts = [] if recording is None or recording.images is None else _points_of_depth(
+        recording.detections, recording.images)
     if not parts and layer is not None:
         parts = [_points_of_keyframe(layer, row) for row in range(len(layer))]
     if not parts:
@@ -106,40 +101,8 @@ def _thinned(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> Cloud:
     return Cloud(points[rows], pale.astype(np.uint8), side)
 
 
-def draw_cloud(scene: viser.SceneApi, cloud: Cloud) -> viser.PointCloudHandle:
+def draw_cloud(scene: viser.SceneApi, cloud: Cloud) -> list[Any]:
     """Draw the points, so large that they nearly touch."""
-    return scene.add_point_cloud('/cloud', cloud.points, cloud.colors, precision='float32',
-                                 point_size=0.25 * cloud.side_m, point_shading='flat',
-                                 point_shape='square')
-
-
-def draw_lines(scene: viser.SceneApi, extent: Bounds) -> viser.GridHandle:
-    """Draw the lines of the floor, half a metre apart."""
-    side = 2.0 * float(np.ceil(1.3 * extent.radius_m)) + 2.0
-    below = extent.middle - (extent.middle @ extent.up - extent.floor_m) * extent.up
-    return scene.add_grid('/floor', width=side, height=side, cell_size=0.5, fade_strength=2.0,
-                          cell_color=(225, 225, 225), section_color=(190, 190, 190),
-                          position=below, wxyz=wxyz_of(extent.upright))
-
-
-def draw_walls(scene: viser.SceneApi, grid: OccupancyGrid) -> viser.ImageHandle:
-    """Draw an occupancy grid at z = 0: walls dark, free cells light, the rest clear."""
-    step = max(1, -(-max(grid.cells.shape) // _MOST_PIXELS))
-    rows, columns = (-(-side // step) * step for side in grid.cells.shape)
-    cells = np.pad(grid.cells, [(0, rows - grid.cells.shape[0]),
-                                (0, columns - grid.cells.shape[1])], constant_values=-1)
-    # a wall of one cell stays
-    cells = cells.reshape(rows // step, step, columns // step, step).max(axis=(1, 3))
-    picture = np.zeros((*cells.shape, 4), dtype=np.uint8)
-    picture[cells == FREE], picture[cells == OCCUPIED] = _FREE_RGBA, _WALL_RGBA
-    least = max(1, -(-512 // max(cells.shape)))  # few cells would be blurred
-    picture = np.repeat(np.repeat(picture, least, axis=0), least, axis=1)
-    x, y, yaw = grid.origin
-    turn = Rotation.from_euler('z', yaw)
-    size = np.array([columns, rows]) * grid.resolution_m
-    middle = np.array([x, y, -_BELOW_M]) + turn.apply([*(0.5 * size), 0.0])
-    # viser's images have y down, and z away from who looks at them: seen from above
-    flipped = turn * Rotation.from_euler('x', np.pi)
-    return scene.add_image('/walls', picture[::-1], *size, format='png', cast_shadow=False,
-                           receive_shadow=False, position=middle,
-                           wxyz=wxyz_of(flipped.as_matrix()))
+    return [scene.add_point_cloud('/cloud', cloud.points, cloud.colors, precision='float32',
+                                  point_size=0.25 * cloud.side_m, point_shading='flat',
+                                  point_shape='square')]

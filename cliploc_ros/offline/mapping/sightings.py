@@ -1,0 +1,115 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The views that show a landmark best: large, whole, sharp, and from different sides."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import (
+    ellipse_bboxes,
+    ellipses_in_pixels,
+    project_ellipsoids,
+)
+from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+
+# A box nearer to the edge of its image may be cut off [px].
+_MARGIN_PX = 3.0
+# Views whose sharpness is asked for, at most: it needs their images.
+_LOOKED_AT = 12
+# Sides that differ [deg].
+_LEAST_ANGLE_DEG = 12.0
+# Projections cost time: every n-th view of more than these is tried.
+_MAX_PROJECTED = 400
+
+
+class Sighting(NamedTuple):
+    """A landmark in a view."""
+
+    view: int
+    bbox_xyxy: NDArray[np.float64]  #: (4,) [px]
+    is_detected: bool  #: A box of the detector; else the landmark's projection
+    is_whole: bool  #: Not cut off by the edge of the image
+    size: float  #: Area of the box [px^2], less where the image is blurred
+
+
+def outlines_in_view(detections: PosedDetections, view: int, centers: NDArray[np.float64],
+                     shapes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the outlines (n, 5) of ellipsoids in a view [px]; NaN behind the camera."""
+    return ellipses_in_pixels(project_ellipsoids(
+        invert_transform(detections.map_from_camera[view]), centers, shapes),
+        detections.camera_of(view))
+
+
+def find_sightings(detections: PosedDetections, rows: NDArray[np.int64],
+                   center: NDArray[np.float64], shape: NDArray[np.float64], limit: int = 6,
+                   sharpness: Callable[[Sighting], float] | None = None) -> list[Sighting]:
+    """Return the views that show a landmark best, the best one first.
+
+    The detector's boxes come first. Without three of them, views that should show it join.
+
+    Parameters
+    ----------
+    rows : ndarray (k,) of int
+        The boxes that show the landmark.
+    center, shape : ndarray (3,), (6,)
+        Of its ellipsoid in the map.
+    sharpness : callable, optional
+        Returns the share of fine detail of what a view shows around the landmark.
+    """
+    found = []
+    for row in rows:
+        view, box = int(detections.frames[row]), detections.bboxes_xyxy[row]
+        camera = detections.camera_of(view)
+        is_whole = _inset(camera, box) >= _MARGIN_PX and _inset(
+            camera, _projection(detections, view, center, shape)) >= 0.0
+        found.append(Sighting(view, box, True, is_whole, _area(box)))
+    if len(found) < 3:
+        known = {one.view for one in found}
+        for view in range(0, len(detections), max(1, -(-len(detections) // _MAX_PROJECTED))):
+            box = _projection(detections, view, center, shape)
+            if view not in known and _inset(detections.camera_of(view), box) >= _MARGIN_PX:
+                found.append(Sighting(view, box, False, True, _area(box)))
+    rays = detections.map_from_camera[:, :3, 3] - center
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
+    if sharpness is not None and found:
+        found = _apart(found, rays, 0.5 * _LEAST_ANGLE_DEG, _LOOKED_AT)
+        sharp = np.array([sharpness(one) for one in found])
+        shares = np.minimum(1.0, sharp / max(float(np.median(sharp)), 1e-9))
+        found = [one._replace(size=one.size * share ** 2)
+                 for one, share in zip(found, shares.tolist(), strict=True)]
+    return _apart(found, rays, _LEAST_ANGLE_DEG, limit)
+
+
+def _projection(detections: PosedDetections, view: int, center: NDArray[np.float64],
+                shape: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the box (4,) around an ellipsoid in a view [px]; NaN behind the camera."""
+    box: NDArray[np.float64] = ellipse_bboxes(
+        outlines_in_view(detections, view, center[None], shape[None]))[0]
+    return box
+
+
+def _inset(camera: Camera, box: NDArray[np.float64]) -> float:
+    """Return how far a box (4,) lies within the image [px]; below 0 where it is cut off."""
+    return float(np.min([*box[:2], camera.width - box[2], camera.height - box[3]]))
+
+
+def _area(box: NDArray[np.float64]) -> float:
+    return float((box[2:] - box[:2]).prod())
+
+
+def _apart(sightings: list[Sighting], rays: NDArray[np.float64], least_deg: float, limit: int
+           ) -> list[Sighting]:
+    """Return the best ones that lie apart from one another, filled up with the others."""
+    kept: list[Sighting] = []
+    near: list[Sighting] = []
+    limit_cos = np.cos(np.radians(least_deg))
+    for one in sorted(sightings, key=lambda one: (
+            not one.is_whole, not one.is_detected, -one.size)):
+        is_near = any(rays[one.view] @ rays[other.view] > limit_cos for other in kept)
+        (near if is_near else kept).append(one)
+    return (kept + near)[:limit]

@@ -1,0 +1,56 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Questions that take long, answered in a thread while people use the page."""
+
+import threading
+from collections.abc import Callable, Hashable
+
+_MOST_KEPT = 1000
+
+
+class Background[Answer]:
+    """Answers questions in a thread, and keeps the answers. Only the last question counts.
+
+    ``on_change`` is called in the thread after each answer.
+    """
+
+    def __init__(self, on_change: Callable[[], None]):
+        self._on_change = on_change
+        self._answers: dict[Hashable, Answer] = {}
+        self._wanted: tuple[Hashable, Callable[[], Answer]] | None = None
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+
+    def ask(self, key: Hashable, find: Callable[[], Answer]) -> Answer | None:
+        """Return the answer to a question that a key tells from others; None until it is found.
+
+        ``find`` returns the answer, and raises nothing.
+        """
+        with self._lock:
+            if key not in self._answers:
+                self._wanted = key, find
+                if self._thread is None:
+                    self._thread = threading.Thread(target=self._work, daemon=True)
+                    self._thread.start()
+            return self._answers.get(key)
+
+    def stop(self) -> None:
+        """Forget the question, and wait for the thread."""
+        with self._lock:
+            self._wanted, thread = None, self._thread
+        if thread is not None:
+            thread.join()
+
+    def _work(self) -> None:
+        while True:
+            with self._lock:
+                if self._wanted is None or self._wanted[0] in self._answers:
+                    self._wanted = self._thread = None
+                    return
+                key, find = self._wanted
+            answer = find()
+            with self._lock:
+                if len(self._answers) >= _MOST_KEPT:
+                    self._answers.clear()
+                self._answers[key] = answer
+            self._on_change()
