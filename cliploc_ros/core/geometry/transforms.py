@@ -119,6 +119,14 @@ class Tolerance(NamedTuple):
         traces = np.einsum('iab,jab->ij', poses[:, :3, :3], others[:, :3, :3])
         return np.asarray(near & (traces > self.least_trace))
 
+    def distinct(self, poses: NDArray[np.float64], most: float = np.inf) -> list[int]:
+        """Return the row of the first of m poses (m, 4, 4) at each place, up to a number."""
+        same, rows = self.agreeing(poses), list[int]()
+        for row in range(len(poses)):
+            if len(rows) < most and not same[row, rows].any():
+                rows.append(row)
+        return rows
+
     def wider(self, distance_m: float, angle_deg: float) -> 'Tolerance':
         """Return a tolerance that allows more by these amounts."""
         return Tolerance(self.distance_m + distance_m, min(180.0, self.angle_deg + angle_deg))
