@@ -181,10 +181,7 @@ def _hypotheses(pose: NDArray[np.float64], compared: Comparison, evidence: Evide
     """Return the pose that leads, and the best one of each other place."""
     poses = np.array([pose, *compared.poses[1:]])
     confidences = compared.likely * evidence.found * evidence.certainty
-    same, rows = SAME_PLACE.agreeing(poses), list[int]()
-    for row in range(len(poses)):
-        if not same[row, rows].any():
-            rows.append(row)
+    rows = SAME_PLACE.distinct(poses)
     found = [compared.contenders[row] for row in rows]
     return tuple(Hypothesis(
         poses[row], one.finalist.score, float(confidences[row]) if row else evidence.confidence,

@@ -40,7 +40,6 @@ from cliploc_ros.core.fit.covariance import fuse, share_within
 from cliploc_ros.core.fit.finalists import (
     Finalist,
     covariance_of,
-    first_of_each_place,
     meetings_of,
 )
 from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, SAME_PLACE
@@ -129,9 +128,10 @@ def search_contenders(joined: JoinedFrames, finalists: Sequence[Finalist],
     contenders = contenders_of(joined, finalists, is_upright.tolist())
     if not joined.options.refine:
         return contenders
-    order = sorted(range(len(contenders)), key=lambda row: -contenders[row].rank)
-    return [contenders[row] for known in (True, False) for row in first_of_each_place(
-        [row for row in order if contenders[row].is_upright == known], finalists, MAX_DISTINCT)]
+    contenders.sort(key=lambda one: -one.rank)
+    kinds = [[one for one in contenders if one.is_upright == known] for known in (True, False)]
+    return [some[row] for some in kinds for row in SAME_PLACE.distinct(
+        np.array([one.pose for one in some]).reshape(-1, 4, 4), MAX_DISTINCT)]
 
 
 def compare(joined: JoinedFrames, contenders: list[Contender],
@@ -196,7 +196,7 @@ def pose_of(joined: JoinedFrames, compared: Comparison
     found = None
     if by_objects is not None:
         covariance = covariance_of(joined.frames, joined.rig, by_objects.finalist,
-                                   by_objects.matches, joined.landmark_map.shared_sigmas,
+                                   joined.landmark_map.shared_sigmas,
                                    joined.options.mount_deviation, CALIBRATED)
         if by_objects.finalist.information is not None:
             others = [one for one in compared.contenders if one.recognized is None]

@@ -109,14 +109,7 @@ def remember(leaders, score, iteration, sample, rotation, translation):
 
 @compiled
 def same_place(rotation_a, translation_a, rotation_b, translation_b):
-    """Return whether two camera_from_map poses are within the distinct distance and angle."""
-    return are_near(rotation_a, translation_a, rotation_b, translation_b, _PLACE_M,
-                    _PLACE_TRACE)
-
-
-@compiled
-def are_near(rotation_a, translation_a, rotation_b, translation_b, distance_m, least_trace):
-    """Return whether two camera_from_map poses differ by at most a distance and an angle.
+    """Return whether two camera_from_map poses are at one place, as Tolerance does.
 
     The trace of the rotation between them is 1 + 2 cos(angle).
     """
@@ -128,7 +121,7 @@ def are_near(rotation_a, translation_a, rotation_b, translation_b, distance_m, l
             center_a -= rotation_a[j, i] * translation_a[j]
             center_b -= rotation_b[j, i] * translation_b[j]
         square += (center_a - center_b) ** 2
-    return trace >= least_trace and square <= distance_m * distance_m
+    return trace >= _PLACE_TRACE and square <= _PLACE_M * _PLACE_M
 
 
 class Progress(NamedTuple):
