@@ -11,13 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.camera_check import CameraCheck, CameraLook, looks_of
-from cliploc_ros.core.acceptance.comparison import (
-    Comparison,
-    compare,
-    evidence_of,
-    pose_of,
-    search_contenders,
-)
+from cliploc_ros.core.acceptance.comparison import Comparison, search_contenders
 from cliploc_ros.core.acceptance.contenders import (
     Contender,
     JoinedFrames,
@@ -146,11 +140,15 @@ class Relocalizer:
         if depth is not None and not depth.is_passed:
             joined = without_depth(joined)
             met = self._meet(joined, budget)
-        compared = compare(joined, met, recognizer)
+        compared = Comparison(joined, met, looks, recognizer)
+        result = Relocalization(
+            False, '', tried=sum(one.progress.tried for one in frames),
+            coverage=coverage_of(frames), stamp_ns=frames[-1].observation.stamp_ns)
         if not compared.contenders:
-            return _nothing_found(frames, budget)
-        pose, covariance = pose_of(joined, compared)
-        evidence = evidence_of(joined, compared, covariance, looks, recognizer)
+            kind, reason = _nothing_found(frames)
+            return replace(result, reason=reason, refusal_kind=kind, search_ms=budget.elapsed_ms)
+        pose, covariance = compared.pose()
+        evidence = compared.evidence(covariance)
         seen: list[CameraLook] = []
         if compared.by_boxes is not None and self.options.refine:
             # an uncertain position may be the camera's fault
@@ -160,15 +158,13 @@ class Relocalizer:
             evidence = replace(evidence, camera=camera, camera_fault=fault)
         refused = refusal(evidence, self.options)
         shown = compared.by_objects or compared.contenders[0]
-        return Relocalization(
-            accepted=refused is None, reason=refused.reason if refused else '',
+        return replace(
+            result, accepted=refused is None, reason=refused.reason if refused else '',
             refusal_kind=refused.kind if refused else None,
             hypotheses=_hypotheses(pose, compared, evidence), frame_matches=tuple(shown.matches),
-            evidence=evidence, covariance=covariance, tried=_tried(frames),
-            best_iteration=shown.finalist.iteration, coverage=coverage_of(frames),
-            search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns,
-            source=compared.source, recognition=compared.recognition, depth=depth,
-            cameras=tuple(seen))
+            evidence=evidence, covariance=covariance, best_iteration=shown.finalist.iteration,
+            search_ms=budget.elapsed_ms, source=compared.source,
+            recognition=compared.recognition, depth=depth, cameras=tuple(seen))
 
     def _meet(self, joined: JoinedFrames, budget: TimeBudget) -> list[Contender]:
         """Return the best poses that the search met, see search_contenders."""
@@ -188,7 +184,8 @@ def _hypotheses(pose: NDArray[np.float64], compared: Comparison, evidence: Evide
         one.support, one.handicap) for row, one in zip(rows, found, strict=True))
 
 
-def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget) -> Relocalization:
+def _nothing_found(frames: Sequence[SearchedFrame]) -> tuple[RefusalKind, str]:
+    """Return why there is no pose."""
     if any(one.has_samples for one in frames):
         kind, reason = RefusalKind.UNEXPLAINED, 'no pose explains the detections'
     else:
@@ -196,10 +193,4 @@ def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget) -> Reloc
         kind = RefusalKind.TOO_FEW_OBJECTS
         reason = (f'{detections} detections give fewer than {frames[-1].sample_size} distinct '
                   'correspondence candidates')
-    return Relocalization(False, f'{reason}; turn the camera to more objects', refusal_kind=kind,
-                          tried=_tried(frames), coverage=coverage_of(frames),
-                          search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
-
-
-def _tried(frames: Sequence[SearchedFrame]) -> int:
-    return sum(one.progress.tried for one in frames)
+    return kind, f'{reason}; turn the camera to more objects'

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.acceptance.confidence import Setting, tilt_handicaps, utilities
-from cliploc_ros.core.acceptance.prior import region_odds
+from cliploc_ros.core.acceptance.confidence import Setting, region_odds, tilt_handicaps, utilities
 from cliploc_ros.core.acceptance.support import Support, compared_frame, support
 from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig

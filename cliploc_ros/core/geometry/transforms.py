@@ -96,6 +96,15 @@ def move_covariance(covariance: NDArray[np.float64], lever: NDArray[np.float64]
     return jacobian @ covariance @ jacobian.T
 
 
+def first_of_each(same: NDArray[np.bool_], most: float = np.inf) -> list[int]:
+    """Return the first of m rows that are not the same (m, m) as one before, up to a number."""
+    rows = list[int]()
+    for row in range(len(same)):
+        if len(rows) < most and not same[row, rows].any():
+            rows.append(row)
+    return rows
+
+
 class Tolerance(NamedTuple):
     """Two poses agree if they are nearer than this to each other, in both [m] [deg]."""
 
@@ -121,11 +130,7 @@ class Tolerance(NamedTuple):
 
     def distinct(self, poses: NDArray[np.float64], most: float = np.inf) -> list[int]:
         """Return the row of the first of m poses (m, 4, 4) at each place, up to a number."""
-        same, rows = self.agreeing(poses), list[int]()
-        for row in range(len(poses)):
-            if len(rows) < most and not same[row, rows].any():
-                rows.append(row)
-        return rows
+        return first_of_each(self.agreeing(poses), most)
 
     def wider(self, distance_m: float, angle_deg: float) -> 'Tolerance':
         """Return a tolerance that allows more by these amounts."""

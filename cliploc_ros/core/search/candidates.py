@@ -9,7 +9,7 @@ both.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +35,7 @@ _FARTHEST = 1e6
 _FARTHEST_M = 40.0
 
 
-@dataclass(frozen=True)
-class Candidates:
+class Candidates(NamedTuple):
     """Correspondence candidates, in the order in which a sampler prefers them."""
 
     #: (c,): indices of the pair
@@ -47,10 +46,6 @@ class Candidates:
     #: (c,): cosine similarity of crop and label; 0 where only the class is known
     similarities: NDArray[np.float64]
 
-    def __len__(self) -> int:
-        """Return the number of candidates."""
-        return len(self.detections)
-
     @property
     def pairs(self) -> NDArray[np.int64]:
         """Return (detection, landmark) of each candidate (c, 2)."""
@@ -58,41 +53,32 @@ class Candidates:
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> 'Candidates':
         """Return some of the candidates."""
-        return Candidates(self.detections[rows], self.landmarks[rows], self.ranks[rows],
-                          self.similarities[rows])
+        return Candidates._make(column[rows] for column in self)
 
     def moved(self, first: int) -> 'Candidates':
         """Return the candidates of a map whose landmarks begin at a row of several maps'."""
-        return replace(self, landmarks=self.landmarks + first)
+        return self._replace(landmarks=self.landmarks + first)
 
     def ordered(self, *keys: NDArray[np.float64] | NDArray[np.int64]) -> 'Candidates':
         """Return the candidates sorted by keys, the first key first; ties keep their order."""
         return self.select(np.lexsort(keys[::-1]))
 
 
-def class_candidates(index: ClassIndex, classes: NDArray[np.int64]) -> Candidates:
-    """Return every pair of equal class, detection by detection.
+def class_candidates(index: ClassIndex, classes: NDArray[np.int64], limit: int | None = None
+                     ) -> Candidates:
+    """Return the pairs of equal class, detection by detection.
+
+    With a limit there are no more than that, beginning with the rarest classes: a pair is the more
+    probable, the fewer landmarks its class has.
 
     Parameters
     ----------
     classes : ndarray (n,) of int
         Class of each detection, as the index numbers them; below 0 for none.
     """
-    return _of_pairs(index.pairs(classes, np.arange(len(classes))))
-
-
-def rarest_class_candidates(index: ClassIndex, classes: NDArray[np.int64], limit: int
-                            ) -> Candidates:
-    """Return pairs of equal class, at most limit, beginning with the rarest classes.
-
-    A pair is the more probable, the fewer landmarks its class has. Parameters are those of
-    class_candidates.
-    """
-    rarest_first = np.argsort(index.sizes_of(classes), kind='stable')
-    return _of_pairs(index.pairs(classes, rarest_first, limit))
-
-
-def _of_pairs(pairs: NDArray[np.int64]) -> Candidates:
+    order = np.arange(len(classes)) if limit is None else np.argsort(index.sizes_of(classes),
+                                                                     kind='stable')
+    pairs = index.pairs(classes, order, limit)
     zeros = np.zeros(len(pairs))
     return Candidates(pairs[:, 0], pairs[:, 1], zeros.astype(np.int64), zeros)
 
@@ -132,10 +118,7 @@ def balanced_order(candidates: Candidates) -> Candidates:
 
 def concatenated(some: Sequence[Candidates]) -> Candidates:
     """Return the candidates of several lists, at least one, one list after the other."""
-    return Candidates(np.concatenate([one.detections for one in some]),
-                      np.concatenate([one.landmarks for one in some]),
-                      np.concatenate([one.ranks for one in some]),
-                      np.concatenate([one.similarities for one in some]))
+    return Candidates(*map(np.concatenate, zip(*some, strict=True)))
 
 
 def joined(first: Candidates, second: Candidates, landmark_count: int) -> Candidates:
@@ -232,42 +215,35 @@ def _nearest(landmark_map: LandmarkMap, observation: Observation, options: Reloc
         nearest_candidates(some, min(options.k, size)).moved(part.first)
         for part, size, some in zip(parts, sizes, split_similarities(similarities, sizes),
                                     strict=True)])
-    nearest = replace(nearest, detections=compared[nearest.detections])
+    nearest = nearest._replace(detections=compared[nearest.detections])
     return nearest.select(sound[nearest.detections])
 
 
 def _candidates(landmark_map: LandmarkMap, class_ids: Sequence[str],
                 classes: NDArray[np.int64], nearest: Candidates | None,
                 options: RelocalizerOptions) -> tuple[Candidates, int]:
-    """Return the candidates in the order of the sampler, and how many are left out."""
-    automatic = options.algorithm == 'auto'
+    """Return the candidates in the order of the sampler, and how many are left out.
+
+    Of pairs of equal class auto has at most MAX_CANDIDATES. Each of several maps gets an equal
+    share, and they take turns: a search that is cut short has looked for rivals on all of them.
+    """
+    index = landmark_map.classes
     if nearest is not None:
         if options.algorithm == 'prosac':
             nearest = prosac_order(nearest)
         elif options.algorithm in ('b-prosac', 'auto'):
             nearest = balanced_order(nearest)
-        if options.matching == 'clip' or not automatic:
+        if options.matching == 'clip' or options.algorithm != 'auto':
             return nearest, 0
-    index = landmark_map.classes
-    if not automatic:
+    if options.algorithm != 'auto':
         return class_candidates(index, classes), 0
-    of_class = _of_rarest_classes(landmark_map, class_ids, classes)
-    left_out = int(index.sizes_of(classes).sum()) - len(of_class)
-    return of_class if nearest is None else joined(nearest, of_class, len(landmark_map)), left_out
-
-
-def _of_rarest_classes(landmark_map: LandmarkMap, class_ids: Sequence[str],
-                       classes: NDArray[np.int64]) -> Candidates:
-    """Return pairs of equal class, at most MAX_CANDIDATES.
-
-    Each of several maps gets an equal share, and they take turns: a search that is cut short has
-    looked for rivals on all of them.
-    """
     parts, found = parts_of(landmark_map), []
     for part in parts:
-        index = part.landmark_map.classes
-        own = np.where(classes >= 0, index.classes_of(class_ids), -1)
-        found.append(rarest_class_candidates(index, own, MAX_CANDIDATES // len(parts))
+        of_part = part.landmark_map.classes
+        own = np.where(classes >= 0, of_part.classes_of(class_ids), -1)
+        found.append(class_candidates(of_part, own, MAX_CANDIDATES // len(parts))
                      .moved(part.first))
-    turns = np.concatenate([np.arange(len(some)) for some in found])
-    return concatenated(found).ordered(turns)
+    turns = np.concatenate([np.arange(len(some.landmarks)) for some in found])
+    of_class = concatenated(found).ordered(turns)
+    left_out = int(index.sizes_of(classes).sum()) - len(of_class.landmarks)
+    return of_class if nearest is None else joined(nearest, of_class, len(landmark_map)), left_out

@@ -9,7 +9,8 @@ Leaders are the best hypotheses of a search, each at a place of its own.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from math import comb, inf
 from typing import NamedTuple
 
@@ -141,36 +142,31 @@ def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
     samples : ndarray (t, 3) of int
         Candidate numbers; rows of -1 are skipped.
     """
-    bench = set_up(scene, constraint)
-    tried = 0
-    pace, start = _Pace(len(samples)), 0
-    while not pace.at_end:
-        block = pace.begin()
+    start = skipped = 0
+
+    def fill(block: NDArray[np.int64]) -> int:
+        nonlocal start, skipped
         block[:] = samples[start:start + len(block)]
-        _try_samples(bench, block, len(block), start, 0.0, leaders)
-        start += len(block)
-        tried += int((block[:, 0] >= 0).sum())
-        pace.end(len(block))
-        yield Progress(tried, start / len(samples))
+        start, skipped = start + len(block), skipped + int((block[:, 0] < 0).sum())
+        return len(block)
+    for tried in _blocks(scene, constraint, leaders, fill, len(samples)):
+        yield Progress(tried - skipped, start / len(samples))
 
 
 def search_exhaustively(scene: Scene, leaders: Leaders, constraint: Constraint | None = None
                         ) -> Iterator[Progress]:
     """Try every valid sample, a block at a time, without storing them."""
-    bench = set_up(scene, constraint)
-    count = len(scene.pairs)
-    cursor = np.array([0, 1, 2], dtype=np.int64)
-    pace, tried = _Pace(), 0
-    while cursor[0] < count - 2:
-        block = pace.begin()
-        found = enumerate_triples(scene.pairs, cursor, block)
-        _try_samples(bench, block, found, tried, 0.0, leaders)
-        tried += found
-        pace.end(found)
-        first, second, third = (int(row) for row in cursor)
+    count, cursor = len(scene.pairs), np.array([0, 1, 2], dtype=np.int64)
+    if count < SAMPLE_SIZE:
+        return
+    for tried in _blocks(scene, constraint, leaders,
+                         partial(enumerate_triples, scene.pairs, cursor)):
+        first, second, third = cursor.tolist()
         left = (comb(max(0, count - first - 1), 3) + comb(max(0, count - second - 1), 2)
                 + max(0, count - third)) if first < count - 2 else 0
         yield Progress(tried, 1.0 - left / comb(count, 3))
+        if not left:
+            return
 
 
 def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: Leaders,
@@ -190,44 +186,37 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
         cliploc_ros.core.geometry.two_point). With two, the third column of the leaders' samples
         is -1.
     """
-    bench = set_up(scene, constraint)
-    count = len(scene.pairs)
-    fill_block, least_iou = _ORDERED[size]
+    count, (enumerate_samples, least_iou) = len(scene.pairs), _ORDERED[size]
     cursor = np.array([size - 1, *range(size - 1)], dtype=np.int64)  # newest, first, ...
-    pace, tried = _Pace(limit), 0
-    while cursor[0] < count and not pace.at_end:
-        block = pace.begin()
-        found = fill_block(compatible, cursor, block)
-        _try_samples(bench, block, found, tried, least_iou, leaders)
-        tried += found
-        pace.end(found)
+    if cursor[0] >= count:
+        return
+    for tried in _blocks(scene, constraint, leaders,
+                         partial(enumerate_samples, compatible, cursor), limit, least_iou):
         reach = min(int(cursor[0]), count)
         yield Progress(tried, comb(reach, size) / max(comb(count, size), 1), reach)
+        if reach == count:
+            return
 
 
-class _Pace:
-    """Blocks of samples of about equal time. Results do not depend on their sizes."""
+def _blocks(scene: Scene, constraint: Constraint | None, leaders: Leaders,
+            fill: Callable[[NDArray[np.int64]], int], limit: float = inf, least_iou: float = 0.0
+            ) -> Iterator[int]:
+    """Try blocks of samples of about equal time; yield how many were tried after each.
 
-    def __init__(self, limit: float = inf) -> None:
-        self._memory = np.full((_LARGEST_BLOCK, SAMPLE_SIZE), -1, dtype=np.int64)
-        self._left, self._size, self._start = limit, _FIRST_BLOCK, 0.0
-
-    @property
-    def at_end(self) -> bool:
-        """Return whether all samples were tried."""
-        return self._left <= 0
-
-    def begin(self) -> NDArray[np.int64]:
-        """Return memory (b, 3) for the samples of the next block."""
-        self._start = time.perf_counter()
-        return self._memory[:int(min(self._size, self._left))]
-
-    def end(self, tried: int) -> None:
-        """Finish a block with a number of samples, and choose the size of the next."""
-        self._left -= tried
-        elapsed = max(time.perf_counter() - self._start, 1e-9)
-        wanted = int(self._size * min(_BLOCK_S / elapsed, 4.0))
-        self._size = min(max(wanted, 1), _LARGEST_BLOCK)
+    Results do not depend on the sizes of the blocks. `fill` writes the next samples into a block
+    (b, 3) and returns their number.
+    """
+    bench, tried, size = set_up(scene, constraint), 0, _FIRST_BLOCK
+    memory = np.full((_LARGEST_BLOCK, SAMPLE_SIZE), -1, dtype=np.int64)
+    while tried < limit:
+        start = time.perf_counter()
+        block = memory[:int(min(size, limit - tried))]
+        found = fill(block)
+        _try_samples(bench, block, found, tried, least_iou, leaders)
+        tried += found
+        elapsed = max(time.perf_counter() - start, 1e-9)
+        size = min(max(int(size * min(_BLOCK_S / elapsed, 4.0)), 1), _LARGEST_BLOCK)
+        yield tried
 
 
 @compiled
