@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.camera_check import CameraLook
+from cliploc_ros.core.acceptance.confidence import Support
 from cliploc_ros.core.acceptance.depth_check import DepthCheck
-from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace

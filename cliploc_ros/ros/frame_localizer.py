@@ -79,7 +79,7 @@ class Localized(NamedTuple):
     #: Whether there was no time for the other crops, which could have helped.
     is_cut: bool
     #: Covariance (6, 6) for a filter that fuses all accepted poses: in continuous mode, that of
-    #: the new information, see cliploc_ros.core.succession.
+    #: the new information, see cliploc_ros.core.localizer.
     for_filter: NDArray[np.float64] | None
     left_out: tuple[str, ...]  #: Names of cameras without a frame, or of another run of odometry
     query: Query  #: With it the same answer comes again

@@ -20,8 +20,13 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
-from cliploc_ros.core.acceptance.confidence import Setting, confidences, none_right, utilities
-from cliploc_ros.core.acceptance.support import Support
+from cliploc_ros.core.acceptance.confidence import (
+    Setting,
+    Support,
+    confidences,
+    none_right,
+    utilities,
+)
 from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, pose_error
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization

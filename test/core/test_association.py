@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference import same_class
 
-from cliploc_ros.core.map.classes import ClassIndex
+from cliploc_ros.core.map.landmark_map import ClassIndex
 from cliploc_ros.core.search.candidates import (
     balanced_order,
     class_candidates,

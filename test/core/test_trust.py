@@ -10,8 +10,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.acceptance.confidence import Setting, confidences, none_right, utilities
-from cliploc_ros.core.acceptance.support import Support, compared_frame, support
+from cliploc_ros.core.acceptance.confidence import (
+    Setting,
+    Support,
+    compared_frame,
+    confidences,
+    none_right,
+    support,
+    utilities,
+)
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, refusal
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.camera import Camera

@@ -6,12 +6,11 @@ The modules in the order in which a pose passes them:
 
 contenders
     The poses that may be right, of objects and of keyframes, and the odds of each.
-support
-    The evidence of the objects for a pose.
 depth_check
     Whether the depths of a request can be right.
 confidence
-    From odds to the probability of each pose, given its rivals; what a region known before says.
+    The evidence of the objects for a pose, what a region known before says, and from these odds to
+    the probability of each pose, given its rivals.
 comparison
     The contenders in one list: which one leads, and all evidence about it; mirror images.
 look_alikes, genuine

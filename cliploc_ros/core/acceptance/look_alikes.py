@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.acceptance.support import Support
+from cliploc_ros.core.acceptance.confidence import Support
 from cliploc_ros.core.geometry.transforms import (
     RIGHT_M,
     SAME_ANSWER,

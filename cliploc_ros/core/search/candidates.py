@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.depth import depth_deviations
-from cliploc_ros.core.map.classes import ClassIndex
 from cliploc_ros.core.map.culling import FEW, SortedLandmarks
 from cliploc_ros.core.map.joined_map import parts_of
-from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import ClassIndex, LandmarkMap
 from cliploc_ros.core.map.similarities import Similarities, nearest_landmarks, split_similarities
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions

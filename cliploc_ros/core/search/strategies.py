@@ -183,8 +183,8 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
         See cliploc_ros.core.search.sampling.
     size : int, optional
         Candidates in a sample: three, or two where the constraint's vertical is known (see
-        cliploc_ros.core.geometry.two_point). With two, the third column of the leaders' samples
-        is -1.
+        cliploc_ros.core.geometry.minimal_solvers). With two, the third column of the leaders'
+        samples is -1.
     """
     count, (enumerate_samples, least_iou) = len(scene.pairs), _ORDERED[size]
     cursor = np.array([size - 1, *range(size - 1)], dtype=np.int64)  # newest, first, ...
