@@ -27,8 +27,13 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from cliploc_ros.command import run_command
-from cliploc_ros.core.acceptance.confidence import tilt_handicaps, utilities
-from cliploc_ros.core.acceptance.support import Support, compared_frame, support
+from cliploc_ros.core.acceptance.confidence import (
+    Support,
+    compared_frame,
+    support,
+    tilt_handicaps,
+    utilities,
+)
 from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.verification import cameras_from_last, make_rig

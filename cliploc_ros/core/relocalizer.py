@@ -11,32 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.camera_check import CameraCheck, CameraLook, looks_of
-from cliploc_ros.core.acceptance.comparison import (
-    Comparison,
-    compare,
-    evidence_of,
-    pose_of,
-    search_contenders,
-)
+from cliploc_ros.core.acceptance.comparison import Comparison, search_contenders
+from cliploc_ros.core.acceptance.confidence import Support
 from cliploc_ros.core.acceptance.contenders import (
     Contender,
     JoinedFrames,
     join_frames,
     without_depth,
 )
-from cliploc_ros.core.acceptance.depth_check import check_depth
+from cliploc_ros.core.acceptance.depth_check import DepthCheck, check_depth
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, refusal
-from cliploc_ros.core.fit.finalists import find_with_rivals
+from cliploc_ros.core.fit.finalists import Match, find_with_rivals
 from cliploc_ros.core.geometry.transforms import SAME_PLACE
 from cliploc_ros.core.kernels.compiled import warm_up
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
+from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
+from cliploc_ros.core.map.joined_map import MapPart, parts_of, place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import Hypothesis, Relocalization
-from cliploc_ros.core.search.candidates import check_k
-from cliploc_ros.core.search.frame_search import SearchedFrame, coverage_of, search_frame
+from cliploc_ros.core.search.frame_search import SearchedFrame, check_k, coverage_of, search_frame
 from cliploc_ros.core.warm_up import call_every_kernel
 
 # Shares of the budget at which the search and the refinement end; acceptance takes the rest.
@@ -46,6 +41,107 @@ _SEARCH_SHARE, _REFINEMENT_SHARE = 0.8, 0.9
 _EARLIER_SEARCH_S, _EARLIER_REFINEMENT_S, _SHORT_BUDGET_S = 0.0065, 0.003, 0.05
 _MOST_FRAMES = 5
 _NO_LOOKS = Looks()
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A possible pose of the camera."""
+
+    map_from_camera: NDArray[np.float64]  #: (4, 4)
+    score: float  #: Sum of the IoUs of its inliers
+    #: Probability that it is within 1 m of the truth, 0 to 1. Each position is taken for as
+    #: uncertain as that of the best hypothesis.
+    confidence: float
+    support: Support  #: Basis of the confidence
+    #: Log odds that its attitude takes from it, see cliploc_ros.core.acceptance.confidence
+    handicap: float = 0.0
+
+
+@dataclass(frozen=True)
+class Relocalization:
+    """The hypotheses of a relocalization, and whether the best one is accepted."""
+
+    accepted: bool  #: Whether to act on the pose
+    reason: str  #: Reason of a refusal, in one line; empty when accepted
+    #: The best distinct hypotheses, best first; empty when nothing was found
+    hypotheses: tuple[Hypothesis, ...] = ()
+    #: Inliers of the best hypothesis in each frame, the newest last; empty when nothing was found
+    frame_matches: tuple[tuple[Match, ...], ...] = ()
+    #: Evidence for the best hypothesis, which decided; None when nothing was found
+    evidence: Evidence | None = None
+    #: (6, 6): of the best hypothesis, see cliploc_ros.core.fit.covariance; None when nothing was
+    #: found
+    covariance: NDArray[np.float64] | None = None
+    tried: int = 0  #: Number of hypotheses tried
+    #: Iteration that found the best hypothesis, from 1; 0 when nothing was found
+    best_iteration: int = 0
+    coverage: float = 1.0  #: Share of its samples that the search tried, 0 to 1
+    search_ms: float = 0.0  #: Time of association, search and verification [ms]
+    stamp_ns: int = 0  #: Stamp of the newest observation [ns]
+    source: str = 'objects'  #: What proposes the best pose: 'objects', 'keyframes' or 'both'
+    #: Kind of the refusal, which programs compare; None when accepted
+    refusal_kind: RefusalKind | None = None
+    #: What keyframes say, whatever the best pose comes from; None without keyframes
+    recognition: Recognition | None = None
+    #: Whether the depths of the objects can be right; None without depth
+    depth: DepthCheck | None = None
+    #: What a pose that depends on boxes, and is accepted with right cameras, says of the cameras
+    cameras: tuple[CameraLook, ...] = ()
+
+    @property
+    def matches(self) -> tuple[Match, ...]:
+        """Return the inliers of the best hypothesis in the newest frame."""
+        return self.frame_matches[-1] if self.frame_matches else ()
+
+    @property
+    def recognized(self) -> RecognizedPlace | None:
+        """Return the first place that keyframes recognize; None without one."""
+        return self.recognition.places[0] if self.recognition and self.recognition.places else None
+
+    @property
+    def solved(self) -> bool:
+        """Return whether any pose was found, accepted or not."""
+        return bool(self.hypotheses)
+
+    @property
+    def map_from_camera(self) -> NDArray[np.float64] | None:
+        """Return the best pose (4, 4), accepted or not; None when there is none."""
+        return self.hypotheses[0].map_from_camera if self.hypotheses else None
+
+    @property
+    def confidence(self) -> float:
+        """Return the probability that the best pose is within 1 m; 0 when nothing was found."""
+        return self.hypotheses[0].confidence if self.hypotheses else 0.0
+
+    @property
+    def score(self) -> float:
+        """Return the best score; 0 when nothing was found."""
+        return self.hypotheses[0].score if self.hypotheses else 0.0
+
+
+def in_its_map(found: Relocalization, landmark_map: LandmarkMap
+               ) -> tuple[Relocalization, MapPart]:
+    """Return a result in the coordinate frame of the map of its best pose, and this map.
+
+    It was found in landmark_map, which may be a JoinedMap. Poses on other maps are left out: they
+    have no place in this coordinate frame. The reason of a refusal names the map. A result from a
+    single map stays as it is.
+    """
+    parts = parts_of(landmark_map)
+    if found.map_from_camera is None or len(parts) == 1:
+        return found, parts[0]
+    places = [place_of(landmark_map, one.map_from_camera) for one in found.hypotheses]
+    part, name = places[0].part, places[0].name
+    rows = range(part.first, part.first + len(part.landmark_map))
+    reason = found.reason and f'in {name}: {found.reason}'
+    return replace(
+        found, reason=reason,
+        hypotheses=tuple(replace(one, map_from_camera=place.map_from_camera)
+                         for one, place in zip(found.hypotheses, places, strict=True)
+                         if place.name == name),
+        frame_matches=tuple(tuple(replace(one, landmark=one.landmark - part.first)
+                                  for one in of_frame if one.landmark in rows)
+                            for of_frame in found.frame_matches)), part
 
 
 @dataclass(frozen=True)
@@ -146,11 +242,15 @@ class Relocalizer:
         if depth is not None and not depth.is_passed:
             joined = without_depth(joined)
             met = self._meet(joined, budget)
-        compared = compare(joined, met, recognizer)
+        compared = Comparison(joined, met, looks, recognizer)
+        result = Relocalization(
+            False, '', tried=sum(one.progress.tried for one in frames),
+            coverage=coverage_of(frames), stamp_ns=frames[-1].observation.stamp_ns)
         if not compared.contenders:
-            return _nothing_found(frames, budget)
-        pose, covariance = pose_of(joined, compared)
-        evidence = evidence_of(joined, compared, covariance, looks, recognizer)
+            kind, reason = _nothing_found(frames)
+            return replace(result, reason=reason, refusal_kind=kind, search_ms=budget.elapsed_ms)
+        pose, covariance = compared.pose()
+        evidence = compared.evidence(covariance)
         seen: list[CameraLook] = []
         if compared.by_boxes is not None and self.options.refine:
             # an uncertain position may be the camera's fault
@@ -160,15 +260,20 @@ class Relocalizer:
             evidence = replace(evidence, camera=camera, camera_fault=fault)
         refused = refusal(evidence, self.options)
         shown = compared.by_objects or compared.contenders[0]
-        return Relocalization(
-            accepted=refused is None, reason=refused.reason if refused else '',
+        # the pose that leads, and the best one of each other place
+        poses = np.array([pose, *compared.poses[1:]])
+        confidences = (compared.likely * evidence.found * evidence.certainty).tolist()
+        confidences[0] = evidence.confidence
+        hypotheses = tuple(Hypothesis(
+            poses[row], one.finalist.score, confidences[row], one.support, one.handicap)
+            for row in SAME_PLACE.distinct(poses) for one in [compared.contenders[row]])
+        return replace(
+            result, accepted=refused is None, reason=refused.reason if refused else '',
             refusal_kind=refused.kind if refused else None,
-            hypotheses=_hypotheses(pose, compared, evidence), frame_matches=tuple(shown.matches),
-            evidence=evidence, covariance=covariance, tried=_tried(frames),
-            best_iteration=shown.finalist.iteration, coverage=coverage_of(frames),
-            search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns,
-            source=compared.source, recognition=compared.recognition, depth=depth,
-            cameras=tuple(seen))
+            hypotheses=hypotheses, frame_matches=tuple(shown.matches),
+            evidence=evidence, covariance=covariance, best_iteration=shown.finalist.iteration,
+            search_ms=budget.elapsed_ms, source=compared.source,
+            recognition=compared.recognition, depth=depth, cameras=tuple(seen))
 
     def _meet(self, joined: JoinedFrames, budget: TimeBudget) -> list[Contender]:
         """Return the best poses that the search met, see search_contenders."""
@@ -176,22 +281,8 @@ class Relocalizer:
             joined.frames, joined.rig, self.options.refine, budget.refinement_end))
 
 
-def _hypotheses(pose: NDArray[np.float64], compared: Comparison, evidence: Evidence
-                ) -> tuple[Hypothesis, ...]:
-    """Return the pose that leads, and the best one of each other place."""
-    poses = np.array([pose, *compared.poses[1:]])
-    confidences = compared.likely * evidence.found * evidence.certainty
-    same, rows = SAME_PLACE.agreeing(poses), list[int]()
-    for row in range(len(poses)):
-        if not same[row, rows].any():
-            rows.append(row)
-    found = [compared.contenders[row] for row in rows]
-    return tuple(Hypothesis(
-        poses[row], one.finalist.score, float(confidences[row]) if row else evidence.confidence,
-        one.support, one.handicap) for row, one in zip(rows, found, strict=True))
-
-
-def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget) -> Relocalization:
+def _nothing_found(frames: Sequence[SearchedFrame]) -> tuple[RefusalKind, str]:
+    """Return why there is no pose."""
     if any(one.has_samples for one in frames):
         kind, reason = RefusalKind.UNEXPLAINED, 'no pose explains the detections'
     else:
@@ -199,10 +290,4 @@ def _nothing_found(frames: Sequence[SearchedFrame], budget: TimeBudget) -> Reloc
         kind = RefusalKind.TOO_FEW_OBJECTS
         reason = (f'{detections} detections give fewer than {frames[-1].sample_size} distinct '
                   'correspondence candidates')
-    return Relocalization(False, f'{reason}; turn the camera to more objects', refusal_kind=kind,
-                          tried=_tried(frames), coverage=coverage_of(frames),
-                          search_ms=budget.elapsed_ms, stamp_ns=frames[-1].observation.stamp_ns)
-
-
-def _tried(frames: Sequence[SearchedFrame]) -> int:
-    return sum(one.progress.tried for one in frames)
+    return kind, f'{reason}; turn the camera to more objects'

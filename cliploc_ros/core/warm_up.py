@@ -18,7 +18,6 @@ from cliploc_ros.core.fit.camera_fit import ERRORS, camera_jacobian, fit_camera
 from cliploc_ros.core.fit.refinement import jacobian_of, one_to_one, refine_rig, residuals_of
 from cliploc_ros.core.fit.verification import (
     camera_pose,
-    choose_distinct,
     make_rig,
     scores_of,
     verify_rig,
@@ -29,12 +28,11 @@ from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.kernels.compiled import warm_up
 from cliploc_ros.core.map.pairs import find_repeats, make_pairs
 from cliploc_ros.core.map.similarities import keep_greatest
-from cliploc_ros.core.search.sampling import compatible_pairs, draw_ransac
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Scene, make_scene
 from cliploc_ros.core.search.strategies import (
     Leaders,
-    are_near,
-    same_place,
+    compatible_pairs,
+    draw_ransac,
     search_exhaustively,
     search_progressively,
     search_samples,
@@ -55,8 +53,6 @@ def call_search_kernels() -> None:
     list(search_exhaustively(scene, Leaders.none_yet()))
     list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet()))
     list(search_progressively(scene, compatible_pairs(scene), Leaders.none_yet(), size=2))
-    same_place(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
-    are_near(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3), 0.05, 2.998)
 
 
 def call_fit_kernels() -> None:
@@ -79,8 +75,7 @@ def call_fit_kernels() -> None:
                   np.zeros((1, 1), np.float32))
     classes = np.zeros(3, dtype=np.int64)
     find_repeats(make_pairs(scene.centers, classes, cKDTree(scene.centers)), classes)
-    scores = scores_of(rig, np.eye(3)[None], np.zeros((1, 3)))
-    choose_distinct(scores, np.eye(3)[None], np.zeros((1, 3)), 1)
+    scores_of(rig, np.eye(3)[None], np.zeros((1, 3)))
 
 
 def _make_scene() -> tuple[Scene, NDArray[np.int64]]:

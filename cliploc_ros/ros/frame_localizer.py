@@ -23,8 +23,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import split_similarities
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
-from cliploc_ros.core.relocalization import Relocalization, in_its_map
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, in_its_map
 from cliploc_ros.core.watch.watch import Watch, WatchReport
 from cliploc_ros.errors import MapError
 from cliploc_ros.files.storage import resolve_cache_dir
@@ -71,7 +70,7 @@ class Localized(NamedTuple):
     #: Whether there was no time for the other crops, which could have helped.
     is_cut: bool
     #: Covariance (6, 6) for a filter that fuses all accepted poses: in continuous mode, that of
-    #: the new information, see cliploc_ros.core.succession.
+    #: the new information, see cliploc_ros.core.localizer.
     for_filter: NDArray[np.float64] | None
     left_out: tuple[str, ...]  #: Names of cameras without a frame, or of another run of odometry
     query: Query  #: With it the same answer comes again

@@ -29,7 +29,7 @@ from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalization
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_array_msg
 

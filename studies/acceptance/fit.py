@@ -20,12 +20,16 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
-from cliploc_ros.core.acceptance.confidence import Setting, confidences, none_right, utilities
-from cliploc_ros.core.acceptance.support import Support
+from cliploc_ros.core.acceptance.confidence import (
+    Setting,
+    Support,
+    confidences,
+    none_right,
+    utilities,
+)
 from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, pose_error
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.errors import OptionsError
 from studies.acceptance.places import ALL, MODES, ONE, Simulated
 from studies.acceptance.troubles import FAMILIES, exchange_landmarks

@@ -12,8 +12,7 @@ from scipy.optimize import minimize
 from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.geometry.transforms import Tolerance
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.watch.alignment import align, look_at
-from cliploc_ros.core.watch.evidence import LookEvidence, log_odds, measure
+from cliploc_ros.core.watch.look import LookEvidence, align, log_odds, look_at, measure
 from studies.reports import table
 from studies.watch.localizers import (
     displaced,

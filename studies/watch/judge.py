@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from cliploc_ros.core.geometry.transforms import Tolerance, invert_transform, make_transform
+from cliploc_ros.core.map.visibility import expect
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.watch.expectation import expect
 from cliploc_ros.core.watch.watch import Watch, WatchReport, WatchState
 from studies.reports import table
 from studies.watch.localizers import LOOK_S, Drive, drifting, kidnapped

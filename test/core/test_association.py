@@ -5,14 +5,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference import same_class
 
-from cliploc_ros.core.map.classes import ClassIndex
-from cliploc_ros.core.search.candidates import (
+from cliploc_ros.core.map.landmark_map import ClassIndex
+from cliploc_ros.core.search.frame_search import (
     balanced_order,
     class_candidates,
     joined,
     nearest_candidates,
     prosac_order,
-    rarest_class_candidates,
 )
 
 SIMILARITIES = np.array([[0.9, 0.1, 0.5], [0.2, 0.8, 0.7]], dtype=np.float32)
@@ -48,7 +47,7 @@ def test_balanced_order_is_balanced(detections, landmarks, data):
 
 def test_rare_classes_come_first_and_nothing_twice():
     index = ClassIndex.of(('a', 'a', 'a', 'b'))
-    rare = rarest_class_candidates(index, index.classes_of(('a', 'b', 'a')), 100)
+    rare = class_candidates(index, index.classes_of(('a', 'b', 'a')), 100)
     assert rare.pairs.tolist() == [[1, 3], [0, 0], [0, 1], [0, 2], [2, 0], [2, 1], [2, 2]]
     similarities = np.array([[0.1, 0.9, 0.2, 0.3]] * 3, dtype=np.float32)
     both = joined(nearest_candidates(similarities, 1), rare, 4)
@@ -67,9 +66,9 @@ def test_landmarks_of_several_classes_agree_with_their_mask(landmarks, others, d
         mask[[one == name for one in detections], row] = True
     classes = index.classes_of(detections)
     assert (class_candidates(index, classes).pairs == np.argwhere(mask)).all()
-    rarest = rarest_class_candidates(index, classes, 100).pairs
+    rarest = class_candidates(index, classes, 100).pairs
     assert sorted(rarest.tolist()) == np.argwhere(mask).tolist()
-    assert (rarest_class_candidates(index, classes, limit).pairs == rarest[:limit]).all()
+    assert (class_candidates(index, classes, limit).pairs == rarest[:limit]).all()
     rows, columns = np.indices(mask.shape).reshape(2, -1)
     assert (index.have(columns, classes[rows]) == mask.ravel()).all()
     assert (np.diff(index.members[:, 0]) >= 0).all()  # in the map's order

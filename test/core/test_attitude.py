@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.confidence import (
     Setting,
+    Support,
     confidences,
     none_right,
     tilt_handicaps,
     utilities,
 )
-from cliploc_ros.core.acceptance.support import Support
 from cliploc_ros.core.acceptance.verdict import Evidence, refusal
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.options import RelocalizerOptions

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cliploc_ros.core.geometry.ellipse import ellipse_iou, unit_circle_overlap
-from cliploc_ros.core.geometry.p3p import largest_cubic_root
+from cliploc_ros.core.geometry.minimal_solvers import largest_cubic_root
 
 sizes = st.floats(0.05, 20.0)
 offsets = st.one_of(st.just(0.0), st.floats(-3.0, 3.0))

@@ -16,12 +16,12 @@ from cliploc_ros.core.fit.refinement import (
     residuals_of_rig,
     robust_cost,
 )
-from cliploc_ros.core.fit.verification import choose_distinct, make_rig, scores_of, verify_rig
-from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.fit.verification import make_rig, scores_of, verify_rig
+from cliploc_ros.core.geometry.transforms import SAME_PLACE, invert_transform, make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.search.candidates import match_frame
+from cliploc_ros.core.search.frame_search import match_frame
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
 
 FRAMES = 4
@@ -155,9 +155,10 @@ def test_the_best_at_each_place_are_chosen(room, walk, rng):
     poses = [*near[:3], far, *near[3:]]
     rotations, translations = (np.array(part) for part in zip(*map(split, poses), strict=True))
     scores = scores_of(rig, rotations, translations)
-    rows = choose_distinct(scores, rotations, translations, 5)
+    order = np.argsort(-scores, kind='stable')
+    rows = order[SAME_PLACE.distinct(np.array(poses)[order], 5)]
     assert len(rows) == 2
     assert rows[1] == 3
     assert scores[rows[0]] == scores.max() > scores[3]
-    rows = choose_distinct(scores, rotations, translations, 1)
+    rows = order[SAME_PLACE.distinct(np.array(poses)[order], 1)]
     np.testing.assert_array_equal(rows, [int(np.argmax(scores))])

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scene import CAMERA, make_room, see_room
 
+from cliploc_ros.core.acceptance.confidence import Support, one_thing
 from cliploc_ros.core.acceptance.look_alikes import lead_over_twin, turned_about_axis
-from cliploc_ros.core.acceptance.support import Support, one_thing
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from cliploc_ros.core.geometry.transforms import make_transform, pose_difference
-from cliploc_ros.core.succession import succeed
+from cliploc_ros.core.localizer import succeed
 
 OWN = np.diag([0.04, 0.01, 0.02, 0.001, 0.002, 0.003])
 

@@ -10,10 +10,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.acceptance.confidence import Setting, confidences, none_right, utilities
-from cliploc_ros.core.acceptance.support import Support, compared_frame, support
+from cliploc_ros.core.acceptance.confidence import (
+    Setting,
+    Support,
+    compared_frame,
+    confidences,
+    none_right,
+    support,
+    utilities,
+)
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, refusal
-from cliploc_ros.core.fit.covariance import pose_covariance
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
@@ -284,33 +290,3 @@ def test_garbage_is_never_accepted(kind, office_map, rng):
             Camera(640, 480, 535.4, 539.2, 320.1, 247.6), detections)]).accepted
     print(f'\n{kind}: {accepted} of 200 garbage frames accepted')
     assert accepted == 0
-
-
-def test_covariance_is_that_of_simulated_boxes(rng):
-    """The linearized covariance against the scatter of poses solved from noisy boxes."""
-    from cliploc_ros.core.fit.covariance import _VARIANCE_INFLATION
-    from cliploc_ros.core.geometry.p3p import solve_p3p
-    centers = np.array([[-1.0, 0.2, 4.0], [1.2, -0.3, 5.0], [0.1, 0.9, 3.0]])
-    seen = centers[:, :2] / centers[:, 2:]
-    sizes, scatter = np.full((3, 2), 0.1), 0.01
-    poses = []
-    for _ in range(2_000):
-        noisy = np.c_[seen + rng.normal(size=(3, 2)) * sizes * scatter, np.ones(3)]
-        rotations, translations = solve_p3p(
-            noisy / np.linalg.norm(noisy, axis=1, keepdims=True), centers)
-        best = np.argmin(np.linalg.norm(translations, axis=1))
-        pose = np.eye(4)
-        pose[:3, :3] = rotations[best].T
-        pose[:3, 3] = -rotations[best].T @ translations[best]
-        poses.append(pose_difference(np.eye(4), pose))
-    covariance = pose_covariance(np.eye(4), centers, sizes, scatter) / _VARIANCE_INFLATION
-    expected = np.sqrt(np.diag(covariance))
-    assert np.std(poses, axis=0) == pytest.approx(expected, rel=0.1)
-
-
-def test_covariance_of_an_undetermined_pose_is_large_not_infinite():
-    centers = np.array([[0.0, 0.0, 4.0]] * 3)
-    covariance = pose_covariance(np.eye(4), centers, np.full((3, 2), 0.1), 0.1)
-    assert np.isfinite(covariance).all()
-    assert np.linalg.eigvalsh(covariance).min() > 0
-    assert covariance.max() > 1

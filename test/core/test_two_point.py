@@ -5,7 +5,7 @@ import pytest
 from reference import bearings_of, nearest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.two_point import two_point
+from cliploc_ros.core.geometry.minimal_solvers import two_point
 
 UP = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 

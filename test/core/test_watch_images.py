@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cliploc_ros.core.watch.image_faults import ImageFaults
+from cliploc_ros.core.watch.camera import ImageFaults
 
 
 def poses(count, step_m=0.2):

@@ -7,8 +7,13 @@ import numpy as np
 import pytest
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.acceptance.confidence import Setting, confidences, none_right, utilities
-from cliploc_ros.core.acceptance.support import Support
+from cliploc_ros.core.acceptance.confidence import (
+    Setting,
+    Support,
+    confidences,
+    none_right,
+    utilities,
+)
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

@@ -6,18 +6,15 @@ The modules in the order in which a pose passes them:
 
 contenders
     The poses that may be right, of objects and of keyframes, and the odds of each.
-support
-    The evidence of the objects for a pose.
-prior
-    What a region that is known before says of a pose.
 depth_check
     Whether the depths of a request can be right.
 confidence
-    From odds to the probability of each pose, given its rivals.
+    The evidence of the objects for a pose, what a region known before says, and from these odds to
+    the probability of each pose, given its rivals.
 comparison
-    The contenders in one list: which one leads, and all evidence about it.
-look_alikes, mirror, genuine
-    Other reasons to be wrong: a place that looks alike, a mirror image, a picture or a change.
+    The contenders in one list: which one leads, and all evidence about it; mirror images.
+look_alikes, genuine
+    Other reasons to be wrong: a place that looks alike, a picture or a change.
 looks
     The earlier looks of a moving robot.
 camera_check

@@ -42,6 +42,9 @@ class Calibration(NamedTuple):
     camera: Terms  #: Errors of a camera and its boxes, and when they are too large
     covariance: Terms  #: How covariances count
     watch: Terms  #: Log odds of a look of the watch, and how its looks add up
+    images: Terms  #: Faults of a camera by its images
+    turn: Terms  #: How a camera is turned against its mount
+    depth: Terms  #: Whether depths can be right
 
 
 #: The installed numbers; a missing or unknown section is a defect of the installation.

@@ -11,9 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.acceptance.confidence import Setting, tilt_handicaps, utilities
-from cliploc_ros.core.acceptance.prior import region_odds
-from cliploc_ros.core.acceptance.support import Support, compared_frame, support
+from cliploc_ros.core.acceptance.confidence import (
+    Setting,
+    Support,
+    compared_frame,
+    region_odds,
+    support,
+    tilt_handicaps,
+    utilities,
+)
 from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.verification import Rig, cameras_from_last, make_rig

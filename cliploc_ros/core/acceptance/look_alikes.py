@@ -23,8 +23,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.acceptance.support import Support
-from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, SAME_MOVE, invert_transform
+from cliploc_ros.core.acceptance.confidence import Support
+from cliploc_ros.core.geometry.transforms import (
+    RIGHT_M,
+    SAME_ANSWER,
+    SAME_MOVE,
+    first_of_each,
+    invert_transform,
+)
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.pairs import find_repeats
 
@@ -121,7 +127,7 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
     misses = np.linalg.norm(ends + moves[:, None, :3, 3] - landmark_map.centers[others], axis=2)
     order = np.lexsort([(misses * found).sum(axis=1), -shares])
     order = order[alike[order]]
-    order = order[_distinct(moves[order], position, _TWINS)]
+    order = order[first_of_each(_are_same(moves[order], position), _TWINS)]
     return Alike(moves[order], rows, others[order], found[order])
 
 
@@ -238,7 +244,7 @@ def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray
     ends = weights @ (moves[:, :3, :3] @ middle + moves[:, :3, 3]) / votes[:, None]
     moves = _upright_moves(np.arctan2(weights @ moves[:, 1, 0], weights @ moves[:, 0, 0]),
                            middle, ends)[np.argsort(-votes, kind='stable')]
-    return moves[_distinct(moves, middle, _MOVES)]
+    return moves[first_of_each(_are_same(moves, middle), _MOVES)]
 
 
 def _upright_moves(turns: NDArray[np.float64], before: NDArray[np.float64],
@@ -258,17 +264,6 @@ def _are_same(moves: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray
     cosines = moves[:, None, 0, 0] * moves[:, 0, 0] + moves[:, None, 1, 0] * moves[:, 1, 0]
     near = np.linalg.norm(ends[:, None] - ends, axis=2) < SAME_MOVE.distance_m
     return np.asarray(near & (cosines > _SAME_TURN))
-
-
-def _distinct(moves: NDArray[np.float64], point: NDArray[np.float64], limit: int
-              ) -> NDArray[np.int64]:
-    """Return the first moves that differ from those before them, up to a number."""
-    same = _are_same(moves, point)
-    kept = np.empty(0, dtype=np.int64)
-    for row in range(len(moves)):
-        if len(kept) < limit and not same[row][kept].any():
-            kept = np.append(kept, row)
-    return kept
 
 
 def _verified(landmark_map: LandmarkMap, rows: NDArray[np.int64], moves: NDArray[np.float64],

@@ -51,6 +51,24 @@ class RefusalKind(StrEnum):
     WRONG_DETECTIONS = auto()
 
 
+# Factors of the confidence besides likely and found, in the order in which equal ones are named.
+_FACTORS = ('distinct', 'near', 'camera', 'genuine', 'not_mirrored', 'uncontradicted')
+# What a refusal says of an Evidence whose weakest factor names its cause.
+_WEAK = {
+    'near': (RefusalKind.UNCERTAIN_POSITION, 'position uncertain by {0.deviation_m:.2g} m; turn '
+                                             'the camera to more or nearer objects'),
+    'camera': (RefusalKind.WRONG_CAMERA,
+               'another focal length or other pixels of the boxes may fit; turn the camera to '
+               'nearer objects, or check camera_info'),
+    'genuine': (RefusalKind.CHANGED, '{0.recognized.inliers} points of keyframes agree as in a '
+                                     'picture or a changed place; move, and ask again'),
+    'not_mirrored': (RefusalKind.AMBIGUOUS, 'mirrored, the image fits another pose; turn the '
+                                            'camera to more objects'),
+    'found': (RefusalKind.SEARCH_CUT_SHORT,
+              'pose met only {0.meetings:g} times in {0.tried} samples; raise iterations or set '
+              'algorithm to auto')}
+
+
 class Refusal(NamedTuple):
     """A kind, and the reason in one line."""
 
@@ -129,8 +147,7 @@ class Evidence:
     @property
     def certainty(self) -> float:
         """Return the probability that nothing besides the poses found makes it wrong."""
-        return (self.distinct * self.near * self.camera * self.genuine * self.not_mirrored
-                * self.uncontradicted)
+        return math.prod(getattr(self, name) for name in _FACTORS)
 
     @property
     def confidence(self) -> float:
@@ -162,8 +179,15 @@ def refusal(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
     if evidence.camera_fault and not by_points:
         return Refusal(RefusalKind.WRONG_CAMERA, f'{evidence.camera_fault}; check camera_info, '
                                                  'and the pixels and corners of the boxes')
-    lacks = None if by_points else _too_short(evidence, options) or _too_few(evidence, options)
-    return lacks or _too_unlikely(evidence, options) or _contradicted(evidence, options)
+    refused = None if by_points else _too_little(evidence, options)
+    refused = refused or _too_unlikely(evidence, options)
+    needed = min(CALIBRATION.looks.mean_confidence, options.min_confidence)
+    if refused or evidence.mean_confidence >= needed:
+        return refused
+    # the looks before this one were too unsure of this pose
+    return Refusal(RefusalKind.FRAMES_DISAGREE,
+                   f'mean confidence {_rounded_down(evidence.mean_confidence)} < {needed:g} of '
+                   f'the last {len(evidence.earlier) + 1} frames in this pose; {_LOOK_ABOUT}')
 
 
 def needed_confidence(evidence: Evidence, options: RelocalizerOptions) -> float:
@@ -178,7 +202,8 @@ def needed_confidence(evidence: Evidence, options: RelocalizerOptions) -> float:
     return 1.0 - CALIBRATION.search.early_share * (1.0 - options.min_confidence)
 
 
-def _too_short(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
+def _too_little(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
+    """Return the refusal of a search that was too short, or that matched too few objects."""
     kind, least = RefusalKind.SEARCH_CUT_SHORT, int(CALIBRATION.search.least_samples)
     if evidence.coverage < 1.0 and options.algorithm == 'auto':
         if evidence.tried < least:
@@ -190,10 +215,6 @@ def _too_short(evidence: Evidence, options: RelocalizerOptions) -> Refusal | Non
     elif options.algorithm not in ('auto', 'bf') and options.iterations < least:
         return Refusal(kind, f'iterations {options.iterations} < {least}, too few to '
                              f'find rivals; set iterations to {least} or more')
-    return None
-
-
-def _too_few(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
     if evidence.inliers >= options.min_inliers:
         return None
     return Refusal(RefusalKind.TOO_FEW_OBJECTS,
@@ -214,75 +235,37 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
     compared = f'confidence {_rounded_down(confidence)} < {options.min_confidence:g}'
     if evidence.prior < 0.0:
         compared += '; the prior has the robot elsewhere'
-    likely = max(evidence.likely, evidence.by_points)
+    likely, rival = max(evidence.likely, evidence.by_points), evidence.rival
     found = max(evidence.likely * evidence.found, evidence.by_points) / max(likely, 1e-9)
-    weakest = min({'likely': likely, 'distinct': evidence.distinct, 'near': evidence.near,
-                   'camera': evidence.camera, 'genuine': evidence.genuine,
-                   'mirror': evidence.not_mirrored, 'keyframes': evidence.uncontradicted,
-                   'found': found}.items(),
-                  key=lambda item: item[1])[0]
+    weakest = min(('likely', likely), *((name, getattr(evidence, name)) for name in _FACTORS),
+                  ('found', found), key=lambda factor: factor[1])[0]
+    # a rival has most of the missing probability, or nearly that of the pose
+    ambiguous = rival is not None and rival.likely > max(
+        _LEAST_RIVAL, min(0.9 * evidence.likely, 0.5 * (1.0 - evidence.likely)))
     # the twin may be among the rivals, too
     if evidence.twin is not None and evidence.distinct < options.min_confidence and (
-            weakest == 'distinct' or (weakest == 'likely' and _is_ambiguous(evidence))):
-        second = evidence.twin_map and f' (the second in {evidence.twin_map})'
-        return Refusal(RefusalKind.LOOK_ALIKE,
-                       f'{compared}; {_point(evidence.place)} and {_point(evidence.twin)} m look '
-                       f'alike{second}; turn the camera to objects that differ')
-    if weakest == 'near':
-        return Refusal(RefusalKind.UNCERTAIN_POSITION,
-                       f'{compared}; position uncertain by {evidence.deviation_m:.2g} m; '
-                       'turn the camera to more or nearer objects')
-    if weakest == 'camera':
-        return Refusal(RefusalKind.WRONG_CAMERA,
-                       f'{compared}; another focal length or other pixels of the boxes may fit; '
-                       'turn the camera to nearer objects, or check camera_info')
-    if weakest == 'genuine' and evidence.recognized is not None:
-        return Refusal(RefusalKind.CHANGED,
-                       f'{compared}; {evidence.recognized.inliers} points of keyframes agree as '
-                       'in a picture or a changed place; move, and ask again')
-    if weakest == 'mirror':
-        return Refusal(RefusalKind.AMBIGUOUS, f'{compared}; mirrored, the image fits another '
-                                              'pose; turn the camera to more objects')
-    if weakest == 'found':
-        return Refusal(RefusalKind.SEARCH_CUT_SHORT,
-                       f'{compared}; pose met only {evidence.meetings:g} times in '
-                       f'{evidence.tried} samples; raise iterations or set algorithm to auto')
-    return _unsure(evidence, compared, weakest == 'keyframes')
-
-
-def _unsure(evidence: Evidence, compared: str, by_keyframes: bool) -> Refusal:
-    """Return the refusal of a pose that others rival, or that too little supports."""
-    rival = evidence.rival
-    if rival is None or not (by_keyframes or _is_ambiguous(evidence)):
-        return Refusal(RefusalKind.UNEXPLAINED,
-                       f'{compared}; {evidence.inliers} objects matched, '
-                       f'{round(evidence.unexplained)} unexplained{_points(evidence)}; '
-                       f'{_LOOK_ABOUT}')
-    if rival.is_other_source or by_keyframes:
+            weakest == 'distinct' or (weakest == 'likely' and ambiguous)):
+        kind, second = RefusalKind.LOOK_ALIKE, evidence.twin_map and (
+            f' (the second in {evidence.twin_map})')
+        said = (f'{_point(evidence.place)} and {_point(evidence.twin)} m look alike{second}; '
+                'turn the camera to objects that differ')
+    elif weakest in _WEAK:
+        kind, sentence = _WEAK[weakest]
+        said = sentence.format(evidence)
+    elif rival is None or not (weakest == 'uncontradicted' or ambiguous):
+        kind = RefusalKind.UNEXPLAINED
+        said = (f'{evidence.inliers} objects matched, {round(evidence.unexplained)} unexplained'
+                f'{_points(evidence)}; {_LOOK_ABOUT}')
+    elif rival.is_other_source or weakest == 'uncontradicted':
         apart = float(np.linalg.norm(np.subtract(rival.place, evidence.place)))
-        return Refusal(RefusalKind.CONTRADICTION,
-                       f'{compared}; objects and keyframes lead {apart:.2f} m apart; '
-                       f'{_LOOK_ABOUT}')
-    where = f' in {rival.map}' if rival.map else ''
-    return Refusal(RefusalKind.AMBIGUOUS,
-                   f'{compared}; ambiguous, another pose has {rival.likely:.2g}{where}; '
-                   'turn the camera to objects that differ')
-
-
-def _is_ambiguous(evidence: Evidence) -> bool:
-    """Return whether a rival has most of the missing probability, or nearly that of the pose."""
-    return evidence.rival is not None and evidence.rival.likely > max(
-        _LEAST_RIVAL, min(0.9 * evidence.likely, 0.5 * (1.0 - evidence.likely)))
-
-
-def _contradicted(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
-    """Return a refusal if the looks before this one were too unsure of this pose."""
-    needed = min(CALIBRATION.looks.mean_confidence, options.min_confidence)
-    if evidence.mean_confidence >= needed:
-        return None
-    return Refusal(RefusalKind.FRAMES_DISAGREE,
-                   f'mean confidence {_rounded_down(evidence.mean_confidence)} < {needed:g} of '
-                   f'the last {len(evidence.earlier) + 1} frames in this pose; {_LOOK_ABOUT}')
+        kind = RefusalKind.CONTRADICTION
+        said = f'objects and keyframes lead {apart:.2f} m apart; {_LOOK_ABOUT}'
+    else:
+        where = f' in {rival.map}' if rival.map else ''
+        kind, said = RefusalKind.AMBIGUOUS, (
+            f'ambiguous, another pose has {rival.likely:.2g}{where}; turn the camera to objects '
+            'that differ')
+    return Refusal(kind, f'{compared}; {said}')
 
 
 def _points(evidence: Evidence) -> str:

@@ -40,20 +40,7 @@ from cliploc_ros.core.fit.refinement import (
 )
 from cliploc_ros.core.fit.verification import Rig, verify_rig
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_difference
-from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN
 
-# Scatter of box centres assumed before any box is seen, as a share of the box, and how many
-# measurements this prior counts as. Without it three boxes alone would seem to fit perfectly.
-_PRIOR_SCATTER = 0.1
-_PRIOR_WEIGHT = 6.0
-# Neighbouring edges share errors of box and map, so fewer edges are independent than counted.
-# Chosen on the 258 TUM frames that also fitted the confidence: with it 94 to 95 % of the accepted
-# poses lie in their 95 % ellipsoids.
-_VARIANCE_INFLATION = 2.0
-# The least deviation of a box centre on the plane z = 1: about a twentieth of a pixel.
-_MIN_DEVIATION = 1e-4
-# Finite-difference steps of position [m] and rotation [rad].
-_STEPS = (1e-5, 1e-5, 1e-5, 1e-6, 1e-6, 1e-6)
 #: Variance of a direction that the boxes do not fix: m^2 and rad^2.
 PRIOR_VARIANCES = (100.0, 100.0, 100.0, 10.0, 10.0, 10.0)
 # Deviation of odometry between two frames, on each axis: a floor, which covers stamps and
@@ -83,72 +70,6 @@ EXACT = np.zeros(ERRORS)
 POSE_UNKNOWN = np.diag(PRIOR_VARIANCES)
 
 
-def box_scatter(ellipses: NDArray[np.float64], box_ellipses: NDArray[np.float64],
-                views: float = 1.0) -> float:
-    """Return the standard deviation of box centres, as a share of the box's size.
-
-    Parameters
-    ----------
-    ellipses : ndarray (m, 5)
-        Projected outlines of the inliers' landmarks, see project_ellipsoids.
-    box_ellipses : ndarray (m, 4)
-        Centre and semi-axes of the ellipses inscribed in the inliers' boxes.
-    views : float
-        Mean number of inliers that show the same object; together they count as one.
-    """
-    size = 2.0 * box_ellipses[:, 2:]
-    center_errors = (ellipses[:, :2] - box_ellipses[:, :2]) / size
-    # An edge moves by half of what its box grows.
-    size_errors = (np.sqrt(ellipses[:, [2, 4]]) - box_ellipses[:, 2:]) / size
-    squares = (np.nansum(center_errors**2) + np.nansum(size_errors**2)) / views
-    # Six of the centres' errors are zero by construction: P3P fits three centres exactly.
-    freedom = max(0.0, center_errors.size / views - 6) + size_errors.size / views
-    return float(np.sqrt((squares + _PRIOR_WEIGHT * _PRIOR_SCATTER**2)
-                         / (freedom + _PRIOR_WEIGHT)))
-
-
-def pose_covariance(map_from_camera: NDArray[np.float64], centers: NDArray[np.float64],
-                    box_sizes: NDArray[np.float64], scatter: float,
-                    vertical: NDArray[np.float64] = VERTICAL_UNKNOWN) -> NDArray[np.float64]:
-    """Return the covariance of a pose from three box centres, or from two and the vertical.
-
-    The error of a minimal pose comes from its bearings and its vertical only. Bearings scatter
-    in proportion to their boxes, as much as the boxes of the inliers miss the projected
-    landmarks. The linearized projection propagates this scatter to the pose.
-
-    Parameters
-    ----------
-    map_from_camera : ndarray (4, 4)
-    centers : ndarray (m, 3)
-        The sampled landmarks' centres in the map [m].
-    box_sizes : ndarray (m, 2)
-        Width and height of the sampled boxes on the plane z = 1.
-    vertical : ndarray (7,), optional
-        See make_rig.
-
-    Returns
-    -------
-    ndarray (6, 6)
-        Of x, y, z [m] and the rotations about the map's fixed X, Y, Z axes [rad], about the
-        camera's position (ROS order). Symmetric and positive definite.
-    """
-    def projections(step: NDArray[np.float64]) -> NDArray[np.float64]:
-        camera_from_map = invert_transform(moved_pose(map_from_camera, step))
-        points = centers @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
-        return (points[:, :2] / points[:, 2:]).ravel()
-
-    jacobian = np.stack([(projections(step) - projections(-step)) / (2 * step.max())
-                         for step in np.diag(_STEPS)], axis=1)
-    variances = _VARIANCE_INFLATION * np.maximum(box_sizes.ravel() * scatter, _MIN_DEVIATION)**2
-    information = (jacobian.T @ (jacobian / variances[:, None])
-                   + np.diag(1.0 / np.array(PRIOR_VARIANCES)))
-    if vertical[6] > 0.0:  # it measures the rotation about level axes
-        up = vertical[3:6]
-        information[3:, 3:] += (np.eye(3) - np.outer(up, up)) / vertical[6] ** 2
-    covariance = np.linalg.inv(information)
-    return (covariance + covariance.T) / 2
-
-
 def odometry_deviations(first_from_second: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the deviations (6,) of odometry between two frames: 0 if the camera did not move.
 
@@ -167,7 +88,7 @@ def odometry_deviations(first_from_second: NDArray[np.float64]) -> NDArray[np.fl
 def share_within(radius_m: float, covariance: NDArray[np.float64]) -> float:
     """Return the probability that a position is within a distance of the truth.
 
-    The covariance (6, 6) is as of pose_covariance.
+    The covariance (6, 6) is as of refined_covariance.
     """
     return float(shares_within(radius_m, covariance[None, :3, :3])[0])
 
@@ -188,7 +109,7 @@ def normalized_square(map_from_camera: NDArray[np.float64], covariance: NDArray[
                       truth: NDArray[np.float64]) -> float:
     """Return the normalized estimation error squared (NEES) of a pose (4, 4).
 
-    Where covariances (6, 6), as of pose_covariance, are right, it follows the chi-squared
+    Where covariances (6, 6), as of refined_covariance, are right, it follows the chi-squared
     distribution with six degrees of freedom (Bar-Shalom, Li and Kirubarajan 2001).
     """
     error = pose_difference(map_from_camera, truth)

@@ -13,25 +13,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.fit.covariance import (
-    EXACT,
-    POSE_UNKNOWN,
-    box_scatter,
-    odometry_deviations,
-    pose_covariance,
-    refined_covariance,
-)
+from cliploc_ros.core.fit.covariance import EXACT, POSE_UNKNOWN, refined_covariance
 from cliploc_ros.core.fit.refinement import refine_rig
-from cliploc_ros.core.fit.verification import Rig, choose_distinct, scores_of, verify_rig
-from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
+from cliploc_ros.core.fit.verification import Rig, scores_of, verify_rig
 from cliploc_ros.core.geometry.transforms import (
     SAME_MINIMUM,
+    SAME_PLACE,
     invert_transform,
     make_transform,
-    move_covariance,
 )
 from cliploc_ros.core.search.frame_search import REFINED, SearchedFrame
-from cliploc_ros.core.search.strategies import MAX_DISTINCT, are_near, same_place
+from cliploc_ros.core.search.strategies import MAX_DISTINCT
 
 # The most refined poses that are compared by their support. Of 614 frames of TUM fr3 (maps of its
 # splits, one image), 16 solve 449 within 0.5 m, 8 solve 440.
@@ -72,6 +64,11 @@ class Finalist(NamedTuple):
         return invert_transform(make_transform(self.rotation, self.translation))
 
 
+def poses_of(found: Sequence[Finalist]) -> NDArray[np.float64]:
+    """Return the poses (m, 4, 4): map_from_camera of each."""
+    return np.array([one.map_from_camera for one in found]).reshape(-1, 4, 4)
+
+
 def find_with_rivals(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, deadline: float
                      ) -> tuple[list[Finalist], NDArray[np.bool_]]:
     """Return the best poses, best first, and which of them use the known vertical.
@@ -84,10 +81,8 @@ def find_with_rivals(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, de
         return [], np.empty(0, dtype=np.bool_)
     tilted = find_finalists([one._replace(leaders=one.tilted) for one in frames], rig, refine,
                             MAX_DISTINCT, deadline)
-    elsewhere = [one for one in tilted if not any(
-        same_place(one.rotation, one.translation, other.rotation, other.translation)
-        for other in upright)]
-    finalists = upright + elsewhere
+    same = SAME_PLACE.agreeing(poses_of(tilted), poses_of(upright)).any(axis=1)
+    finalists = upright + [tilted[row] for row in np.nonzero(~same)[0]]
     return finalists, np.arange(len(finalists)) < len(upright)
 
 
@@ -103,12 +98,21 @@ def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, coun
              for one in _leaders_of(frames, rig, frame)[:_SCORED // len(frames)**2]]
     if len(frames) > 1 and found:
         # The best distinct poses by their scores in all frames, best first.
-        rotations = np.stack([one.rotation for one in found])
-        translations = np.stack([one.translation for one in found])
-        scores = scores_of(rig, rotations, translations)
-        rows = choose_distinct(scores, rotations, translations, count)
-        found = [found[row]._replace(score=float(scores[row])) for row in rows]
-    return _refined(found, rig, deadline)[:_COMPARED] if refine else found[:MAX_DISTINCT]
+        scores = scores_of(rig, np.stack([one.rotation for one in found]),
+                           np.stack([one.translation for one in found]))
+        order = np.argsort(-scores, kind='stable')
+        found = [found[row]._replace(score=float(scores[row])) for row in order[
+            SAME_PLACE.distinct(poses_of(found)[order], count)]]
+    if not refine:
+        return found[:MAX_DISTINCT]
+    improved: list[Finalist] = []
+    for some in batched(found, _REFINED_AT_ONCE):
+        in_time = not improved or time.perf_counter() <= deadline
+        improved += [one._replace(**refine_rig(rig, one.rotation, one.translation)._asdict())
+                     for one in some] if in_time else some
+    improved.sort(key=lambda one: -one.score)
+    # one of each minimum
+    return [improved[row] for row in SAME_MINIMUM.distinct(poses_of(improved), _COMPARED)]
 
 
 def _leaders_of(frames: Sequence[SearchedFrame], rig: Rig, frame: int) -> list[Finalist]:
@@ -120,35 +124,6 @@ def _leaders_of(frames: Sequence[SearchedFrame], rig: Rig, frame: int) -> list[F
                      float(leaders.scores[row]), int(leaders.iterations[row]), frame,
                      leaders.samples[row][leaders.samples[row] >= 0])
             for row in leaders.ranked()]
-
-
-def _refined(found: list[Finalist], rig: Rig, deadline: float) -> list[Finalist]:
-    """Return the poses after refinement, best first, one of each minimum."""
-    improved: list[Finalist] = []
-    for some in batched(found, _REFINED_AT_ONCE):
-        if improved and time.perf_counter() > deadline:
-            improved += some
-            continue
-        improved += [one._replace(**refine_rig(rig, one.rotation, one.translation)._asdict())
-                     for one in some]
-    distinct: list[Finalist] = []
-    for one in sorted(improved, key=lambda one: -one.score):
-        if not any(are_near(one.rotation, one.translation, better.rotation, better.translation,
-                            SAME_MINIMUM.distance_m, SAME_MINIMUM.least_trace)
-                   for better in distinct):
-            distinct.append(one)
-    return distinct
-
-
-def first_of_each_place(order: Sequence[int], found: Sequence[Finalist], count: int) -> list[int]:
-    """Return the first of the rows at each place, in their order, and no more than a count."""
-    chosen: list[int] = []
-    for row in order:
-        if len(chosen) < count and not any(same_place(
-                found[row].rotation, found[row].translation, found[other].rotation,
-                found[other].translation) for other in chosen):
-            chosen.append(row)
-    return chosen
 
 
 def matches_of(rig: Rig, pose: Finalist) -> list[tuple[Match, ...]]:
@@ -178,27 +153,21 @@ def meetings_of(frames: Sequence[SearchedFrame], pose: Finalist,
 
 
 def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
-                  matches: Sequence[Sequence[Match]],
                   shared: NDArray[np.float64] | None = None,
                   mount_deviation: tuple[float, float] = (0.0, 0.0),
                   camera_deviations: NDArray[np.float64] = EXACT) -> NDArray[np.float64]:
-    """Return the covariance of a pose: of its refinement, or of its minimal sample.
+    """Return the covariance of a pose by its inliers.
 
     Parameters
     ----------
     shared, mount_deviation, camera_deviations
         See refined_covariance.
     """
-    if pose.information is not None:
-        if not pose.information.any():
-            return POSE_UNKNOWN
-        return refined_covariance(rig, pose.rotation, pose.translation, _instants(frames), shared,
-                                  mount_deviation=mount_deviation,
-                                  camera_deviations=camera_deviations)
-    cameras = np.array([make_transform(camera[:, :3], camera[:, 3]) for camera in rig.cameras])
-    scatter = _scatter(frames, cameras, pose, matches)
-    return (_sample_covariance(frames, cameras, pose, scatter)
-            + np.diag(odometry_deviations(cameras[pose.frame]) ** 2))
+    if pose.information is not None and not pose.information.any():
+        return POSE_UNKNOWN
+    return refined_covariance(rig, pose.rotation, pose.translation, _instants(frames), shared,
+                              mount_deviation=mount_deviation,
+                              camera_deviations=camera_deviations)
 
 
 def _instants(frames: Sequence[SearchedFrame]) -> NDArray[np.int64]:
@@ -215,30 +184,3 @@ def _instants(frames: Sequence[SearchedFrame]) -> NDArray[np.int64]:
     return np.array([order.index(key) for key in keys])
 
 
-def _scatter(frames: Sequence[SearchedFrame], cameras: NDArray[np.float64], pose: Finalist,
-             matches: Sequence[Sequence[Match]]) -> float:
-    """Return the scatter of the inliers' boxes."""
-    reference_from_map = make_transform(pose.rotation, pose.translation)
-    outlines, boxes = [], []
-    for frame, camera, found in zip(frames, cameras, matches, strict=True):
-        landmarks = [match.landmark for match in found]
-        outlines.append(project_ellipsoids(camera @ reference_from_map,
-                                           frame.scene.centers[landmarks],
-                                           frame.scene.shapes[landmarks]))
-        boxes.append(frame.scene.box_ellipses[[match.detection for match in found]])
-    seen = [row for found in matches for row in {match.landmark for match in found}]
-    views = max(1.0, len(seen) / max(1, len(set(seen))))
-    return box_scatter(np.concatenate(outlines), np.concatenate(boxes), views)
-
-
-def _sample_covariance(frames: Sequence[SearchedFrame], cameras: NDArray[np.float64],
-                       pose: Finalist, scatter: float) -> NDArray[np.float64]:
-    """Return the covariance of a pose that was not refined, from its minimal sample."""
-    scene = frames[pose.frame].scene
-    map_from_camera = pose.map_from_camera @ invert_transform(cameras[pose.frame])
-    sampled = scene.pairs[pose.sample]
-    covariance = pose_covariance(map_from_camera, scene.centers[sampled[:, 1]],
-                                 2.0 * scene.box_ellipses[sampled[:, 0], 2:], scatter,
-                                 frames[pose.frame].vertical)
-    lever = pose.map_from_camera[:3, 3] - map_from_camera[:3, 3]
-    return move_covariance(covariance, lever)

@@ -128,18 +128,11 @@ def robust_cost(residuals):
 
 
 @compiled
-def linearize(pairs, vertical, rotation, translation, residuals):
-    """Return the normal equations at a pose of known residuals: information (6, 6), gradient (6,).
-
-    They are for steps of the camera's position [m] and rotations about the map's axes [rad]. See
-    residuals_of for the parameters.
-    """
-    return normal_equations(jacobian_of(pairs, vertical, rotation, translation), residuals)
-
-
-@compiled
 def jacobian_of(pairs, vertical, rotation, translation):
-    """Return the derivatives (5 * m + 3, 6) of the residuals, see residuals_of and linearize."""
+    """Return the derivatives (5 * m + 3, 6) of the residuals, see residuals_of.
+
+    They are for steps of the camera's position [m] and rotations about the map's axes [rad].
+    """
     jacobian = np.zeros((5 * len(pairs) + 3, 6))
     for row in range(len(pairs)):
         _differentiate(pairs[row, 4:7], pairs[row, 7:13], rotation, translation, pairs[row, 13],
@@ -370,8 +363,8 @@ def linearize_rig(inliers, rotation, translation, residuals):
     for frame in range(len(cameras)):
         own_rotation, own_translation = camera_pose(cameras[frame], rotation, translation)
         first, last = starts[frame], starts[frame + 1]
-        own_information, own_gradient = linearize(
-            pairs[first:last], verticals[frame], own_rotation, own_translation,
+        own_information, own_gradient = normal_equations(
+            jacobian_of(pairs[first:last], verticals[frame], own_rotation, own_translation),
             residuals[5 * first + 3 * frame:5 * last + 3 * frame + 3])
         lever = np.zeros(3)
         for axis in range(3):
@@ -419,7 +412,7 @@ def _minimize(inliers, rotation, translation):
                 damped[axis, axis] += damping * information[axis, axis] + 1e-9
             if not solve(damped, gradient, step):
                 return rotation, translation
-            if _squared_length(step) > _LONGEST_STEP * _LONGEST_STEP:
+            if np.sum(step ** 2) > _LONGEST_STEP * _LONGEST_STEP:
                 damping = 10.0 * damping
                 continue
             new_rotation, new_translation = move(rotation, translation, step)
@@ -439,14 +432,6 @@ def _minimize(inliers, rotation, translation):
         if settled:
             break
     return rotation, translation
-
-
-@compiled
-def _squared_length(step):
-    total = 0.0
-    for value in step:
-        total += value * value
-    return total
 
 
 @compiled

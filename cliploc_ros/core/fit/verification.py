@@ -24,7 +24,6 @@ from cliploc_ros.core.kernels.compiled import ZERO, compiled
 from cliploc_ros.core.map.culling import Groups, visible_members
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.search.scene import Potential, Scene
-from cliploc_ros.core.search.strategies import same_place
 from cliploc_ros.errors import OptionsError
 
 #: The most frames that are fused. The leaders of each frame are verified on every frame, so the
@@ -96,18 +95,15 @@ def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64]
                                                      strict=True))),
         pairs=first.pairs[:0],
         groups=Groups(*map(np.concatenate, zip(*(one.groups for one in scenes), strict=True))))
-    sizes = [[0] * len(FrameStarts._fields), *map(_sizes, scenes)]
+    # how many rows each frame has in each array, in the order of FrameStarts
+    sizes = [[0] * len(FrameStarts._fields), *(
+        [len(one.box_ellipses), len(one.potential.landmarks), len(one.potential.detections),
+         len(one.groups.starts) - 1, *(len(rows) for rows in (
+             one.groups.detections, one.groups.members, one.groups.levels, one.groups.spheres))]
+        for one in scenes)]
     starts = np.ascontiguousarray(np.cumsum(sizes, axis=0, dtype=np.int64).T)
     return Rig(joined, FrameStarts(*starts), np.ascontiguousarray(camera_from_reference[:, :3]),
                np.ascontiguousarray(verticals), sigmas)
-
-
-def _sizes(scene: Scene) -> list[int]:
-    """Return how many rows a frame has in each array, in the order of FrameStarts."""
-    potential, groups = scene.potential, scene.groups
-    return [len(scene.box_ellipses), len(potential.landmarks), len(potential.detections),
-            len(groups.starts) - 1, len(groups.detections), len(groups.members),
-            len(groups.levels), len(groups.spheres)]
 
 
 @compiled
@@ -232,31 +228,3 @@ def scores_of(rig, rotations, translations):
     for row in range(len(rotations)):
         scores[row] = verify_rig(rig, rotations[row], translations[row]).score
     return scores
-
-
-def choose_distinct(scores: NDArray[np.float64], rotations: NDArray[np.float64],
-                    translations: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Return the rows (<= count,) of the best of m poses at distinct places, best first.
-
-    Poses are rotations (m, 3, 3) and translations (m, 3) of camera_from_map with scores (m,).
-    """
-    return _choose_distinct(np.argsort(-scores, kind='stable'), rotations, translations, count)
-
-
-@compiled
-def _choose_distinct(order, rotations, translations, count):
-    chosen = np.empty(count, dtype=np.int64)
-    found = 0
-    for row in order:
-        if found == count:
-            break
-        distinct = True
-        for other in chosen[:found]:
-            if same_place(rotations[row], translations[row], rotations[other],
-                          translations[other]):
-                distinct = False
-                break
-        if distinct:
-            chosen[found] = row
-            found += 1
-    return chosen[:found]

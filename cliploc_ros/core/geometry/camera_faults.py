@@ -3,7 +3,7 @@
 """Whether a camera is plausible: intrinsics of another resolution, unit or lens."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -70,8 +70,7 @@ def calibration_faults(sensor: Camera, k: NDArray[np.float64], r: NDArray[np.flo
     # either doubt alone may be harmless
     if contradiction is not None and len(faults) > 1:
         faults = [fault._replace(is_certain=True) for fault in faults]
-    return [*faults, *(Fault(text, False) for text in (
-        *_doubts_of_rotation(r, rectified), *_doubts_of_projection(p)))]
+    return [*faults, *(Fault(text, False) for text in _doubts(r, p, rectified))]
 
 
 def check_faults(faults: Iterable[Fault]) -> None:
@@ -87,32 +86,7 @@ def camera_faults(camera: Camera) -> tuple[Fault, ...]:
 
     An image that is cut out of a larger one has any principal point: give the camera of the whole.
     """
-    faults = [*_off_middle(camera), *_field(camera), *_stretch(camera), *_fold(camera)]
-    return tuple(sorted(faults, key=lambda fault: not fault.is_certain))
-
-
-def _off_middle(camera: Camera) -> list[Fault]:
-    share = np.array([camera.cx / camera.width, camera.cy / camera.height])
-    off = float(np.linalg.norm(share - 0.5))
-    if off <= _OFF_MIDDLE:
-        return []
-    return [Fault(
-        f'the principal point ({camera.cx:g}, {camera.cy:g}) is far from the middle of '
-        f'{camera.width}x{camera.height} px, as that of an image of {2 * camera.cx:.0f}x'
-        f'{2 * camera.cy:.0f} px is: scale K with the image; give width, height and roi of a '
-        'cropped one', off > _FAR_OFF_MIDDLE)]
-
-
-def _field(camera: Camera) -> list[Fault]:
-    is_fisheye = camera.distortion_model == 'equidistant'
-    wide_deg, no_lens_deg = _WIDE[is_fisheye]
-    return [Fault(
-        f'the image is {field_deg:.3g} degrees {side} by a focal length of {focal_px:g} px and '
-        f"{'a fisheye' if is_fisheye else 'no fisheye'}: is it in pixels of this image?",
-        not _NEEDLE_DEG <= field_deg <= no_lens_deg)
-        for side, field_deg, focal_px in zip(('wide', 'high'), fields_of_view(camera),
-                                             (camera.fx, camera.fy), strict=True)
-        if not _NARROW_DEG <= field_deg <= wide_deg]
+    return tuple(sorted(_faults_of(camera), key=lambda fault: not fault.is_certain))
 
 
 def fields_of_view(camera: Camera) -> tuple[float, float]:
@@ -123,40 +97,57 @@ def fields_of_view(camera: Camera) -> tuple[float, float]:
     return math.degrees(2.0 * halves[0]), math.degrees(2.0 * halves[1])
 
 
-def _stretch(camera: Camera) -> list[Fault]:
+def _faults_of(camera: Camera) -> Iterator[Fault]:
+    off = math.hypot(camera.cx / camera.width - 0.5, camera.cy / camera.height - 0.5)
+    if off > _OFF_MIDDLE:
+        yield Fault(
+            f'the principal point ({camera.cx:g}, {camera.cy:g}) is far from the middle of '
+            f'{camera.width}x{camera.height} px, as that of an image of {2 * camera.cx:.0f}x'
+            f'{2 * camera.cy:.0f} px is: scale K with the image; give width, height and roi of a '
+            'cropped one', off > _FAR_OFF_MIDDLE)
+    is_fisheye = camera.distortion_model == 'equidistant'
+    wide_deg, no_lens_deg = _WIDE[is_fisheye]
+    for side, field_deg, focal_px in zip(('wide', 'high'), fields_of_view(camera),
+                                         (camera.fx, camera.fy), strict=True):
+        if not _NARROW_DEG <= field_deg <= wide_deg:
+            yield Fault(
+                f'the image is {field_deg:.3g} degrees {side} by a focal length of {focal_px:g} '
+                f"px and {'a fisheye' if is_fisheye else 'no fisheye'}: is it in pixels of this "
+                'image?', not _NEEDLE_DEG <= field_deg <= no_lens_deg)
     ratio = max(camera.fx / camera.fy, camera.fy / camera.fx)
-    return [] if ratio <= _STRETCHED else [Fault(
-        f'the focal lengths {camera.fx:g} and {camera.fy:g} px differ by a factor of {ratio:.3g}: '
-        'is the image stretched like that?', ratio > _TORN)]
+    if ratio > _STRETCHED:
+        yield Fault(f'the focal lengths {camera.fx:g} and {camera.fy:g} px differ by a factor of '
+                    f'{ratio:.3g}: is the image stretched like that?', ratio > _TORN)
+    # coefficients that fold the image are of another lens or model, or order
+    folds = [share for share in (0.5, 1.0) if not camera.is_pinhole and np.isnan(
+        camera.normalize_points((0.5 + share * _MIDDLES) * (camera.width, camera.height))).any()
+        and (share == 0.5 or not is_fisheye)]
+    if folds:
+        yield Fault(
+            f"the coefficients {[float(f'{one:.4g}') for one in camera.distortion]} of "
+            f'{camera.distortion_model} fold the image onto itself before its '
+            f"{'border' if folds[0] == 1.0 else 'inner half ends'}: are they of this lens, and "
+            'in this order?', folds[0] == 0.5)
 
 
-def _fold(camera: Camera) -> list[Fault]:
-    """Return whether coefficients fold the image: they are of another lens or model, or order."""
-    if camera.is_pinhole:
-        return []
-    size = (camera.width, camera.height)
-    for share in (0.5, 1.0):
-        pixels = np.multiply(0.5 + share * _MIDDLES, size)
-        if np.isnan(camera.normalize_points(pixels)).any() and (
-                share == 0.5 or camera.distortion_model != 'equidistant'):
-            return [Fault(
-                f"the coefficients {[float(f'{one:.4g}') for one in camera.distortion]} of "
-                f'{camera.distortion_model} fold the image onto itself before its '
-                f"{'border' if share == 1.0 else 'inner half ends'}: are they of this lens, and "
-                'in this order?', share == 0.5)]
-    return []
-
-
-def _doubts_of_rotation(rotation: NDArray[np.float64], rectified: bool) -> list[str]:
-    """Return what is unusual about R (3, 3); zeros stand for no rectification."""
-    if not np.any(rotation):
-        return []
-    if not is_rigid(make_transform(rotation, np.zeros(3)), _ROTATION_TOLERANCE):
-        return ['R is no rotation: set it to the identity']
-    turn_deg = rotation_angle_deg(rotation)
-    return [] if rectified or turn_deg <= _MOST_TURN_DEG else [
-        f'R turns rectified images by {turn_deg:.3g} degrees, and the coordinate frame is theirs: '
-        'use them, with rectified true']
+def _doubts(rotation: NDArray[np.float64], projection: NDArray[np.float64], rectified: bool
+            ) -> Iterator[str]:
+    """Return what is unusual about R (3, 3) and P (3, 4); zeros stand for none."""
+    if np.any(rotation):
+        if not is_rigid(make_transform(rotation, np.zeros(3)), _ROTATION_TOLERANCE):
+            yield 'R is no rotation: set it to the identity'
+        elif (turn_deg := rotation_angle_deg(rotation)) > _MOST_TURN_DEG and not rectified:
+            yield (f'R turns rectified images by {turn_deg:.3g} degrees, and the coordinate frame '
+                   'is theirs: use them, with rectified true')
+    if np.any(projection):
+        focal_px = projection[0, 0]
+        if not (np.isfinite(projection).all() and focal_px > 0.0 and projection[1, 1] > 0.0
+                and abs(projection[0, 1]) <= _MOST_SKEW * focal_px and projection[1, 0] == 0.0
+                and (projection[2] == (0.0, 0.0, 1.0, 0.0)).all()):
+            yield 'P is not of the form [fx 0 cx Tx, 0 fy cy Ty, 0 0 1 0]: set it to that of K'
+        elif (beside_m := float(np.linalg.norm(projection[:2, 3])) / focal_px) > _MOST_BESIDE_M:
+            yield (f'P is of the second camera of a stereo pair, {beside_m:.2g} m beside the '
+                   'first: the coordinate frame must be its own')
 
 
 def _contradiction(projection: NDArray[np.float64], matrix: NDArray[np.float64], sensor: Camera,
@@ -179,18 +170,3 @@ def _contradiction(projection: NDArray[np.float64], matrix: NDArray[np.float64],
             *focal_px, *projection[:2, 2], *of_k, *matrix[:2, 2]),
         should_equal and not scaled and not 1.0 / _TIMES_K <= ratios.min() <= ratios.max()
         <= _TIMES_K)
-
-
-def _doubts_of_projection(projection: NDArray[np.float64]) -> list[str]:
-    """Return what is unusual about P (3, 4); zeros stand for no P."""
-    if not np.any(projection):
-        return []
-    focal_px = projection[0, 0]
-    if not (np.isfinite(projection).all() and focal_px > 0.0 and projection[1, 1] > 0.0
-            and abs(projection[0, 1]) <= _MOST_SKEW * focal_px and projection[1, 0] == 0.0
-            and (projection[2] == (0.0, 0.0, 1.0, 0.0)).all()):
-        return ['P is not of the form [fx 0 cx Tx, 0 fy cy Ty, 0 0 1 0]: set it to that of K']
-    beside_m = float(np.linalg.norm(projection[:2, 3])) / focal_px
-    return [] if beside_m <= _MOST_BESIDE_M else [
-        f'P is of the second camera of a stereo pair, {beside_m:.2g} m beside the first: the '
-        'coordinate frame must be its own']

@@ -15,7 +15,7 @@ one whole ellipse minus the difference of the caps.
 
 from math import acos, copysign, pi, sqrt
 
-from cliploc_ros.core.geometry.p3p import largest_cubic_root
+from cliploc_ros.core.geometry.minimal_solvers import largest_cubic_root
 from cliploc_ros.core.kernels.compiled import compiled
 
 # The least relative difference of the squared semi-axes: the pencil of two circles has no pair of

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.p3p import MAX_SOLUTIONS
+from cliploc_ros.core.geometry.minimal_solvers import MAX_SOLUTIONS
 from cliploc_ros.core.kernels.compiled import compiled
 
 _UPPER = np.triu_indices(3)

@@ -96,6 +96,15 @@ def move_covariance(covariance: NDArray[np.float64], lever: NDArray[np.float64]
     return jacobian @ covariance @ jacobian.T
 
 
+def first_of_each(same: NDArray[np.bool_], most: float = np.inf) -> list[int]:
+    """Return the first of m rows that are not the same (m, m) as one before, up to a number."""
+    rows = list[int]()
+    for row in range(len(same)):
+        if len(rows) < most and not same[row, rows].any():
+            rows.append(row)
+    return rows
+
+
 class Tolerance(NamedTuple):
     """Two poses agree if they are nearer than this to each other, in both [m] [deg]."""
 
@@ -118,6 +127,10 @@ class Tolerance(NamedTuple):
         near = np.linalg.norm(poses[:, None, :3, 3] - others[:, :3, 3], axis=2) < self.distance_m
         traces = np.einsum('iab,jab->ij', poses[:, :3, :3], others[:, :3, :3])
         return np.asarray(near & (traces > self.least_trace))
+
+    def distinct(self, poses: NDArray[np.float64], most: float = np.inf) -> list[int]:
+        """Return the row of the first of m poses (m, 4, 4) at each place, up to a number."""
+        return first_of_each(self.agreeing(poses), most)
 
     def wider(self, distance_m: float, angle_deg: float) -> 'Tolerance':
         """Return a tolerance that allows more by these amounts."""

@@ -3,13 +3,16 @@
 """The map: landmarks, one map or several, their files, and their indices.
 
 landmark_map
-    The map, and how its file is read; landmark_details has its optional fields.
+    The map, its landmarks by class, and how its file is read; landmark_details has its optional
+    fields.
 landmark_embeddings
     Images of each landmark, as an encoder saw them, and how crops are compared with them.
 joined_map
     Several maps, searched as one.
-map_file, written_map, parameter_file
+map_file, parameter_file
     Writing a map, reading what was written in a second, and any parameter file without ROS.
-classes, similarities, pairs, culling
-    The landmarks by class, by similarity of their labels, by pairs, and by place.
+similarities, pairs, culling
+    The landmarks by similarity of their labels, by pairs, and by place.
+visibility
+    The landmarks that an image should show, and those that are gone.
 """

@@ -95,7 +95,7 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
 class Constraint(NamedTuple):
     """Vertical and height of the camera, which rule poses out; by default nothing is known.
 
-    Where the robot probably is rules none out, see cliploc_ros.core.acceptance.prior.
+    Where the robot probably is rules none out, see cliploc_ros.core.acceptance.confidence.
     """
 
     #: The vertical, unit vectors in the camera's optical frame and in the map frame

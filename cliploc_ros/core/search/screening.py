@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.ellipse import ellipse_iou, iou_bound
 from cliploc_ros.core.geometry.ellipsoid import Poses, project
-from cliploc_ros.core.geometry.p3p import MAX_SOLUTIONS, p3p
-from cliploc_ros.core.geometry.two_point import two_point
+from cliploc_ros.core.geometry.minimal_solvers import MAX_SOLUTIONS, p3p, two_point
 from cliploc_ros.core.kernels.compiled import ZERO, compiled
 from cliploc_ros.core.map.culling import Groups, project_visible
 from cliploc_ros.core.search.scene import Constraint, Scene

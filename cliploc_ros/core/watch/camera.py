@@ -1,34 +1,83 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How a camera is turned against its stated mount: a constant angle over looks at right poses.
+"""What looks tell of the camera: faults of its images, and how it is turned against its mount.
 
-Each look gives the turn from the given pose to the fitted pose, with its information. The given
-pose is off by decimetres and its yaw by degrees, which changes along the way, while the turn of
-the camera stays. So looks are averaged by their information and by how much they scatter, far ones
-with less weight (Cauchy). A yaw error of the localizer that never changes is the same as a camera
-that is turned about the vertical: the images cannot tell which.
+Each sign of a fault has to last for some looks. A wall before a standing robot is as bare as a
+cloth over its lens, and its image as smooth as one that is out of focus, so what is blurred or
+dirty shows in different views only. An image that stays the same to the last bit is frozen once
+the robot moves.
+
+A camera that is turned against its stated mount is so by a constant angle over looks at right
+poses. Each look gives the turn from the given pose to the fitted pose, with its information. The
+given pose is off by decimetres and its yaw by degrees, which changes along the way, while the turn
+of the camera stays. So looks are averaged by their information and by how much they scatter, far
+ones with less weight (Cauchy). A yaw error of the localizer that never changes is the same as a
+camera that is turned about the vertical: the images cannot tell which.
 """
 
 import math
+import zlib
 from collections import deque
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.watch.alignment import Alignment
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.geometry.transforms import SAME_VIEW
+from cliploc_ros.core.watch.look import Alignment
 
-# Looks that are averaged, and from how many on a turn is named. Objects that a look must match.
-_MOST_LOOKS, _LEAST_LOOKS, _LEAST_MATCHED = 40, 8, 3
-# Standard deviations of a localizer: of x, y and height [m], and of the yaw [deg].
-_DRIFT_M, _YAW_DEG = (0.15, 0.15, 0.03), 2.0
-# A turn is significant from this angle [deg] and this many deviations on.
-_LEAST_DEG, _LEAST_SIGMAS = 1.5, 3.0
+# Of the grey image at this width [px], see images in calibration.yaml.
+_WIDTH_PX = 320
+# Looks in a row until a fault is named, and its name.
+_FAULTS = {'dark': (3, 'the camera is in the dark, or covered'),
+           'bare': (3, 'the camera is covered, or before a bare wall'),
+           'frozen': (2, 'the image is frozen'),
+           'smooth': (5, 'the image is blurred, or the lens dirty')}
+# Looks that are averaged, and from how many on a turn is named.
+_MOST_LOOKS, _LEAST_LOOKS = 40, 8
 _ROUNDS = 10
-# A turn whose axis has this cosine with the vertical is about it.
-_YAW_SHARE = 0.8
+
+
+class ImageFaults:
+    """Signs of faults over the images of one camera."""
+
+    def __init__(self) -> None:
+        self._counts = dict.fromkeys(_FAULTS, 0)
+        self._pose = np.full((4, 4), np.nan)
+        self._checksum = -1
+
+    def add(self, image: NDArray[np.uint8], pose: NDArray[np.float64]) -> str:
+        """Take in an image (h, w, 3) from a pose (4, 4), by odometry if known; return the fault.
+
+        The text is empty where there is none.
+        """
+        terms = CALIBRATION.images
+        height = max(1, round(image.shape[0] * _WIDTH_PX / image.shape[1]))
+        small = cv2.resize(image, (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+        grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
+        mean, deviation = grey.mean(), grey.std()
+        is_dark = mean < terms.dark and np.quantile(grey, 0.95) < terms.dark_high
+        is_bare = deviation < terms.bare and not is_dark
+        is_smooth = cv2.Laplacian(grey, cv2.CV_32F).std() < terms.smooth
+        moved = not SAME_VIEW.agree(pose, self._pose)  # true of the first one
+        for name, shown in (('dark', is_dark), ('bare', is_bare),
+                            ('smooth', is_smooth and not (is_dark or is_bare))):
+            if not shown:
+                self._counts[name] = 0
+            elif moved or name != 'smooth':
+                self._counts[name] += 1
+        checksum = zlib.crc32(np.ascontiguousarray(image))
+        self._counts['frozen'] = self._counts['frozen'] + moved \
+            if checksum == self._checksum else 0
+        self._checksum = checksum
+        if moved:
+            self._pose = pose
+        return next((words for name, (least, words) in _FAULTS.items()
+                     if self._counts[name] >= least), '')
 
 
 @dataclass(frozen=True)
@@ -76,37 +125,35 @@ class TurnEstimate:
 
     def add(self, alignment: Alignment, given: NDArray[np.float64], is_new: bool) -> None:
         """Take in a look at a right pose (4, 4)."""
-        fit = alignment.fit
+        fit, terms = alignment.fit, CALIBRATION.turn
         information = fit.finalist.information
-        if fit.support.inliers < _LEAST_MATCHED or information is None or not information.any():
+        if fit.support.inliers < terms.matched or information is None or not information.any():
             return
         if self._turns and not is_new:
             self._turns.pop()
         self._turns.append(_turn_of(fit.pose, information, given))
-        if len(self._turns) >= _LEAST_LOOKS:
-            self.turn = self._significant()
-
-    def _significant(self) -> CameraTurn | None:
+        if len(self._turns) < _LEAST_LOOKS:
+            return
         mean, covariance = _robust_mean(self._turns)
         angle = float(np.linalg.norm(mean))
         axis = mean / max(angle, 1e-12)
         deviation = math.sqrt(float(axis @ covariance @ axis))
-        if math.degrees(angle) < max(_LEAST_DEG, _LEAST_SIGMAS * math.degrees(deviation)):
-            return None
-        return CameraTurn(
+        is_sure = math.degrees(angle) >= max(terms.least_deg,
+                                             terms.least_sigmas * math.degrees(deviation))
+        self.turn = CameraTurn(
             np.degrees(mean), math.degrees(math.sqrt(np.linalg.eigvalsh(covariance)[-1])),
-            bool(abs(axis @ self._turns[-1].up) > _YAW_SHARE))
+            bool(abs(axis @ self._turns[-1].up) > terms.yaw_share)) if is_sure else None
 
 
 def _turn_of(pose: NDArray[np.float64], information: NDArray[np.float64],
              given: NDArray[np.float64]) -> _Turn:
     """Return the turn from a given pose (4, 4) to the fitted pose, at the likeliest position.
 
-    The given position is right to within _DRIFT_M, so what moves the fit away from it is in part
-    a turn: the least squares of the fit and of the given position together.
+    The given position is right to within the drift of a localizer, so what moves the fit away from
+    it is in part a turn: the least squares of the fit and of the given position together.
     """
-    back = given[:3, 3] - pose[:3, 3]
-    prior = np.diag(1.0 / np.square(_DRIFT_M))
+    terms, back = CALIBRATION.turn, given[:3, 3] - pose[:3, 3]
+    prior = np.diag(1.0 / np.square([terms.drift_m, terms.drift_m, terms.drift_up_m]))
     of_step, mixed, of_turn = information[:3, :3], information[:3, 3:], information[3:, 3:]
     marginal = of_turn - mixed.T @ np.linalg.solve(of_step + prior, mixed)
     # of position and turn together, with the prior of the position
@@ -117,7 +164,7 @@ def _turn_of(pose: NDArray[np.float64], information: NDArray[np.float64],
     axes = given[:3, :3]
     up = axes[2]
     covariance = (axes.T @ np.linalg.inv(marginal + 1e-6 * np.eye(3)) @ axes
-                  + math.radians(_YAW_DEG) ** 2 * np.outer(up, up))
+                  + math.radians(terms.yaw_deg) ** 2 * np.outer(up, up))
     return _Turn(Rotation.from_matrix(axes.T @ turned).as_rotvec(), np.linalg.inv(covariance), up)
 
 

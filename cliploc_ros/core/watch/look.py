@@ -1,0 +1,196 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""One look at a given pose: the pose near it that fits best, and whether the given one is right.
+
+A localizer drifts by decimetres and a few degrees, and a camera may be turned on its robot. Then
+outlines miss the boxes of small objects. So a grid of turns and shifts about the given pose is
+scored, and the best few are refined; nothing else of the map is searched.
+
+The evidence is the log odds that the given pose is right, against one elsewhere: a logistic model
+of looks of right and of wrong poses in simulated worlds, as many of each, so its log odds are
+those of a likelihood ratio. Right poses include those of places that changed since they were
+mapped: some objects fit, others are missing or stand where nothing is mapped. At a wrong pose of
+the same map little fits.
+"""
+
+import math
+from dataclasses import replace
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
+from cliploc_ros.core.acceptance.confidence import points_utility, utilities
+from cliploc_ros.core.acceptance.contenders import (
+    Contender,
+    JoinedFrames,
+    contenders_of,
+    join_frames,
+    refined,
+    unrefined,
+)
+from cliploc_ros.core.fit.verification import scores_of
+from cliploc_ros.core.geometry.transforms import (
+    SAME_ANSWER,
+    SAME_NEIGHBOURHOOD,
+    Tolerance,
+    pose_error,
+)
+from cliploc_ros.core.keyframes.localization import ImageRecognizer
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.visibility import Expected, expect
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.search.frame_search import SearchedFrame, constraint_of, match_frame
+from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN
+from cliploc_ros.core.search.strategies import Leaders, Progress
+
+# Turns about x and y of the camera, and about z [deg]; shifts along x and z [m]. A box of 45 px
+# overlaps its outline by more than .2 if a pose of the grid is within 2 degrees (focal length 525
+# px). Near objects move by as much where the pose is off by decimetres.
+_TURNS_DEG, _ROLLS_DEG, _SHIFTS_M = (-8.0, -4.0, 0.0, 4.0, 8.0), (-6.0, 6.0), (-0.25, 0.0, 0.25)
+_STEPS = np.array([*product(_TURNS_DEG, _TURNS_DEG, (0.0,), _SHIFTS_M, _SHIFTS_M),
+                   *product(_TURNS_DEG, _TURNS_DEG, _ROLLS_DEG, (0.0,), (0.0,))])
+# Poses (k, 4, 4) of the grid, in the camera at the given pose.
+_GRID = np.tile(np.eye(4), (len(_STEPS), 1, 1))
+_GRID[:, :3, :3] = Rotation.from_rotvec(_STEPS[:, :3], degrees=True).as_matrix()
+_GRID[:, [0, 2], 3] = _STEPS[:, 3:]
+# Poses of the grid that are refined, and how far apart they are at least [m] [deg].
+_REFINED, _APART = 4, Tolerance(0.3, 5.0)
+
+
+class Alignment(NamedTuple):
+    """The best pose near a given one."""
+
+    joined: JoinedFrames  #: The frame, without its vertical
+    fit: Contender
+    away_m: float  #: From the given pose
+    away_deg: float
+
+
+def look_at(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions
+            ) -> JoinedFrames:
+    """Return an observation as a frame that poses are compared on.
+
+    Its vertical comes by the stated mount, which may be wrong, so it must not bend the fit.
+    """
+    if observation.similarities is None:
+        options = replace(options, matching='class')
+    free = replace(observation, up_in_camera=None, odom_from_camera=None)
+    scene, _ = match_frame(landmark_map, free, options)
+    none = Leaders.none_yet(1)
+    return join_frames(landmark_map, options, [SearchedFrame(
+        free, scene, VERTICAL_UNKNOWN, none, none, Progress(0, 1.0))])
+
+
+def align(joined: JoinedFrames, map_from_camera: NDArray[np.float64]) -> Alignment:
+    """Return the best pose near a given one (4, 4)."""
+    starts = map_from_camera @ _GRID
+    rotations = np.ascontiguousarray(starts[:, :3, :3].transpose(0, 2, 1))
+    translations = -np.einsum('kij,kj->ki', rotations, starts[:, :3, 3])
+    scores = scores_of(joined.rig, rotations, translations)
+    order = np.argsort(-scores, kind='stable')
+    starts = starts[order[scores[order] > 0.0]]
+    some = [unrefined(map_from_camera),
+            *(unrefined(starts[row]) for row in _APART.distinct(starts, _REFINED))]
+    if len(some) > 1:
+        some += [refined(joined, one) for one in some]
+    found, terms = contenders_of(joined, some, [True] * len(some)), CALIBRATION.watch
+    errors = [pose_error(one.pose, map_from_camera) for one in found]
+    near = [row for row, error in enumerate(errors)
+            if error[0] < SAME_NEIGHBOURHOOD.distance_m
+            and error[1] < SAME_NEIGHBOURHOOD.angle_deg]
+    odds = [one.odds - 0.5 * ((away_m / terms.pull_m) ** 2 + (away_deg / terms.pull_deg) ** 2)
+            for one, (away_m, away_deg) in zip(found, errors, strict=True)]
+    fit = max(near, key=lambda row: odds[row])
+    return Alignment(joined, found[fit], *errors[fit])
+
+
+class LookEvidence(NamedTuple):
+    """What one look says of the given pose."""
+
+    known: int  #: Detections of the map's classes
+    matched: int  #: Objects that are where the pose expects them
+    unexplained: int  #: Other detections of the map's classes
+    utility: float  #: Of the matched objects, by the acceptance's model [log odds]
+    expected: int  #: Landmarks that the image should show
+    missed: int  #: Those of them that no detection shows
+    away_m: float  #: From the given pose to the best one near it
+    away_deg: float
+    crowd: float  #: Logarithm of the pairs of a detection and a landmark in view of its class
+
+    def is_full(self, has_jumped: bool) -> bool:
+        """Return whether a wrong pose would show; one that jumped need not be at a mapped spot."""
+        terms = CALIBRATION.watch
+        return self.known >= terms.full_objects and (
+            has_jumped or self.expected >= terms.full_mapped)
+
+    @property
+    def terms(self) -> dict[str, float]:
+        """Return the terms of the model by their names in calibration.yaml."""
+        return {
+            'none': 1.0, 'utility': min(self.utility, 12.0), 'any': float(self.matched > 0),
+            'unexplained': float(self.unexplained), 'missed': float(self.missed),
+            'away': math.log1p((self.away_m / 0.3) ** 2),
+            'turned': math.log1p((self.away_deg / 8.0) ** 2), 'crowd': self.crowd}
+
+
+def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
+    """Return what an aligned look says, and the landmarks that it expects."""
+    joined, fit = alignment.joined, alignment.fit
+    landmark_map, observation = joined.landmark_map, joined.frames[0].observation
+    index, (matches,) = landmark_map.classes, fit.matches
+    classes = index.classes_of(observation.detections.class_ids)
+    own = index.are_own(classes)
+    taken = {one.detection for one in matches}
+    unexplained = sum(row not in taken for row in np.nonzero(own)[0].tolist())
+    found = expect(landmark_map, observation.camera, fit.pose,
+                   np.array([one.landmark for one in matches], dtype=np.int64))
+    # what nothing explains is a term of its own
+    utility, = utilities([fit.support]) - CALIBRATION.objects.unexplained * fit.support.unexplained
+    in_view = index.of_landmarks[found.landmarks]
+    pairs = sum(int((in_view == one).sum()) for one in classes[own])
+    return LookEvidence(int(own.sum()), round(fit.support.inliers), unexplained, float(utility),
+                        len(found.landmarks), int((~found.was_seen).sum()), alignment.away_m,
+                        alignment.away_deg, math.log1p(pairs)), found
+
+
+def log_odds(evidence: LookEvidence, is_full: bool, calibration: Calibration = CALIBRATION
+             ) -> float:
+    """Return the log odds of a look by its objects that the given pose is right.
+
+    A place that the map does not show is no wrong pose, nor is a view without objects: a look that
+    is not full says little against a pose.
+    """
+    terms = calibration.watch
+    if not evidence.known:
+        return 0.0  # something may hide everything
+    found = sum(terms[name] * value for name, value in evidence.terms.items())
+    return min(max(found, terms.least if is_full else terms.least_unsure), terms.most)
+
+
+def by_keyframes(recognizer: ImageRecognizer, alignment: Alignment,
+                 given: NDArray[np.float64]) -> float:
+    """Return the log odds by keyframes that a given pose (4, 4) is right."""
+    joined, terms = alignment.joined, CALIBRATION.keyframes
+    constraint = constraint_of(joined.frames[0].observation, joined.options)
+    seen = recognizer.recognize([given], constraint)
+    here, elsewhere = (max([0.0] + [
+        points_utility(one) for one in seen.places
+        if SAME_ANSWER.agree(one.map_from_camera, given) == near]) for near in (True, False))
+    missed = 0.0 if here or not seen.is_complete else terms.missed * recognizer.coverage(given)
+    return here - elsewhere + missed
+
+
+def by_vertical(map_from_camera: NDArray[np.float64], up_in_camera: NDArray[np.float64] | None,
+                deviation_deg: float) -> float:
+    """Return the log odds, 0 or less, of a given pose (4, 4) by the vertical (3,)."""
+    if up_in_camera is None:
+        return 0.0
+    cosine = float(map_from_camera[2, :3] @ up_in_camera)
+    tilt_deg = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
+    sigmas = tilt_deg / math.hypot(deviation_deg, CALIBRATION.watch.slope_deg)
+    return -min(CALIBRATION.attitude.wrong_mount, 0.5 * sigmas ** 2)
