@@ -8,19 +8,19 @@ Camera axes are OpenGL's: x right, y up, z back. Fields that are not used here a
 import math
 from pathlib import Path, PurePosixPath
 
-import cv2
 import numpy as np
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.captures.capture import (
     Capture,
-    Fields,
-    Shot,
+    FolderOptions,
     arrange,
     beside,
-    camera_of,
+    size_of_image,
 )
+from cliploc_ros.offline.datasets.frames import NO_STAMP, ImageFile
+from cliploc_ros.offline.datasets.parsing import Fields, camera_of
 
 FILE = 'transforms.json'
 _PERSPECTIVE = ('PINHOLE', 'SIMPLE_PINHOLE', 'SIMPLE_RADIAL', 'RADIAL', 'OPENCV', 'PERSPECTIVE')
@@ -30,35 +30,21 @@ _INTRINSICS = ('w', 'h', 'fl_x', 'fl_y', 'cx', 'cy', 'camera_angle_x', 'k1', 'k2
 _ENDINGS = ('.png', '.jpg', '.jpeg', '.JPG', '.PNG')
 
 
-def is_nerf(folder: Path) -> bool:
-    """Return whether a folder has a transforms.json, or is one."""
-    return folder.name.endswith('.json') or (folder / FILE).is_file()
+def read_nerf(folder: Path, options: FolderOptions) -> Capture:
+    """Return the images that a transforms.json lists; the folder may be this file.
 
-
-def read_nerf(folder: Path, images: Path | None) -> Capture:
-    """Return the images that a transforms.json lists.
-
-    Parameters
-    ----------
-    folder : Path
-        The file, or its folder.
-    images : Path, optional
-        Folder that holds the images by their names alone; None: where the file says.
-
-    Raises
-    ------
-    DatasetError
-        A field cannot be used; names it.
+    The folder of images holds them by their names alone; None: they are where the file says.
+    DatasetError: a field cannot be used; names it.
     """
     path = folder if folder.name.endswith('.json') else folder / FILE
     meta = Fields.of_file(path)
-    frames = meta.values.get('frames')
-    if not isinstance(frames, list) or not frames:
+    frames = meta.entries('frames') if 'frames' in meta else []
+    if not frames:
         raise DatasetError(f'{path}: lists no frames')
     scale = meta.number('applied_scale', 1.0)
     if scale <= 0.0:
         raise DatasetError(f'{path}: applied_scale is {scale:g}, not above 0')
-    shots, cameras = [], dict[str, Camera]()
+    files, cameras, images = [], dict[str, Camera](), options.images
     for place, values in enumerate(frames):
         # a frame's own values come before those of all
         frame = Fields(values, f'{path}: frame {place}')
@@ -78,11 +64,11 @@ def read_nerf(folder: Path, images: Path | None) -> Capture:
         full = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])[:4]
         full[:3, 3] /= scale
         depth = frame.text('depth_file_path', '')
-        shots.append(Shot(color, cameras[shown], full,
-                          depth=beside(path.parent / depth) if depth else None))
-    files, poses = arrange(shots, str(path))
+        files.append(ImageFile(NO_STAMP, color, cameras[shown], full,
+                               beside(path.parent / depth) if depth else None))
+    arranged = arrange(files, path)
     # depth is in metres, and so are the poses that it goes with
-    return Capture(files, poses, 'opengl', is_metric=all(one.depth for one in files))
+    return Capture(arranged, 'opengl', is_metric=all(one.depth for one in arranged))
 
 
 def _camera(values: Fields, image: Path) -> Camera:
@@ -92,10 +78,10 @@ def _camera(values: Fields, image: Path) -> Camera:
     if 'w' in values and 'h' in values:
         width, height = values.size('w', 'h')
     else:
-        pixels = cv2.imread(str(image), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        if pixels is None:
+        size = size_of_image(image)
+        if size is None:
             raise DatasetError(f'{where}: fields w and h are missing, and {image} cannot be read')
-        height, width = pixels.shape[:2]
+        width, height = size
     if 'fl_x' in values:
         fx = values.number('fl_x')
     elif 'camera_angle_x' in values:
