@@ -17,24 +17,16 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, MappingError
 from cliploc_ros.offline.datasets.observations import load_observations
+from cliploc_ros.offline.datasets.parsing import naming
 from cliploc_ros.offline.mapping.refit import refit_map
+from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
 
 # A landmark with a thinner semi-axis is a fit that collapsed; a larger one is no object. Guesses.
 _SEMI_AXIS_RANGE_M = (1e-3, 100.0)
 _MAX_COORDINATE_M = 1e6
 _MAX_NORM_ERROR = 0.01
 MAX_FILE_BYTES = 512 * 1024 * 1024
-COCO = (
-    'person', 'bicycle', 'car', 'motorcycle', 'airplane', 'bus', 'train', 'truck', 'boat',
-    'traffic light', 'fire hydrant', 'stop sign', 'parking meter', 'bench', 'bird', 'cat', 'dog',
-    'horse', 'sheep', 'cow', 'elephant', 'bear', 'zebra', 'giraffe', 'backpack', 'umbrella',
-    'handbag', 'tie', 'suitcase', 'frisbee', 'skis', 'snowboard', 'sports ball', 'kite',
-    'baseball bat', 'baseball glove', 'skateboard', 'surfboard', 'tennis racket', 'bottle',
-    'wine glass', 'cup', 'fork', 'knife', 'spoon', 'bowl', 'banana', 'apple', 'sandwich',
-    'orange', 'broccoli', 'carrot', 'hot dog', 'pizza', 'donut', 'cake', 'chair', 'couch',
-    'potted plant', 'bed', 'dining table', 'toilet', 'tv', 'laptop', 'mouse', 'remote',
-    'keyboard', 'cell phone', 'microwave', 'oven', 'toaster', 'sink', 'refrigerator', 'book',
-    'clock', 'vase', 'scissors', 'teddy bear', 'hair drier', 'toothbrush')
+COCO = shipped_classes()
 _MAX_LENGTH = 1000
 # A map file holds four decimals of a weight. A class with less means nothing.
 _LEAST_SHARE = 0.001
@@ -190,13 +182,11 @@ def read_bytes(path: Path) -> bytes:
 
     DatasetError: the message names the file and what is wrong with it.
     """
-    try:
+    with naming(path, OSError, what='cannot be read: '):
         if not S_ISREG(path.stat().st_mode):
             raise DatasetError(f'{path}: is no file; name the file of the map')
         with path.open('rb') as file:
             content = file.read(MAX_FILE_BYTES + 1)
-    except OSError as error:
-        raise DatasetError(f'{path}: cannot be read: {error.strerror}') from error
     if len(content) > MAX_FILE_BYTES:
         raise DatasetError(f'{path}: is larger than {MAX_FILE_BYTES // 2**20} MiB; split it')
     if not content:
@@ -209,10 +199,8 @@ def read_class_names(path: Path) -> tuple[str, ...]:
 
     DatasetError: the message names the file and the line to correct.
     """
-    try:
+    with naming(path, UnicodeDecodeError, what='not a text file in UTF-8: '):
         lines = read_bytes(path).decode('utf-8-sig').splitlines()
-    except UnicodeDecodeError as error:
-        raise DatasetError(f'{path}: not a text file in UTF-8') from error
     names = tuple(line.strip() for line in lines)
     for number, name in enumerate(names, 1):
         if not name or len(name) > _MAX_LENGTH:

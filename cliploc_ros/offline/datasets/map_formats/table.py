@@ -12,6 +12,7 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.errors import DatasetError
@@ -21,6 +22,7 @@ from cliploc_ros.offline.datasets.map_formats.given_map import (
     make_id,
     read_bytes,
 )
+from cliploc_ros.offline.datasets.parsing import unit_quaternion
 
 _CENTER, _SEMI_AXES, _QUATERNION = ('x', 'y', 'z'), ('a', 'b', 'c'), ('qx', 'qy', 'qz', 'qw')
 _REQUIRED = ('class_id', *_CENTER, *_SEMI_AXES)
@@ -104,10 +106,7 @@ def _landmark(row: Mapping[str, str], number: int, where: str) -> GivenLandmark:
     label = _text(row, 'label', where) if row.get('label') else class_id
     has_turn = _QUATERNION[0] in row
     quat_xyzw = [_number(row, name, where) for name in _QUATERNION] if has_turn else _NO_TURN
-    norm = math.hypot(*quat_xyzw)
-    if abs(norm - 1.0) > _MAX_NORM_ERROR:
-        raise DatasetError(f'{where}: columns qx to qw: the quaternion has the norm {norm:.3g}, '
-                           'not 1')
+    unit_quaternion(quat_xyzw, f'{where}: columns qx to qw', _MAX_NORM_ERROR)
     semi_axes = [_number(row, name, where) for name in _SEMI_AXES]
     for name, value in zip(_SEMI_AXES, semi_axes, strict=True):
         if value <= 0.0:
@@ -118,15 +117,14 @@ def _landmark(row: Mapping[str, str], number: int, where: str) -> GivenLandmark:
 
 
 def _details(row: Mapping[str, str], where: str) -> LandmarkDetails:
-    values = {name: _number(row, name, where) for name in _DETAILS if row.get(name)}
+    values: dict[str, Any] = {name: _number(row, name, where) for name in _DETAILS
+                              if row.get(name)}
     for name, value in values.items():
         if value < 0.0:
             raise DatasetError(f'{where}: column {name}: {value:g} must not be negative')
-    support = values.get('support')
-    return LandmarkDetails(
-        position_sigma=values.get('position_sigma'),
-        support=None if support is None else int(support), seen_ratio=values.get('seen_ratio'),
-        baseline_deg=values.get('baseline_deg'), last_seen=values.get('last_seen'))
+    if 'support' in values:
+        values['support'] = int(values['support'])
+    return LandmarkDetails(**values)
 
 
 def _text(row: Mapping[str, str], name: str, where: str) -> str:
