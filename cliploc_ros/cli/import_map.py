@@ -143,10 +143,13 @@ def _check_paths(options: argparse.Namespace) -> None:
 
 def _read(options: argparse.Namespace) -> 'GivenMap':
     """Return the content of the input."""
-    from cliploc_ros.offline.datasets.map_formats.given_map import COCO, read_class_names
-    from cliploc_ros.offline.datasets.map_formats.msgloc import read_msgloc
+    from cliploc_ros.offline.datasets.map_formats.given_map import (
+        COCO,
+        read_class_names,
+        read_msgloc,
+        read_table,
+    )
     from cliploc_ros.offline.datasets.map_formats.quadric_maps import read_goreloc, read_oaslam
-    from cliploc_ros.offline.datasets.map_formats.table import read_table
 
     if options.format == 'csv':
         if options.class_names is not None:

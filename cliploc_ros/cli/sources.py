@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from cliploc_ros.models.clip_weights import ClipOptions
     from cliploc_ros.models.protocols import DetectorOptions
-    from cliploc_ros.offline.datasets.bag_poses import ReadPoses
+    from cliploc_ros.offline.datasets.bag_frames import ReadPoses
     from cliploc_ros.offline.datasets.frames import DepthFormat, Frames
     from cliploc_ros.offline.datasets.map_recording import MapRecording
     from cliploc_ros.offline.datasets.observations import Recorded
@@ -252,12 +252,12 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: 'NDArray[np.flo
 
     A topic without a mount is the camera's own, in its namespace.
     """
-    from cliploc_ros.offline.datasets.bag_frames import topic_of
-    from cliploc_ros.offline.datasets.bag_poses import (
+    from cliploc_ros.offline.datasets.bag_frames import (
         GROUND_TRUTH,
         find_poses,
         poses_of_tf,
         poses_of_topic,
+        topic_of,
     )
     from cliploc_ros.offline.datasets.tum import read_tum_trajectory
 
@@ -291,8 +291,12 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: 'NDArray[np.flo
 
 def _odometry(options: argparse.Namespace) -> 'dict[str, Poses] | None':
     """Return the cameras of a bag by odometry, by name; None where none is asked for."""
-    from cliploc_ros.offline.datasets.bag_frames import bag_odometry, topic_of
-    from cliploc_ros.offline.datasets.bag_poses import poses_of_tf, poses_of_topic
+    from cliploc_ros.offline.datasets.bag_frames import (
+        bag_odometry,
+        poses_of_tf,
+        poses_of_topic,
+        topic_of,
+    )
 
     max_gap_ns = round(options.max_gap * NS_PER_S)
     if options.odometry_frame is None and options.odometry_topic is None:

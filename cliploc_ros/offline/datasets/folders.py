@@ -25,7 +25,7 @@ from cliploc_ros.core.geometry.transforms import (
     quaternion_from_transform,
 )
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.captures import colmap, devices, nerf
+from cliploc_ros.offline.datasets.captures import colmap, devices
 from cliploc_ros.offline.datasets.captures.capture import Capture, FolderOptions
 from cliploc_ros.offline.datasets.captures.placing import (
     UP,
@@ -265,7 +265,7 @@ LAYOUTS = (
     Layout('hololens', 'HoloLens 2', lambda folder: any(folder.glob('*_pv.txt')),
            devices.read_hololens),
     Layout('nerf', 'transforms.json', lambda folder: folder.name.endswith('.json') or
-           (folder / nerf.FILE).is_file(), nerf.read_nerf, ('images',)),
+           (folder / devices.TRANSFORMS).is_file(), devices.read_nerf, ('images',)),
     Layout('colmap', 'COLMAP model', lambda folder: bool(colmap.models_of(folder)),
            colmap.read_colmap, ('images',)),
     Layout('tum', 'TUM RGB-D', lambda folder: False, partial(_tum, with_depth=False),
