@@ -121,10 +121,14 @@ def check(options: argparse.Namespace) -> int:
     # Late, so that --help is fast.
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
-    from cliploc_ros.offline.datasets.queries import load_queries
-    from cliploc_ros.offline.evaluation.map_check.page import PAGE, summary_lines, write_report
+    from cliploc_ros.offline.datasets.observations import load_queries
+    from cliploc_ros.offline.evaluation.map_check.page import (
+        PAGE,
+        ViewPainter,
+        summary_lines,
+        write_report,
+    )
     from cliploc_ros.offline.evaluation.map_check.pictures import draw_pictures
-    from cliploc_ros.offline.evaluation.map_check.views import ViewPainter
     from cliploc_ros.offline.evaluation.trials import make_queries
     from cliploc_ros.offline.mapping.check.checking import check_map
     from cliploc_ros.offline.mapping.check.relocalization import PosedObservation

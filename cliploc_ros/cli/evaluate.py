@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.datasets.frames import Frames
-    from cliploc_ros.offline.datasets.queries import Queries
+    from cliploc_ros.offline.datasets.observations import Queries
     from cliploc_ros.offline.evaluation.methods import Method
     from cliploc_ros.offline.evaluation.trials import PosedQuery
 
@@ -156,8 +156,12 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.offline.evaluation.methods import parse_methods
     from cliploc_ros.offline.evaluation.recording import with_features
     from cliploc_ros.offline.evaluation.run import compare_methods
-    from cliploc_ros.offline.evaluation.sensors import with_neighbours, with_vertical
-    from cliploc_ros.offline.evaluation.trials import join_cameras, make_queries
+    from cliploc_ros.offline.evaluation.trials import (
+        join_cameras,
+        make_queries,
+        with_neighbours,
+        with_vertical,
+    )
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):
@@ -311,7 +315,7 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
 def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', camera: str,
                   frames: 'Frames | None') -> 'Queries':
     """Return the queries of a file, or those of the images of a camera, recorded once."""
-    from cliploc_ros.offline.datasets.queries import load_queries, save_queries
+    from cliploc_ros.offline.datasets.observations import load_queries, save_queries
     from cliploc_ros.offline.evaluation.recording import recorded_queries
     from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions
 

@@ -25,7 +25,7 @@ from cliploc_ros.files.page import (
     table,
 )
 from cliploc_ros.files.storage import write_text
-from cliploc_ros.offline.evaluation.drawing import draw_map, png_of
+from cliploc_ros.offline.evaluation.figures import draw_map, png_of
 from studies.rooms.asking import BOTH, KEYFRAMES, KNOWN, NOTHING, OBJECTS, WAYS, Answers, Outcome
 from studies.rooms.rooms import Room
 from studies.rooms.tables import grouped

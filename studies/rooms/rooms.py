@@ -31,8 +31,7 @@ from cliploc_ros.offline.datasets.frames import (
     RawFrame,
     folder_frames,
 )
-from cliploc_ros.offline.evaluation.sensors import with_vertical
-from cliploc_ros.offline.evaluation.trials import ImageFeatures, PosedQuery
+from cliploc_ros.offline.evaluation.trials import ImageFeatures, PosedQuery, with_vertical
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
 from cliploc_ros.units import NS_PER_S

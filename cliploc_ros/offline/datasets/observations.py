@@ -1,11 +1,15 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Observation files: what a detector said about a recording, and where the camera was.
+"""Observation and query files: recorded boxes, and where the camera was.
 
-Mapping, evaluation and the map editor read the same file, so that the networks run once.
+Mapping, evaluation and the map editor read the same observations, so that the networks run once.
+A query file has the similarities of a map, too: identical input for every method.
 """
 
+import math
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +19,208 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import are_rigid
 from cliploc_ros.errors import CameraError, DatasetError
-from cliploc_ros.files.arrays import FINITE, UNIQUE, ArrayError, Arrays, Check, Field, Schema
-from cliploc_ros.offline.datasets.queries import FRAME_FIELDS
+from cliploc_ros.files.arrays import (
+    BOX,
+    FINITE,
+    SHARE,
+    UNIQUE,
+    ArrayError,
+    Arrays,
+    Check,
+    Field,
+    Offsets,
+    Schema,
+)
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.units import NS_PER_S
+
+_STAGES = ('detector_ms', 'clip_ms')
+#: Of files of frames with boxes: F frames, n boxes.
+FRAME_FIELDS = {
+    'intrinsics_fx_fy_cx_cy': Field('numbers', (4,), (FINITE,)),
+    'boxes_xyxy': Field('numbers', ('n', 4), (FINITE, BOX)),
+    'frame_offsets': Field('integers', ('F+1',), (Offsets('boxes_xyxy', 'boxes'),)),
+    'class_ids': Field('text', ('n',)),
+    'scores': Field('numbers', ('n',), (FINITE, SHARE)),
+    'timestamps': Field('numbers', ('F',), (FINITE,)),
+    'map_from_camera': Field('numbers', ('F', 4, 4), (FINITE, Check(
+        'is no rigid transform', lambda poses: ~are_rigid(poses)))),
+    # NaN where unknown [m]
+    'depths': Field('floats', ('n',), (Check('is not positive', lambda depths: depths <= 0.0),),
+                    is_optional=True),
+    # exact, which a float64 of seconds is not [ns]
+    'stamps_ns': Field('integers', ('F',), is_optional=True),
+    # time that the networks took [ms], NaN where unknown
+    **dict.fromkeys(_STAGES, Field('numbers', ('F',), is_optional=True)),
+}
+
+
+def _check_truth(name: str, arrays: Arrays) -> None:
+    landmarks = len(arrays['landmark_ids'])
+    Check('is no landmark', lambda rows: (rows < -1) | (rows >= landmarks))(name, arrays)
+
+
+def _check_stamps(name: str, arrays: Arrays) -> None:
+    seconds = arrays['timestamps']
+    Check('contradicts timestamps',
+          lambda stamps_ns: np.abs(stamps_ns / NS_PER_S - seconds) > 1e-6)(name, arrays)
+
+
+def _check_groups(name: str, arrays: Arrays) -> None:
+    groups = arrays['query_group']
+    for group in np.unique(groups):
+        mains = int(arrays[name][groups == group].sum())
+        if mains != 1:
+            raise ArrayError(f'array {name} marks {mains} frames of query_group {group}, not 1')
+
+
+# F frames, n boxes, L landmarks.
+_QUERIES = Schema('query file', {
+    'landmark_ids': Field('text', ('L',), (UNIQUE, Check('is empty', lambda ids: ids == ''))),
+    **FRAME_FIELDS,
+    'intrinsics_fx_fy_cx_cy': Field('numbers', (4,), (FINITE, Check(
+        'is a focal length that is not above 0',
+        lambda numbers: (numbers <= 0) & (np.arange(4) < 2)))),
+    # half precision rounds some cosines to just above 1
+    'similarities': Field('numbers', ('n', 'L'), (FINITE, Check(
+        'is no cosine, outside -1 to 1', lambda rows: (np.abs(rows) > 1.001).any(axis=1)))),
+    'true_landmark': Field('integers', ('n',), (_check_truth,)),
+    'timestamps': Field('numbers', ('F',), (
+        FINITE, Check('is negative', lambda seconds: seconds < 0))),
+    'query_group': Field('integers', ('F',)),
+    'is_main': Field('booleans', ('F',), (_check_groups,)),
+    'stamps_ns': Field('integers', ('F',), (_check_stamps,), is_optional=True),
+}, DatasetError, not_empty={'F': 'frames', 'L': 'landmarks'})
+
+
+@dataclass(frozen=True)
+class QueryFrame:
+    """One frame of a query file: n boxes, L landmarks."""
+
+    stamp_ns: int  #: Time of the image [ns]
+    bboxes_xyxy: NDArray[np.float64]  #: (n, 4): Left, top, right, bottom [px], undistorted
+    class_ids: tuple[str, ...]  #: Detector classes
+    scores: NDArray[np.float64]  #: (n,): detector confidences
+    #: (n, L): cosine similarity of each crop and each landmark's label
+    similarities: NDArray[np.float64]
+    #: (n,): index into the landmarks, -1 where unknown. For evaluation only.
+    true_landmark: NDArray[np.int64]
+    map_from_camera: NDArray[np.float64]  #: (4, 4): ground truth
+    group: int  #: The query to which the frame belongs
+    is_main: bool  #: Whether the frame is the query itself and not one of its neighbours
+    #: Processing time of the image [ms]; NaN if not recorded
+    detector_ms: float = math.nan
+    clip_ms: float = math.nan
+    #: (n,): depth of what each box shows [m], NaN where unknown; None without a depth camera
+    depths: NDArray[np.float64] | None = None
+
+    def __len__(self) -> int:
+        """Return the number of boxes."""
+        return len(self.class_ids)
+
+
+@dataclass(frozen=True)
+class Queries:
+    """The content of a query file."""
+
+    landmark_ids: tuple[str, ...]  #: The landmarks of the columns of the similarities
+    intrinsics_fx_fy_cx_cy: tuple[float, float, float, float]  #: Of the undistorted camera [px]
+    frames: tuple[QueryFrame, ...]  #: In the file's order
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.frames)
+
+    def __iter__(self) -> Iterator[QueryFrame]:
+        """Iterate over the frames."""
+        return iter(self.frames)
+
+    def __getitem__(self, index: int) -> QueryFrame:
+        """Return a frame."""
+        return self.frames[index]
+
+    def main_frames(self) -> tuple[QueryFrame, ...]:
+        """Return the main frame of each query."""
+        return tuple(frame for frame in self.frames if frame.is_main)
+
+    def group(self, group: int) -> tuple[QueryFrame, ...]:
+        """Return all frames of one query, in the file's order."""
+        return tuple(frame for frame in self.frames if frame.group == group)
+
+
+def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) -> Queries:
+    """Read and validate a query file.
+
+    With `landmark_ids`, those of a map, the file must contain no others. DatasetError: the message
+    names file, array and error.
+    """
+    path = Path(path)
+    arrays = _QUERIES.read(path)
+    unknown = [one for one in map(str, arrays['landmark_ids'])
+               if landmark_ids is not None and one not in landmark_ids]
+    if unknown:
+        more = f' (and {len(unknown) - 1} more)' if len(unknown) > 1 else ''
+        raise DatasetError(f'{path}: array landmark_ids has {unknown[0]!r}, which the map does '
+                           f'not know{more}')
+    fx, fy, cx, cy = map(float, arrays['intrinsics_fx_fy_cx_cy'])
+    # A float64 of today's seconds resolves 0.24 us: round to microseconds.
+    stamps_ns = (arrays['stamps_ns'].tolist() if 'stamps_ns' in arrays else
+                 [round(float(seconds) * 1e6) * 1000 for seconds in arrays['timestamps']])
+    frames = []
+    for index, (begin, end) in enumerate(pairwise(map(int, arrays['frame_offsets']))):
+        rows = slice(begin, end)
+        frames.append(QueryFrame(
+            stamp_ns=stamps_ns[index],
+            bboxes_xyxy=arrays['boxes_xyxy'][rows].astype(np.float64),
+            class_ids=tuple(map(str, arrays['class_ids'][rows])),
+            scores=arrays['scores'][rows].astype(np.float64),
+            similarities=arrays['similarities'][rows].astype(np.float64),
+            true_landmark=arrays['true_landmark'][rows].astype(np.int64),
+            map_from_camera=arrays['map_from_camera'][index].astype(np.float64),
+            group=int(arrays['query_group'][index]), is_main=bool(arrays['is_main'][index]),
+            depths=arrays['depths'][rows].astype(np.float64) if 'depths' in arrays else None,
+            **{name: float(arrays[name][index]) for name in _STAGES if name in arrays}))
+    return Queries(tuple(map(str, arrays['landmark_ids'])), (fx, fy, cx, cy), tuple(frames))
+
+
+def save_queries(path: str | Path, queries: Queries) -> None:
+    """Write a query file atomically; an existing one is replaced.
+
+    DatasetError: the queries are invalid or the file cannot be written.
+    """
+    path = Path(path)
+    frames = queries.frames
+
+    def rows(name: str, none: NDArray[Any]) -> NDArray[Any]:
+        return np.concatenate([none, *(getattr(one, name) for one in frames)])
+
+    try:
+        arrays = {
+            'landmark_ids': np.array(queries.landmark_ids, dtype=np.str_),
+            'intrinsics_fx_fy_cx_cy': np.array(queries.intrinsics_fx_fy_cx_cy, dtype=np.float64),
+            'frame_offsets': np.cumsum([0, *map(len, frames)], dtype=np.int64),
+            'boxes_xyxy': rows('bboxes_xyxy', np.empty((0, 4))),
+            'class_ids': np.array([name for one in frames for name in one.class_ids],
+                                  dtype=np.str_),
+            'scores': rows('scores', np.empty(0)),
+            'similarities': rows('similarities', np.empty((0, len(queries.landmark_ids)))
+                                 ).astype(np.float32),
+            'true_landmark': rows('true_landmark', np.empty(0, dtype=np.int64)),
+            'map_from_camera': np.array([one.map_from_camera for one in frames]).reshape(-1, 4, 4),
+            # Python's division of integers rounds once, NumPy's twice.
+            'timestamps': np.array([frame.stamp_ns / NS_PER_S for frame in frames]),
+            'query_group': np.array([one.group for one in frames], dtype=np.int64),
+            'is_main': np.array([one.is_main for one in frames], dtype=np.bool_),
+            'stamps_ns': np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
+            **{name: np.array([getattr(one, name) for one in frames]) for name in _STAGES},
+        }
+        if any(one.depths is not None for one in frames):
+            arrays['depths'] = np.concatenate([
+                np.full(len(one), np.nan) if one.depths is None else one.depths for one in frames])
+    except ValueError as error:  # arrays of different widths
+        raise DatasetError(f'{path}: cannot be written: {error}') from error
+    _QUERIES.write(path, arrays, compress=True)
+
 
 _OF_CAMERAS = ('camera_names', 'camera_sizes', 'camera_intrinsics', 'camera_rows')
 
@@ -35,7 +238,7 @@ def _check_cameras(name: str, arrays: Arrays) -> None:
 
 
 # F frames, n boxes, d numbers of an embedding, C cameras.
-_SCHEMA = Schema('observation file', {
+_OBSERVATIONS = Schema('observation file', {
     **FRAME_FIELDS,
     'image_size': Field('integers', (2,)),
     'depth_spreads': Field('floats', ('n',), is_optional=True),
@@ -98,13 +301,13 @@ def load_observations(path: str | Path) -> PosedDetections:
 
 def load_recorded(path: str | Path) -> Recorded:
     """Read and validate an observation file, and how it came about; see load_observations."""
-    arrays = _SCHEMA.read(Path(path))
+    arrays = _OBSERVATIONS.read(Path(path))
     try:
         cameras = tuple(camera_from_numbers(*numbers) for numbers in zip(
             arrays.get('camera_sizes', arrays['image_size'][None]),
             arrays.get('camera_intrinsics', arrays['intrinsics_fx_fy_cx_cy'][None]), strict=True))
     except CameraError as error:
-        raise _SCHEMA.invalid(Path(path), error) from error
+        raise _OBSERVATIONS.invalid(Path(path), error) from error
     names, classes = np.unique(arrays['class_ids'], return_inverse=True)
     detections = PosedDetections(
         cameras=cameras, map_from_camera=arrays['map_from_camera'].astype(np.float64),
@@ -171,4 +374,4 @@ def _write(path: Path, detections: PosedDetections, more: Arrays) -> None:
     if detections.encoder_key:
         arrays['encoder_key'] = np.array(detections.encoder_key)
     # embeddings do not compress, and take minutes to try
-    _SCHEMA.write(path, arrays, compress='embeddings' not in arrays)
+    _OBSERVATIONS.write(path, arrays, compress='embeddings' not in arrays)

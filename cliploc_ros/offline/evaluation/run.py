@@ -25,7 +25,7 @@ from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.files.storage import make_folder, write_text
-from cliploc_ros.offline.datasets.queries import QueryFrame
+from cliploc_ros.offline.datasets.observations import QueryFrame
 from cliploc_ros.offline.evaluation.methods import Method
 from cliploc_ros.offline.evaluation.report import PAGE, write_report
 from cliploc_ros.offline.evaluation.summary import (

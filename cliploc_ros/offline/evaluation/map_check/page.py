@@ -1,13 +1,29 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The files of a check: figures as JSON; a page whose first screen says all, the rest folded."""
+"""The files of a check: figures as JSON; a page whose first screen says all, the rest folded.
+
+Beside an advice are the room's own images: a landmark in its best view, or the nearest view.
+"""
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import (
+    ellipse_bboxes,
+    ellipses_in_pixels,
+    outline_points,
+    project_ellipsoids,
+)
+from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.files.page import (
     ACCEPTED,
     MISLED,
@@ -26,7 +42,6 @@ from cliploc_ros.files.page import (
     verdict,
 )
 from cliploc_ros.files.storage import write_text
-from cliploc_ros.offline.evaluation.map_check.views import ViewPainter
 from cliploc_ros.offline.mapping.check.landmark_faults import LandmarkCheck
 from cliploc_ros.offline.mapping.check.relocalization import Trial, count_verdicts
 from cliploc_ros.offline.mapping.check.report import (
@@ -38,6 +53,121 @@ from cliploc_ros.offline.mapping.check.report import (
     count_by_objects,
     share,
 )
+from cliploc_ros.offline.mapping.landmarks import box_iou
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+
+#: Returns the image (h, w, 3), red first, of a time [s] and a camera, as a pinhole shows it.
+ReadImage = Callable[[float, str, Camera], NDArray[np.uint8] | None]
+_MOST_FRAMES = 600
+# A landmark that fills this share of the image is large enough.
+_LARGE = 0.04
+_OWN_IOU = 0.3
+# A picture of a landmark is this many times as large as it.
+_AROUND = 3.0
+# An angle that makes a view as different as a metre does [deg]; what is the same view, and a view
+# that is too different [m].
+_DEGREES_PER_M, _SAME, _MOST_DIFFERENT = 30.0, 0.1, 3.0
+_WIDTH_PX, _JPEG_QUALITY = 480, 75
+_BOX_RGB, _OUTLINE_RGB = (255, 255, 255), (230, 159, 0)
+
+
+class Picture(NamedTuple):
+    """A picture of a recorded view."""
+
+    jpeg: bytes
+    caption: str
+
+
+class ViewPainter:
+    """Draws views of a recording, with its boxes and the outlines of landmarks."""
+
+    def __init__(self, landmark_map: LandmarkMap, detections: PosedDetections, read: ReadImage):
+        self._map, self._detections, self._read = landmark_map, detections, read
+
+    def of(self, advice: Advice) -> Picture | None:
+        """Return the view that shows best what an advice is about; None where there is none."""
+        if advice.landmarks:
+            rows = [self._map.landmark_ids.index(one) for one in advice.landmarks]
+            found = self._showing(rows[0], 'outlined: ' + ' and '.join(advice.landmarks))
+        elif advice.view is not None:
+            rows, found = [], self._near(advice.view)
+        else:
+            return None
+        for frame, words in found:
+            if (picture := self._draw(frame, rows)) is not None:
+                seconds = self._detections.stamps_s[frame] - self._detections.stamps_s[0]
+                return Picture(picture, f'{words}; image at {seconds:.0f} s')
+        return None
+
+    def _showing(self, row: int, words: str) -> Iterator[tuple[int, str]]:
+        """Yield the frames that show a landmark: whole, large, in a box of it first."""
+        worths = []
+        for frame in self._detections.every(max(1, len(self._detections) // _MOST_FRAMES)):
+            outline = self._outlines(frame, [row])
+            if not np.isfinite(outline).all():
+                continue
+            camera, box = self._detections.camera_of(frame), ellipse_bboxes(outline)
+            bounds = np.array([0.0, 0.0, camera.width, camera.height])
+            inside = np.clip(box, 0.0, np.tile(bounds[2:], 2))
+            area, seen = (float(np.prod(one[0, 2:] - one[0, :2])) for one in (box, inside))
+            worth = seen / area * min(1.0, seen / (_LARGE * camera.width * camera.height))
+            if any(box_iou(box[0], one, bounds) > _OWN_IOU for one in self._boxes(frame)):
+                worth += 1.0
+            if seen > 0.0:
+                worths.append((-worth, int(frame)))
+        yield from ((frame, words) for _, frame in sorted(worths))
+
+    def _near(self, view: Trial) -> Iterator[tuple[int, str]]:
+        """Yield the frames near to a view, the nearest first, and how far they are off."""
+        poses = self._detections.map_from_camera
+        far_m = np.linalg.norm(poses[:, :3, 3] - view.position, axis=1)
+        off_deg = np.degrees(np.arccos(np.clip(poses[:, :3, 2] @ view.forward, -1.0, 1.0)))
+        different = far_m + off_deg / _DEGREES_PER_M
+        for frame in np.argsort(different):
+            if different[frame] < _MOST_DIFFERENT:
+                yield int(frame), 'this view' if different[frame] < _SAME else (
+                    f'a view {far_m[frame]:.1f} m and {off_deg[frame]:.0f} degrees off')
+
+    def _boxes(self, frame: int) -> NDArray[np.float64]:
+        return self._detections.bboxes_xyxy[slice(
+            *self._detections.frame_offsets[frame:frame + 2])]
+
+    def _outlines(self, frame: int, rows: list[int]) -> NDArray[np.float64]:
+        """Return the outlines (n, 5) of landmarks in a frame [px]; NaN behind the camera."""
+        return ellipses_in_pixels(project_ellipsoids(
+            invert_transform(self._detections.map_from_camera[frame]), self._map.centers[rows],
+            self._map.shapes[rows]), self._detections.camera_of(frame))
+
+    def _draw(self, frame: int, rows: list[int]) -> bytes | None:
+        """Return a JPEG with the boxes of a frame, and with outlines; None without its image."""
+        camera = self._detections.camera_of(frame)
+        image = self._read(float(self._detections.stamps_s[frame]),
+                           self._detections.name_of(frame), camera)
+        if image is None:
+            return None
+        outlines = self._outlines(frame, rows)
+        corner, size = np.zeros(2), np.array([camera.width, camera.height], dtype=np.float64)
+        if rows:
+            # a part of the image, in which a small landmark is to be seen
+            left, top, right, bottom = ellipse_bboxes(outlines[:1])[0]
+            part = float(np.clip(_AROUND * max(right - left, bottom - top) / size[1], 0.3, 1.0))
+            corner = np.clip(np.array([left + right, top + bottom]) / 2 - part * size / 2, 0.0,
+                             (1.0 - part) * size).round()
+            size = part * size
+        scale = _WIDTH_PX / size[0]
+        (x, y), (width, height) = corner.astype(int).tolist(), size.astype(int).tolist()
+        small = cv2.resize(np.ascontiguousarray(image[y:y + height, x:x + width]), None, fx=scale,
+                           fy=scale, interpolation=cv2.INTER_AREA)
+        for box in (self._boxes(frame) - np.tile(corner, 2)) * scale:
+            left, top, right, bottom = np.rint(box).astype(int).tolist()
+            cv2.rectangle(small, (left, top), (right, bottom), _BOX_RGB, 1, cv2.LINE_AA)
+        for outline in outlines:
+            if np.isfinite(outline).all():
+                points = np.rint((outline_points(outline) - corner) * scale).clip(-9999, 9999)
+                cv2.polylines(small, [points.astype(np.int32)], True, _OUTLINE_RGB, 4, cv2.LINE_AA)
+        return cv2.imencode('.jpg', small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+                            )[1].tobytes()
+
 
 PAGE, DATA = 'check.html', 'check.json'
 LOOK_ALIKE = '#CC79A7'
@@ -236,4 +366,3 @@ def _corrections(recording: RecordingCheck) -> str:
                  'turned mount and a shifted principal point look much the same.')
             + table(('cause', 'what', '#correction', '#deviation', '#effect [px]',
                      '#cost that the cause explains', ''), rows))
-

@@ -18,7 +18,7 @@ from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.files.page import FAINT
-from cliploc_ros.offline.evaluation.drawing import EDGED, draw_outline, png_of, write_name
+from cliploc_ros.offline.evaluation.figures import EDGED, draw_outline, png_of, write_name
 from cliploc_ros.offline.evaluation.map_check.page import (
     FIRST_ADVICE,
     GRADE_COLORS,
