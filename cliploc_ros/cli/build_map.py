@@ -13,32 +13,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cliploc_ros.cli import check_map
-from cliploc_ros.cli.map_layer import (
-    add_layer_options,
-    check_layer_options,
-    make_layer,
-    write_layer,
-)
+from cliploc_ros import command
+from cliploc_ros.cli import check_map, map_layer, sources
 from cliploc_ros.cli.options import add_source_options
-from cliploc_ros.cli.sources import (
-    clip_options,
-    folder_of,
-    metres_of,
-    mount_of,
-    read_source,
-    recording_of,
-    source_of,
-)
-from cliploc_ros.command import (
-    SEEDS,
-    StageBar,
-    not_negative,
-    positive,
-    positive_int,
-    run_main,
-    within,
-)
 from cliploc_ros.errors import CliplocError, MappingError, OptionsError
 
 if TYPE_CHECKING:
@@ -68,7 +45,7 @@ examples:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Build a map; return the exit code."""
-    return run_main(make_parser(), build, args)
+    return command.run_main(make_parser(), build, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -85,9 +62,10 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--report', type=Path, metavar='JSON',
                         help='also write what was found and left out, and why')
     parser.add_argument('--frame-id', default='map', help='of the map (%(default)s)')
-    parser.add_argument('--every', type=positive_int, default=1, metavar='N',
+    parser.add_argument('--every', type=command.positive_int, default=1, metavar='N',
                         help='use each N-th frame only (%(default)s)')
-    parser.add_argument('--seed', type=within(*SEEDS), default=0, help='(%(default)s)')
+    parser.add_argument('--seed', type=command.within(*command.SEEDS), default=0,
+                        help='(%(default)s)')
     parser.add_argument('--check', action=argparse.BooleanOptionalAction, default=True,
                         help='at the end, check the map as check_map does, with fewer views, into '
                         'NAME_check; the exit code is that of the build (%(default)s)')
@@ -97,26 +75,29 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--object-size', nargs=2, metavar=('CLASS', 'METRES'),
                         help='the longest extent of the objects of a class, which says the scale '
                         'of the poses')
-    add_layer_options(parser)
+    map_layer.add_layer_options(parser)
     poses = parser.add_argument_group('poses with errors')
     poses.add_argument('--joint', action=argparse.BooleanOptionalAction,
                        help='refine the poses together with the landmarks (default: if '
                        '--pose-noise is given, or where the boxes tell that they are off)')
-    poses.add_argument('--pose-noise', type=positive, nargs=2, metavar=('METRES', 'DEGREES'),
+    poses.add_argument('--pose-noise', type=command.positive, nargs=2,
+                       metavar=('METRES', 'DEGREES'),
                        help='standard deviations of the poses on each axis (0.02 0.5 with '
                        '--joint)')
-    poses.add_argument('--pose-correlation', type=not_negative, default=3.0, metavar='SECONDS',
+    poses.add_argument('--pose-correlation', type=command.not_negative, default=3.0,
+                       metavar='SECONDS',
                        help='time after which a pose error is another one (%(default)s)')
-    poses.add_argument('--odometry-noise', type=positive, nargs=2, metavar=('METRES', 'DEGREES'),
+    poses.add_argument('--odometry-noise', type=command.positive, nargs=2,
+                       metavar=('METRES', 'DEGREES'),
                        help='standard deviations of odometry on each axis after a metre of the '
                        'way (0.03 1.5)')
     poses.add_argument('--refine-mount', action='store_true',
                        help='correct a mount of the camera that is off by centimetres or degrees')
     limits = parser.add_argument_group('which landmarks belong into the map')
-    limits.add_argument('--min-viewpoints', type=positive_int, default=3, metavar='N',
+    limits.add_argument('--min-viewpoints', type=command.positive_int, default=3, metavar='N',
                         help='10 cm or 5 degrees apart (%(default)s)')
-    limits.add_argument('--min-baseline', type=within(0.0, 180.0), default=20.0, metavar='DEG',
-                        help='angle between two of its directions (%(default)s)')
+    limits.add_argument('--min-baseline', type=command.within(0.0, 180.0), default=20.0,
+                        metavar='DEG', help='angle between two of its directions (%(default)s)')
     return parser
 
 
@@ -132,7 +113,7 @@ def build(options: argparse.Namespace) -> int:
     from cliploc_ros.offline.mapping.options import MappingOptions, OdometryErrors
 
     begin = time.monotonic()
-    path, update, name = options.out, options.update, source_of(options).name
+    path, update, name = options.out, options.update, sources.source_of(options).name
     _check(options)
     if update is not None:
         LandmarkMap.from_file(update)
@@ -142,22 +123,22 @@ def build(options: argparse.Namespace) -> int:
         refine_mount=options.refine_mount, min_viewpoints=options.min_viewpoints,
         min_baseline_deg=options.min_baseline, frame_id=options.frame_id,
         source=f'build_map {name}', random_seed=options.seed)
-    source = read_source(options)
+    source = sources.read_source(options)
     recorded = source.recorded
     detections, scale, rotation = _placed(recorded.detections, options, mapping)
     if recorded.without_pose:
         print(f'no pose: {recorded.without_pose} of {recorded.images} images', flush=True)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
-    labeller = find_labeller(detections, partial(clip_options, options) if options.clip else None,
-                             options.vocabulary)
+    clip = partial(sources.clip_options, options) if options.clip else None
+    labeller = find_labeller(detections, clip, options.vocabulary)
     layer, note = None, ''
     if update is None:
-        with StageBar() as bar, _reporting_failure(options.report):
+        with command.StageBar() as bar, _reporting_failure(options.report):
             made = make_map(detections, labeller, mapping, progress=bar.show)
         _write_report(options.report, made.report.as_dict())
         frames = source.frames and move_frames(source.frames, scale, rotation)
-        layer, note = make_layer(options, frames, made.landmark_map)
+        layer, note = map_layer.make_layer(options, frames, made.landmark_map)
         lines = made.report.lines()
         head = [f'built by build_map from {name}', *lines[:2]]
         if made.mount is not None:
@@ -169,10 +150,10 @@ def build(options: argparse.Namespace) -> int:
         lines = made.report.lines()
         head = [f'{update.name}, updated by build_map from {name}', lines[0]]
     write_map(path, made.landmark_map, head, made.embeddings)
-    save_recording(path, recording_of(options, source.file, scale, rotation))
+    save_recording(path, sources.recording_of(options, source.file, scale, rotation))
     is_same_map = update is not None and path.resolve() == update.resolve()
     if layer is not None:
-        lines.append(write_layer(path, layer))
+        lines.append(map_layer.write_layer(path, layer))
     elif not is_same_map and (removed := remove_layer(path)):
         lines.append(removed)
     print('\n'.join(lines))
@@ -222,7 +203,7 @@ def _check(options: argparse.Namespace) -> None:
         raise MappingError(f'{path}: there is no folder {path.parent}; create it')
     if path.is_dir():
         raise MappingError(f'{path} is a folder; name the map file to write')
-    check_layer_options(options)
+    map_layer.check_layer_options(options)
     if options.level and options.update is not None:
         raise OptionsError('--level is for new maps, not for --update')
     if options.object_size is not None and (options.scale or options.known_distance
@@ -245,7 +226,7 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
     from cliploc_ros.offline.mapping.tilt import NO_VERTICAL, find_tilt, tilt_note
 
     scale, rotation = 1.0, np.eye(3)
-    if folder_of(options) is None:  # whoever reads a folder levels it
+    if sources.folder_of(options) is None:  # whoever reads a folder levels it
         found, note = find_tilt(detections.map_from_camera), tilt_note(detections.map_from_camera)
         if options.level:
             if found is None:
@@ -256,7 +237,7 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
         detections = detections.moved(scale, rotation)
     if options.object_size is not None:
         class_name = options.object_size[0]
-        metres = metres_of(options.object_size[1], '--object-size')
+        metres = sources.metres_of(options.object_size[1], '--object-size')
         scale, objects = scale_of_objects(detections, mapping, class_name, metres)
         print(f'a unit is {scale:.5g} m, by {objects} objects of class {class_name}', flush=True)
         detections = detections.moved(scale, np.eye(3))
@@ -281,7 +262,7 @@ def _mount_option(options: argparse.Namespace, correction: 'NDArray[np.float64]'
     """Return the corrected mount as the option --mount takes it."""
     from cliploc_ros.core.geometry.transforms import quaternion_from_transform
 
-    mount = mount_of(options.mount)
+    mount = sources.mount_of(options.mount)
     given = correction if mount is None else mount @ correction
     numbers = [*given[:3, 3], *quaternion_from_transform(given)]
     return 'corrected mount: --mount ' + ' '.join(f'{number:.5f}' for number in numbers)

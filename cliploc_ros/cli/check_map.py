@@ -12,18 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cliploc_ros import command
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.cli.options import add_topic_options
-from cliploc_ros.command import (
-    SEEDS,
-    StageBar,
-    finite,
-    positive,
-    positive_int,
-    printable,
-    run_main,
-    within,
-)
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
@@ -49,7 +40,7 @@ exit code: 0 the map reaches all thresholds, 1 it misses one or the input is inv
 
 def main(args: Sequence[str] | None = None) -> int:
     """Check a map; return the exit code."""
-    return run_main(make_parser(), check, args)
+    return command.run_main(make_parser(), check, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -70,9 +61,10 @@ def make_parser() -> argparse.ArgumentParser:
                         help='a query file of this map: frames with similarities')
     parser.add_argument('--out', type=Path, metavar='DIR',
                         help='folder of check.html and check.json (NAME_check next to the map)')
-    parser.add_argument('--every', type=positive_int, default=1, metavar='N',
+    parser.add_argument('--every', type=command.positive_int, default=1, metavar='N',
                         help='use each N-th frame of the observations only (%(default)s)')
-    parser.add_argument('--seed', type=within(*SEEDS), default=0, help='(%(default)s)')
+    parser.add_argument('--seed', type=command.within(*command.SEEDS), default=0,
+                        help='(%(default)s)')
     add_use_option(parser, 'report what the keyframes next to the map reach')
     _add_relocalizer_options(parser)
     _add_thresholds(parser)
@@ -82,27 +74,29 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('expected relocalization')
-    group.add_argument('--frames', type=positive_int, default=CheckOptions.frames, metavar='N',
-                       help='the most recorded frames to relocalize (%(default)s)')
-    group.add_argument('--folds', type=within(2, 10**6), default=CheckOptions.folds, metavar='N',
-                       help='of the cross-validation, 2 or more (%(default)s)')
-    group.add_argument('--grid', type=positive, default=CheckOptions.spacing_m, metavar='METRES',
+    group.add_argument('--frames', type=command.positive_int, default=CheckOptions.frames,
+                       metavar='N', help='the most recorded frames to relocalize (%(default)s)')
+    group.add_argument('--folds', type=command.within(2, 10**6), default=CheckOptions.folds,
+                       metavar='N', help='of the cross-validation, 2 or more (%(default)s)')
+    group.add_argument('--grid', type=command.positive, default=CheckOptions.spacing_m,
+                       metavar='METRES',
                        help='spacing of the camera positions, larger in large maps (%(default)s)')
-    group.add_argument('--positions', type=positive_int, default=CheckOptions.max_positions,
-                       metavar='N', help='the most camera positions (%(default)s)')
-    group.add_argument('--headings', type=positive_int, default=CheckOptions.headings, metavar='N',
-                       help='directions at each position (%(default)s)')
-    group.add_argument('--camera-height', type=finite, metavar='METRES',
+    group.add_argument('--positions', type=command.positive_int, metavar='N',
+                       default=CheckOptions.max_positions,
+                       help='the most camera positions (%(default)s)')
+    group.add_argument('--headings', type=command.positive_int, default=CheckOptions.headings,
+                       metavar='N', help='directions at each position (%(default)s)')
+    group.add_argument('--camera-height', type=command.finite, metavar='METRES',
                        help='of the grid (as recorded; else .3 m above the middle landmark)')
     group.add_argument('--gravity', action='store_true', help='the robot knows the vertical')
-    group.add_argument('--min-confidence', type=within(0.0, 1.0),
+    group.add_argument('--min-confidence', type=command.within(0.0, 1.0),
                        default=RelocalizerOptions().min_confidence,
                        help="the relocalizer's (%(default)s)")
 
 
 def _add_thresholds(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('thresholds; beyond one of them, the exit code is 1')
-    share, count = within(0.0, 1.0), within(0, 10**9)
+    share, count = command.within(0.0, 1.0), command.within(0, 10**9)
     for name, kind, text in (
             ('min_explained', share, 'share of held-out boxes that a landmark explains'),
             ('min_iou', share, 'their median IoU'),
@@ -122,12 +116,7 @@ def check(options: argparse.Namespace) -> int:
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
     from cliploc_ros.offline.datasets.observations import load_queries
-    from cliploc_ros.offline.evaluation.map_check.page import (
-        PAGE,
-        ViewPainter,
-        summary_lines,
-        write_report,
-    )
+    from cliploc_ros.offline.evaluation.map_check import page
     from cliploc_ros.offline.evaluation.map_check.pictures import draw_pictures
     from cliploc_ros.offline.evaluation.trials import make_queries
     from cliploc_ros.offline.mapping.check.checking import check_map
@@ -147,7 +136,7 @@ def check(options: argparse.Namespace) -> int:
     detections, images = _read_recording(options) or (None, None)
     image_of = views = None
     if detections is not None and images is not None:
-        views = ViewPainter(landmark_map, detections, images.near)
+        views = page.ViewPainter(landmark_map, detections, images.near)
         if options.observations is None:  # the layer's own: judged by those of other times
             image_of = partial(_image_of, detections, images)
     if detections is not None and (note := tilt_note(detections.map_from_camera)):
@@ -159,16 +148,17 @@ def check(options: argparse.Namespace) -> int:
     layer = read_layer(options.map, landmark_map, options.keyframes)
     out = options.out or options.map.with_name(f'{options.map.stem}_check')
     make_folder(out)
-    with StageBar() as bar:
+    with command.StageBar() as bar:
         report = check_map(landmark_map, detections, queries, check_options, thresholds, bar.show,
                            layer, image_of)
-        write_report(out, options.map.name, report, draw_pictures(landmark_map, report), views)
-    print('\n'.join(summary_lines(report)))
+        page.write_report(out, options.map.name, report, draw_pictures(landmark_map, report),
+                          views)
+    print('\n'.join(page.summary_lines(report)))
     print('what to do:')
-    print('\n'.join(f'  {printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
+    print('\n'.join(f'  {command.printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
     for failure in report.failures:
         print(f'fails: {failure}')
-    print(f'wrote {out / PAGE} in {time.monotonic() - begin:.1f} s: '
+    print(f'wrote {out / page.PAGE} in {time.monotonic() - begin:.1f} s: '
           f'{"passed" if report.passed else "failed"}')
     return 0 if report.passed else 1
 

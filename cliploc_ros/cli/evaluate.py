@@ -11,18 +11,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cliploc_ros.cli import sources
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.cli.options import add_folders, add_network_options, add_reading_options
-from cliploc_ros.cli.sources import (
-    check_folder_options,
-    clip_options,
-    detector_options,
-    find_topics,
-    folder_of,
-    read_cameras,
-    reading_of,
-    source_of,
-)
 from cliploc_ros.command import SEEDS, limit, not_negative, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
@@ -66,12 +57,12 @@ def make_parser() -> argparse.ArgumentParser:
         prog='evaluate', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Compare methods on the same input. Writes the paper's table, results.json, "
         'summary.csv, figures and trajectories. Needs no sourced ROS.')
-    sources = parser.add_mutually_exclusive_group(required=True)
-    sources.add_argument('--queries', type=Path, metavar='NPZ',
+    group = parser.add_mutually_exclusive_group(required=True)
+    group.add_argument('--queries', type=Path, metavar='NPZ',
                          help='recorded boxes and similarities')
-    sources.add_argument('--bag', type=Path, help='a rosbag2 recording with ground truth; or a '
+    group.add_argument('--bag', type=Path, help='a rosbag2 recording with ground truth; or a '
                          'request that ~/record stored (npz), which is answered again')
-    add_folders(sources)
+    add_folders(group)
     parser.add_argument('--map', type=Path, nargs='+', required=True, metavar='YAML',
                         help='several maps are searched as one; true poses are in the first')
     parser.add_argument('--methods', nargs='+', default=[ALL], metavar='M',
@@ -153,25 +144,20 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.core.map.joined_map import join_maps
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
+    from cliploc_ros.offline.evaluation import trials
     from cliploc_ros.offline.evaluation.methods import parse_methods
     from cliploc_ros.offline.evaluation.recording import with_features
     from cliploc_ros.offline.evaluation.run import compare_methods
-    from cliploc_ros.offline.evaluation.trials import (
-        join_cameras,
-        make_queries,
-        with_neighbours,
-        with_vertical,
-    )
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):
         raise OptionsError('--cameras is for --bag, without --fuse and --save-queries')
-    check_folder_options(options)
-    if options.level and folder_of(options) is None:
+    sources.check_folder_options(options)
+    if options.level and sources.folder_of(options) is None:
         raise OptionsError('--level is for folders of images only')
     of_case = options.bag is not None and options.bag.suffix == '.npz'
     if options.queries is None and not of_case:
-        find_topics(options, options.bag)
+        sources.find_topics(options, options.bag)
     landmark_map = join_maps([LandmarkMap.from_file(file) for file in options.map],
                              [str(file) for file in options.map])
     if of_case:
@@ -191,10 +177,11 @@ def evaluate(options: argparse.Namespace) -> int:
     of_cameras = {camera: _read_queries(options, landmark_map, camera, images.get(camera))
                   for camera in images or ('',)}
     recorded = next(iter(of_cameras.values()))
-    queries = make_queries(recorded, landmark_map, every_frame=True)
-    if len(of_cameras) > 1:
-        queries = join_cameras({camera: make_queries(its, landmark_map, every_frame=True)
-                                for camera, its in of_cameras.items()}, options.sync_tolerance)
+    asked = {camera: trials.make_queries(its, landmark_map, every_frame=True)
+             for camera, its in of_cameras.items()}
+    queries = next(iter(asked.values()))
+    if len(asked) > 1:
+        queries = trials.join_cameras(asked, options.sync_tolerance)
     if layer is not None:
         queries = with_features(queries, next(iter(images.values())))
         notes = {layer.camera_note(one.image.camera) for one in queries if one.image is not None}
@@ -205,10 +192,10 @@ def evaluate(options: argparse.Namespace) -> int:
     def sensed(seed: int) -> 'tuple[PosedQuery, ...]':
         found = queries
         if options.gravity:
-            found = with_vertical(found, options.gravity_noise_deg, seed)
+            found = trials.with_vertical(found, options.gravity_noise_deg, seed)
         if options.fuse:
-            found = with_neighbours(found, [frame.group for frame in recorded], noise_m,
-                                    noise_deg, seed)
+            found = trials.with_neighbours(found, [frame.group for frame in recorded], noise_m,
+                                           noise_deg, seed)
         return tuple(one for one in found
                      if options.frames == 'all' or recorded[one.number].is_main)
     is_noisy = (options.gravity and options.gravity_noise_deg) or (
@@ -238,7 +225,7 @@ def _notes_on_maps(options: argparse.Namespace) -> list[str]:
 
     if options.queries is not None:
         return []
-    images = source_of(options).resolve()
+    images = sources.source_of(options).resolve()
     return [f'note: {file} was built from these images ({images}): expect less on others'
             for file in options.map
             if (recording := load_recording(file)) is not None
@@ -296,7 +283,7 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
     case, observer = read_case(options.bag), None
     if case.options.needs_similarities:
         observer = Observer(*load_encoder_for_map(
-            clip_options(options), landmark_map, [str(file) for file in options.map],
+            sources.clip_options(options), landmark_map, [str(file) for file in options.map],
             options.landmark_embeddings))
     wanted = options.keyframes
     if wanted is None and not case.report.get('parameters', {}).get('keyframes_file', True):
@@ -317,16 +304,14 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
     """Return the queries of a file, or those of the images of a camera, recorded once."""
     from cliploc_ros.offline.datasets.observations import load_queries, save_queries
     from cliploc_ros.offline.evaluation.recording import recorded_queries
-    from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions
+    from cliploc_ros.offline.recording.recorder import EVERY_FRAME
 
     if frames is None:
         if options.save_queries is not None:
             raise OptionsError('--save-queries needs --bag or a folder')
         return load_queries(options.queries, landmark_map.landmark_ids)
     print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
-    recording = RecordingOptions(
-        detector_options(options), clip_options(options) if options.clip else None, EVERY_FRAME,
-        reading_of(options, options.every, camera), options.workers or 1, options.scheduler)
+    recording = sources.recording_options(options, EVERY_FRAME, options.every, camera)
     queries = recorded_queries(frames, landmark_map, recording, list(map(str, options.map)),
                                options.landmark_embeddings)
     if without := frames.count - len(queries):
@@ -346,7 +331,7 @@ def _read_images(options: argparse.Namespace) -> 'dict[str, Frames]':
     if options.bag is not None and built_from is not None and built_from.is_moved:
         raise OptionsError(f'{options.map[0]}: was turned or scaled by build_map, the poses of '
                            '--bag are not; build it without --level and --object-size')
-    images = read_cameras(options, gap_s=0.0)
+    images = sources.read_cameras(options, gap_s=0.0)
     return images if options.bag is not None else {
         name: frames.select(range(0, frames.count, options.every))
         for name, frames in images.items()}

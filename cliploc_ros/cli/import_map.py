@@ -143,20 +143,16 @@ def _check_paths(options: argparse.Namespace) -> None:
 
 def _read(options: argparse.Namespace) -> 'GivenMap':
     """Return the content of the input."""
-    from cliploc_ros.offline.datasets.map_formats.given_map import (
-        COCO,
-        read_class_names,
-        read_msgloc,
-        read_table,
-    )
+    from cliploc_ros.offline.datasets.map_formats import given_map
     from cliploc_ros.offline.datasets.map_formats.quadric_maps import read_goreloc, read_oaslam
 
     if options.format == 'csv':
         if options.class_names is not None:
             raise OptionsError('--class-names is not for csv, whose column class_id has names')
-        return read_table(options.input)
-    names = COCO if options.class_names is None else read_class_names(options.class_names)
-    readers = {'msgloc': read_msgloc, 'goreloc': read_goreloc, 'oaslam': read_oaslam}
+        return given_map.read_table(options.input)
+    names = (given_map.COCO if options.class_names is None
+             else given_map.read_class_names(options.class_names))
+    readers = {'msgloc': given_map.read_msgloc, 'goreloc': read_goreloc, 'oaslam': read_oaslam}
     return readers[options.format](options.input, names)
 
 

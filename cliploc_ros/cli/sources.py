@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from cliploc_ros.offline.datasets.map_recording import MapRecording
     from cliploc_ros.offline.datasets.observations import Recorded
     from cliploc_ros.offline.datasets.poses import Poses
+    from cliploc_ros.offline.recording.recorder import KeyframeOptions, RecordingOptions
 
 # Of a recording, these change how its frames are read.
 _READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'max_gap', 'image',
@@ -103,12 +104,7 @@ def read_source(options: argparse.Namespace) -> Source:
     CliplocError: the source, the networks or the options cannot be used.
     """
     from cliploc_ros.offline.datasets.observations import load_recorded
-    from cliploc_ros.offline.recording.recorder import (
-        KeyframeOptions,
-        RecordingOptions,
-        observation_file,
-        record_once,
-    )
+    from cliploc_ros.offline.recording import recorder
 
     if options.bag is None and (options.odometry_topic or options.odometry_frame):
         raise OptionsError('--odometry-topic and --odometry-frame are for --bag')
@@ -119,18 +115,26 @@ def read_source(options: argparse.Namespace) -> Source:
         return Source(load_recorded(options.observations), options.observations, None)
     frames = read_frames(options)
     print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
-    recording = RecordingOptions(
-        detector_options(options, conf=options.conf),
-        clip_options(options) if options.clip else None, KeyframeOptions(*options.keyframes),
-        reading_of(options), options.workers, options.scheduler)
-    file = options.record_to or observation_file(frames, recording)
-    return Source(record_once(frames, recording, file, _odometry(options)), file, frames)
+    recording = recording_options(options, recorder.KeyframeOptions(*options.keyframes))
+    file = options.record_to or recorder.observation_file(frames, recording)
+    return Source(recorder.record_once(frames, recording, file, _odometry(options)), file, frames)
 
 
-def reading_of(options: argparse.Namespace, *more: object) -> str:
-    """Return all that says how a recording is read: another text, another observation file."""
-    return repr([str(getattr(options, name)) for name in _READING]
-                + (options.cameras if options.cameras != [''] else []) + list(map(str, more)))
+def recording_options(options: argparse.Namespace, keyframes: 'KeyframeOptions', *more: object
+                      ) -> 'RecordingOptions':
+    """Return how detector and CLIP look at the images that the command line names.
+
+    All that says how a recording is read is part of it, with more of the program: another text,
+    another observation file.
+    """
+    from cliploc_ros.offline.recording.recorder import RecordingOptions
+
+    reading = [*(str(getattr(options, name)) for name in _READING),
+               *(options.cameras if options.cameras != [''] else []), *map(str, more)]
+    conf = {'conf': options.conf} if 'conf' in options else {}
+    return RecordingOptions(
+        detector_options(options, **conf), clip_options(options) if options.clip else None,
+        keyframes, repr(reading), options.workers or 1, options.scheduler)
 
 
 def recording_of(options: argparse.Namespace, file: Path, scale: float,

@@ -66,24 +66,22 @@ def convert(options: argparse.Namespace) -> int:
     # Late, so that --help is fast.
     from tqdm import tqdm
 
+    from cliploc_ros.offline.datasets import tum_conversion
     from cliploc_ros.offline.datasets.folders import read_sequence
-    from cliploc_ros.offline.datasets.tum_conversion import (
-        ConversionOptions,
-        convert_tum,
-        read_recorded_detections,
-    )
 
     begin = time.monotonic()
     sequence, camera, origin = read_sequence(options.folder, options.intrinsics)
     sequence = sequence.every(options.every)
     detections = None
     if options.detections is not None:
-        detections = read_recorded_detections(options.detections, (camera.width, camera.height))
+        detections = tum_conversion.read_recorded_detections(
+            options.detections, (camera.width, camera.height))
     print(f'{len(sequence)} images, intrinsics: {origin}', flush=True)
-    result = convert_tum(
+    result = tum_conversion.convert_tum(
         sequence, camera, options.output,
-        ConversionOptions(options.storage, options.image_format, prefix=options.prefix,
-                          camera_frame=options.camera_frame, world_frame=options.world_frame),
+        tum_conversion.ConversionOptions(
+            options.storage, options.image_format, prefix=options.prefix,
+            camera_frame=options.camera_frame, world_frame=options.world_frame),
         detections,
         progress=lambda images: tqdm(images, unit='image', disable=None))  # on a terminal only
     print(f'wrote {options.output}: {result.images} images, {result.poses} ground-truth poses, '

@@ -18,25 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros import messages
 from cliploc_ros.core.depth_image import DepthImage, depth_from_counts
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.camera_faults import check_faults
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.errors import CliplocError, DatasetError
-from cliploc_ros.messages import (
-    camera_from_msg,
-    depth_counts_from_msg,
-    faults_of_camera_info,
-    faults_of_headers,
-    faults_of_rectified,
-    image_from_msg,
-)
-from cliploc_ros.offline.datasets.bag_messages import (
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    IMAGE,
-    stamp_ns,
-)
+from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import BagMessage, BagReader, deserialize
 from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, RawFrame, Wanted
 from cliploc_ros.offline.datasets.poses import Poses, TimedPoses, check_clock
@@ -72,7 +60,7 @@ def poses_of_topic(name: str, max_gap_ns: int = 0,
         for recorded in reader.messages([name]):
             message = reader.deserialize(recorded)
             pose = pose_of(message)
-            stamps.append(stamp_ns(message))
+            stamps.append(bag_messages.stamp_ns(message))
             rows.append(_numbers(pose.position, pose.orientation))
         poses = TimedPoses.from_samples(stamps, rows, f'{reader.path}: {name}')
         return replace(poses, max_gap_ns=max_gap_ns, body_from_camera=body_from_camera)
@@ -227,7 +215,7 @@ def _read_links(reader: BagReader, topics: Collection[str], children: Collection
                     f"{reader.path}: tf: '{child}' has two parents, '{parents[child]}' and "
                     f"'{_name(message.header.frame_id)}'; record one tree of one robot")
             stamps, rows = samples[recorded.topic][child]
-            stamps.append(stamp_ns(message))
+            stamps.append(bag_messages.stamp_ns(message))
             rows.append(_numbers(transform.translation, transform.rotation))
     links: dict[str, Poses] = {}
     for child in children:
@@ -251,7 +239,7 @@ def _name(frame_id: str) -> str:
     return frame_id.removeprefix('/')
 
 
-_IMAGES = (IMAGE, COMPRESSED_IMAGE)
+_IMAGES = (bag_messages.IMAGE, bag_messages.COMPRESSED_IMAGE)
 _COMPRESSED = '/compressed'
 # A depth image belongs to a colour image at most this far away in time.
 _MAX_DEPTH_DELAY_NS = 20_000_000
@@ -307,7 +295,7 @@ def find_topics(bag: Path, image: str | None, camera_info: str | None) -> tuple[
                or name.removesuffix(_COMPRESSED) not in images]
         image = image or only(raw, 'colour images', 'image')
         beside = image.removesuffix(_COMPRESSED).rpartition('/')[0] + '/camera_info'
-        infos = named((CAMERA_INFO,))
+        infos = named((bag_messages.CAMERA_INFO,))
         return image, camera_info or (
             beside if beside in infos else only(infos, 'camera_info', 'camera_info'))
 
@@ -335,7 +323,7 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
         with BagReader(bag) as reader:
             msgtype = reader.topic(topics.image).msgtype
             for place, stamp_ns, pose, data, depth_data in _paired(reader, topics, poses,
-                                                                   is_wanted):
+                                                                                is_wanted):
                 yield RawFrame(place, stamp_ns, pose, partial(decode, msgtype, data),
                                None if depth_data is None else partial(decode_depth, depth_data))
     return Frames(bag, count, read_raw, notes=notes)
@@ -348,16 +336,16 @@ def _notes(reader: BagReader, topics: BagTopics) -> tuple[str, ...]:
     """
     image, info = (reader.deserialize(next(reader.messages([topic])))
                    for topic in (topics.image, topics.camera_info))
-    faults = [*faults_of_headers(image.header.frame_id, info.header.frame_id),
-              *faults_of_rectified(topics.image, topics.rectified, info)]
+    faults = [*messages.faults_of_headers(image.header.frame_id, info.header.frame_id),
+              *messages.faults_of_rectified(topics.image, topics.rectified, info)]
     try:
         check_faults(faults)
     except CliplocError as error:
         raise DatasetError(f'{reader.path}: {error}') from error
     with suppress(CliplocError):  # who decodes the image says so
-        size = image_from_msg(image).shape[1::-1]
-        faults += faults_of_camera_info(info, camera_from_msg(info, size, topics.rectified),
-                                        topics.rectified)
+        size = messages.image_from_msg(image).shape[1::-1]
+        camera = messages.camera_from_msg(info, size, topics.rectified)
+        faults += messages.faults_of_camera_info(info, camera, topics.rectified)
     return tuple(f'note: {fault.text}' for fault in faults)
 
 
@@ -374,7 +362,7 @@ def _poses_of_images(reader: BagReader, image_topic: str, read_poses: ReadPoses,
                      ) -> Poses:
     image = reader.deserialize(next(reader.messages([image_topic])))
     poses = read_poses(reader, str(image.header.frame_id))
-    first_ns = stamp_ns(image)
+    first_ns = bag_messages.stamp_ns(image)
     check_clock(poses, first_ns, first_ns + reader.end_ns - reader.start_ns, where)
     return poses
 
@@ -420,7 +408,7 @@ class BagImages:
 
 
 def _check_topics(reader: BagReader, topics: BagTopics) -> None:
-    for name, types in ((topics.image, _IMAGES), (topics.camera_info, (CAMERA_INFO,)),
+    for name, types in ((topics.image, _IMAGES), (topics.camera_info, (bag_messages.CAMERA_INFO,)),
                         *([(topics.depth, _IMAGES)] if topics.depth else [])):
         topic = reader.topic(name)
         if topic.msgtype not in types:
@@ -473,21 +461,22 @@ def _decode_color(where: str, info: bytes, rectified: bool, msgtype: str, data: 
                   ) -> tuple[NDArray[np.uint8], Camera]:
     message = deserialize(data, msgtype, where)
     try:
-        image = image_from_msg(message)
+        image = messages.image_from_msg(message)
         size = (image.shape[1], image.shape[0])
-        calibration = deserialize(info, CAMERA_INFO, where)
-        camera = camera_from_msg(calibration, size, rectified)
-        check_faults(faults_of_camera_info(calibration, camera, rectified))
+        calibration = deserialize(info, bag_messages.CAMERA_INFO, where)
+        camera = messages.camera_from_msg(calibration, size, rectified)
+        check_faults(messages.faults_of_camera_info(calibration, camera, rectified))
         return image, camera
     except CliplocError as error:
-        raise DatasetError(f'{where} at {stamp_ns(message) / NS_PER_S:.6f}: {error}') from error
+        seconds = bag_messages.stamp_ns(message) / NS_PER_S
+        raise DatasetError(f'{where} at {seconds:.6f}: {error}') from error
 
 
 def _decode_depth(where: str, msgtype: str, form: DepthFormat, data: bytes) -> DepthImage:
     message = deserialize(data, msgtype, where)
-    where = f'{where} at {stamp_ns(message) / NS_PER_S:.6f}'
+    where = f'{where} at {bag_messages.stamp_ns(message) / NS_PER_S:.6f}'
     try:
-        counts = depth_counts_from_msg(message)
+        counts = messages.depth_counts_from_msg(message)
     except CliplocError as error:
         raise DatasetError(f'{where}: {error}') from error
     return DepthImage(depth_from_counts(counts, form.unit_m, where), form.camera)

@@ -17,22 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.depth_image import MILLIMETRE, TUM_UNIT, DepthCamera
+from cliploc_ros.core.geometry import transforms
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import (
-    invert_transform,
-    is_rigid,
-    make_transform,
-    quaternion_from_transform,
-)
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.captures import colmap, devices
+from cliploc_ros.offline.datasets.captures import colmap, devices, placing
 from cliploc_ros.offline.datasets.captures.capture import Capture, FolderOptions
-from cliploc_ros.offline.datasets.captures.placing import (
-    UP,
-    check_axes,
-    find_scale,
-    place_images,
-)
 from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, ImageFile, folder_frames
 from cliploc_ros.offline.datasets.intrinsics import find_camera, read_camera
 from cliploc_ros.offline.datasets.parsing import naming, read_numbers
@@ -44,8 +33,9 @@ from cliploc_ros.units import NS_PER_S
 # Colour images of 7-Scenes are not registered, and its authors give no intrinsics for them. These
 # values make the edges of colour and depth agree best (measured for this project on RedKitchen).
 _SEVEN_SCENES_COLOR = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
-_SEVEN_SCENES_DEPTH = DepthCamera(585.0, 585.0, 320.0, 240.0,
-                                  make_transform(np.eye(3), np.array([-0.025, 0.0, 0.0])))
+_SEVEN_SCENES_DEPTH = DepthCamera(
+    585.0, 585.0, 320.0, 240.0,
+    transforms.make_transform(np.eye(3), np.array([-0.025, 0.0, 0.0])))
 _SEVEN_SCENES_NAME = re.compile(r'frame-(\d+)\.color\.(?:jpe?g|png)')
 _SEVEN_SCENES_HZ = 30
 _MAX_DEPTH_DELAY_NS = 20_000_000
@@ -106,11 +96,12 @@ def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Ca
             one.number is not None for one in capture.files):
         raise DatasetError(f'{folder}: {layout.name} with {len(cameras)} cameras: a recording '
                            'needs image files of one camera, and poses in metres')
-    files = place_images(capture.files, capture.axes, map_from_stored=UP[capture.up or 'z'])
+    files = placing.place_images(capture.files, capture.axes,
+                                 map_from_stored=placing.UP[capture.up or 'z'])
     posed = {one.stamp_ns: one.pose for one in files if one.pose is not None}
     trajectory = TimedPoses.from_samples(
-        list(posed), [[*pose[:3, 3], *quaternion_from_transform(pose)] for pose in posed.values()],
-        str(folder))
+        list(posed), [[*pose[:3, 3], *transforms.quaternion_from_transform(pose)]
+                      for pose in posed.values()], str(folder))
     return (TumSequence(folder, tuple(one.stamp_ns for one in files),
                         tuple(one.color for one in files), trajectory), cameras.pop(),
             intrinsics or f'those of {layout.name}')
@@ -129,25 +120,25 @@ def find_layout(folder: Path, key: str = '') -> Layout | None:
 
 def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptions) -> Frames:
     """Return the frames of a capture, in the map's coordinate frame."""
-    axes, scale, turn = options.axes or capture.axes, options.scale, UP[capture.up or 'z']
-    files = place_images(capture.files, axes)
+    axes, scale, turn = options.axes or capture.axes, options.scale, placing.UP[capture.up or 'z']
+    files = placing.place_images(capture.files, axes)
     notes = [f'read as {layout.name}: {sum(one.pose is not None for one in files)} of '
              f'{max(len(files), capture.images)} images have poses', *capture.notes,
-             check_axes(capture.files, axes, folder)]
+             placing.check_axes(capture.files, axes, folder)]
     if options.known_distance is not None:
-        scale = find_scale(files, *options.known_distance, folder)
+        scale = placing.find_scale(files, *options.known_distance, folder)
         notes.append(f'a unit is {scale:.5g} m, by the known distance')
     if scale is None and not capture.is_metric and not options.any_unit:
         raise DatasetError(f'{folder}: {layout.name} does not know its unit: give the `scale` '
                            'of a unit (1 where they are metres), a `known_distance` or an '
                            '`object_size`')
-    files = place_images(capture.files, axes, scale or 1.0, turn)
+    files = placing.place_images(capture.files, axes, scale or 1.0, turn)
     poses = np.array([one.pose for one in files if one.pose is not None]).reshape(-1, 4, 4)
     if options.level:
         found = find_tilt(poses)
         if found is None:
             raise DatasetError(f'{folder}: {NO_VERTICAL}')
-        files = place_images(capture.files, axes, scale or 1.0, found[0] @ turn)
+        files = placing.place_images(capture.files, axes, scale or 1.0, found[0] @ turn)
         notes.append(f'levelled: the vertical of the cameras was {found[1]:.1f} degrees off z')
     elif not capture.up:
         notes.append(tilt_note(poses))
@@ -221,7 +212,7 @@ def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
     form = DepthFormat(options.depth.unit_m or MILLIMETRE,
                        options.depth.camera or _SEVEN_SCENES_DEPTH)
     assert form.camera is not None
-    depth_from_color = invert_transform(form.camera.color_from_depth)
+    depth_from_color = transforms.invert_transform(form.camera.color_from_depth)
     for number, path in sorted(images.items()):
         stem = path.name.partition('.')[0]
         depth, pose = folder / f'{stem}.depth.png', folder / f'{stem}.pose.txt'
@@ -242,7 +233,7 @@ def _read_pose(path: Path) -> NDArray[np.float64] | None:
         raise DatasetError(f'{path}: is no 4x4 matrix, its shape is {pose.shape}')
     if not np.isfinite(pose).all():
         return None
-    if not is_rigid(pose, tolerance=1e-3):
+    if not transforms.is_rigid(pose, tolerance=1e-3):
         raise DatasetError(f'{path}: is no rigid transform (rotation and translation [m])')
     return pose
 

@@ -9,13 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.parsing import (
-    parse_all,
-    parse_stamp_ns,
-    read_cells,
-    read_lines,
-    unit_quaternion,
-)
+from cliploc_ros.offline.datasets import parsing
 from cliploc_ros.offline.datasets.poses import TimedPoses
 
 # Files of the dataset round their quaternions to four decimals.
@@ -94,13 +88,13 @@ def read_stamped(path: Path, names: str) -> tuple[list[int], list[list[float]]]:
     four of seven, that is far from unit norm; the message names file and line.
     """
     stamps_ns, rows = [], []
-    for where, (stamp, *cells) in read_cells(path, f'timestamp {names}'):
-        stamps_ns.append(parse_stamp_ns(stamp, where))
-        rows.append(parse_all(cells, float, where))
+    for where, (stamp, *cells) in parsing.read_cells(path, f'timestamp {names}'):
+        stamps_ns.append(parsing.parse_stamp_ns(stamp, where))
+        rows.append(parsing.parse_all(cells, float, where))
         if not np.all(np.isfinite(rows[-1])):
             raise DatasetError(f'{where}: {" ".join(cells)!r} is not finite')
         if len(cells) == 7:
-            unit_quaternion(rows[-1][3:], where, _MAX_NORM_ERROR)
+            parsing.unit_quaternion(rows[-1][3:], where, _MAX_NORM_ERROR)
     return stamps_ns, rows
 
 
@@ -113,12 +107,12 @@ def read_image_list(path: Path) -> tuple[tuple[int, ...], tuple[Path, ...]]:
         raise DatasetError(f'{path}: no such file; a TUM folder lists its images in rgb.txt')
     stamps_ns: list[int] = []
     image_paths: list[Path] = []
-    for where, line in read_lines(path):
+    for where, line in parsing.read_lines(path):
         stamp, *name = line.split(maxsplit=1)
         if not name:
             raise DatasetError(f'{where}: expected timestamp and file name, got {line!r}')
         image_path = path.parent / name[0]
-        stamps_ns.append(parse_stamp_ns(stamp, where))
+        stamps_ns.append(parsing.parse_stamp_ns(stamp, where))
         if stamps_ns[:-1] and stamps_ns[-1] <= stamps_ns[-2]:
             raise DatasetError(f'{where}: timestamp {stamp} does not exceed the one before')
         if not image_path.is_file():

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core import localizer
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.camera import Camera
@@ -24,12 +25,6 @@ from cliploc_ros.core.geometry.depth import (
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.keyframes.features import Features
 from cliploc_ros.core.keyframes.localization import ImageRecognizer, KeyframeLocalizer
-from cliploc_ros.core.localizer import (
-    by_classes,
-    can_do_without_crops,
-    localize_on_demand,
-    recorded_crops,
-)
 from cliploc_ros.core.map.joined_map import place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
@@ -162,7 +157,8 @@ def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Se
     """
     seed = method.options.random_seed + trial
     relocalizer = Relocalizer(landmark_map, replace(method.options, random_seed=seed))
-    on_demand = method.options.crops == 'on_demand' and can_do_without_crops(method.options)
+    on_demand = (method.options.crops == 'on_demand'
+                 and localizer.can_do_without_crops(method.options))
     results = []
     for query in queries:
         recognizer, spent_ms = None, 0.0
@@ -191,10 +187,11 @@ def _localize_on_demand(relocalizer: Relocalizer, observations: Sequence[Observa
     count = len(relocalizer.landmark_map)
     for observation in observations:
         if observation.camera_name and observation is not observations[-1]:
-            frames.append(relocalizer.search(by_classes(observation, count)))
+            frames.append(relocalizer.search(localizer.by_classes(observation, count)))
             continue
-        frame, found = localize_on_demand(
-            relocalizer, frames, observation, recorded_crops(observation, relocalizer.options),
+        frame, found = localizer.localize_on_demand(
+            relocalizer, frames, observation,
+            localizer.recorded_crops(observation, relocalizer.options),
             recognizer=recognizer if observation is observations[-1] else None)
         frames.append(frame)
     crops = sum(len(one.observation.detections) for one in frames)

@@ -14,21 +14,9 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.captures.capture import (
-    IMAGES,
-    Capture,
-    FolderOptions,
-    arrange,
-)
+from cliploc_ros.offline.datasets import parsing
+from cliploc_ros.offline.datasets.captures import capture
 from cliploc_ros.offline.datasets.frames import NO_STAMP, ImageFile
-from cliploc_ros.offline.datasets.parsing import (
-    camera_of,
-    naming,
-    parse_all,
-    pose_of,
-    read_cells,
-    read_text,
-)
 
 _PLACES = ('.', 'sparse', 'sparse/0', 'sparse/1', 'colmap/sparse/0', 'model', 'colmap')
 _MOST_NAME = 4096
@@ -73,7 +61,7 @@ class _Posed(NamedTuple):
     pose: NDArray[np.float64] | None  #: (4, 4): map_from_camera
 
 
-def read_colmap(folder: Path, options: FolderOptions) -> Capture:
+def read_colmap(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     """Return the images of a model, or of the largest one of a project.
 
     The folder is that of the model (cameras and images, .bin or .txt), or of the project around
@@ -100,12 +88,12 @@ def read_colmap(folder: Path, options: FolderOptions) -> Capture:
             raise DatasetError(f'{model}: image {one.name} is of camera {one.camera_id}, which '
                                'the model does not have')
         files.append(ImageFile(NO_STAMP, root / one.name, cameras[one.camera_id], one.pose))
-    arranged = arrange(files, model)
+    arranged = capture.arrange(files, model)
     if len(arranged) < len(files):
         notes.append(f'{len(files) - len(arranged)} of {len(files)} images of the model are not '
                      f'in {root}')
-    there = sum(one.suffix.lower() in IMAGES for one in root.rglob('*'))
-    return Capture(arranged, is_metric=False, notes=tuple(notes), images=there)
+    there = sum(one.suffix.lower() in capture.IMAGES for one in root.rglob('*'))
+    return capture.Capture(arranged, is_metric=False, notes=tuple(notes), images=there)
 
 
 def models_of(folder: Path) -> list[Path]:
@@ -125,11 +113,11 @@ def _cameras(model: Path) -> Iterator[tuple[int, Camera]]:
     """Yield the cameras of a model by their ids."""
     binary = model / 'cameras.bin'
     if not _has(model, 'bin'):
-        lines = read_cells(model / 'cameras.txt', 'CAMERA_ID MODEL WIDTH HEIGHT ...')
+        lines = parsing.read_cells(model / 'cameras.txt', 'CAMERA_ID MODEL WIDTH HEIGHT ...')
         for where, (camera_id, name, *cells) in lines:
-            number, width, height = parse_all([camera_id, *cells[:2]], int, where)
+            number, width, height = parsing.parse_all([camera_id, *cells[:2]], int, where)
             yield number, _camera(where, _BY_NAME.get(name, -1), name, (width, height),
-                                  parse_all(cells[2:], float, where))
+                                  parsing.parse_all(cells[2:], float, where))
         return
     with _Bytes(binary) as data:
         for place in range(data.count(24)):
@@ -151,8 +139,8 @@ def _camera(where: str, number: int, name: str, size: tuple[int, int], values: S
     fx, fy, (cx, cy) = values[0], values[model.focals - 1], values[model.focals:model.focals + 2]
     distortion = np.zeros(_LENGTHS[model.distortion])
     distortion[list(model.places)] = values[model.focals + 2:]
-    return camera_of(where, *size, fx, fy, cx - 0.5, cy - 0.5, model.distortion,
-                     tuple(distortion.tolist()))
+    return parsing.camera_of(where, *size, fx, fy, cx - 0.5, cy - 0.5, model.distortion,
+                             tuple(distortion.tolist()))
 
 
 def _images(model: Path) -> Iterator[_Posed]:
@@ -171,7 +159,7 @@ def _images(model: Path) -> Iterator[_Posed]:
 
 def _text_images(path: Path) -> Iterator[_Posed]:
     """Yield the images of a text file: two lines each, the second one may be empty."""
-    lines = [line for line in read_text(path).split('\n') if not line.startswith('#')]
+    lines = [line for line in parsing.read_text(path).split('\n') if not line.startswith('#')]
     for number, line in enumerate(lines[::2]):
         cells = line.strip().split(maxsplit=9)
         where = f'{path}: image {number}'
@@ -180,13 +168,13 @@ def _text_images(path: Path) -> Iterator[_Posed]:
         if len(cells) != 10:
             raise DatasetError(f'{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, '
                                f'got {line[:60]!r}')
-        yield _posed(cells[9], parse_all(cells[8:9], int, where)[0],
-                     parse_all(cells[1:8], float, where), where)
+        yield _posed(cells[9], parsing.parse_all(cells[8:9], int, where)[0],
+                     parsing.parse_all(cells[1:8], float, where), where)
 
 
 def _posed(name: str, camera_id: int, numbers: Sequence[float], where: str) -> _Posed:
     w, x, y, z, *position = numbers
-    camera_from_map = pose_of(position, (x, y, z, w), where)
+    camera_from_map = parsing.pose_of(position, (x, y, z, w), where)
     return _Posed(name, camera_id,
                   None if camera_from_map is None else invert_transform(camera_from_map))
 
@@ -197,7 +185,8 @@ class _Bytes:
     def __init__(self, path: Path) -> None:
         self._path, self._place = path, 0
         # ValueError: it is empty
-        with naming(path, OSError, ValueError, what='cannot be read: '), path.open('rb') as file:
+        with (parsing.naming(path, OSError, ValueError, what='cannot be read: '),
+              path.open('rb') as file):
             self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
     def __enter__(self) -> '_Bytes':

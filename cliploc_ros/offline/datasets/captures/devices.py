@@ -20,24 +20,9 @@ from cliploc_ros.core.depth_image import MILLIMETRE
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.captures.capture import (
-    IMAGES,
-    Capture,
-    FolderOptions,
-    arrange,
-    beside,
-    first_image,
-    size_of_image,
-)
+from cliploc_ros.offline.datasets import parsing
+from cliploc_ros.offline.datasets.captures import capture
 from cliploc_ros.offline.datasets.frames import NO_STAMP, DepthFormat, ImageFile
-from cliploc_ros.offline.datasets.parsing import (
-    Fields,
-    camera_of,
-    parse_all,
-    pose_of,
-    read_cells,
-    read_numbers,
-)
 from cliploc_ros.offline.datasets.poses import TimedPoses
 from cliploc_ros.units import NS_PER_S
 
@@ -50,18 +35,18 @@ _ROUNDING_S = 0.001
 _MAX_GAP_NS = 200_000_000
 
 
-def read_polycam(folder: Path, options: FolderOptions) -> Capture:
+def read_polycam(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     """Return the keyframes of Polycam's raw data, the optimized ones where there are any."""
     root, kind = folder / 'keyframes', 'corrected_'
     if not ((root / 'corrected_images').is_dir() and (root / 'corrected_cameras').is_dir()):
         kind = ''
     files = []
     for path in sorted((root / f'{kind}cameras').glob('*.json')):
-        fields = Fields.of_file(path)
+        fields = parsing.Fields.of_file(path)
         pose = np.eye(4)
         pose[:3] = [[fields.number(f't_{row}{column}') for column in range(4)]
                     for row in range(3)]
-        camera = camera_of(str(path), *fields.size('width', 'height'), *(
+        camera = parsing.camera_of(str(path), *fields.size('width', 'height'), *(
             fields.number(name) for name in ('fx', 'fy', 'cx', 'cy')))
         is_stamp = path.stem.isdecimal() and len(path.stem) < 20
         files.append(_with_depth(
@@ -69,21 +54,22 @@ def read_polycam(folder: Path, options: FolderOptions) -> Capture:
                       root / f'{kind}images' / f'{path.stem}.jpg', camera, pose),
             root / 'depth', root / 'confidence', path.stem))
     notes = () if kind else ('its poses are not optimized: they drift as ARKit does',)
-    return Capture(arrange(files, root), 'opengl', _IN_MILLIMETRES, 'y', notes=notes)
+    return capture.Capture(capture.arrange(files, root), 'opengl', _IN_MILLIMETRES, 'y',
+                           notes=notes)
 
 
 def _with_depth(image: ImageFile, depths: Path, confidences: Path, stem: str) -> ImageFile:
     """Return an image with the depth image of its name, where there is one."""
-    depth = beside(depths / f'{stem}.png')
+    depth = capture.beside(depths / f'{stem}.png')
     return image._replace(depth=depth,
-                          confidence=depth and beside(confidences / f'{stem}.png'))
+                          confidence=depth and capture.beside(confidences / f'{stem}.png'))
 
 
-def read_record3d(folder: Path, options: FolderOptions) -> Capture:
+def read_record3d(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     """Return the images of Record3D. Its depth is compressed in a way that is not read here."""
     path = metadata_of_record3d(folder)
     assert path is not None
-    meta = Fields.of_file(path)
+    meta = parsing.Fields.of_file(path)
     size = meta.size('w', 'h')
     matrix = meta.numbers('K', (-1,), [])
     rows = meta.numbers('poses', (-1, 7))
@@ -100,51 +86,53 @@ def read_record3d(folder: Path, options: FolderOptions) -> Capture:
         where = f'{path}: frame {place}'
         files.append(ImageFile(
             _stamp_ns(times[place]) if place < len(times) else NO_STAMP,
-            first_image(images, str(place)) or images / f'{place}.jpg',
-            camera_of(where, *size, *intrinsics.tolist()), pose_of(pose[4:], pose[:4], where)))
-    return Capture(arrange(files, path), 'opengl', up='y', notes=(
+            capture.first_image(images, str(place)) or images / f'{place}.jpg',
+            parsing.camera_of(where, *size, *intrinsics.tolist()),
+            parsing.pose_of(pose[4:], pose[:4], where)))
+    return capture.Capture(capture.arrange(files, path), 'opengl', up='y', notes=(
         'the depth of Record3D is not read: it is compressed by LZFSE or EXR',))
 
 
 def metadata_of_record3d(folder: Path) -> Path | None:
     """Return the file of an unpacked .r3d file, or of an export of Record3D; None without one."""
-    is_there = any((folder / name).is_dir() for name in ('rgbd', 'rgb'))
-    return (beside(folder / 'metadata') or beside(folder / 'metadata.json')) if is_there else None
+    if not any((folder / name).is_dir() for name in ('rgbd', 'rgb')):
+        return None
+    return capture.beside(folder / 'metadata') or capture.beside(folder / 'metadata.json')
 
 
-def read_stray(folder: Path, options: FolderOptions) -> Capture:
+def read_stray(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     """Return the images of Stray Scanner: of its video, or of rgb/, where they were unpacked to.
 
     Its quaternions are of OpenCV's camera axes.
     """
     path, lens = folder / 'odometry.csv', folder / 'camera_matrix.csv'
-    table = read_cells(path, 'timestamp frame x y z qx qy qz qw ...')
-    matrix = read_numbers(lens, 'fx 0 cx ...')
+    table = parsing.read_cells(path, 'timestamp frame x y z qx qy qz qw ...')
+    matrix = parsing.read_numbers(lens, 'fx 0 cx ...')
     if len(matrix) != 3:
         raise DatasetError(f'{lens} has {len(matrix)} rows, expected 3')
-    video = beside(folder / 'rgb.mp4')
-    camera = camera_of(str(lens), *_size_of(folder, video), matrix[0][0], matrix[1][1],
-                       matrix[0][2], matrix[1][2])
+    video = capture.beside(folder / 'rgb.mp4')
+    camera = parsing.camera_of(str(lens), *_size_of(folder, video), matrix[0][0], matrix[1][1],
+                               matrix[0][2], matrix[1][2])
     files = []
     for place, (where, cells) in enumerate(islice(table, 1, None)):
-        time_s, frame, *numbers = parse_all(cells, float, where)
+        time_s, frame, *numbers = parsing.parse_all(cells, float, where)
         stem = f'{frame:06.0f}'
-        image = first_image(folder / 'rgb', stem)
+        image = capture.first_image(folder / 'rgb', stem)
         files.append(_with_depth(
             ImageFile(_stamp_ns(time_s), image or video or folder / 'rgb' / f'{stem}.jpg', camera,
-                      pose_of(numbers[:3], numbers[3:7], where),
+                      parsing.pose_of(numbers[:3], numbers[3:7], where),
                       number=place if image is None and video is not None else None),
             folder / 'depth', folder / 'confidence', stem))
-    return Capture(arrange(files, path), 'opencv', _IN_MILLIMETRES, 'y')
+    return capture.Capture(capture.arrange(files, path), 'opencv', _IN_MILLIMETRES, 'y')
 
 
 def _size_of(folder: Path, video: Path | None) -> tuple[int, int]:
     """Return width and height of the images of Stray Scanner, which no file tells."""
     first = next((one for one in sorted((folder / 'rgb').glob('*.*'))
-                  if one.suffix in IMAGES), None)
+                  if one.suffix in capture.IMAGES), None)
     size = None
     if first is not None:
-        size = size_of_image(first)
+        size = capture.size_of_image(first)
     elif video is not None and (image := cv2.VideoCapture(str(video)).read()[1]) is not None:
         size = image.shape[1], image.shape[0]
     if size is None:
@@ -152,11 +140,11 @@ def _size_of(folder: Path, video: Path | None) -> tuple[int, int]:
     return size
 
 
-def read_arkitscenes(folder: Path, options: FolderOptions) -> Capture:
+def read_arkitscenes(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     """Return a scan of ARKitScenes: camera_from_map of OpenCV's axes as axis and angle, z up."""
     path = folder / 'lowres_wide.traj'
-    rows = np.array([row[:7] for row in read_numbers(path, 'timestamp rx ry rz tx ty tz ...')]
-                    ).reshape(-1, 7)
+    lines = parsing.read_numbers(path, 'timestamp rx ry rz tx ty tz ...')
+    rows = np.array([line[:7] for line in lines]).reshape(-1, 7)
     if not np.isfinite(rows).all():
         raise DatasetError(f'{path}: has numbers that are not finite')
     poses = [invert_transform(make_transform(Rotation.from_rotvec(row[1:4]).as_matrix(), row[4:]))
@@ -177,46 +165,46 @@ def read_arkitscenes(folder: Path, options: FolderOptions) -> Capture:
         if stamp != NO_STAMP and camera is not None:
             files.append(_with_depth(ImageFile(stamp, color, camera, known.pose_at(stamp)),
                                      folder / 'lowres_depth', folder / 'confidence', color.stem))
-    return Capture(arrange(files, folder), 'opencv', _IN_MILLIMETRES, 'z')
+    return capture.Capture(capture.arrange(files, folder), 'opencv', _IN_MILLIMETRES, 'z')
 
 
 def _pincam(folder: Path, scan: str, time_s: float) -> Camera | None:
     """Return the camera of an image; None without its file, whose time may be rounded."""
     for shift_s in (0.0, -_ROUNDING_S, _ROUNDING_S):
-        path = beside(folder / f'{scan}_{time_s + shift_s:.3f}.pincam')
+        path = capture.beside(folder / f'{scan}_{time_s + shift_s:.3f}.pincam')
         if path is not None:
-            rows = read_numbers(path, 'width height fx fy cx cy ...')
+            rows = parsing.read_numbers(path, 'width height fx fy cx cy ...')
             if not rows or not np.isfinite(rows[0]).all():
                 raise DatasetError(f'{path}: expected width height fx fy cx cy')
             width, height, *intrinsics = rows[0][:6]
-            return camera_of(str(path), round(width), round(height), *intrinsics)
+            return parsing.camera_of(str(path), round(width), round(height), *intrinsics)
     return None
 
 
-def read_hololens(folder: Path, options: FolderOptions) -> Capture:
+def read_hololens(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     """Return the images of the photo-video camera, unpacked and converted to PNG by the sample.
 
     Its long-throw depth needs a table of rays and is not read here.
     """
     path = min(folder.glob('*_pv.txt'))
     images = folder / ('PV' if (folder / 'PV').is_dir() else 'rgb')
-    lines = list(read_cells(path, 'cx cy width height ...'))
-    header = parse_all(lines[0][1], float, lines[0][0]) if lines else []
+    lines = list(parsing.read_cells(path, 'cx cy width height ...'))
+    header = parsing.parse_all(lines[0][1], float, lines[0][0]) if lines else []
     if len(lines) < 2 or not np.isfinite(header).all():
         raise DatasetError(f'{path}: expected cx,cy,width,height and a row for each image')
     cx, cy, width, height = header[:4]
     files = []
     for where, (time, *cells) in lines[1:]:
-        row = parse_all(cells, float, where)
+        row = parsing.parse_all(cells, float, where)
         # a float does not hold the 18 digits of the time, which names the image
         if len(row) < 18 or not (time.isdecimal() and len(time) < 20):
             raise DatasetError(f'{where}: expected time, fx, fy and the 16 numbers of the pose')
         pose = np.array(row[2:18]).reshape(4, 4)
         files.append(ImageFile(
             _TICK_NS * (int(time) - _TICKS_TO_1970), images / f'{time}.png',
-            camera_of(where, round(width), round(height), row[0], row[1], cx, cy),
+            parsing.camera_of(where, round(width), round(height), row[0], row[1], cx, cy),
             pose if pose.any() else None))
-    return Capture(arrange(files, path), 'opengl', up='y', notes=(
+    return capture.Capture(capture.arrange(files, path), 'opengl', up='y', notes=(
         'the depth of the HoloLens is not read: it needs its table of rays',))
 
 
@@ -233,7 +221,7 @@ _INTRINSICS = ('w', 'h', 'fl_x', 'fl_y', 'cx', 'cy', 'camera_angle_x', 'k1', 'k2
 _ENDINGS = ('.png', '.jpg', '.jpeg', '.JPG', '.PNG')
 
 
-def read_nerf(folder: Path, options: FolderOptions) -> Capture:
+def read_nerf(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     """Return the images that a transforms.json lists; the folder may be this file.
 
     It is of nerfstudio, Instant-NGP or the original NeRF.
@@ -241,7 +229,7 @@ def read_nerf(folder: Path, options: FolderOptions) -> Capture:
     DatasetError: a field cannot be used; names it.
     """
     path = folder if folder.name.endswith('.json') else folder / TRANSFORMS
-    meta = Fields.of_file(path)
+    meta = parsing.Fields.of_file(path)
     frames = meta.entries('frames') if 'frames' in meta else []
     if not frames:
         raise DatasetError(f'{path}: lists no frames')
@@ -251,14 +239,13 @@ def read_nerf(folder: Path, options: FolderOptions) -> Capture:
     files, cameras, images = [], dict[str, Camera](), options.images
     for place, values in enumerate(frames):
         # a frame's own values come before those of all
-        frame = Fields(values, f'{path}: frame {place}')
-        both = Fields({**{name: value for name, value in meta.values.items() if name != 'frames'},
-                       **frame.values}, frame.where)
+        frame = parsing.Fields(values, f'{path}: frame {place}')
+        both = parsing.Fields({**meta.values, 'frames': None, **frame.values}, frame.where)
         name = frame.text('file_path')
         color = path.parent / name if images is None else images / PurePosixPath(name).name
         # the original NeRF leaves the ending of an image away
-        color = next((found for end in ('', *_ENDINGS)
-                      if (found := beside(color.with_name(color.name + end))) is not None), color)
+        endings = [color.with_name(color.name + end) for end in ('', *_ENDINGS)]
+        color = next(filter(None, map(capture.beside, endings)), color)
         shown = repr([both.values.get(name) for name in _INTRINSICS])
         if shown not in cameras:
             cameras[shown] = _camera(both, color)
@@ -269,20 +256,20 @@ def read_nerf(folder: Path, options: FolderOptions) -> Capture:
         full[:3, 3] /= scale
         depth = frame.text('depth_file_path', '')
         files.append(ImageFile(NO_STAMP, color, cameras[shown], full,
-                               beside(path.parent / depth) if depth else None))
-    arranged = arrange(files, path)
+                               capture.beside(path.parent / depth) if depth else None))
+    arranged = capture.arrange(files, path)
     # depth is in metres, and so are the poses that it goes with
-    return Capture(arranged, 'opengl', is_metric=all(one.depth for one in arranged))
+    return capture.Capture(arranged, 'opengl', is_metric=all(one.depth for one in arranged))
 
 
-def _camera(values: Fields, image: Path) -> Camera:
+def _camera(values: parsing.Fields, image: Path) -> Camera:
     """Return the camera of a frame. Pixels are counted from the corner of the first one."""
     where = values.where
     model = values.text('camera_model', 'OPENCV')
     if 'w' in values and 'h' in values:
         width, height = values.size('w', 'h')
     else:
-        size = size_of_image(image)
+        size = capture.size_of_image(image)
         if size is None:
             raise DatasetError(f'{where}: fields w and h are missing, and {image} cannot be read')
         width, height = size
@@ -297,9 +284,10 @@ def _camera(values: Fields, image: Path) -> Camera:
     k1, k2, k3, k4, p1, p2 = (values.number(name, 0.0)
                               for name in ('k1', 'k2', 'k3', 'k4', 'p1', 'p2'))
     if model in _FISHEYE or values.values.get('is_fisheye') is True:
-        return camera_of(where, width, height, fx, fy, cx, cy, 'equidistant',
-                         (k1, k2, k3, k4))
+        return parsing.camera_of(where, width, height, fx, fy, cx, cy, 'equidistant',
+                                 (k1, k2, k3, k4))
     if model not in _PERSPECTIVE or k4:
         raise DatasetError(f'{where}: camera_model {model} ' + ('with k4 ' if k4 else '')
                            + 'is not known here; undistort the images to PINHOLE')
-    return camera_of(where, width, height, fx, fy, cx, cy, 'plumb_bob', (k1, k2, p1, p2, k3))
+    return parsing.camera_of(where, width, height, fx, fy, cx, cy, 'plumb_bob',
+                             (k1, k2, p1, p2, k3))
