@@ -94,58 +94,32 @@ def printable(text: str) -> str:
     return ''.join(char if char.isprintable() else ' ' for char in text)
 
 
-def positive_int(text: str) -> int:
-    """Return a whole number above 0, for argparse."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f'{text} is not 1 or more')
-    return value
+def _number[Number: (int, float)](kind: type[Number], is_valid: Callable[[Number], bool],
+                                  expected: str) -> Callable[[str], Number]:
+    """Return a type for argparse: numbers that meet a condition, which is said in words."""
+    def number(text: str) -> Number:
+        value = kind(text)
+        if not is_valid(value):
+            raise argparse.ArgumentTypeError(f'{text} is not {expected}')
+        return value
+    return number
 
 
-def positive(text: str) -> float:
-    """Return a finite number above 0, for argparse."""
-    value = float(text)
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f'{text} is not a number above 0')
-    return value
-
-
-def not_negative(text: str) -> float:
-    """Return a finite number of 0 or more, for argparse."""
-    value = float(text)
-    if not 0.0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f'{text} is not a number of 0 or more')
-    return value
-
-
-def finite(text: str) -> float:
-    """Return a number that is not infinite, for argparse."""
-    value = float(text)
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f'{text} is not a finite number')
-    return value
-
-
-def limit(text: str) -> float:
-    """Return a number, which may be infinite, for argparse."""
-    value = float(text)
-    if math.isnan(value):
-        raise argparse.ArgumentTypeError(f'{text} is not a number')
-    return value
-
-
+# Types for argparse.
+positive_int = _number(int, lambda value: value >= 1, '1 or more')
+positive = _number(float, lambda value: 0.0 < value < math.inf, 'a number above 0')
+not_negative = _number(float, lambda value: 0.0 <= value < math.inf, 'a number of 0 or more')
+finite = _number(float, math.isfinite, 'a finite number')
+#: May be infinite.
+limit = _number(float, lambda value: not math.isnan(value), 'a number')
 #: Seeds that NumPy takes, for argparse.
 SEEDS = 0, 2**63 - 1
 
 
 def within[Number: (int, float)](low: Number, high: Number) -> Callable[[str], Number]:
     """Return a type for argparse: numbers of the limits' type, from low to high."""
-    def number(text: str) -> Number:
-        value = type(low)(text)
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f'{text} is not within {low:g} and {high:g}')
-        return value
-    return number
+    return _number(type(low), lambda value: low <= value <= high,
+                   f'within {low:g} and {high:g}')
 
 
 @contextmanager

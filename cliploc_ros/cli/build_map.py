@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cliploc_ros import command
-from cliploc_ros.cli import check_map, map_layer, sources
-from cliploc_ros.cli.options import add_source_options
+from cliploc_ros.cli import check_map, map_layer
+from cliploc_ros.cli.options import add_source_options, folder_of
 from cliploc_ros.errors import CliplocError, MappingError, OptionsError
 
 if TYPE_CHECKING:
@@ -104,6 +104,7 @@ def make_parser() -> argparse.ArgumentParser:
 def build(options: argparse.Namespace) -> int:
     """Build as the command line asks; return the exit code."""
     # Late, so that --help is fast.
+    from cliploc_ros.cli import sources
     from cliploc_ros.core.keyframes.layer import remove_layer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.core.map.map_file import write_map
@@ -124,10 +125,9 @@ def build(options: argparse.Namespace) -> int:
         min_baseline_deg=options.min_baseline, frame_id=options.frame_id,
         source=f'build_map {name}', random_seed=options.seed)
     source = sources.read_source(options)
-    recorded = source.recorded
-    detections, scale, rotation = _placed(recorded.detections, options, mapping)
-    if recorded.without_pose:
-        print(f'no pose: {recorded.without_pose} of {recorded.images} images', flush=True)
+    detections, scale, rotation = _placed(source.recorded.detections, options, mapping)
+    if without := source.recorded.without_pose:
+        print(f'no pose: {without} of {source.recorded.images} images', flush=True)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
     clip = partial(sources.clip_options, options) if options.clip else None
@@ -222,11 +222,12 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
     """Return detections in the map, and the scale and rotation (3, 3) that moved them there."""
     import numpy as np
 
+    from cliploc_ros.cli.sources import metres_of
     from cliploc_ros.offline.make_map import scale_of_objects
     from cliploc_ros.offline.mapping.tilt import NO_VERTICAL, find_tilt, tilt_note
 
     scale, rotation = 1.0, np.eye(3)
-    if sources.folder_of(options) is None:  # whoever reads a folder levels it
+    if folder_of(options) is None:  # whoever reads a folder levels it
         found, note = find_tilt(detections.map_from_camera), tilt_note(detections.map_from_camera)
         if options.level:
             if found is None:
@@ -237,7 +238,7 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
         detections = detections.moved(scale, rotation)
     if options.object_size is not None:
         class_name = options.object_size[0]
-        metres = sources.metres_of(options.object_size[1], '--object-size')
+        metres = metres_of(options.object_size[1], '--object-size')
         scale, objects = scale_of_objects(detections, mapping, class_name, metres)
         print(f'a unit is {scale:.5g} m, by {objects} objects of class {class_name}', flush=True)
         detections = detections.moved(scale, np.eye(3))
@@ -261,9 +262,10 @@ def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':
 def _mount_option(options: argparse.Namespace, correction: 'NDArray[np.float64]') -> str:
     """Return the corrected mount as the option --mount takes it."""
     from cliploc_ros.core.geometry.transforms import quaternion_from_transform
+    from cliploc_ros.offline.datasets.poses import mount_from_numbers
 
-    mount = sources.mount_of(options.mount)
-    given = correction if mount is None else mount @ correction
+    given = (correction if options.mount is None
+             else mount_from_numbers(options.mount) @ correction)
     numbers = [*given[:3, 3], *quaternion_from_transform(given)]
     return 'corrected mount: --mount ' + ' '.join(f'{number:.5f}' for number in numbers)
 

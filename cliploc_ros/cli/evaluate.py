@@ -11,9 +11,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cliploc_ros.cli import sources
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
-from cliploc_ros.cli.options import add_folders, add_network_options, add_reading_options
+from cliploc_ros.cli.options import (
+    add_folders,
+    add_network_options,
+    add_reading_options,
+    check_folder_options,
+    folder_of,
+)
 from cliploc_ros.command import SEEDS, limit, not_negative, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
@@ -152,12 +157,14 @@ def evaluate(options: argparse.Namespace) -> int:
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):
         raise OptionsError('--cameras is for --bag, without --fuse and --save-queries')
-    sources.check_folder_options(options)
-    if options.level and sources.folder_of(options) is None:
+    check_folder_options(options)
+    if options.level and folder_of(options) is None:
         raise OptionsError('--level is for folders of images only')
     of_case = options.bag is not None and options.bag.suffix == '.npz'
     if options.queries is None and not of_case:
-        sources.find_topics(options, options.bag)
+        from cliploc_ros.cli.sources import find_topics
+
+        find_topics(options, options.bag)
     landmark_map = join_maps([LandmarkMap.from_file(file) for file in options.map],
                              [str(file) for file in options.map])
     if of_case:
@@ -221,11 +228,12 @@ def _notes_on_detector(queries: 'Sequence[PosedQuery]', landmark_map: 'LandmarkM
 
 def _notes_on_maps(options: argparse.Namespace) -> list[str]:
     """Return a note on each map that was built from the images it is evaluated on."""
+    from cliploc_ros.cli.sources import source_of
     from cliploc_ros.offline.datasets.map_recording import load_recording
 
     if options.queries is not None:
         return []
-    images = sources.source_of(options).resolve()
+    images = source_of(options).resolve()
     return [f'note: {file} was built from these images ({images}): expect less on others'
             for file in options.map
             if (recording := load_recording(file)) is not None
@@ -273,6 +281,7 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
 
 def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
     """Answer a recorded request again; return 0 if the verdict is the same, else 1."""
+    from cliploc_ros.cli.sources import clip_options
     from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
     from cliploc_ros.core.localizer import Localizer, repeat
     from cliploc_ros.core.query import read_case
@@ -283,7 +292,7 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
     case, observer = read_case(options.bag), None
     if case.options.needs_similarities:
         observer = Observer(*load_encoder_for_map(
-            sources.clip_options(options), landmark_map, [str(file) for file in options.map],
+            clip_options(options), landmark_map, [str(file) for file in options.map],
             options.landmark_embeddings))
     wanted = options.keyframes
     if wanted is None and not case.report.get('parameters', {}).get('keyframes_file', True):
@@ -310,8 +319,10 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
         if options.save_queries is not None:
             raise OptionsError('--save-queries needs --bag or a folder')
         return load_queries(options.queries, landmark_map.landmark_ids)
+    from cliploc_ros.cli.sources import recording_options
+
     print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
-    recording = sources.recording_options(options, EVERY_FRAME, options.every, camera)
+    recording = recording_options(options, EVERY_FRAME, options.every, camera)
     queries = recorded_queries(frames, landmark_map, recording, list(map(str, options.map)),
                                options.landmark_embeddings)
     if without := frames.count - len(queries):
@@ -325,13 +336,14 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
 
 def _read_images(options: argparse.Namespace) -> 'dict[str, Frames]':
     """Return the images of each camera with the true poses; of a folder, every n-th."""
+    from cliploc_ros.cli.sources import read_cameras
     from cliploc_ros.offline.datasets.map_recording import load_recording
 
     built_from = load_recording(options.map[0])
     if options.bag is not None and built_from is not None and built_from.is_moved:
         raise OptionsError(f'{options.map[0]}: was turned or scaled by build_map, the poses of '
                            '--bag are not; build it without --level and --object-size')
-    images = sources.read_cameras(options, gap_s=0.0)
+    images = read_cameras(options, gap_s=0.0)
     return images if options.bag is not None else {
         name: frames.select(range(0, frames.count, options.every))
         for name, frames in images.items()}

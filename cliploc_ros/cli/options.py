@@ -7,8 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from cliploc_ros.command import finite, not_negative, positive, positive_int, within
+from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES
+
+# Of folders only.
+_PLACING = ('images', 'axes', 'scale', 'known_distance')
 
 
 def add_source_options(parser: argparse.ArgumentParser) -> None:
@@ -130,3 +134,18 @@ def add_network_options(group: Any) -> None:
                        help='run no CLIP: boxes and classes only')
     group.add_argument('--scheduler', default='', metavar='ADDRESS',
                        help='of a Dask cluster, instead of local processes')
+
+
+def folder_of(options: argparse.Namespace) -> tuple[Path, str] | None:
+    """Return the folder that the command line names and the key of its layout; '' to find it."""
+    named = {'tum': 'tum', 'rgbd': 'rgbd', 'folder': '', 'colmap': 'colmap', 'nerf': 'nerf'}
+    return next(((getattr(options, name), key) for name, key in named.items()
+                 if getattr(options, name) is not None), None)
+
+
+def check_folder_options(options: argparse.Namespace) -> None:
+    """Refuse options of folders with another source; OptionsError names them."""
+    given = [f'--{name.replace("_", "-")}' for name in _PLACING
+             if getattr(options, name) not in (None, False)]
+    if given and folder_of(options) is None:
+        raise OptionsError(f'{", ".join(given)}: for folders of images only')

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import read_layer
 from cliploc_ros.cli.options import add_topic_options
-from cliploc_ros.cli.sources import find_topics
 from cliploc_ros.command import needs_ros, run_main, within
 from cliploc_ros.errors import OptionsError
 
@@ -117,6 +116,7 @@ def follow(options: argparse.Namespace) -> 'AbstractContextManager[LiveRelocaliz
 
 def open_studio(options: argparse.Namespace) -> 'Studio':
     """Return the studio that the command line asks for."""
+    from cliploc_ros.cli.sources import find_topics
     from cliploc_ros.offline.datasets.bag_frames import BagTopics
     from cliploc_ros.offline.datasets.folders import find_layout
     from cliploc_ros.offline.datasets.map_recording import load_recording

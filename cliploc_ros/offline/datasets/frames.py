@@ -106,8 +106,7 @@ class Frames:
         def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
             return self.read_raw(lambda place, stamp_ns, pose: place in chosen
                                  and is_wanted(place, stamp_ns, pose))
-        return Frames(self.source, len(chosen), read_raw, varies=self.varies, digest=self.digest,
-                      notes=self.notes)
+        return replace(self, count=len(chosen), read_raw=read_raw, camera='', of_cameras=())
 
 
 def move_frames(frames: Frames, scale: float, rotation: NDArray[np.float64]) -> Frames:

@@ -148,6 +148,15 @@ class Queries:
         return tuple(frame for frame in self.frames if frame.group == group)
 
 
+def _stamps_ns(arrays: Arrays) -> NDArray[np.int64]:
+    """Return exact stamps [ns], or the microseconds of a float64 of seconds, which it still holds.
+
+    A float64 of today's seconds resolves 0.24 us.
+    """
+    rounded = np.round(arrays['timestamps'].astype(np.float64) * 1e6).astype(np.int64) * 1000
+    return arrays.get('stamps_ns', rounded).astype(np.int64)
+
+
 def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) -> Queries:
     """Read and validate a query file.
 
@@ -163,14 +172,11 @@ def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) 
         raise DatasetError(f'{path}: array landmark_ids has {unknown[0]!r}, which the map does '
                            f'not know{more}')
     fx, fy, cx, cy = map(float, arrays['intrinsics_fx_fy_cx_cy'])
-    # A float64 of today's seconds resolves 0.24 us: round to microseconds.
-    stamps_ns = (arrays['stamps_ns'].tolist() if 'stamps_ns' in arrays else
-                 [round(float(seconds) * 1e6) * 1000 for seconds in arrays['timestamps']])
-    frames = []
+    frames, stamps_ns = [], _stamps_ns(arrays)
     for index, (begin, end) in enumerate(pairwise(map(int, arrays['frame_offsets']))):
         rows = slice(begin, end)
         frames.append(QueryFrame(
-            stamp_ns=stamps_ns[index],
+            stamp_ns=int(stamps_ns[index]),
             bboxes_xyxy=arrays['boxes_xyxy'][rows].astype(np.float64),
             class_ids=tuple(map(str, arrays['class_ids'][rows])),
             scores=arrays['scores'][rows].astype(np.float64),
@@ -326,13 +332,11 @@ def load_recorded(path: str | Path) -> Recorded:
     if (order != np.arange(len(order))).any():
         detections = detections.select_frames(order)
     frames = len(order)
-    # a float64 of today's seconds resolves 0.24 us: microseconds are what it still knows
-    rounded = np.round(arrays['timestamps'] * 1e6).astype(np.int64) * 1000
     detector_ms, clip_ms = (arrays.get(name, np.full(frames, np.nan)).astype(np.float64)[order]
                             for name in ('detector_ms', 'clip_ms'))
     images, without_pose = arrays.get('image_counts', (frames, 0))
     return Recorded(
-        detections, arrays.get('stamps_ns', rounded).astype(np.int64)[order], detector_ms,
+        detections, _stamps_ns(arrays)[order], detector_ms,
         clip_ms, int(images), int(without_pose), str(arrays.get('described', '')))
 
 

@@ -102,14 +102,6 @@ def parse_stamp_ns(text: str, where: str) -> int:
     return int((seconds * NS_PER_S).to_integral_value())
 
 
-def rounded_stamp_ns(seconds: float) -> int:
-    """Return the stamp [ns] of a float of seconds.
-
-    A float64 of today's seconds resolves 0.24 us: microseconds are what it still knows.
-    """
-    return round(float(seconds) * 1e6) * 1000
-
-
 def unit_quaternion(quat: Sequence[float], where: str, tolerance: float
                     ) -> NDArray[np.float64]:
     """Return a quaternion (4,) of unit length; DatasetError: it is far from it."""

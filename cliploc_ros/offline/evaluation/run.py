@@ -232,32 +232,30 @@ def describe(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], methods: 
              trials: int, layer: KeyframeLayer | None, noisy: Sequence[Sequence[PosedQuery]]
              ) -> dict[str, Any]:
     """Return what identifies a run, as JSON keeps it."""
+    asked = _digest(part for query in chain(queries, *noisy) for part in (
+        *(part for one in (*query.neighbours, query.observation) for part in (
+            one.similarities, one.detections.bboxes_xyxy, one.detections.class_ids,
+            one.up_in_camera, one.odom_from_camera)), query.map_from_camera, query.number))
+    world = _digest([landmark_map.landmark_ids, landmark_map.class_ids,
+                     landmark_map.classes.members, landmark_map.centers, landmark_map.shapes])
+    return {
+        'queries': asked, 'map': world, 'trials': trials,
+        'methods': {one.name: {name: str(value) for name, value in asdict(one.options).items()}
+                    for one in methods},
+        'keyframes': None if layer is None else {
+            'digest': _digest([*(query.image.features.descriptors for query in queries
+                                 if query.image is not None),
+                               layer.map_from_camera, layer.points, layer.descriptors]),
+            'methods': [one.name for one in methods if one.keyframes]}}
+
+
+def _digest(parts: Iterable[object]) -> str:
+    """Return a hash of arrays and of what has a representation."""
     digest = hashlib.sha256()
-    for query in chain(queries, *noisy):
-        for one in (*query.neighbours, query.observation):
-            for part in (one.similarities, one.detections.bboxes_xyxy):
-                digest.update(np.ascontiguousarray(part).tobytes())
-            digest.update(repr((one.detections.class_ids, one.up_in_camera,
-                                one.odom_from_camera)).encode())
-        digest.update(np.ascontiguousarray(query.map_from_camera).tobytes())
-        digest.update(repr(query.number).encode())
-    world = hashlib.sha256(repr((landmark_map.landmark_ids, landmark_map.class_ids,
-                                 landmark_map.classes.members.tolist(),
-                                 landmark_map.centers.tolist(),
-                                 landmark_map.shapes.tolist())).encode())
-    run = {'queries': digest.hexdigest(), 'map': world.hexdigest(), 'trials': trials,
-           'methods': {one.name: {name: str(value) for name, value in asdict(one.options).items()}
-                       for one in methods}, 'keyframes': None}
-    if layer is not None:
-        digest = hashlib.sha256()
-        for query in queries:
-            if query.image is not None:
-                digest.update(query.image.features.descriptors.tobytes())
-        for array in (layer.map_from_camera, layer.points, layer.descriptors):
-            digest.update(np.ascontiguousarray(array).tobytes())
-        run['keyframes'] = {'digest': digest.hexdigest(),
-                            'methods': [one.name for one in methods if one.keyframes]}
-    return run
+    for part in parts:
+        digest.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray)
+                      else repr(part).encode())
+    return digest.hexdigest()
 
 
 def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
