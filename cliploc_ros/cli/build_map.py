@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from cliploc_ros import command
 from cliploc_ros.cli import check_map, map_layer
 from cliploc_ros.cli.options import add_source_options, folder_of
+from cliploc_ros.command import option
 from cliploc_ros.errors import CliplocError, MappingError, OptionsError
 
 if TYPE_CHECKING:
@@ -55,49 +56,37 @@ def make_parser() -> argparse.ArgumentParser:
         description='Build a map of ellipsoids from detections with poses. An existing map is '
         'replaced only when the new one is complete. Needs no sourced ROS.')
     add_source_options(parser)
-    parser.add_argument('--out', type=Path, required=True, metavar='YAML',
-                        help='the map to write')
-    parser.add_argument('--update', type=Path, metavar='YAML',
-                        help='bring this map up to date; --out may be the same file')
-    parser.add_argument('--report', type=Path, metavar='JSON',
-                        help='also write what was found and left out, and why')
-    parser.add_argument('--frame-id', default='map', help='of the map (%(default)s)')
-    parser.add_argument('--every', type=command.positive_int, default=1, metavar='N',
-                        help='use each N-th frame only (%(default)s)')
-    parser.add_argument('--seed', type=command.within(*command.SEEDS), default=0,
-                        help='(%(default)s)')
-    parser.add_argument('--check', action=argparse.BooleanOptionalAction, default=True,
-                        help='at the end, check the map as check_map does, with fewer views, into '
-                        'NAME_check; the exit code is that of the build (%(default)s)')
+    option(parser, '--out YAML', 'the map to write', required=True)
+    option(parser, '--update YAML', 'bring this map up to date; --out may be the same file')
+    option(parser, '--report JSON', 'also write what was found and left out, and why')
+    option(parser, '--frame-id', 'of the map (%(default)s)', default='map')
+    option(parser, '--every N', 'use each N-th frame only (%(default)s)', command.positive_int, 1)
+    option(parser, '--seed', '(%(default)s)', command.within(*command.SEEDS), 0)
+    option(parser, '--check', 'at the end, check the map as check_map does, with fewer views, '
+           'into NAME_check; the exit code is that of the build (%(default)s)', default=True,
+           action=argparse.BooleanOptionalAction)
     labels = parser.add_argument_group('labels')
-    labels.add_argument('--vocabulary', type=Path, metavar='FILE',
-                        help='phrases by class (YAML), besides the shipped ones')
-    parser.add_argument('--object-size', nargs=2, metavar=('CLASS', 'METRES'),
-                        help='the longest extent of the objects of a class, which says the scale '
-                        'of the poses')
+    option(labels, '--vocabulary FILE', 'phrases by class (YAML), besides the shipped ones')
+    option(parser, '--object-size CLASS METRES', 'the longest extent of the objects of a class, '
+           'which says the scale of the poses')
     map_layer.add_layer_options(parser)
     poses = parser.add_argument_group('poses with errors')
-    poses.add_argument('--joint', action=argparse.BooleanOptionalAction,
-                       help='refine the poses together with the landmarks (default: if '
-                       '--pose-noise is given, or where the boxes tell that they are off)')
-    poses.add_argument('--pose-noise', type=command.positive, nargs=2,
-                       metavar=('METRES', 'DEGREES'),
-                       help='standard deviations of the poses on each axis (0.02 0.5 with '
-                       '--joint)')
-    poses.add_argument('--pose-correlation', type=command.not_negative, default=3.0,
-                       metavar='SECONDS',
-                       help='time after which a pose error is another one (%(default)s)')
-    poses.add_argument('--odometry-noise', type=command.positive, nargs=2,
-                       metavar=('METRES', 'DEGREES'),
-                       help='standard deviations of odometry on each axis after a metre of the '
-                       'way (0.03 1.5)')
-    poses.add_argument('--refine-mount', action='store_true',
-                       help='correct a mount of the camera that is off by centimetres or degrees')
+    option(poses, '--joint', 'refine the poses together with the landmarks (default: if '
+           '--pose-noise is given, or where the boxes tell that they are off)',
+           action=argparse.BooleanOptionalAction)
+    option(poses, '--pose-noise METRES DEGREES', 'standard deviations of the poses on each axis '
+           '(0.02 0.5 with --joint)', command.positive)
+    option(poses, '--pose-correlation SECONDS', 'time after which a pose error is another one '
+           '(%(default)s)', command.not_negative, 3.0)
+    option(poses, '--odometry-noise METRES DEGREES', 'standard deviations of odometry on each '
+           'axis after a metre of the way (0.03 1.5)', command.positive)
+    option(poses, '--refine-mount', 'correct a mount of the camera that is off by centimetres or '
+           'degrees')
     limits = parser.add_argument_group('which landmarks belong into the map')
-    limits.add_argument('--min-viewpoints', type=command.positive_int, default=3, metavar='N',
-                        help='10 cm or 5 degrees apart (%(default)s)')
-    limits.add_argument('--min-baseline', type=command.within(0.0, 180.0), default=20.0,
-                        metavar='DEG', help='angle between two of its directions (%(default)s)')
+    option(limits, '--min-viewpoints N', '10 cm or 5 degrees apart (%(default)s)',
+           command.positive_int, 3)
+    option(limits, '--min-baseline DEG', 'angle between two of its directions (%(default)s)',
+           command.within(0.0, 180.0), 20.0)
     return parser
 
 

@@ -9,12 +9,12 @@ import time
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros import command
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.cli.options import add_topic_options
+from cliploc_ros.command import option
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
@@ -50,21 +50,16 @@ def make_parser() -> argparse.ArgumentParser:
         description='Check a map: its landmarks, where a robot would be accepted, refused or '
         'misled in it, places that look alike, and systematic errors. Writes check.html and '
         'check.json. Without observations the report is shorter. Needs no sourced ROS.')
-    parser.add_argument('map', type=Path, metavar='MAP', help='a map file')
-    parser.add_argument('--observations', type=Path, metavar='NPZ',
-                        help='boxes and poses of a recording of the place (those that build_map '
-                        'made the map from, if NAME.recording.json next to the map names them)')
-    parser.add_argument('--images', type=Path, metavar='BAG|DIR',
-                        help='the images of this recording (found where NAME.recording.json '
-                        'names them, or where the observations lie beside them)')
-    parser.add_argument('--queries', type=Path, metavar='NPZ',
-                        help='a query file of this map: frames with similarities')
-    parser.add_argument('--out', type=Path, metavar='DIR',
-                        help='folder of check.html and check.json (NAME_check next to the map)')
-    parser.add_argument('--every', type=command.positive_int, default=1, metavar='N',
-                        help='use each N-th frame of the observations only (%(default)s)')
-    parser.add_argument('--seed', type=command.within(*command.SEEDS), default=0,
-                        help='(%(default)s)')
+    option(parser, 'map MAP', 'a map file')
+    option(parser, '--observations NPZ', 'boxes and poses of a recording of the place (those that '
+           'build_map made the map from, if NAME.recording.json next to the map names them)')
+    option(parser, '--images BAG|DIR', 'the images of this recording (found where '
+           'NAME.recording.json names them, or where the observations lie beside them)')
+    option(parser, '--queries NPZ', 'a query file of this map: frames with similarities')
+    option(parser, '--out DIR', 'folder of check.html and check.json (NAME_check next to the map)')
+    option(parser, '--every N', 'use each N-th frame of the observations only (%(default)s)',
+           command.positive_int, 1)
+    option(parser, '--seed', '(%(default)s)', command.within(*command.SEEDS), 0)
     add_use_option(parser, 'report what the keyframes next to the map reach')
     _add_relocalizer_options(parser)
     _add_thresholds(parser)
@@ -74,24 +69,21 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('expected relocalization')
-    group.add_argument('--frames', type=command.positive_int, default=CheckOptions.frames,
-                       metavar='N', help='the most recorded frames to relocalize (%(default)s)')
-    group.add_argument('--folds', type=command.within(2, 10**6), default=CheckOptions.folds,
-                       metavar='N', help='of the cross-validation, 2 or more (%(default)s)')
-    group.add_argument('--grid', type=command.positive, default=CheckOptions.spacing_m,
-                       metavar='METRES',
-                       help='spacing of the camera positions, larger in large maps (%(default)s)')
-    group.add_argument('--positions', type=command.positive_int, metavar='N',
-                       default=CheckOptions.max_positions,
-                       help='the most camera positions (%(default)s)')
-    group.add_argument('--headings', type=command.positive_int, default=CheckOptions.headings,
-                       metavar='N', help='directions at each position (%(default)s)')
-    group.add_argument('--camera-height', type=command.finite, metavar='METRES',
-                       help='of the grid (as recorded; else .3 m above the middle landmark)')
-    group.add_argument('--gravity', action='store_true', help='the robot knows the vertical')
-    group.add_argument('--min-confidence', type=command.within(0.0, 1.0),
-                       default=RelocalizerOptions().min_confidence,
-                       help="the relocalizer's (%(default)s)")
+    option(group, '--frames N', 'the most recorded frames to relocalize (%(default)s)',
+           command.positive_int, CheckOptions.frames)
+    option(group, '--folds N', 'of the cross-validation, 2 or more (%(default)s)',
+           command.within(2, 10**6), CheckOptions.folds)
+    option(group, '--grid METRES', 'spacing of the camera positions, larger in large maps '
+           '(%(default)s)', command.positive, CheckOptions.spacing_m)
+    option(group, '--positions N', 'the most camera positions (%(default)s)', command.positive_int,
+           CheckOptions.max_positions)
+    option(group, '--headings N', 'directions at each position (%(default)s)',
+           command.positive_int, CheckOptions.headings)
+    option(group, '--camera-height METRES', 'of the grid (as recorded; else .3 m above the middle '
+           'landmark)', command.finite)
+    option(group, '--gravity', 'the robot knows the vertical')
+    option(group, '--min-confidence', "the relocalizer's (%(default)s)", command.within(0.0, 1.0),
+           RelocalizerOptions().min_confidence)
 
 
 def _add_thresholds(parser: argparse.ArgumentParser) -> None:

@@ -19,7 +19,7 @@ from cliploc_ros.cli.options import (
     check_folder_options,
     folder_of,
 )
-from cliploc_ros.command import SEEDS, limit, not_negative, positive_int, run_main, within
+from cliploc_ros.command import SEEDS, limit, not_negative, option, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.evaluation.methods import ALL, AUTO, PAPER_METHODS
@@ -63,29 +63,24 @@ def make_parser() -> argparse.ArgumentParser:
         description="Compare methods on the same input. Writes the paper's table, results.json, "
         'summary.csv, figures and trajectories. Needs no sourced ROS.')
     group = parser.add_mutually_exclusive_group(required=True)
-    group.add_argument('--queries', type=Path, metavar='NPZ',
-                         help='recorded boxes and similarities')
-    group.add_argument('--bag', type=Path, help='a rosbag2 recording with ground truth; or a '
-                         'request that ~/record stored (npz), which is answered again')
+    option(group, '--queries NPZ', 'recorded boxes and similarities')
+    option(group, '--bag', 'a rosbag2 recording with ground truth; or a request that ~/record '
+           'stored (npz), which is answered again', Path)
     add_folders(group)
-    parser.add_argument('--map', type=Path, nargs='+', required=True, metavar='YAML',
-                        help='several maps are searched as one; true poses are in the first')
-    parser.add_argument('--methods', nargs='+', default=[ALL], metavar='M',
-                        help=f'default: {ALL}; see below')
-    parser.add_argument('--trials', type=positive_int, default=5,
-                        help="the paper's %(default)s by default")
-    parser.add_argument('--seed', type=within(*SEEDS), default=0,
-                        help='of the first trial (%(default)s)')
-    parser.add_argument('--frames', choices=('main', 'all'), default='main',
-                        help="of a query file; 'all' includes the neighbours of the queries")
-    parser.add_argument('--crops', type=lambda text: text.replace('-', '_'), choices=CROPS,
-                        default=RelocalizerOptions.crops,
-                        help=f"crops that '{AUTO}' compares with labels (%(default)s)")
-    parser.add_argument('--out', type=Path, default=Path('evaluation'), metavar='DIR')
-    parser.add_argument('--workers', type=positive_int, metavar='N',
-                        help=f'local processes ({_cores()} for searches, 1 for detector and CLIP)')
-    parser.add_argument('--resume', action='store_true', help='continue an unfinished run')
-    parser.add_argument('--no-figures', dest='figures', action='store_false')
+    option(parser, '--map YAML', 'several maps are searched as one; true poses are in the first',
+           nargs='+', required=True)
+    option(parser, '--methods M', f'default: {ALL}; see below', default=[ALL], nargs='+')
+    option(parser, '--trials', "the paper's %(default)s by default", positive_int, 5)
+    option(parser, '--seed', 'of the first trial (%(default)s)', within(*SEEDS), 0)
+    option(parser, '--frames', "of a query file; 'all' includes the neighbours of the queries",
+           default='main', choices=('main', 'all'))
+    option(parser, '--crops', f"crops that '{AUTO}' compares with labels (%(default)s)",
+           lambda text: text.replace('-', '_'), RelocalizerOptions.crops, choices=CROPS)
+    option(parser, '--out DIR', default=Path('evaluation'))
+    option(parser, '--workers N',
+           f'local processes ({_cores()} for searches, 1 for detector and CLIP)', positive_int)
+    option(parser, '--resume', 'continue an unfinished run')
+    option(parser, '--no-figures', dest='figures', action='store_false')
     add_use_option(parser, f"'{AUTO}' uses the keyframes of the map, as the relocalizer does; "
                    'needs the images of --bag or a folder')
     _add_paper_options(parser)
@@ -97,50 +92,42 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _add_paper_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("options of the paper's methods")
-    group.add_argument('--iterations', type=positive_int, default=500, help='(%(default)s)')
-    group.add_argument('--k', type=positive_int, default=3, help='(%(default)s)')
-    group.add_argument('--iou-threshold', type=within(0.0, 1.0), default=0.2, help='(%(default)s)')
-    group.add_argument('--time-budget-ms', type=limit, default=float('inf'), metavar='MS',
-                       help='limit of each search (none); with one, results vary')
-    group.add_argument('--sweep', type=positive_int, nargs='*', metavar='N',
-                       default=[50, 100, 200, 1000],
-                       help='numbers of iterations to compare (50 100 200 1000)')
+    option(group, '--iterations', '(%(default)s)', positive_int, 500)
+    option(group, '--k', '(%(default)s)', positive_int, 3)
+    option(group, '--iou-threshold', '(%(default)s)', within(0.0, 1.0), 0.2)
+    option(group, '--time-budget-ms MS', 'limit of each search (none); with one, results vary',
+           limit, float('inf'))
+    option(group, '--sweep N', 'numbers of iterations to compare (50 100 200 1000)', positive_int,
+           [50, 100, 200, 1000], nargs='*')
 
 
 def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('simulated sensors besides the camera')
-    group.add_argument('--gravity', action='store_true',
-                       help=f"'{AUTO}' knows the vertical, from the true poses; the paper's "
-                       'methods do not use it')
-    group.add_argument('--gravity-noise-deg', type=within(0.0, 45.0), default=0.0, metavar='DEG',
-                       help='standard deviation of the vertical (0)')
-    group.add_argument('--height-range', type=limit, nargs=2, metavar=('LOW', 'HIGH'),
-                       default=(-math.inf, math.inf),
-                       help='heights that the camera may have in the map [m]')
-    group.add_argument('--tilt-deviation', type=not_negative, default=40.0, metavar='DEG',
-                       help=f"of the camera off upright, for '{AUTO}' without vertical; 0 where "
-                       "the map's z axis is not up (%(default)s)")
-    group.add_argument('--fuse', action='store_true',
-                       help='localize each query with the other frames of its group, linked by '
-                       'odometry from the true poses')
-    group.add_argument('--odometry-noise', type=not_negative, nargs=2, default=(0.0, 0.0),
-                       metavar=('METRES', 'DEGREES'),
-                       help='standard deviations of each step of odometry, on each axis (0 0)')
+    option(group, '--gravity', f"'{AUTO}' knows the vertical, from the true poses; the paper's "
+           'methods do not use it')
+    option(group, '--gravity-noise-deg DEG', 'standard deviation of the vertical (0)',
+           within(0.0, 45.0), 0.0)
+    option(group, '--height-range LOW HIGH', 'heights that the camera may have in the map [m]',
+           limit, (-math.inf, math.inf))
+    option(group, '--tilt-deviation DEG',
+           f"of the camera off upright, for '{AUTO}' without vertical; 0 where "
+           "the map's z axis is not up (%(default)s)", not_negative, 40.0)
+    option(group, '--fuse', 'localize each query with the other frames of its group, linked by '
+           'odometry from the true poses')
+    option(group, '--odometry-noise METRES DEGREES', 'standard deviations of each step of '
+           'odometry, on each axis (0 0)', not_negative, (0.0, 0.0))
 
 
 def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('options of --bag and folders')
-    group.add_argument('--save-queries', type=Path, metavar='NPZ',
-                       help='write the recorded boxes and similarities, for --queries')
+    option(group, '--save-queries NPZ', 'write the recorded boxes and similarities, for --queries')
     add_network_options(group)
-    group.add_argument('--landmark-embeddings', choices=COMPARED, default='image',
-                       help="compare crops with the map's labels (text), with the images next to "
-                       'it, or with both (%(default)s)')
-    group.add_argument('--every', type=positive_int, default=1, metavar='N',
-                       help='use every N-th image of a folder')
-    group.add_argument('--sync-tolerance', type=not_negative, default=0.05, metavar='SECONDS',
-                       help='images of several --cameras within this time are of one instant, and '
-                       'localized together, from the first camera (%(default)s)')
+    option(group, '--landmark-embeddings', "compare crops with the map's labels (text), with the "
+           'images next to it, or with both (%(default)s)', default='image', choices=COMPARED)
+    option(group, '--every N', 'use every N-th image of a folder', positive_int, 1)
+    option(group, '--sync-tolerance SECONDS', 'images of several --cameras within this time are '
+           'of one instant, and localized together, from the first camera (%(default)s)',
+           not_negative, 0.05)
 
 
 def evaluate(options: argparse.Namespace) -> int:

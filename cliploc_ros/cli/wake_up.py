@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from cliploc_ros import command
+from cliploc_ros.command import option
 
 _NOT_READY = 2
 
@@ -36,17 +37,15 @@ def make_parser() -> argparse.ArgumentParser:
         usage='wake_up [options] [--ros-args ...]',
         description='Wait for an active relocalizer, its camera and a localizer; then request '
         "the pose, and turn with Nav2's action spin between looks, until a pose is accepted.")
-    parser.add_argument('--relocalizer', default='relocalizer', metavar='NAME',
-                        help='its name, in the namespace of this node or absolute (%(default)s)')
-    parser.add_argument('--timeout', type=command.positive, default=60.0, metavar='S',
-                        help='begin no turn after S seconds (%(default)g)')
-    parser.add_argument('--turn-deg', type=command.within(-180.0, 180.0), default=45.0,
-                        metavar='DEG',
-                        help='turn counterclockwise by this much between looks; 0: never '
-                        '(%(default)g)')
-    parser.add_argument('--watch', nargs='?', choices=('true', 'false'), const='true',
-                        default='false', help='go on: wake up again whenever the relocalizer, '
-                        'which has to watch, finds the robot lost and at rest')
+    option(parser, '--relocalizer NAME', 'its name, in the namespace of this node or absolute '
+           '(%(default)s)', default='relocalizer')
+    option(parser, '--timeout S', 'begin no turn after S seconds (%(default)g)', command.positive,
+           60.0)
+    option(parser, '--turn-deg DEG', 'turn counterclockwise by this much between looks; 0: never '
+           '(%(default)g)', command.within(-180.0, 180.0), 45.0)
+    option(parser, '--watch', 'go on: wake up again whenever the relocalizer, which has to watch, '
+           'finds the robot lost and at rest', default='false', nargs='?',
+           choices=('true', 'false'), const='true')
     return parser
 
 
