@@ -19,77 +19,68 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import are_rigid
 from cliploc_ros.errors import CameraError, DatasetError
-from cliploc_ros.files.arrays import (
-    BOX,
-    FINITE,
-    SHARE,
-    UNIQUE,
-    ArrayError,
-    Arrays,
-    Check,
-    Field,
-    Offsets,
-    Schema,
-)
+from cliploc_ros.files import arrays as npz
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.units import NS_PER_S
 
 _STAGES = ('detector_ms', 'clip_ms')
 #: Of files of frames with boxes: F frames, n boxes.
 FRAME_FIELDS = {
-    'intrinsics_fx_fy_cx_cy': Field('numbers', (4,), (FINITE,)),
-    'boxes_xyxy': Field('numbers', ('n', 4), (FINITE, BOX)),
-    'frame_offsets': Field('integers', ('F+1',), (Offsets('boxes_xyxy', 'boxes'),)),
-    'class_ids': Field('text', ('n',)),
-    'scores': Field('numbers', ('n',), (FINITE, SHARE)),
-    'timestamps': Field('numbers', ('F',), (FINITE,)),
-    'map_from_camera': Field('numbers', ('F', 4, 4), (FINITE, Check(
+    'intrinsics_fx_fy_cx_cy': npz.Field('numbers', (4,), (npz.FINITE,)),
+    'boxes_xyxy': npz.Field('numbers', ('n', 4), (npz.FINITE, npz.BOX)),
+    'frame_offsets': npz.Field('integers', ('F+1',), (npz.Offsets('boxes_xyxy', 'boxes'),)),
+    'class_ids': npz.Field('text', ('n',)),
+    'scores': npz.Field('numbers', ('n',), (npz.FINITE, npz.SHARE)),
+    'timestamps': npz.Field('numbers', ('F',), (npz.FINITE,)),
+    'map_from_camera': npz.Field('numbers', ('F', 4, 4), (npz.FINITE, npz.Check(
         'is no rigid transform', lambda poses: ~are_rigid(poses)))),
     # NaN where unknown [m]
-    'depths': Field('floats', ('n',), (Check('is not positive', lambda depths: depths <= 0.0),),
-                    is_optional=True),
+    'depths': npz.Field('floats', ('n',), (
+        npz.Check('is not positive', lambda depths: depths <= 0.0),), is_optional=True),
     # exact, which a float64 of seconds is not [ns]
-    'stamps_ns': Field('integers', ('F',), is_optional=True),
+    'stamps_ns': npz.Field('integers', ('F',), is_optional=True),
     # time that the networks took [ms], NaN where unknown
-    **dict.fromkeys(_STAGES, Field('numbers', ('F',), is_optional=True)),
+    **dict.fromkeys(_STAGES, npz.Field('numbers', ('F',), is_optional=True)),
 }
 
 
-def _check_truth(name: str, arrays: Arrays) -> None:
+def _check_truth(name: str, arrays: npz.Arrays) -> None:
     landmarks = len(arrays['landmark_ids'])
-    Check('is no landmark', lambda rows: (rows < -1) | (rows >= landmarks))(name, arrays)
+    npz.Check('is no landmark', lambda rows: (rows < -1) | (rows >= landmarks))(name, arrays)
 
 
-def _check_stamps(name: str, arrays: Arrays) -> None:
+def _check_stamps(name: str, arrays: npz.Arrays) -> None:
     seconds = arrays['timestamps']
-    Check('contradicts timestamps',
-          lambda stamps_ns: np.abs(stamps_ns / NS_PER_S - seconds) > 1e-6)(name, arrays)
+    npz.Check('contradicts timestamps',
+              lambda stamps_ns: np.abs(stamps_ns / NS_PER_S - seconds) > 1e-6)(name, arrays)
 
 
-def _check_groups(name: str, arrays: Arrays) -> None:
+def _check_groups(name: str, arrays: npz.Arrays) -> None:
     groups = arrays['query_group']
     for group in np.unique(groups):
         mains = int(arrays[name][groups == group].sum())
         if mains != 1:
-            raise ArrayError(f'array {name} marks {mains} frames of query_group {group}, not 1')
+            raise npz.ArrayError(f'array {name} marks {mains} frames of query_group {group}, '
+                                 'not 1')
 
 
 # F frames, n boxes, L landmarks.
-_QUERIES = Schema('query file', {
-    'landmark_ids': Field('text', ('L',), (UNIQUE, Check('is empty', lambda ids: ids == ''))),
+_QUERIES = npz.Schema('query file', {
+    'landmark_ids': npz.Field('text', ('L',), (
+        npz.UNIQUE, npz.Check('is empty', lambda ids: ids == ''))),
     **FRAME_FIELDS,
-    'intrinsics_fx_fy_cx_cy': Field('numbers', (4,), (FINITE, Check(
+    'intrinsics_fx_fy_cx_cy': npz.Field('numbers', (4,), (npz.FINITE, npz.Check(
         'is a focal length that is not above 0',
         lambda numbers: (numbers <= 0) & (np.arange(4) < 2)))),
     # half precision rounds some cosines to just above 1
-    'similarities': Field('numbers', ('n', 'L'), (FINITE, Check(
+    'similarities': npz.Field('numbers', ('n', 'L'), (npz.FINITE, npz.Check(
         'is no cosine, outside -1 to 1', lambda rows: (np.abs(rows) > 1.001).any(axis=1)))),
-    'true_landmark': Field('integers', ('n',), (_check_truth,)),
-    'timestamps': Field('numbers', ('F',), (
-        FINITE, Check('is negative', lambda seconds: seconds < 0))),
-    'query_group': Field('integers', ('F',)),
-    'is_main': Field('booleans', ('F',), (_check_groups,)),
-    'stamps_ns': Field('integers', ('F',), (_check_stamps,), is_optional=True),
+    'true_landmark': npz.Field('integers', ('n',), (_check_truth,)),
+    'timestamps': npz.Field('numbers', ('F',), (
+        npz.FINITE, npz.Check('is negative', lambda seconds: seconds < 0))),
+    'query_group': npz.Field('integers', ('F',)),
+    'is_main': npz.Field('booleans', ('F',), (_check_groups,)),
+    'stamps_ns': npz.Field('integers', ('F',), (_check_stamps,), is_optional=True),
 }, DatasetError, not_empty={'F': 'frames', 'L': 'landmarks'})
 
 
@@ -148,7 +139,7 @@ class Queries:
         return tuple(frame for frame in self.frames if frame.group == group)
 
 
-def _stamps_ns(arrays: Arrays) -> NDArray[np.int64]:
+def _stamps_ns(arrays: npz.Arrays) -> NDArray[np.int64]:
     """Return exact stamps [ns], or the microseconds of a float64 of seconds, which it still holds.
 
     A float64 of today's seconds resolves 0.24 us.
@@ -231,39 +222,40 @@ def save_queries(path: str | Path, queries: Queries) -> None:
 _OF_CAMERAS = ('camera_names', 'camera_sizes', 'camera_intrinsics', 'camera_rows')
 
 
-def _check_cameras(name: str, arrays: Arrays) -> None:
+def _check_cameras(name: str, arrays: npz.Arrays) -> None:
     if missing := [one for one in _OF_CAMERAS if one not in arrays]:
-        raise ArrayError(f'array {missing[0]} is missing next to {name}')
+        raise npz.ArrayError(f'array {missing[0]} is missing next to {name}')
     if name != 'camera_rows':
         return
     count = len(arrays['camera_names'])
-    Check(f'names none of the {count} cameras', lambda rows: (rows < 0) | (rows >= count)
-          )(name, arrays)
+    npz.Check(f'names none of the {count} cameras', lambda rows: (rows < 0) | (rows >= count)
+              )(name, arrays)
     if unseen := sorted({*range(count)} - {*arrays[name].tolist()}):
-        raise ArrayError(f"no frame is of the camera '{arrays['camera_names'][unseen[0]]}'")
+        raise npz.ArrayError(f"no frame is of the camera '{arrays['camera_names'][unseen[0]]}'")
 
 
 # F frames, n boxes, d numbers of an embedding, C cameras.
-_OBSERVATIONS = Schema('observation file', {
+_OBSERVATIONS = npz.Schema('observation file', {
     **FRAME_FIELDS,
-    'image_size': Field('integers', (2,)),
-    'depth_spreads': Field('floats', ('n',), is_optional=True),
-    'open_edges': Field('booleans', ('n', 4), is_optional=True),
+    'image_size': npz.Field('integers', (2,)),
+    'depth_spreads': npz.Field('floats', ('n',), is_optional=True),
+    'open_edges': npz.Field('booleans', ('n', 4), is_optional=True),
     # large, and few of the rows are in use at once
-    'embeddings': Field('floats', ('n', 'd'), (FINITE,), is_optional=True, stays=True),
-    'encoder_key': Field('text', is_optional=True),
+    'embeddings': npz.Field('floats', ('n', 'd'), (npz.FINITE,), is_optional=True, stays=True),
+    'encoder_key': npz.Field('text', is_optional=True),
     # a row without odometry is NaN
-    'odom_from_camera': Field('floats', ('F', 4, 4), (Check(
+    'odom_from_camera': npz.Field('floats', ('F', 4, 4), (npz.Check(
         'is no rigid transform',
         lambda poses: ~np.isnan(poses).all(axis=(1, 2)) & ~are_rigid(poses)),), is_optional=True),
-    'image_counts': Field('integers', (2,), is_optional=True),
+    'image_counts': npz.Field('integers', (2,), is_optional=True),
     # of several cameras: their names, width and height, fx, fy, cx, cy, and the camera of each
     # frame; image_size and intrinsics_fx_fy_cx_cy are the first one's
-    'camera_names': Field('text', ('C',), (UNIQUE, _check_cameras), is_optional=True),
-    'camera_sizes': Field('integers', ('C', 2), (_check_cameras,), is_optional=True),
-    'camera_intrinsics': Field('numbers', ('C', 4), (FINITE, _check_cameras), is_optional=True),
-    'camera_rows': Field('integers', ('F',), (_check_cameras,), is_optional=True),
-    'described': Field('text', is_optional=True),
+    'camera_names': npz.Field('text', ('C',), (npz.UNIQUE, _check_cameras), is_optional=True),
+    'camera_sizes': npz.Field('integers', ('C', 2), (_check_cameras,), is_optional=True),
+    'camera_intrinsics': npz.Field('numbers', ('C', 4), (npz.FINITE, _check_cameras),
+                                   is_optional=True),
+    'camera_rows': npz.Field('integers', ('F',), (_check_cameras,), is_optional=True),
+    'described': npz.Field('text', is_optional=True),
 }, DatasetError, 'record the observations again', {'F': 'frames'},
     {'similarities': 'this is a query file: map from an observation file'})
 
@@ -356,7 +348,7 @@ def save_recorded(path: str | Path, recorded: Recorded) -> None:
         'image_counts': np.array([recorded.images, recorded.without_pose])})
 
 
-def _write(path: Path, detections: PosedDetections, more: Arrays) -> None:
+def _write(path: Path, detections: PosedDetections, more: npz.Arrays) -> None:
     sizes = np.array([[one.width, one.height] for one in detections.cameras])
     intrinsics = np.array([[one.fx, one.fy, one.cx, one.cy] for one in detections.cameras])
     names = np.array(detections.class_names, dtype=np.str_)

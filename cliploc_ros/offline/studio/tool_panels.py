@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from cliploc_ros.offline.evaluation.map_check.page import LOOK_ALIKE, MISLED
+from cliploc_ros.files.page import MISLED
+from cliploc_ros.offline.evaluation.map_check.page import LOOK_ALIKE
 from cliploc_ros.offline.mapping.check.places import RADIUS_M
 from cliploc_ros.offline.mapping.check.report import GridCheck
 from cliploc_ros.offline.studio.panels import Actions

@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.files.page import FAINT
+from cliploc_ros.files import page as html
 from cliploc_ros.offline.evaluation.figures import EDGED, draw_outline, png_of, write_name
 from cliploc_ros.offline.evaluation.map_check import page
 from cliploc_ros.offline.mapping.check.places import RADIUS_M
@@ -137,10 +137,10 @@ def _grid_figure(canvas: _Canvas) -> Figure:
         x, y = one.position[:2]
         ahead = one.forward[:2] / max(float(np.linalg.norm(one.forward[:2])), 1e-9)
         dx, dy = 0.45 * side * ahead
-        axes.plot([x, x + dx], [y, y + dy], color=page.MISLED, linewidth=2.5, zorder=7,
+        axes.plot([x, x + dx], [y, y + dy], color=html.MISLED, linewidth=2.5, zorder=7,
                   path_effects=EDGED)
-        axes.plot(x, y, 'X', color=page.MISLED, markersize=9, markeredgecolor='white', zorder=8)
-    handles.append(Line2D([], [], color=page.MISLED, marker='X', linewidth=2.5,
+        axes.plot(x, y, 'X', color=html.MISLED, markersize=9, markeredgecolor='white', zorder=8)
+    handles.append(Line2D([], [], color=html.MISLED, marker='X', linewidth=2.5,
                           label=f'misled ({len(wrong)} of {len(grid.trials)} views)'))
     rows = {name: row for row, name in enumerate(canvas.map.landmark_ids)}
     for number, advice in enumerate(canvas.report.to_do[:page.FIRST_ADVICE], start=1):
@@ -170,7 +170,7 @@ def _frames_figure(canvas: _Canvas, trials: Sequence[Trial]) -> Figure:
         axes.plot(tip[0], tip[1], marker='s' if is_refused else 'o', color=color, markersize=4,
                   zorder=6)
         if one.verdict == 'misled' and one.estimate is not None:
-            axes.plot([tip[0], one.estimate[0]], [tip[1], one.estimate[1]], color=page.MISLED,
+            axes.plot([tip[0], one.estimate[0]], [tip[1], one.estimate[1]], color=html.MISLED,
                       linewidth=1.5, zorder=7)
     first = trials[0].stamp_s or 0.0
     for run in [run for run in refused_spans(trials) if len(run) > 1][:8]:
@@ -222,7 +222,7 @@ def _landmarks_figure(canvas: _Canvas) -> Figure:
     for one in named:
         write_name(axes, one.center[:2], one.landmark_id)
     if canvas.path is not None:
-        axes.plot(*canvas.path.T, color=FAINT, linewidth=0.8, zorder=2)
+        axes.plot(*canvas.path.T, color=html.FAINT, linewidth=0.8, zorder=2)
     counts = Counter(grades.values())
     _add_legend(figure, [Patch(facecolor=color, edgecolor='#444444', alpha=0.6,
                                label=f'{page.GRADE_NAMES[name]} ({counts[name]})')
