@@ -347,7 +347,7 @@ def _corrections(recording: RecordingCheck) -> str:
                  'may follow from the cause that explains most' if one.follows
                  else 'significant'))
             for one in recording.corrections]
-    return (html.note('The correction that fits the edges of the boxes best, each cause on its own. '
-                      'A turned mount and a shifted principal point look much the same.')
+    return (html.note('The correction that fits the edges of the boxes best, each cause on its '
+                      'own. A turned mount and a shifted principal point look much the same.')
             + html.table(('cause', 'what', '#correction', '#deviation', '#effect [px]',
                           '#cost that the cause explains', ''), rows))
