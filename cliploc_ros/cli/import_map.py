@@ -9,8 +9,9 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from cliploc_ros.cli.options import check_output
 from cliploc_ros.command import finite, option, positive, printable, run_main
-from cliploc_ros.errors import DatasetError, MapError, OptionsError
+from cliploc_ros.errors import DatasetError, OptionsError
 
 if TYPE_CHECKING:
     from cliploc_ros.offline.datasets.map_formats.given_map import GivenMap
@@ -125,10 +126,7 @@ def _check_paths(options: argparse.Namespace) -> None:
         path = getattr(options, name)
         if path is None:
             continue
-        if not path.parent.is_dir():
-            raise MapError(f'{path}: there is no folder {path.parent}; create it')
-        if path.is_dir():
-            raise MapError(f'{path} is a folder; name the file to write')
+        check_output(path)
         for other in (options.input, options.refit, options.class_names):
             if other is not None and path.exists() and other.exists() and path.samefile(other):
                 raise OptionsError(f'--{name} {path} is an input; name another file')
