@@ -17,7 +17,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Self
 
-from cliploc_ros.errors import CliplocError, OptionsError
+from cliploc_ros.errors import CliplocError, MapError, OptionsError
 
 #: The shell's exit code of a command that Ctrl-C ended.
 EXIT_INTERRUPTED = 130
@@ -158,6 +158,14 @@ def option(group: Any, shown: str, text: str | None = None,
     if kind is not None:
         more['type'] = kind
     group.add_argument(*names, help=text, **more)
+
+
+def check_output(path: Path) -> None:
+    """Refuse a file that cannot be written, before the work is done; MapError says why."""
+    if not path.parent.is_dir():
+        raise MapError(f'{path}: there is no folder {path.parent}; create it')
+    if path.is_dir():
+        raise MapError(f'{path} is a folder; name the file to write')
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from cliploc_ros import command
 from cliploc_ros.cli import check_map, map_layer
-from cliploc_ros.cli.options import add_source_options, check_output, folder_of
+from cliploc_ros.cli.options import add_source_options, folder_of
 from cliploc_ros.command import option
 from cliploc_ros.errors import CliplocError, MappingError, OptionsError
 
@@ -187,7 +187,7 @@ def _check_map(path: Path, wanted: bool) -> int:
 
 def _check(options: argparse.Namespace) -> None:
     """Refuse an output that cannot be written, and options, before the work is done."""
-    check_output(options.out)
+    command.check_output(options.out)
     map_layer.check_layer_options(options)
     if options.level and options.update is not None:
         raise OptionsError('--level is for new maps, not for --update')

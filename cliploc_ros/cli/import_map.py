@@ -9,8 +9,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from cliploc_ros.cli.options import check_output
-from cliploc_ros.command import finite, option, positive, printable, run_main
+from cliploc_ros.command import check_output, finite, option, positive, printable, run_main
 from cliploc_ros.errors import DatasetError, OptionsError
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cliploc_ros.command import finite, not_negative, option, positive, positive_int, within
-from cliploc_ros.errors import MapError, OptionsError
+from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES
 
@@ -128,11 +128,3 @@ def check_folder_options(options: argparse.Namespace) -> None:
              if getattr(options, name) not in (None, False)]
     if given and folder_of(options) is None:
         raise OptionsError(f'{", ".join(given)}: for folders of images only')
-
-
-def check_output(path: Path) -> None:
-    """Refuse a file that cannot be written, before the work is done; MapError says why."""
-    if not path.parent.is_dir():
-        raise MapError(f'{path}: there is no folder {path.parent}; create it')
-    if path.is_dir():
-        raise MapError(f'{path} is a folder; name the file to write')
