@@ -178,9 +178,7 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
         'top_view': _top_view(landmark_map, queries,
                               [one for one in results if one.method == best.method], best.method),
     }
-    sampled = [one for one in summaries if one.method in PAPER_METHODS
-               and not one.method.endswith('_bf')]
-    if sampled:
+    if sampled := [one for one in summaries if not one.method.endswith('_bf')]:
         figures['best_iteration'] = _drawn('iteration that found the best pose', '',
                                            _best_iteration, sampled)
     if sweep:
