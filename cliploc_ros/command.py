@@ -13,10 +13,11 @@ import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import metadata
+from pathlib import Path
 from types import FrameType
-from typing import Self
+from typing import Any, Self
 
-from cliploc_ros.errors import CliplocError, OptionsError
+from cliploc_ros.errors import CliplocError, MapError, OptionsError
 
 #: The shell's exit code of a command that Ctrl-C ended.
 EXIT_INTERRUPTED = 130
@@ -125,6 +126,51 @@ def within[Number: (int, float)](low: Number, high: Number) -> Callable[[str], N
     """Return a type for argparse: numbers of the limits' type, from low to high."""
     return number(type(low), lambda value: low <= value <= high,
                   f'within {low:g} and {high:g}')
+
+
+# Values that are paths.
+_PATHS = ('DIR', 'NPZ', 'YAML', 'FILE', 'JSON', 'MAP', 'BAG|DIR', 'IN')
+
+
+def option(group: Any, shown: str, text: str | None = None,
+           kind: Callable[[str], Any] | None = None, default: Any = None, **more: Any) -> None:
+    """Add an option or argument to a parser, or to a group of it.
+
+    Parameters
+    ----------
+    shown : str
+        Its names and values as the help shows them: '-r --rate X'. Without a value, a kind, a
+        default and choices it is a switch.
+    text : str, optional
+        The help.
+    kind : callable, optional
+        The type for argparse; by default that of a path where the value is DIR, FILE and so on.
+    more
+        Further arguments of add_argument.
+    """
+    first, *words = shown.split()
+    names = [first, *(word for word in words if word.startswith('-'))]
+    values = [word for word in words if not word.startswith('-')]
+    if len(values) == 1:
+        more['metavar'] = values[0]
+        kind = kind or (Path if values[0] in _PATHS else None)
+    elif values:
+        more |= {'metavar': tuple(values), 'nargs': len(values)}
+    if not values and kind is None and default is None and 'choices' not in more:
+        more.setdefault('action', 'store_true')
+    if default is not None:
+        more['default'] = default
+    if kind is not None:
+        more['type'] = kind
+    group.add_argument(*names, help=text, **more)
+
+
+def check_output(path: Path) -> None:
+    """Refuse a file that cannot be written, before the work is done; MapError says why."""
+    if not path.parent.is_dir():
+        raise MapError(f'{path}: there is no folder {path.parent}; create it')
+    if path.is_dir():
+        raise MapError(f'{path} is a folder; name the file to write')
 
 
 @contextmanager

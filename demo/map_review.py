@@ -18,8 +18,8 @@ from scipy.optimize import linear_sum_assignment
 
 from cliploc_ros.core.geometry.ellipsoid import outline_points, shape_matrices
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.datasets.tum import parse_stamp_ns
-from cliploc_ros.offline.evaluation.drawing import spread_names, write_name
+from cliploc_ros.offline.datasets.parsing import parse_stamp_ns
+from cliploc_ros.offline.evaluation.figures import spread_names, write_name
 from cliploc_ros.offline.evaluation.summary import LIMITS_M, Summary
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.page import ACCEPTED, BAD, figure, fold, table

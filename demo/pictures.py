@@ -22,7 +22,7 @@ from cliploc_ros.core.geometry.ellipsoid import outline_points, project_ellipsoi
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.offline.evaluation.drawing import draw_map, spread_names, write_name
+from cliploc_ros.offline.evaluation.figures import draw_map, spread_names, write_name
 from cliploc_ros.offline.page import ACCEPTED, BAD
 from demo.review import Judged, Review
 

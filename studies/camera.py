@@ -26,10 +26,9 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.offline.datasets.queries import load_queries
+from cliploc_ros.offline.datasets.observations import load_queries
 from cliploc_ros.offline.evaluation.figures import within_ellipsoid
-from cliploc_ros.offline.evaluation.sensors import with_vertical
-from cliploc_ros.offline.evaluation.trials import PosedQuery, make_queries
+from cliploc_ros.offline.evaluation.trials import PosedQuery, make_queries, with_vertical
 from studies import wrong_sensors
 from studies.reports import errors_of, interval, table
 from studies.worlds.places import KINDS

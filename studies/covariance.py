@@ -22,7 +22,7 @@ from cliploc_ros.command import run_command
 from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_difference
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.offline.evaluation.sensors import with_neighbours
+from cliploc_ros.offline.evaluation.trials import with_neighbours
 from studies.acceptance.places import (
     STEP_DEG,
     STEP_M,

@@ -24,7 +24,8 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.command import run_command
 from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.offline.datasets.tum import parse_stamp_ns, read_image_list, read_tum_trajectory
+from cliploc_ros.offline.datasets.parsing import parse_stamp_ns
+from cliploc_ros.offline.datasets.tum import read_image_list, read_tum_trajectory
 from cliploc_ros.offline.mapping.options import OdometryErrors
 from cliploc_ros.ros.inputs.odometry import OdometryWindow
 from cliploc_ros.ros.inputs.robot_state import (

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.offline.evaluation.sensors import turned
-from cliploc_ros.offline.evaluation.trials import PosedQuery
+from cliploc_ros.offline.evaluation.trials import PosedQuery, turned
 
 
 def with_mount_error(queries: Sequence[PosedQuery], groups: Sequence[int], noise_deg: float,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room, write_map
 
-from cliploc_ros.offline.datasets.queries import Queries, QueryFrame, save_queries
+from cliploc_ros.offline.datasets.observations import Queries, QueryFrame, save_queries
 
 QUERIES = 12
 

@@ -13,32 +13,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cliploc_ros.cli import check_map
-from cliploc_ros.cli.map_layer import (
-    add_layer_options,
-    check_layer_options,
-    make_layer,
-    write_layer,
-)
-from cliploc_ros.cli.options import add_source_options
-from cliploc_ros.cli.sources import (
-    clip_options,
-    folder_of,
-    metres_of,
-    mount_of,
-    read_source,
-    recording_of,
-    source_of,
-)
-from cliploc_ros.command import (
-    SEEDS,
-    StageBar,
-    not_negative,
-    positive,
-    positive_int,
-    run_main,
-    within,
-)
+from cliploc_ros import command
+from cliploc_ros.cli import check_map, map_layer
+from cliploc_ros.cli.options import add_source_options, folder_of
+from cliploc_ros.command import option
 from cliploc_ros.errors import CliplocError, MappingError, OptionsError
 
 if TYPE_CHECKING:
@@ -68,7 +46,7 @@ examples:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Build a map; return the exit code."""
-    return run_main(make_parser(), build, args)
+    return command.run_main(make_parser(), build, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -78,51 +56,44 @@ def make_parser() -> argparse.ArgumentParser:
         description='Build a map of ellipsoids from detections with poses. An existing map is '
         'replaced only when the new one is complete. Needs no sourced ROS.')
     add_source_options(parser)
-    parser.add_argument('--out', type=Path, required=True, metavar='YAML',
-                        help='the map to write')
-    parser.add_argument('--update', type=Path, metavar='YAML',
-                        help='bring this map up to date; --out may be the same file')
-    parser.add_argument('--report', type=Path, metavar='JSON',
-                        help='also write what was found and left out, and why')
-    parser.add_argument('--frame-id', default='map', help='of the map (%(default)s)')
-    parser.add_argument('--every', type=positive_int, default=1, metavar='N',
-                        help='use each N-th frame only (%(default)s)')
-    parser.add_argument('--seed', type=within(*SEEDS), default=0, help='(%(default)s)')
-    parser.add_argument('--check', action=argparse.BooleanOptionalAction, default=True,
-                        help='at the end, check the map as check_map does, with fewer views, into '
-                        'NAME_check; the exit code is that of the build (%(default)s)')
+    option(parser, '--out YAML', 'the map to write', required=True)
+    option(parser, '--update YAML', 'bring this map up to date; --out may be the same file')
+    option(parser, '--report JSON', 'also write what was found and left out, and why')
+    option(parser, '--frame-id', 'of the map (%(default)s)', default='map')
+    option(parser, '--every N', 'use each N-th frame only (%(default)s)', command.positive_int, 1)
+    option(parser, '--seed', '(%(default)s)', command.within(*command.SEEDS), 0)
+    option(parser, '--check', 'at the end, check the map as check_map does, with fewer views, '
+           'into NAME_check; the exit code is that of the build (%(default)s)', default=True,
+           action=argparse.BooleanOptionalAction)
     labels = parser.add_argument_group('labels')
-    labels.add_argument('--vocabulary', type=Path, metavar='FILE',
-                        help='phrases by class (YAML), besides the shipped ones')
-    parser.add_argument('--object-size', nargs=2, metavar=('CLASS', 'METRES'),
-                        help='the longest extent of the objects of a class, which says the scale '
-                        'of the poses')
-    add_layer_options(parser)
+    option(labels, '--vocabulary FILE', 'phrases by class (YAML), besides the shipped ones')
+    option(parser, '--object-size CLASS METRES', 'the longest extent of the objects of a class, '
+           'which says the scale of the poses')
+    map_layer.add_layer_options(parser)
     poses = parser.add_argument_group('poses with errors')
-    poses.add_argument('--joint', action=argparse.BooleanOptionalAction,
-                       help='refine the poses together with the landmarks (default: if '
-                       '--pose-noise is given, or where the boxes tell that they are off)')
-    poses.add_argument('--pose-noise', type=positive, nargs=2, metavar=('METRES', 'DEGREES'),
-                       help='standard deviations of the poses on each axis (0.02 0.5 with '
-                       '--joint)')
-    poses.add_argument('--pose-correlation', type=not_negative, default=3.0, metavar='SECONDS',
-                       help='time after which a pose error is another one (%(default)s)')
-    poses.add_argument('--odometry-noise', type=positive, nargs=2, metavar=('METRES', 'DEGREES'),
-                       help='standard deviations of odometry on each axis after a metre of the '
-                       'way (0.03 1.5)')
-    poses.add_argument('--refine-mount', action='store_true',
-                       help='correct a mount of the camera that is off by centimetres or degrees')
+    option(poses, '--joint', 'refine the poses together with the landmarks (default: if '
+           '--pose-noise is given, or where the boxes tell that they are off)',
+           action=argparse.BooleanOptionalAction)
+    option(poses, '--pose-noise METRES DEGREES', 'standard deviations of the poses on each axis '
+           '(0.02 0.5 with --joint)', command.positive)
+    option(poses, '--pose-correlation SECONDS', 'time after which a pose error is another one '
+           '(%(default)s)', command.not_negative, 3.0)
+    option(poses, '--odometry-noise METRES DEGREES', 'standard deviations of odometry on each '
+           'axis after a metre of the way (0.03 1.5)', command.positive)
+    option(poses, '--refine-mount', 'correct a mount of the camera that is off by centimetres or '
+           'degrees')
     limits = parser.add_argument_group('which landmarks belong into the map')
-    limits.add_argument('--min-viewpoints', type=positive_int, default=3, metavar='N',
-                        help='10 cm or 5 degrees apart (%(default)s)')
-    limits.add_argument('--min-baseline', type=within(0.0, 180.0), default=20.0, metavar='DEG',
-                        help='angle between two of its directions (%(default)s)')
+    option(limits, '--min-viewpoints N', '10 cm or 5 degrees apart (%(default)s)',
+           command.positive_int, 3)
+    option(limits, '--min-baseline DEG', 'angle between two of its directions (%(default)s)',
+           command.within(0.0, 180.0), 20.0)
     return parser
 
 
 def build(options: argparse.Namespace) -> int:
     """Build as the command line asks; return the exit code."""
     # Late, so that --help is fast.
+    from cliploc_ros.cli import sources
     from cliploc_ros.core.keyframes.layer import remove_layer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.core.map.map_file import write_map
@@ -132,7 +103,7 @@ def build(options: argparse.Namespace) -> int:
     from cliploc_ros.offline.mapping.options import MappingOptions, OdometryErrors
 
     begin = time.monotonic()
-    path, update, name = options.out, options.update, source_of(options).name
+    path, update, name = options.out, options.update, sources.source_of(options).name
     _check(options)
     if update is not None:
         LandmarkMap.from_file(update)
@@ -142,22 +113,21 @@ def build(options: argparse.Namespace) -> int:
         refine_mount=options.refine_mount, min_viewpoints=options.min_viewpoints,
         min_baseline_deg=options.min_baseline, frame_id=options.frame_id,
         source=f'build_map {name}', random_seed=options.seed)
-    source = read_source(options)
-    recorded = source.recorded
-    detections, scale, rotation = _placed(recorded.detections, options, mapping)
-    if recorded.without_pose:
-        print(f'no pose: {recorded.without_pose} of {recorded.images} images', flush=True)
+    source = sources.read_source(options)
+    detections, scale, rotation = _placed(source.recorded.detections, options, mapping)
+    if without := source.recorded.without_pose:
+        print(f'no pose: {without} of {source.recorded.images} images', flush=True)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
-    labeller = find_labeller(detections, partial(clip_options, options) if options.clip else None,
-                             options.vocabulary)
+    clip = partial(sources.clip_options, options) if options.clip else None
+    labeller = find_labeller(detections, clip, options.vocabulary)
     layer, note = None, ''
     if update is None:
-        with StageBar() as bar, _reporting_failure(options.report):
+        with command.StageBar() as bar, _reporting_failure(options.report):
             made = make_map(detections, labeller, mapping, progress=bar.show)
         _write_report(options.report, made.report.as_dict())
         frames = source.frames and move_frames(source.frames, scale, rotation)
-        layer, note = make_layer(options, frames, made.landmark_map)
+        layer, note = map_layer.make_layer(options, frames, made.landmark_map)
         lines = made.report.lines()
         head = [f'built by build_map from {name}', *lines[:2]]
         if made.mount is not None:
@@ -169,10 +139,10 @@ def build(options: argparse.Namespace) -> int:
         lines = made.report.lines()
         head = [f'{update.name}, updated by build_map from {name}', lines[0]]
     write_map(path, made.landmark_map, head, made.embeddings)
-    save_recording(path, recording_of(options, source.file, scale, rotation))
+    save_recording(path, sources.recording_of(options, source.file, scale, rotation))
     is_same_map = update is not None and path.resolve() == update.resolve()
     if layer is not None:
-        lines.append(write_layer(path, layer))
+        lines.append(map_layer.write_layer(path, layer))
     elif not is_same_map and (removed := remove_layer(path)):
         lines.append(removed)
     print('\n'.join(lines))
@@ -217,12 +187,8 @@ def _check_map(path: Path, wanted: bool) -> int:
 
 def _check(options: argparse.Namespace) -> None:
     """Refuse an output that cannot be written, and options, before the work is done."""
-    path = options.out
-    if not path.parent.is_dir():
-        raise MappingError(f'{path}: there is no folder {path.parent}; create it')
-    if path.is_dir():
-        raise MappingError(f'{path} is a folder; name the map file to write')
-    check_layer_options(options)
+    command.check_output(options.out)
+    map_layer.check_layer_options(options)
     if options.level and options.update is not None:
         raise OptionsError('--level is for new maps, not for --update')
     if options.object_size is not None and (options.scale or options.known_distance
@@ -241,6 +207,7 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
     """Return detections in the map, and the scale and rotation (3, 3) that moved them there."""
     import numpy as np
 
+    from cliploc_ros.cli.sources import metres_of
     from cliploc_ros.offline.make_map import scale_of_objects
     from cliploc_ros.offline.mapping.tilt import NO_VERTICAL, find_tilt, tilt_note
 
@@ -280,9 +247,10 @@ def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':
 def _mount_option(options: argparse.Namespace, correction: 'NDArray[np.float64]') -> str:
     """Return the corrected mount as the option --mount takes it."""
     from cliploc_ros.core.geometry.transforms import quaternion_from_transform
+    from cliploc_ros.offline.datasets.poses import mount_from_numbers
 
-    mount = mount_of(options.mount)
-    given = correction if mount is None else mount @ correction
+    given = (correction if options.mount is None
+             else mount_from_numbers(options.mount) @ correction)
     numbers = [*given[:3, 3], *quaternion_from_transform(given)]
     return 'corrected mount: --mount ' + ' '.join(f'{number:.5f}' for number in numbers)
 

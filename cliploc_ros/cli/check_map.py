@@ -9,21 +9,12 @@ import time
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cliploc_ros import command
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.cli.options import add_topic_options
-from cliploc_ros.command import (
-    SEEDS,
-    StageBar,
-    finite,
-    positive,
-    positive_int,
-    printable,
-    run_main,
-    within,
-)
+from cliploc_ros.command import option
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
@@ -47,7 +38,7 @@ exit code: 0 the map reaches all thresholds, 1 it misses one or the input is inv
 
 def main(args: Sequence[str] | None = None) -> int:
     """Check a map; return the exit code."""
-    return run_main(make_parser(), check, args)
+    return command.run_main(make_parser(), check, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -57,20 +48,16 @@ def make_parser() -> argparse.ArgumentParser:
         description='Check a map: its landmarks, where a robot would be accepted, refused or '
         'misled in it, places that look alike, and systematic errors. Writes check.html and '
         'check.json. Without observations the report is shorter. Needs no sourced ROS.')
-    parser.add_argument('map', type=Path, metavar='MAP', help='a map file')
-    parser.add_argument('--observations', type=Path, metavar='NPZ',
-                        help='boxes and poses of a recording of the place (those that build_map '
-                        'made the map from, if NAME.recording.json next to the map names them)')
-    parser.add_argument('--images', type=Path, metavar='BAG|DIR',
-                        help='the images of this recording (found where NAME.recording.json '
-                        'names them, or where the observations lie beside them)')
-    parser.add_argument('--queries', type=Path, metavar='NPZ',
-                        help='a query file of this map: frames with similarities')
-    parser.add_argument('--out', type=Path, metavar='DIR',
-                        help='folder of check.html and check.json (NAME_check next to the map)')
-    parser.add_argument('--every', type=positive_int, default=1, metavar='N',
-                        help='use each N-th frame of the observations only (%(default)s)')
-    parser.add_argument('--seed', type=within(*SEEDS), default=0, help='(%(default)s)')
+    option(parser, 'map MAP', 'a map file')
+    option(parser, '--observations NPZ', 'boxes and poses of a recording of the place (those that '
+           'build_map made the map from, if NAME.recording.json next to the map names them)')
+    option(parser, '--images BAG|DIR', 'the images of this recording (found where '
+           'NAME.recording.json names them, or where the observations lie beside them)')
+    option(parser, '--queries NPZ', 'a query file of this map: frames with similarities')
+    option(parser, '--out DIR', 'folder of check.html and check.json (NAME_check next to the map)')
+    option(parser, '--every N', 'use each N-th frame of the observations only (%(default)s)',
+           command.positive_int, 1)
+    option(parser, '--seed', '(%(default)s)', command.within(*command.SEEDS), 0)
     add_use_option(parser, 'report what the keyframes next to the map reach')
     _add_relocalizer_options(parser)
     _add_thresholds(parser)
@@ -80,27 +67,26 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('expected relocalization')
-    group.add_argument('--frames', type=positive_int, default=CheckOptions.frames, metavar='N',
-                       help='the most recorded frames to relocalize (%(default)s)')
-    group.add_argument('--folds', type=within(2, 10**6), default=CheckOptions.folds, metavar='N',
-                       help='of the cross-validation, 2 or more (%(default)s)')
-    group.add_argument('--grid', type=positive, default=CheckOptions.spacing_m, metavar='METRES',
-                       help='spacing of the camera positions, larger in large maps (%(default)s)')
-    group.add_argument('--positions', type=positive_int, default=CheckOptions.max_positions,
-                       metavar='N', help='the most camera positions (%(default)s)')
-    group.add_argument('--headings', type=positive_int, default=CheckOptions.headings, metavar='N',
-                       help='directions at each position (%(default)s)')
-    group.add_argument('--camera-height', type=finite, metavar='METRES',
-                       help='of the grid (as recorded; else .3 m above the middle landmark)')
-    group.add_argument('--gravity', action='store_true', help='the robot knows the vertical')
-    group.add_argument('--min-confidence', type=within(0.0, 1.0),
-                       default=RelocalizerOptions().min_confidence,
-                       help="the relocalizer's (%(default)s)")
+    option(group, '--frames N', 'the most recorded frames to relocalize (%(default)s)',
+           command.positive_int, CheckOptions.frames)
+    option(group, '--folds N', 'of the cross-validation, 2 or more (%(default)s)',
+           command.within(2, 10**6), CheckOptions.folds)
+    option(group, '--grid METRES', 'spacing of the camera positions, larger in large maps '
+           '(%(default)s)', command.positive, CheckOptions.spacing_m)
+    option(group, '--positions N', 'the most camera positions (%(default)s)', command.positive_int,
+           CheckOptions.max_positions)
+    option(group, '--headings N', 'directions at each position (%(default)s)',
+           command.positive_int, CheckOptions.headings)
+    option(group, '--camera-height METRES', 'of the grid (as recorded; else .3 m above the middle '
+           'landmark)', command.finite)
+    option(group, '--gravity', 'the robot knows the vertical')
+    option(group, '--min-confidence', "the relocalizer's (%(default)s)", command.within(0.0, 1.0),
+           RelocalizerOptions().min_confidence)
 
 
 def _add_thresholds(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('thresholds; beyond one of them, the exit code is 1')
-    share, count = within(0.0, 1.0), within(0, 10**9)
+    share, count = command.within(0.0, 1.0), command.within(0, 10**9)
     for name, kind, text in (
             ('min_explained', share, 'share of held-out boxes that a landmark explains'),
             ('min_iou', share, 'their median IoU'),
@@ -119,10 +105,9 @@ def check(options: argparse.Namespace) -> int:
     # Late, so that --help is fast.
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
-    from cliploc_ros.offline.datasets.queries import load_queries
-    from cliploc_ros.offline.evaluation.map_check.page import PAGE, summary_lines, write_report
+    from cliploc_ros.offline.datasets.observations import load_queries
+    from cliploc_ros.offline.evaluation.map_check import page
     from cliploc_ros.offline.evaluation.map_check.pictures import draw_pictures
-    from cliploc_ros.offline.evaluation.map_check.views import ViewPainter
     from cliploc_ros.offline.evaluation.trials import make_queries
     from cliploc_ros.offline.mapping.check.checking import check_map
     from cliploc_ros.offline.mapping.check.relocalization import PosedObservation
@@ -141,7 +126,7 @@ def check(options: argparse.Namespace) -> int:
     detections, images = _read_recording(options) or (None, None)
     image_of = views = None
     if detections is not None and images is not None:
-        views = ViewPainter(landmark_map, detections, images.near)
+        views = page.ViewPainter(landmark_map, detections, images.near)
         if options.observations is None:  # the layer's own: judged by those of other times
             image_of = partial(images.of, detections)
     if detections is not None and (note := tilt_note(detections.map_from_camera)):
@@ -153,16 +138,17 @@ def check(options: argparse.Namespace) -> int:
     layer = read_layer(options.map, landmark_map, options.keyframes)
     out = options.out or options.map.with_name(f'{options.map.stem}_check')
     make_folder(out)
-    with StageBar() as bar:
+    with command.StageBar() as bar:
         report = check_map(landmark_map, detections, queries, check_options, thresholds, bar.show,
                            layer, image_of)
-        write_report(out, options.map.name, report, draw_pictures(landmark_map, report), views)
-    print('\n'.join(summary_lines(report)))
+        page.write_report(out, options.map.name, report, draw_pictures(landmark_map, report),
+                          views)
+    print('\n'.join(page.summary_lines(report)))
     print('what to do:')
-    print('\n'.join(f'  {printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
+    print('\n'.join(f'  {command.printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
     for failure in report.failures:
         print(f'fails: {failure}')
-    print(f'wrote {out / PAGE} in {time.monotonic() - begin:.1f} s: '
+    print(f'wrote {out / page.PAGE} in {time.monotonic() - begin:.1f} s: '
           f'{"passed" if report.passed else "failed"}')
     return 0 if report.passed else 1
 

@@ -5,9 +5,8 @@
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
-from cliploc_ros.command import needs_ros, positive, printable, run_main, running_ros
+from cliploc_ros.command import needs_ros, option, positive, printable, run_main, running_ros
 
 EPILOG = """\
 It asks the running relocalizer for its parameters and topics, listens to the same topics, and
@@ -35,13 +34,12 @@ def make_parser() -> argparse.ArgumentParser:
         usage='doctor [options] [--ros-args ...]',
         description='Check parameters, map, camera, calibration, clock, tf, odometry, detector, '
         'localizer and the time of a request, each with what to do.')
-    parser.add_argument('--relocalizer', default='relocalizer', metavar='NAME',
-                        help='its name, in the namespace of this node or absolute (%(default)s)')
-    parser.add_argument('--params-file', type=Path, action='append', default=[], metavar='FILE',
-                        help='check with these parameters; repeat it as on the command line of '
-                        'the node (default: ask the running relocalizer)')
-    parser.add_argument('--timeout', type=positive, default=10.0, metavar='S',
-                        help='wait S seconds for an input (%(default)g)')
+    option(parser, '--relocalizer NAME', 'its name, in the namespace of this node or absolute '
+           '(%(default)s)', default='relocalizer')
+    option(parser, '--params-file FILE', 'check with these parameters; repeat it as on the '
+           'command line of the node (default: ask the running relocalizer)', default=[],
+           action='append')
+    option(parser, '--timeout S', 'wait S seconds for an input (%(default)g)', positive, 10.0)
     return parser
 
 

@@ -12,18 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
-from cliploc_ros.cli.options import add_folders, add_network_options, add_reading_options
-from cliploc_ros.cli.sources import (
+from cliploc_ros.cli.options import (
+    add_folders,
+    add_network_options,
+    add_reading_options,
     check_folder_options,
-    clip_options,
-    detector_options,
-    find_topics,
     folder_of,
-    read_cameras,
-    reading_of,
-    source_of,
 )
-from cliploc_ros.command import SEEDS, limit, not_negative, positive_int, run_main, within
+from cliploc_ros.command import SEEDS, limit, not_negative, option, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.evaluation.methods import ALL, AUTO, PAPER_METHODS
@@ -33,7 +29,7 @@ if TYPE_CHECKING:
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.datasets.frames import Frames
-    from cliploc_ros.offline.datasets.queries import Queries
+    from cliploc_ros.offline.datasets.observations import Queries
     from cliploc_ros.offline.evaluation.methods import Method
     from cliploc_ros.offline.evaluation.trials import PosedQuery
 
@@ -66,30 +62,25 @@ def make_parser() -> argparse.ArgumentParser:
         prog='evaluate', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Compare methods on the same input. Writes the paper's table, results.json, "
         'summary.csv, figures and trajectories. Needs no sourced ROS.')
-    sources = parser.add_mutually_exclusive_group(required=True)
-    sources.add_argument('--queries', type=Path, metavar='NPZ',
-                         help='recorded boxes and similarities')
-    sources.add_argument('--bag', type=Path, help='a rosbag2 recording with ground truth; or a '
-                         'request that ~/record stored (npz), which is answered again')
-    add_folders(sources)
-    parser.add_argument('--map', type=Path, nargs='+', required=True, metavar='YAML',
-                        help='several maps are searched as one; true poses are in the first')
-    parser.add_argument('--methods', nargs='+', default=[ALL], metavar='M',
-                        help=f'default: {ALL}; see below')
-    parser.add_argument('--trials', type=positive_int, default=5,
-                        help="the paper's %(default)s by default")
-    parser.add_argument('--seed', type=within(*SEEDS), default=0,
-                        help='of the first trial (%(default)s)')
-    parser.add_argument('--frames', choices=('main', 'all'), default='main',
-                        help="of a query file; 'all' includes the neighbours of the queries")
-    parser.add_argument('--crops', type=lambda text: text.replace('-', '_'), choices=CROPS,
-                        default=RelocalizerOptions.crops,
-                        help=f"crops that '{AUTO}' compares with labels (%(default)s)")
-    parser.add_argument('--out', type=Path, default=Path('evaluation'), metavar='DIR')
-    parser.add_argument('--workers', type=positive_int, metavar='N',
-                        help=f'local processes ({_cores()} for searches, 1 for detector and CLIP)')
-    parser.add_argument('--resume', action='store_true', help='continue an unfinished run')
-    parser.add_argument('--no-figures', dest='figures', action='store_false')
+    group = parser.add_mutually_exclusive_group(required=True)
+    option(group, '--queries NPZ', 'recorded boxes and similarities')
+    option(group, '--bag', 'a rosbag2 recording with ground truth; or a request that ~/record '
+           'stored (npz), which is answered again', Path)
+    add_folders(group)
+    option(parser, '--map YAML', 'several maps are searched as one; true poses are in the first',
+           nargs='+', required=True)
+    option(parser, '--methods M', f'default: {ALL}; see below', default=[ALL], nargs='+')
+    option(parser, '--trials', "the paper's %(default)s by default", positive_int, 5)
+    option(parser, '--seed', 'of the first trial (%(default)s)', within(*SEEDS), 0)
+    option(parser, '--frames', "of a query file; 'all' includes the neighbours of the queries",
+           default='main', choices=('main', 'all'))
+    option(parser, '--crops', f"crops that '{AUTO}' compares with labels (%(default)s)",
+           lambda text: text.replace('-', '_'), RelocalizerOptions.crops, choices=CROPS)
+    option(parser, '--out DIR', default=Path('evaluation'))
+    option(parser, '--workers N',
+           f'local processes ({_cores()} for searches, 1 for detector and CLIP)', positive_int)
+    option(parser, '--resume', 'continue an unfinished run')
+    option(parser, '--no-figures', dest='figures', action='store_false')
     add_use_option(parser, f"'{AUTO}' uses the keyframes of the map, as the relocalizer does; "
                    'needs the images of --bag or a folder')
     _add_paper_options(parser)
@@ -101,50 +92,42 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _add_paper_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("options of the paper's methods")
-    group.add_argument('--iterations', type=positive_int, default=500, help='(%(default)s)')
-    group.add_argument('--k', type=positive_int, default=3, help='(%(default)s)')
-    group.add_argument('--iou-threshold', type=within(0.0, 1.0), default=0.2, help='(%(default)s)')
-    group.add_argument('--time-budget-ms', type=limit, default=float('inf'), metavar='MS',
-                       help='limit of each search (none); with one, results vary')
-    group.add_argument('--sweep', type=positive_int, nargs='*', metavar='N',
-                       default=[50, 100, 200, 1000],
-                       help='numbers of iterations to compare (50 100 200 1000)')
+    option(group, '--iterations', '(%(default)s)', positive_int, 500)
+    option(group, '--k', '(%(default)s)', positive_int, 3)
+    option(group, '--iou-threshold', '(%(default)s)', within(0.0, 1.0), 0.2)
+    option(group, '--time-budget-ms MS', 'limit of each search (none); with one, results vary',
+           limit, float('inf'))
+    option(group, '--sweep N', 'numbers of iterations to compare (50 100 200 1000)', positive_int,
+           [50, 100, 200, 1000], nargs='*')
 
 
 def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('simulated sensors besides the camera')
-    group.add_argument('--gravity', action='store_true',
-                       help=f"'{AUTO}' knows the vertical, from the true poses; the paper's "
-                       'methods do not use it')
-    group.add_argument('--gravity-noise-deg', type=within(0.0, 45.0), default=0.0, metavar='DEG',
-                       help='standard deviation of the vertical (0)')
-    group.add_argument('--height-range', type=limit, nargs=2, metavar=('LOW', 'HIGH'),
-                       default=(-math.inf, math.inf),
-                       help='heights that the camera may have in the map [m]')
-    group.add_argument('--tilt-deviation', type=not_negative, default=40.0, metavar='DEG',
-                       help=f"of the camera off upright, for '{AUTO}' without vertical; 0 where "
-                       "the map's z axis is not up (%(default)s)")
-    group.add_argument('--fuse', action='store_true',
-                       help='localize each query with the other frames of its group, linked by '
-                       'odometry from the true poses')
-    group.add_argument('--odometry-noise', type=not_negative, nargs=2, default=(0.0, 0.0),
-                       metavar=('METRES', 'DEGREES'),
-                       help='standard deviations of each step of odometry, on each axis (0 0)')
+    option(group, '--gravity', f"'{AUTO}' knows the vertical, from the true poses; the paper's "
+           'methods do not use it')
+    option(group, '--gravity-noise-deg DEG', 'standard deviation of the vertical (0)',
+           within(0.0, 45.0), 0.0)
+    option(group, '--height-range LOW HIGH', 'heights that the camera may have in the map [m]',
+           limit, (-math.inf, math.inf))
+    option(group, '--tilt-deviation DEG',
+           f"of the camera off upright, for '{AUTO}' without vertical; 0 where "
+           "the map's z axis is not up (%(default)s)", not_negative, 40.0)
+    option(group, '--fuse', 'localize each query with the other frames of its group, linked by '
+           'odometry from the true poses')
+    option(group, '--odometry-noise METRES DEGREES', 'standard deviations of each step of '
+           'odometry, on each axis (0 0)', not_negative, (0.0, 0.0))
 
 
 def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('options of --bag and folders')
-    group.add_argument('--save-queries', type=Path, metavar='NPZ',
-                       help='write the recorded boxes and similarities, for --queries')
+    option(group, '--save-queries NPZ', 'write the recorded boxes and similarities, for --queries')
     add_network_options(group)
-    group.add_argument('--landmark-embeddings', choices=COMPARED, default='image',
-                       help="compare crops with the map's labels (text), with the images next to "
-                       'it, or with both (%(default)s)')
-    group.add_argument('--every', type=positive_int, default=1, metavar='N',
-                       help='use every N-th image of a folder')
-    group.add_argument('--sync-tolerance', type=not_negative, default=0.05, metavar='SECONDS',
-                       help='images of several --cameras within this time are of one instant, and '
-                       'localized together, from the first camera (%(default)s)')
+    option(group, '--landmark-embeddings', "compare crops with the map's labels (text), with the "
+           'images next to it, or with both (%(default)s)', default='image', choices=COMPARED)
+    option(group, '--every N', 'use every N-th image of a folder', positive_int, 1)
+    option(group, '--sync-tolerance SECONDS', 'images of several --cameras within this time are '
+           'of one instant, and localized together, from the first camera (%(default)s)',
+           not_negative, 0.05)
 
 
 def evaluate(options: argparse.Namespace) -> int:
@@ -153,11 +136,10 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.core.map.joined_map import join_maps
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
+    from cliploc_ros.offline.evaluation import trials
     from cliploc_ros.offline.evaluation.methods import parse_methods
     from cliploc_ros.offline.evaluation.recording import with_features
     from cliploc_ros.offline.evaluation.run import compare_methods
-    from cliploc_ros.offline.evaluation.sensors import with_neighbours, with_vertical
-    from cliploc_ros.offline.evaluation.trials import join_cameras, make_queries
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):
@@ -167,6 +149,8 @@ def evaluate(options: argparse.Namespace) -> int:
         raise OptionsError('--level is for folders of images only')
     of_case = options.bag is not None and options.bag.suffix == '.npz'
     if options.queries is None and not of_case:
+        from cliploc_ros.cli.sources import find_topics
+
         find_topics(options, options.bag)
     landmark_map = join_maps([LandmarkMap.from_file(file) for file in options.map],
                              [str(file) for file in options.map])
@@ -187,10 +171,11 @@ def evaluate(options: argparse.Namespace) -> int:
     of_cameras = {camera: _read_queries(options, landmark_map, camera, images.get(camera))
                   for camera in images or ('',)}
     recorded = next(iter(of_cameras.values()))
-    queries = make_queries(recorded, landmark_map, every_frame=True)
-    if len(of_cameras) > 1:
-        queries = join_cameras({camera: make_queries(its, landmark_map, every_frame=True)
-                                for camera, its in of_cameras.items()}, options.sync_tolerance)
+    asked = {camera: trials.make_queries(its, landmark_map, every_frame=True)
+             for camera, its in of_cameras.items()}
+    queries = next(iter(asked.values()))
+    if len(asked) > 1:
+        queries = trials.join_cameras(asked, options.sync_tolerance)
     if layer is not None:
         queries = with_features(queries, next(iter(images.values())))
         notes = {layer.camera_note(one.image.camera) for one in queries if one.image is not None}
@@ -201,10 +186,10 @@ def evaluate(options: argparse.Namespace) -> int:
     def sensed(seed: int) -> 'tuple[PosedQuery, ...]':
         found = queries
         if options.gravity:
-            found = with_vertical(found, options.gravity_noise_deg, seed)
+            found = trials.with_vertical(found, options.gravity_noise_deg, seed)
         if options.fuse:
-            found = with_neighbours(found, [frame.group for frame in recorded], noise_m,
-                                    noise_deg, seed)
+            found = trials.with_neighbours(found, [frame.group for frame in recorded], noise_m,
+                                           noise_deg, seed)
         return tuple(one for one in found
                      if options.frames == 'all' or recorded[one.number].is_main)
     is_noisy = (options.gravity and options.gravity_noise_deg) or (
@@ -230,6 +215,7 @@ def _notes_on_detector(queries: 'Sequence[PosedQuery]', landmark_map: 'LandmarkM
 
 def _notes_on_maps(options: argparse.Namespace) -> list[str]:
     """Return a note on each map that was built from the images it is evaluated on."""
+    from cliploc_ros.cli.sources import source_of
     from cliploc_ros.offline.datasets.map_recording import load_recording
 
     if options.queries is not None:
@@ -282,6 +268,7 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
 
 def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
     """Answer a recorded request again; return 0 if the verdict is the same, else 1."""
+    from cliploc_ros.cli.sources import clip_options
     from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
     from cliploc_ros.core.localizer import Localizer, repeat
     from cliploc_ros.core.query import read_case
@@ -311,18 +298,18 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
 def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', camera: str,
                   frames: 'Frames | None') -> 'Queries':
     """Return the queries of a file, or those of the images of a camera, recorded once."""
-    from cliploc_ros.offline.datasets.queries import load_queries, save_queries
+    from cliploc_ros.offline.datasets.observations import load_queries, save_queries
     from cliploc_ros.offline.evaluation.recording import recorded_queries
-    from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions
+    from cliploc_ros.offline.recording.recorder import EVERY_FRAME
 
     if frames is None:
         if options.save_queries is not None:
             raise OptionsError('--save-queries needs --bag or a folder')
         return load_queries(options.queries, landmark_map.landmark_ids)
+    from cliploc_ros.cli.sources import recording_options
+
     print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
-    recording = RecordingOptions(
-        detector_options(options), clip_options(options) if options.clip else None, EVERY_FRAME,
-        reading_of(options, options.every, camera), options.workers or 1, options.scheduler)
+    recording = recording_options(options, EVERY_FRAME, options.every, camera)
     queries = recorded_queries(frames, landmark_map, recording, list(map(str, options.map)),
                                options.landmark_embeddings)
     if without := frames.count - len(queries):
@@ -336,6 +323,7 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
 
 def _read_images(options: argparse.Namespace) -> 'dict[str, Frames]':
     """Return the images of each camera with the true poses; of a folder, every n-th."""
+    from cliploc_ros.cli.sources import read_cameras
     from cliploc_ros.offline.datasets.map_recording import load_recording
 
     built_from = load_recording(options.map[0])

@@ -7,11 +7,10 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cliploc_ros.command import finite, positive, printable, run_main
-from cliploc_ros.errors import DatasetError, MapError, OptionsError
+from cliploc_ros.command import check_output, finite, option, positive, printable, run_main
+from cliploc_ros.errors import DatasetError, OptionsError
 
 if TYPE_CHECKING:
     from cliploc_ros.offline.datasets.map_formats.given_map import GivenMap
@@ -47,31 +46,25 @@ def make_parser() -> argparse.ArgumentParser:
         prog='import_map', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         description='Import a map of another system. An existing map is replaced only when the '
         'new one is complete. Needs no sourced ROS.')
-    parser.add_argument('input', type=Path, metavar='IN', help='the file to import')
-    parser.add_argument('--from', dest='format', choices=_FORMATS, required=True,
-                        help='its format')
-    parser.add_argument('--out', type=Path, required=True, metavar='YAML',
-                        help='the map to write')
-    parser.add_argument('--report', type=Path, metavar='JSON',
-                        help='also write what was left out, and why')
-    parser.add_argument('--class-names', type=Path, metavar='FILE',
-                        help='a class name in each line, for formats with indices (COCO)')
+    option(parser, 'input IN', 'the file to import')
+    option(parser, '--from', 'its format', dest='format', choices=_FORMATS, required=True)
+    option(parser, '--out YAML', 'the map to write', required=True)
+    option(parser, '--report JSON', 'also write what was left out, and why')
+    option(parser, '--class-names FILE', 'a class name in each line, for formats with indices '
+           '(COCO)')
     place = parser.add_argument_group('where the map lies')
-    place.add_argument('--frame-id', default='map', help='of the map (%(default)s)')
-    place.add_argument('--scale', type=positive, default=1.0, metavar='METRES',
-                       help='metres in a unit of length of the file (%(default)s)')
-    place.add_argument('--transform', type=finite, nargs=7, metavar='V',
-                       default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
-                       help="x y z [m] qx qy qz qw of the file's coordinate frame in the map's")
-    place.add_argument('--errors', type=positive, nargs=2, metavar=('METRES', 'DEGREES'),
-                       default=_ERRORS,
-                       help='how far landmarks are off on each axis, each on its own and all '
-                       'together, where the file has no position_sigma (0.05 1)')
+    option(place, '--frame-id', 'of the map (%(default)s)', default='map')
+    option(place, '--scale METRES', 'metres in a unit of length of the file (%(default)s)',
+           positive, 1.0)
+    option(place, '--transform V', "x y z [m] qx qy qz qw of the file's coordinate frame in the "
+           "map's", finite, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), nargs=7)
+    option(place, '--errors METRES DEGREES', 'how far landmarks are off on each axis, each on its '
+           'own and all together, where the file has no position_sigma (0.05 1)', positive,
+           _ERRORS)
     refit = parser.add_argument_group('fit to a recording')
-    refit.add_argument('--refit', type=Path, metavar='NPZ',
-                       help='fit each landmark to the boxes of these observations')
-    refit.add_argument('--keep-unsupported', action='store_true',
-                       help='keep landmarks that cannot be fitted, where the file has them')
+    option(refit, '--refit NPZ', 'fit each landmark to the boxes of these observations')
+    option(refit, '--keep-unsupported', 'keep landmarks that cannot be fitted, where the file has '
+           'them')
     return parser
 
 
@@ -132,10 +125,7 @@ def _check_paths(options: argparse.Namespace) -> None:
         path = getattr(options, name)
         if path is None:
             continue
-        if not path.parent.is_dir():
-            raise MapError(f'{path}: there is no folder {path.parent}; create it')
-        if path.is_dir():
-            raise MapError(f'{path} is a folder; name the file to write')
+        check_output(path)
         for other in (options.input, options.refit, options.class_names):
             if other is not None and path.exists() and other.exists() and path.samefile(other):
                 raise OptionsError(f'--{name} {path} is an input; name another file')
@@ -143,17 +133,16 @@ def _check_paths(options: argparse.Namespace) -> None:
 
 def _read(options: argparse.Namespace) -> 'GivenMap':
     """Return the content of the input."""
-    from cliploc_ros.offline.datasets.map_formats.given_map import COCO, read_class_names
-    from cliploc_ros.offline.datasets.map_formats.msgloc import read_msgloc
+    from cliploc_ros.offline.datasets.map_formats import given_map
     from cliploc_ros.offline.datasets.map_formats.quadric_maps import read_goreloc, read_oaslam
-    from cliploc_ros.offline.datasets.map_formats.table import read_table
 
     if options.format == 'csv':
         if options.class_names is not None:
             raise OptionsError('--class-names is not for csv, whose column class_id has names')
-        return read_table(options.input)
-    names = COCO if options.class_names is None else read_class_names(options.class_names)
-    readers = {'msgloc': read_msgloc, 'goreloc': read_goreloc, 'oaslam': read_oaslam}
+        return given_map.read_table(options.input)
+    names = (given_map.COCO if options.class_names is None
+             else given_map.read_class_names(options.class_names))
+    readers = {'msgloc': given_map.read_msgloc, 'goreloc': read_goreloc, 'oaslam': read_oaslam}
     return readers[options.format](options.input, names)
 
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cliploc_ros.command import positive_int
+from cliploc_ros.command import option, positive_int
 from cliploc_ros.errors import MapError, MappingError, OptionsError
 
 if TYPE_CHECKING:
@@ -20,16 +20,13 @@ _DEFAULT_POINTS = 600
 def add_layer_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the layer to a parser."""
     group = parser.add_argument_group('keyframes next to the map')
-    group.add_argument('--keyframe-layer', action=argparse.BooleanOptionalAction,
-                       help='write NAME.keyframes.npz: local features of the images of '
-                       '--keyframes, with their places from depth or triangulated (default: '
-                       'where the source has images, and a layer can be made of them)')
-    group.add_argument('--keyframe-points', type=positive_int, default=_DEFAULT_POINTS,
-                       metavar='N', help='the most points of a keyframe, 146 bytes each '
-                       '(%(default)s)')
-    group.add_argument('--keyframe-images', action='store_true',
-                       help='also store small images of the keyframes, for the debug image: '
-                       'anyone who has the file sees the place')
+    option(group, '--keyframe-layer', 'write NAME.keyframes.npz: local features of the images of '
+           '--keyframes, with their places from depth or triangulated (default: where the source '
+           'has images, and a layer can be made of them)', action=argparse.BooleanOptionalAction)
+    option(group, '--keyframe-points N', 'the most points of a keyframe, 146 bytes each '
+           '(%(default)s)', positive_int, _DEFAULT_POINTS)
+    option(group, '--keyframe-images', 'also store small images of the keyframes, for the debug '
+           'image: anyone who has the file sees the place')
 
 
 def check_layer_options(options: argparse.Namespace) -> None:
@@ -93,8 +90,8 @@ def write_layer(map_file: Path, layer: 'KeyframeLayer') -> str:
 
 def add_use_option(parser: argparse.ArgumentParser, what: str) -> None:
     """Add the switch --keyframes to a parser; what it does is for the help."""
-    parser.add_argument('--keyframes', action=argparse.BooleanOptionalAction,
-                        help=f'{what} (default: if NAME.keyframes.npz lies next to the map)')
+    option(parser, '--keyframes', f'{what} (default: if NAME.keyframes.npz lies next to the map)',
+           action=argparse.BooleanOptionalAction)
 
 
 def read_layer(map_file: Path, landmark_map: 'LandmarkMap', wanted: bool | None

@@ -6,9 +6,8 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
-from cliploc_ros.command import needs_ros, run_main, running_ros
+from cliploc_ros.command import needs_ros, option, run_main, running_ros
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 
 EPILOG = """\
@@ -37,19 +36,14 @@ def make_parser() -> argparse.ArgumentParser:
         prog='prepare', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         usage='prepare --params-file FILE [options] [--ros-args ...]',
         description='Download, convert and compile what the nodes need, and measure a request.')
-    parser.add_argument(
-        '--params-file', type=Path, action='append', required=True, metavar='FILE',
-        help='parameter file of the nodes; repeat it as on their command line')
-    parser.add_argument(
-        '--image', type=Path, metavar='FILE',
-        help="picture of the robot's camera for the request (default: a drawn one)")
-    parser.add_argument(
-        '--cache-dir', type=Path, metavar='DIR',
-        help='keep everything in this folder, to copy it to a robot (default: where the '
-        'parameters say)')
-    parser.add_argument(
-        '--without-detector', action='store_true',
-        help='the robot has a detector of its own: load no YOLO, and draw boxes instead')
+    option(parser, '--params-file FILE', 'parameter file of the nodes; repeat it as on their '
+           'command line', action='append', required=True)
+    option(parser, '--image FILE', "picture of the robot's camera for the request (default: a "
+           'drawn one)')
+    option(parser, '--cache-dir DIR', 'keep everything in this folder, to copy it to a robot '
+           '(default: where the parameters say)')
+    option(parser, '--without-detector', 'the robot has a detector of its own: load no YOLO, and '
+           'draw boxes instead')
     return parser
 
 

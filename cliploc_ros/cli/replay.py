@@ -12,15 +12,8 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from cliploc_ros.command import (
-    Interruption,
-    needs_ros,
-    not_negative,
-    positive,
-    run_command,
-    running_ros,
-    split_ros_args,
-)
+from cliploc_ros import command
+from cliploc_ros.command import option
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.datasets.bags import BagReader
 from cliploc_ros.units import NS_PER_S
@@ -40,9 +33,9 @@ examples:
 def main(args: Sequence[str] | None = None) -> int:
     """Publish a recording; return the exit code."""
     arguments = list(sys.argv[1:] if args is None else args)
-    stop = Interruption()
+    stop = command.Interruption()
     stop.catch(signal.SIGINT, signal.SIGTERM)
-    return run_command(lambda: replay(arguments, stop))
+    return command.run_command(lambda: replay(arguments, stop))
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -52,34 +45,30 @@ def make_parser() -> argparse.ArgumentParser:
         usage='replay BAG [options] [--ros-args ...]',
         description='Publish the messages of a rosbag2 recording (sqlite3 or mcap, also those of '
         '`ros2 bag record`) with their recorded bytes, types and QoS.')
-    parser.add_argument('bag', type=Path, metavar='BAG', help='folder, or a .mcap or .db3 file')
-    parser.add_argument('-r', '--rate', type=positive, default=1.0, metavar='X',
-                        help='speed: 2 is twice as fast as recorded (default: 1)')
-    parser.add_argument('-l', '--loop', action='store_true', help='begin again at the end')
-    parser.add_argument('--start-offset', type=not_negative, default=0.0, metavar='S',
-                        help='begin S seconds after the start of the recording')
-    parser.add_argument('--topics', nargs='+', type=_absolute, metavar='TOPIC',
-                        help='publish these only (default: all)')
-    parser.add_argument('--exclude', nargs='+', type=_absolute, default=[], metavar='TOPIC',
-                        help='leave these out')
-    parser.add_argument('-m', '--remap', nargs='+', type=_remap_rule, default=[],
-                        metavar='OLD:=NEW', help='publish the recorded topic OLD as NEW')
-    parser.add_argument('--clock', nargs='?', type=positive, const=40.0, metavar='HZ',
-                        help="publish the recording's time on /clock, HZ times a second (default: "
-                        '40), for nodes with use_sim_time; with --loop it jumps back at each '
-                        'start')
-    parser.add_argument('--wait-for-subscribers', nargs='*', type=_absolute, metavar='TOPIC',
-                        help='begin when each of these topics (all if none is named) has a '
-                        'subscriber')
-    parser.add_argument('--wait-timeout', type=not_negative, default=30.0, metavar='S',
-                        help='give up waiting for subscribers after S seconds (default: 30)')
-    parser.add_argument('--wait-for-all-acked', type=not_negative, default=10.0, metavar='S',
-                        help='at the end, wait up to S seconds until reliable subscribers have '
-                        'acknowledged all messages, which takes about 3 s (default: 10)')
+    option(parser, 'bag BAG', 'folder, or a .mcap or .db3 file', Path)
+    option(parser, '-r --rate X', 'speed: 2 is twice as fast as recorded (default: 1)',
+           command.positive, 1.0)
+    option(parser, '-l --loop', 'begin again at the end')
+    option(parser, '--start-offset S', 'begin S seconds after the start of the recording',
+           command.not_negative, 0.0)
+    option(parser, '--topics TOPIC', 'publish these only (default: all)', _absolute, nargs='+')
+    option(parser, '--exclude TOPIC', 'leave these out', _absolute, [], nargs='+')
+    option(parser, '-m --remap OLD:=NEW', 'publish the recorded topic OLD as NEW', _remap_rule, [],
+           nargs='+')
+    option(parser, '--clock HZ', "publish the recording's time on /clock, HZ times a second "
+           '(default: 40), for nodes with use_sim_time; with --loop it jumps back at each start',
+           command.positive, nargs='?', const=40.0)
+    option(parser, '--wait-for-subscribers TOPIC', 'begin when each of these topics (all if none '
+           'is named) has a subscriber', _absolute, nargs='*')
+    option(parser, '--wait-timeout S', 'give up waiting for subscribers after S seconds (default: '
+           '30)', command.not_negative, 30.0)
+    option(parser, '--wait-for-all-acked S', 'at the end, wait up to S seconds until reliable '
+           'subscribers have acknowledged all messages, which takes about 3 s (default: 10)',
+           command.not_negative, 10.0)
     return parser
 
 
-def replay(args: list[str], stop: Interruption) -> int:
+def replay(args: list[str], stop: command.Interruption) -> int:
     """Publish a recording until its end or until stopped; return the exit code.
 
     CliplocError: for a recording or an option that cannot be used, or without ROS.
@@ -91,12 +80,12 @@ def replay(args: list[str], stop: Interruption) -> int:
     stop : Interruption
         Ends the replay.
     """
-    plain_args, ros_args = split_ros_args(args)
+    plain_args, ros_args = command.split_ros_args(args)
     options = make_parser().parse_args(plain_args)
-    with needs_ros('replay'):
+    with command.needs_ros('replay'):
         from rclpy.exceptions import InvalidTopicNameException
         from rclpy.node import Node
-    with running_ros(ros_args), BagReader(options.bag) as reader:
+    with command.running_ros(ros_args), BagReader(options.bag) as reader:
         from cliploc_ros.offline.replay import Player, PlayOptions
 
         # Nothing spins this node, so it could not serve its parameters.
@@ -111,7 +100,7 @@ def replay(args: list[str], stop: Interruption) -> int:
         return _play(player, options, stop)
 
 
-def _play(player: 'Player', options: argparse.Namespace, stop: Interruption) -> int:
+def _play(player: 'Player', options: argparse.Namespace, stop: command.Interruption) -> int:
     if options.wait_for_subscribers is not None:
         player.wait_for_subscribers(options.wait_for_subscribers, options.wait_timeout)
     for topic in player.without_type:

@@ -3,42 +3,42 @@
 """Read the recording that the options of a program name, see cli.options."""
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.cli.options import check_folder_options, folder_of
 from cliploc_ros.command import positive
+from cliploc_ros.core.depth_image import DepthCamera
+from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.models.open_vocabulary import prompts_of_map, prompts_of_names
 from cliploc_ros.models.profiles import with_detector, with_encoder
+from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.offline.datasets import bag_frames
+from cliploc_ros.offline.datasets.captures.capture import FolderOptions
+from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
+from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, join_frames
+from cliploc_ros.offline.datasets.map_recording import MapRecording
+from cliploc_ros.offline.datasets.observations import Recorded, load_recorded
+from cliploc_ros.offline.datasets.poses import Poses, mount_from_numbers
+from cliploc_ros.offline.datasets.tum import read_tum_trajectory
+from cliploc_ros.offline.recording import recorder
 from cliploc_ros.units import NS_PER_S
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from cliploc_ros.models.clip_weights import ClipOptions
-    from cliploc_ros.models.protocols import DetectorOptions
-    from cliploc_ros.offline.datasets.bag_poses import ReadPoses
-    from cliploc_ros.offline.datasets.frames import DepthFormat, Frames
-    from cliploc_ros.offline.datasets.map_recording import MapRecording
-    from cliploc_ros.offline.datasets.observations import Recorded
-    from cliploc_ros.offline.datasets.poses import Poses
 
 # Of a recording, these change how its frames are read.
 _READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'max_gap', 'image',
             'camera_info', 'rectified', 'depth', 'depth_unit', 'depth_intrinsics',
             'depth_baseline', 'intrinsics')
-# Of folders only.
-_PLACING = ('images', 'axes', 'scale', 'known_distance')
 
 
-def detector_options(options: argparse.Namespace, **more: Any) -> 'DetectorOptions':
+def detector_options(options: argparse.Namespace, **more: Any) -> DetectorOptions:
     """Return the detector that the command line names."""
-    from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.models.open_vocabulary import prompts_of_map, prompts_of_names
-    from cliploc_ros.models.protocols import DetectorOptions
-
     words = options.detector_vocabulary
     prompts = () if not words else (
         prompts_of_map(LandmarkMap.from_file(words), words) if words.endswith('.yaml')
@@ -48,20 +48,11 @@ def detector_options(options: argparse.Namespace, **more: Any) -> 'DetectorOptio
         text_model=options.text_model, **more), options.profile)
 
 
-def clip_options(options: argparse.Namespace) -> 'ClipOptions':
+def clip_options(options: argparse.Namespace) -> ClipOptions:
     """Return the CLIP that the command line names."""
-    from cliploc_ros.models.clip_weights import ClipOptions
-
     return with_encoder(ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
                                     device=options.device, inference=options.inference),
                         options.profile)
-
-
-def folder_of(options: argparse.Namespace) -> 'tuple[Path, str] | None':
-    """Return the folder that the command line names and the key of its layout; '' to find it."""
-    named = {'tum': 'tum', 'rgbd': 'rgbd', 'folder': '', 'colmap': 'colmap', 'nerf': 'nerf'}
-    return next(((getattr(options, name), key) for name, key in named.items()
-                 if getattr(options, name) is not None), None)
 
 
 def metres_of(text: str, option: str) -> float:
@@ -77,8 +68,6 @@ def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
 
     DatasetError: the bag has none, or several.
     """
-    from cliploc_ros.offline.datasets import bag_frames
-
     open_topics = [name for name in ('image', 'camera_info') if getattr(options, name) is None]
     if bag is None or options.cameras != ['']:
         options.image = options.image or bag_frames.BagTopics.image
@@ -92,9 +81,9 @@ def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
 class Source(NamedTuple):
     """What a source says: observations, the file that has them, and its images if there are."""
 
-    recorded: 'Recorded'
+    recorded: Recorded
     file: Path
-    frames: 'Frames | None'
+    frames: Frames | None
 
 
 def read_source(options: argparse.Namespace) -> Source:
@@ -102,14 +91,6 @@ def read_source(options: argparse.Namespace) -> Source:
 
     CliplocError: the source, the networks or the options cannot be used.
     """
-    from cliploc_ros.offline.datasets.observations import load_recorded
-    from cliploc_ros.offline.recording.recorder import (
-        KeyframeOptions,
-        RecordingOptions,
-        observation_file,
-        record_once,
-    )
-
     if options.bag is None and (options.odometry_topic or options.odometry_frame):
         raise OptionsError('--odometry-topic and --odometry-frame are for --bag')
     camera_names(options)
@@ -119,25 +100,29 @@ def read_source(options: argparse.Namespace) -> Source:
         return Source(load_recorded(options.observations), options.observations, None)
     frames = read_frames(options)
     print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
-    recording = RecordingOptions(
-        detector_options(options, conf=options.conf),
-        clip_options(options) if options.clip else None, KeyframeOptions(*options.keyframes),
-        reading_of(options), options.workers, options.scheduler)
-    file = options.record_to or observation_file(frames, recording)
-    return Source(record_once(frames, recording, file, _odometry(options)), file, frames)
+    recording = recording_options(options, recorder.KeyframeOptions(*options.keyframes))
+    file = options.record_to or recorder.observation_file(frames, recording)
+    return Source(recorder.record_once(frames, recording, file, _odometry(options)), file, frames)
 
 
-def reading_of(options: argparse.Namespace, *more: object) -> str:
-    """Return all that says how a recording is read: another text, another observation file."""
-    return repr([str(getattr(options, name)) for name in _READING]
-                + (options.cameras if options.cameras != [''] else []) + list(map(str, more)))
+def recording_options(options: argparse.Namespace, keyframes: recorder.KeyframeOptions,
+                      *more: object) -> recorder.RecordingOptions:
+    """Return how detector and CLIP look at the images that the command line names.
+
+    All that says how a recording is read is part of it, with more of the program: another text,
+    another observation file.
+    """
+    reading = [*(str(getattr(options, name)) for name in _READING),
+               *(options.cameras if options.cameras != [''] else []), *map(str, more)]
+    conf = {'conf': options.conf} if 'conf' in options else {}
+    return recorder.RecordingOptions(
+        detector_options(options, **conf), clip_options(options) if options.clip else None,
+        keyframes, repr(reading), options.workers or 1, options.scheduler)
 
 
 def recording_of(options: argparse.Namespace, file: Path, scale: float,
-                 rotation: 'NDArray[np.float64]') -> 'MapRecording':
+                 rotation: NDArray[np.float64]) -> MapRecording:
     """Return what a map is built from; its poses are those of a file, scaled and turned."""
-    from cliploc_ros.offline.datasets.map_recording import MapRecording
-
     folder = folder_of(options)
     source, layout = folder or (options.bag, '')
     if options.bag is not None:
@@ -149,37 +134,24 @@ def recording_of(options: argparse.Namespace, file: Path, scale: float,
                         rotation=rotation.tolist())
 
 
-def check_folder_options(options: argparse.Namespace) -> None:
-    """Refuse options of folders with another source; OptionsError names them."""
-    given = [f'--{name.replace("_", "-")}' for name in _PLACING
-             if getattr(options, name) not in (None, False)]
-    if given and folder_of(options) is None:
-        raise OptionsError(f'{", ".join(given)}: for folders of images only')
-
-
 def source_of(options: argparse.Namespace) -> Path:
     """Return the folder or file that the command line names."""
     found = folder_of(options)
     return found[0] if found is not None else Path(options.bag or options.observations)
 
 
-def read_frames(options: argparse.Namespace) -> 'Frames':
+def read_frames(options: argparse.Namespace) -> Frames:
     """Return the images of the source, of all its cameras, see read_cameras."""
-    from cliploc_ros.offline.datasets.frames import join_frames
-
     of_cameras = read_cameras(options)
     return of_cameras[''] if '' in of_cameras else join_frames(of_cameras)
 
 
-def read_cameras(options: argparse.Namespace, gap_s: float | None = None) -> 'dict[str, Frames]':
+def read_cameras(options: argparse.Namespace, gap_s: float | None = None) -> dict[str, Frames]:
     """Return the images of the source with their poses, by the name of the camera, '' for one.
 
     The poses of a topic or a folder are interpolated over gaps of `gap_s` [s]; None: as those of
     tf. Not for --observations. CliplocError: the source or the options cannot be used.
     """
-    from cliploc_ros.offline.datasets.folders import FolderOptions, read_folder, rgbd_frames
-    from cliploc_ros.offline.datasets.tum import read_tum_trajectory
-
     mounts = _mounts(options)
     gap_ns = round((options.max_gap if gap_s is None else gap_s) * NS_PER_S)
     if (found := folder_of(options)) is None:
@@ -213,7 +185,7 @@ def camera_names(options: argparse.Namespace) -> list[str]:
     return names
 
 
-def _mounts(options: argparse.Namespace) -> 'dict[str, NDArray[np.float64] | None]':
+def _mounts(options: argparse.Namespace) -> dict[str, NDArray[np.float64] | None]:
     """Return the mount (4, 4) of each camera by its name; None where it is not given."""
     names, numbers = camera_names(options), options.mount
     if numbers is None:
@@ -221,46 +193,35 @@ def _mounts(options: argparse.Namespace) -> 'dict[str, NDArray[np.float64] | Non
     if len(numbers) != 7 * len(names):
         raise OptionsError(f'--mount has {len(numbers)} numbers, expected 7 for each of '
                            f'{len(names)} camera{"s" if len(names) > 1 else ""}')
-    return {name: mount_of(numbers[7 * row:7 * row + 7]) for row, name in enumerate(names)}
+    return {name: mount_from_numbers(numbers[7 * row:7 * row + 7])
+            for row, name in enumerate(names)}
 
 
-def _frames_of(options: argparse.Namespace, name: str, mount: 'NDArray[np.float64] | None',
-               gap_ns: int) -> 'Frames':
+def _frames_of(options: argparse.Namespace, name: str, mount: NDArray[np.float64] | None,
+               gap_ns: int) -> Frames:
     """Return the images of one camera of a bag; its name is '' where it is the only one."""
-    from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
-
-    topics = BagTopics(options.image, options.camera_info, options.rectified, options.depth or '')
+    topics = bag_frames.BagTopics(options.image, options.camera_info, options.rectified,
+                                  options.depth or '')
     read = _read_poses(options, name, mount, gap_ns)
     try:
-        return bag_frames(options.bag, topics.of_camera(name), read, _depth_format(options))
+        return bag_frames.bag_frames(options.bag, topics.of_camera(name), read,
+                                     _depth_format(options))
     except DatasetError as error:
         if not name:
             raise
         raise DatasetError(f"camera '{name}': {error}") from error
 
 
-def mount_of(numbers: Sequence[float] | None) -> 'NDArray[np.float64] | None':
-    """Return the mount (4, 4) that an option gives; None where it is not given."""
-    from cliploc_ros.offline.datasets.poses import mount_from_numbers
+def _poses_of_topic(topic: str, camera: str, mount: NDArray[np.float64] | None, gap_ns: int
+                    ) -> bag_frames.ReadPoses:
+    """Return what reads a topic, which without a mount is the camera's own, in its namespace."""
+    return bag_frames.poses_of_topic(
+        topic if mount is not None else bag_frames.topic_of(camera, topic), gap_ns, mount)
 
-    return None if numbers is None else mount_from_numbers(numbers)
 
-
-def _read_poses(options: argparse.Namespace, camera: str, mount: 'NDArray[np.float64] | None',
-                gap_ns: int) -> 'ReadPoses':
-    """Return what reads the poses of a camera of a bag; the gap [ns] is that of a topic.
-
-    A topic without a mount is the camera's own, in its namespace.
-    """
-    from cliploc_ros.offline.datasets.bag_frames import topic_of
-    from cliploc_ros.offline.datasets.bag_poses import (
-        GROUND_TRUTH,
-        find_poses,
-        poses_of_tf,
-        poses_of_topic,
-    )
-    from cliploc_ros.offline.datasets.tum import read_tum_trajectory
-
+def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.float64] | None,
+                gap_ns: int) -> bag_frames.ReadPoses:
+    """Return what reads the poses of a camera of a bag; the gap [ns] is that of a topic."""
     given = [name for name in ('pose_topic', 'map_frame', 'trajectory')
              if getattr(options, name) is not None]
     max_gap_ns = round(options.max_gap * NS_PER_S)
@@ -270,11 +231,10 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: 'NDArray[np.flo
     if not given:
         if mount is not None:
             raise OptionsError('--mount is for --pose-topic and --trajectory: name one of them')
-        return find_poses(max_gap_ns, topic_of(camera, GROUND_TRUTH), options.camera_frame,
-                          gap_ns)
+        truth = bag_frames.topic_of(camera, bag_frames.GROUND_TRUTH)
+        return bag_frames.find_poses(max_gap_ns, truth, options.camera_frame, gap_ns)
     if options.pose_topic is not None:
-        topic = options.pose_topic if mount is not None else topic_of(camera, options.pose_topic)
-        return poses_of_topic(topic, gap_ns, mount)
+        return _poses_of_topic(options.pose_topic, camera, mount, gap_ns)
     if options.trajectory is not None:
         if mount is None and len(options.cameras) > 1:
             raise OptionsError('--trajectory of several cameras: give the --mount of each')
@@ -286,39 +246,26 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: 'NDArray[np.flo
     if options.camera_frame is not None and len(options.cameras) > 1:
         raise OptionsError('--camera-frame is of one camera: several have the frames of their '
                            'images')
-    return poses_of_tf(options.map_frame, options.camera_frame, max_gap_ns)
+    return bag_frames.poses_of_tf(options.map_frame, options.camera_frame, max_gap_ns)
 
 
-def _odometry(options: argparse.Namespace) -> 'dict[str, Poses] | None':
+def _odometry(options: argparse.Namespace) -> dict[str, Poses] | None:
     """Return the cameras of a bag by odometry, by name; None where none is asked for."""
-    from cliploc_ros.offline.datasets.bag_frames import bag_odometry, topic_of
-    from cliploc_ros.offline.datasets.bag_poses import poses_of_tf, poses_of_topic
-
     max_gap_ns = round(options.max_gap * NS_PER_S)
     if options.odometry_frame is None and options.odometry_topic is None:
         return None
     if options.odometry_topic is not None and options.map_frame is not None:
         raise OptionsError('--odometry-topic needs a --mount, which --map-frame has from tf: give '
                            '--odometry-frame')
-    found = {}
-    for name, mount in _mounts(options).items():
-        if options.odometry_frame is not None:
-            read = poses_of_tf(options.odometry_frame, options.camera_frame, max_gap_ns)
-        else:
-            topic = options.odometry_topic
-            read = poses_of_topic(topic if mount is not None else topic_of(name, topic),
-                                  max_gap_ns, mount)
-        found[name] = bag_odometry(options.bag, topic_of(name, options.image), read)
-    return found
+    return {name: bag_frames.bag_odometry(
+        options.bag, bag_frames.topic_of(name, options.image),
+        _poses_of_topic(options.odometry_topic, name, mount, max_gap_ns)
+        if options.odometry_frame is None else bag_frames.poses_of_tf(
+            options.odometry_frame, options.camera_frame, max_gap_ns))
+        for name, mount in _mounts(options).items()}
 
 
-def _depth_format(options: argparse.Namespace) -> 'DepthFormat':
-    import numpy as np
-
-    from cliploc_ros.core.depth_image import DepthCamera
-    from cliploc_ros.core.geometry.transforms import make_transform
-    from cliploc_ros.offline.datasets.frames import DepthFormat
-
+def _depth_format(options: argparse.Namespace) -> DepthFormat:
     camera = None
     if options.depth_intrinsics is not None:
         baseline = np.array(options.depth_baseline or (0.0, 0.0, 0.0))

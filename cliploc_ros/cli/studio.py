@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.map_layer import read_layer
 from cliploc_ros.cli.options import add_topic_options
-from cliploc_ros.cli.sources import find_topics
-from cliploc_ros.command import needs_ros, run_main, within
+from cliploc_ros.command import needs_ros, option, run_main, within
 from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:
@@ -49,34 +48,28 @@ def make_parser() -> argparse.ArgumentParser:
         prog='studio', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         description='Create and correct a map in the browser. Needs no sourced ROS, except for '
         '--ros.')
-    parser.add_argument('map', type=Path, nargs='?', metavar='MAP',
-                        help='a map file; one that does not exist yet starts empty (map.yaml, '
-                        'or the first free of map-2.yaml, map-3.yaml, ...)')
-    parser.add_argument('--observations', type=Path, metavar='NPZ',
-                        help='boxes and poses of a recording of the place')
-    parser.add_argument('--images', type=Path, metavar='BAG|DIR',
-                        help='a rosbag2 recording, or a folder as of build_map --folder, with the '
-                        'images of the views')
+    option(parser, 'map MAP', 'a map file; one that does not exist yet starts empty (map.yaml, or '
+           'the first free of map-2.yaml, map-3.yaml, ...)', nargs='?')
+    option(parser, '--observations NPZ', 'boxes and poses of a recording of the place')
+    option(parser, '--images BAG|DIR', 'a rosbag2 recording, or a folder as of build_map '
+           '--folder, with the images of the views')
     add_topic_options(parser)
-    parser.add_argument('--clip-model', metavar='NAME|JSON',
-                        help='offer the five phrases that this CLIP finds best, as build_map')
-    parser.add_argument('--clip-pretrained', metavar='TAG|FILE', help='its weights')
-    parser.add_argument('--device', default='auto', help='of CLIP (%(default)s)')
-    parser.add_argument('--vocabulary', type=Path, metavar='FILE',
-                        help='phrases by class (YAML), besides the shipped ones')
-    parser.add_argument('--occupancy-grid', type=Path, metavar='FILE',
-                        help="show the walls: the YAML file of nav2_map_server, in the map's "
-                        'coordinate frame')
-    parser.add_argument('--port', type=within(0, 65535), default=8080, metavar='N',
-                        help='the next free one from this on (%(default)s)')
-    parser.add_argument('--host', default=_LOOPBACK, metavar='ADDRESS',
-                        help='listen at this address too; the URL then holds a token '
-                        '(%(default)s: this machine only)')
-    parser.add_argument('--ros', action='store_true', help="show the running relocalizer's last "
-                        'answer in the map, and let it relocalize and reload the map')
-    parser.add_argument('--relocalizer', default='/relocalizer', metavar='NAME',
-                        help='its name, with its namespace (%(default)s)')
-    parser.add_argument('--no-browser', action='store_true', help='print the URL only')
+    option(parser, '--clip-model NAME|JSON', 'offer the five phrases that this CLIP finds best, '
+           'as build_map')
+    option(parser, '--clip-pretrained TAG|FILE', 'its weights')
+    option(parser, '--device', 'of CLIP (%(default)s)', default='auto')
+    option(parser, '--vocabulary FILE', 'phrases by class (YAML), besides the shipped ones')
+    option(parser, '--occupancy-grid FILE', 'show the walls: the YAML file of nav2_map_server, in '
+           "the map's coordinate frame")
+    option(parser, '--port N', 'the next free one from this on (%(default)s)', within(0, 65535),
+           8080)
+    option(parser, '--host ADDRESS', 'listen at this address too; the URL then holds a token '
+           '(%(default)s: this machine only)', default=_LOOPBACK)
+    option(parser, '--ros', "show the running relocalizer's last answer in the map, and let it "
+           'relocalize and reload the map')
+    option(parser, '--relocalizer NAME', 'its name, with its namespace (%(default)s)',
+           default='/relocalizer')
+    option(parser, '--no-browser', 'print the URL only')
     return parser
 
 
@@ -116,6 +109,7 @@ def follow(options: argparse.Namespace) -> 'AbstractContextManager[LiveRelocaliz
 
 def open_studio(options: argparse.Namespace) -> 'Studio':
     """Return the studio that the command line asks for."""
+    from cliploc_ros.cli.sources import find_topics
     from cliploc_ros.offline.datasets.bag_frames import BagTopics
     from cliploc_ros.offline.datasets.folders import find_layout
     from cliploc_ros.offline.datasets.images import (

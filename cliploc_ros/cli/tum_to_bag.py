@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from cliploc_ros.command import positive_int, run_main
+from cliploc_ros.command import option, positive_int, run_main
 from cliploc_ros.offline.datasets.bags import STORAGES
 
 EPILOG = """\
@@ -37,27 +37,21 @@ def make_parser() -> argparse.ArgumentParser:
         description='Convert a TUM RGB-D folder (rgb.txt, rgb/, groundtruth.txt), 7-Scenes or '
         'another folder of build_map --folder into a rosbag2 recording with the topics of the '
         'nodes, without depth. Needs no sourced ROS.')
-    parser.add_argument('folder', type=Path, help='the folder')
-    parser.add_argument('output', type=Path, help='folder of the recording; must not exist')
-    parser.add_argument('--every', type=positive_int, default=1, metavar='N',
-                        help='take every N-th image only (default: 1)')
-    parser.add_argument('--detections', type=Path, metavar='FILE',
-                        help='also write these recorded detections (JSON)')
-    parser.add_argument('--intrinsics', metavar='fr1|fr2|fr3|FILE',
-                        help="the dataset's camera, or a camera.json (default: the folder's "
-                        "camera.json, else the camera in the folder's name)")
-    parser.add_argument('--storage', choices=list(STORAGES), default='sqlite3',
-                        help='default: %(default)s')
+    option(parser, 'folder', 'the folder', Path)
+    option(parser, 'output', 'folder of the recording; must not exist', Path)
+    option(parser, '--every N', 'take every N-th image only (default: 1)', positive_int, 1)
+    option(parser, '--detections FILE', 'also write these recorded detections (JSON)')
+    option(parser, '--intrinsics fr1|fr2|fr3|FILE', "the dataset's camera, or a camera.json "
+           "(default: the folder's camera.json, else the camera in the folder's name)")
+    option(parser, '--storage', 'default: %(default)s', default='sqlite3', choices=list(STORAGES))
     images = parser.add_mutually_exclusive_group()
-    images.add_argument('--raw', dest='image_format', action='store_const', const='raw',
-                        default='raw', help='write decoded images (the default)')
-    images.add_argument('--compressed', dest='image_format', action='store_const',
-                        const='compressed',
-                        help='write the bytes of the image files as compressed images')
-    parser.add_argument('--prefix', default='', help='namespace of all topics')
-    parser.add_argument('--camera-frame', default='camera_optical_frame',
-                        help='default: %(default)s')
-    parser.add_argument('--world-frame', default='world', help='default: %(default)s')
+    option(images, '--raw', 'write decoded images (the default)', default='raw',
+           dest='image_format', action='store_const', const='raw')
+    option(images, '--compressed', 'write the bytes of the image files as compressed images',
+           dest='image_format', action='store_const', const='compressed')
+    option(parser, '--prefix', 'namespace of all topics', default='')
+    option(parser, '--camera-frame', 'default: %(default)s', default='camera_optical_frame')
+    option(parser, '--world-frame', 'default: %(default)s', default='world')
     return parser
 
 
@@ -66,24 +60,22 @@ def convert(options: argparse.Namespace) -> int:
     # Late, so that --help is fast.
     from tqdm import tqdm
 
+    from cliploc_ros.offline.datasets import tum_conversion
     from cliploc_ros.offline.datasets.folders import read_sequence
-    from cliploc_ros.offline.datasets.tum_conversion import (
-        ConversionOptions,
-        convert_tum,
-        read_recorded_detections,
-    )
 
     begin = time.monotonic()
     sequence, camera, origin = read_sequence(options.folder, options.intrinsics)
     sequence = sequence.every(options.every)
     detections = None
     if options.detections is not None:
-        detections = read_recorded_detections(options.detections, (camera.width, camera.height))
+        detections = tum_conversion.read_recorded_detections(
+            options.detections, (camera.width, camera.height))
     print(f'{len(sequence)} images, intrinsics: {origin}', flush=True)
-    result = convert_tum(
+    result = tum_conversion.convert_tum(
         sequence, camera, options.output,
-        ConversionOptions(options.storage, options.image_format, prefix=options.prefix,
-                          camera_frame=options.camera_frame, world_frame=options.world_frame),
+        tum_conversion.ConversionOptions(
+            options.storage, options.image_format, prefix=options.prefix,
+            camera_frame=options.camera_frame, world_frame=options.world_frame),
         detections,
         progress=lambda images: tqdm(images, unit='image', disable=None))  # on a terminal only
     print(f'wrote {options.output}: {result.images} images, {result.poses} ground-truth poses, '

@@ -7,15 +7,8 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from cliploc_ros.command import (
-    Interruption,
-    needs_ros,
-    positive,
-    run_command,
-    running_ros,
-    split_ros_args,
-    within,
-)
+from cliploc_ros import command
+from cliploc_ros.command import option
 
 _NOT_READY = 2
 
@@ -30,11 +23,11 @@ examples:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Wake the robot up; return the exit code."""
-    plain_args, ros_args = split_ros_args(sys.argv[1:] if args is None else args)
+    plain_args, ros_args = command.split_ros_args(sys.argv[1:] if args is None else args)
     options = make_parser().parse_args(plain_args)
-    interrupted = Interruption()
+    interrupted = command.Interruption()
     interrupted.catch(signal.SIGINT, signal.SIGTERM)
-    return run_command(lambda: wake_up(options, ros_args, interrupted), failure=_NOT_READY)
+    return command.run_command(lambda: wake_up(options, ros_args, interrupted), failure=_NOT_READY)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -44,30 +37,29 @@ def make_parser() -> argparse.ArgumentParser:
         usage='wake_up [options] [--ros-args ...]',
         description='Wait for an active relocalizer, its camera and a localizer; then request '
         "the pose, and turn with Nav2's action spin between looks, until a pose is accepted.")
-    parser.add_argument('--relocalizer', default='relocalizer', metavar='NAME',
-                        help='its name, in the namespace of this node or absolute (%(default)s)')
-    parser.add_argument('--timeout', type=positive, default=60.0, metavar='S',
-                        help='begin no turn after S seconds (%(default)g)')
-    parser.add_argument('--turn-deg', type=within(-180.0, 180.0), default=45.0, metavar='DEG',
-                        help='turn counterclockwise by this much between looks; 0: never '
-                        '(%(default)g)')
-    parser.add_argument('--watch', nargs='?', choices=('true', 'false'), const='true',
-                        default='false', help='go on: wake up again whenever the relocalizer, '
-                        'which has to watch, finds the robot lost and at rest')
+    option(parser, '--relocalizer NAME', 'its name, in the namespace of this node or absolute '
+           '(%(default)s)', default='relocalizer')
+    option(parser, '--timeout S', 'begin no turn after S seconds (%(default)g)', command.positive,
+           60.0)
+    option(parser, '--turn-deg DEG', 'turn counterclockwise by this much between looks; 0: never '
+           '(%(default)g)', command.within(-180.0, 180.0), 45.0)
+    option(parser, '--watch', 'go on: wake up again whenever the relocalizer, which has to watch, '
+           'finds the robot lost and at rest', default='false', nargs='?',
+           choices=('true', 'false'), const='true')
     return parser
 
 
-def wake_up(options: argparse.Namespace, ros_args: list[str], interrupted: Interruption
+def wake_up(options: argparse.Namespace, ros_args: list[str], interrupted: command.Interruption
             ) -> int:
     """Wake the robot up with the options of the command line; return the exit code.
 
     OptionsError: there is no ROS, or it does not start with these arguments.
     """
-    with needs_ros('wake_up'):
+    with command.needs_ros('wake_up'):
         from cliploc_ros.ros.running import check_name
         from cliploc_ros.ros.wake_up import WakeUp
     check_name(options.relocalizer)
-    with running_ros(ros_args):
+    with command.running_ros(ros_args):
         node = WakeUp(interrupted, options.relocalizer, options.timeout, options.turn_deg,
                       options.watch == 'true')
         try:

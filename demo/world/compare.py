@@ -27,7 +27,7 @@ from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_weights import import_ultralytics
 from cliploc_ros.offline.datasets.folders import tum_frames
 from cliploc_ros.offline.datasets.intrinsics import find_camera
-from cliploc_ros.offline.datasets.queries import Queries, QueryFrame, save_queries
+from cliploc_ros.offline.datasets.observations import Queries, QueryFrame, save_queries
 from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.evaluation.methods import parse_methods
 from cliploc_ros.offline.evaluation.recording import make_queries_of

@@ -15,10 +15,14 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.offline.datasets.observations import load_observations
-from cliploc_ros.offline.datasets.queries import Queries, load_queries
-from cliploc_ros.offline.evaluation.sensors import simulate_depths, with_neighbours, with_vertical
-from cliploc_ros.offline.evaluation.trials import PosedQuery, make_queries
+from cliploc_ros.offline.datasets.observations import Queries, load_observations, load_queries
+from cliploc_ros.offline.evaluation.trials import (
+    PosedQuery,
+    make_queries,
+    simulate_depths,
+    with_neighbours,
+    with_vertical,
+)
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.units import NS_PER_S

@@ -14,8 +14,7 @@ from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.localizer import by_classes
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.offline.evaluation.sensors import with_vertical
-from cliploc_ros.offline.evaluation.trials import PosedQuery
+from cliploc_ros.offline.evaluation.trials import PosedQuery, with_vertical
 from studies import wrong_sensors
 from studies.acceptance.places import ALL, FIVE, LEVEL, ONE, VERTICAL, VERTICAL_DEG
 from studies.worlds.cameras import GROUP_SIZE

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 
 from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.files.storage import write_text
-from cliploc_ros.offline.evaluation.drawing import draw_map, png_of
+from cliploc_ros.offline.evaluation.figures import draw_map, png_of
 from cliploc_ros.offline.page import (
     ACCEPTED,
     FAINT,

@@ -31,8 +31,7 @@ from cliploc_ros.offline.datasets.frames import (
     RawFrame,
     folder_frames,
 )
-from cliploc_ros.offline.evaluation.sensors import with_vertical
-from cliploc_ros.offline.evaluation.trials import ImageFeatures, PosedQuery
+from cliploc_ros.offline.evaluation.trials import ImageFeatures, PosedQuery, with_vertical
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
 from cliploc_ros.units import NS_PER_S
@@ -188,18 +187,8 @@ def _frames_of(folder: Path, depth_unit: float | None) -> tuple[Frames, bool]:
         depth=DepthFormat(depth_unit), level=not is_tum)), True
 
 
-@dataclass(frozen=True)
-class _Nowhere:
-    """The poses of images whose poses nobody knows."""
-
-    span_ns: tuple[int, int]
-
-    def pose_at(self, stamp_ns: int) -> Floats | None:
-        return np.eye(4)
-
-
 def _without_poses(folder: Path) -> Frames:
-    """Return images without poses, by a usual camera."""
+    """Return images whose poses nobody knows, by a usual camera."""
     paths = sorted(one for one in folder.iterdir() if one.suffix.lower() in ('.jpg', '.png'))
     if not paths:
         raise DatasetError(f'{folder}: has no images')
@@ -209,8 +198,8 @@ def _without_poses(folder: Path) -> Frames:
     height, width = first.shape[:2]
     focal = 0.5 * width / np.tan(np.radians(0.5 * _USUAL_VIEW_DEG))
     camera = Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
-    files = [ImageFile(row * NS_PER_S, path, camera) for row, path in enumerate(paths)]
-    return folder_frames(folder, files, _Nowhere((0, len(files) * NS_PER_S)))
+    files = [ImageFile(row * NS_PER_S, path, camera, np.eye(4)) for row, path in enumerate(paths)]
+    return folder_frames(folder, files)
 
 
 def _features_of(raws: tuple[RawFrame, ...], file: Path) -> tuple[tuple[Features, Camera], ...]:

@@ -91,7 +91,7 @@ def query_scenes(queries: Path, map_file: Path, matching: str) -> list[Scene]:
     matching : str
         'hybrid' or 'class'.
     """
-    from cliploc_ros.offline.datasets.queries import (
+    from cliploc_ros.offline.datasets.observations import (
         load_queries,  # core needs no data sets otherwise
     )
 

@@ -13,8 +13,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.offline.evaluation.sensors import simulate_depths
-from cliploc_ros.offline.evaluation.trials import PosedQuery
+from cliploc_ros.offline.evaluation.trials import PosedQuery, simulate_depths
 from cliploc_ros.units import NS_PER_S
 from studies.worlds.appearance import Encoder
 from studies.worlds.cameras import (

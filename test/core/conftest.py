@@ -12,7 +12,7 @@ from scene import make_room
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.offline.datasets.queries import Queries, load_queries
+from cliploc_ros.offline.datasets.observations import Queries, load_queries
 
 
 @pytest.fixture(scope='session')

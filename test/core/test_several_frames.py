@@ -18,8 +18,7 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.offline.evaluation.sensors import with_neighbours, with_vertical
-from cliploc_ros.offline.evaluation.trials import make_queries
+from cliploc_ros.offline.evaluation.trials import make_queries, with_neighbours, with_vertical
 
 ODOM_FROM_MAP = make_transform(Rotation.from_euler('z', 70, degrees=True).as_matrix(),
                                np.array([30.0, -4.0, 1.0]))

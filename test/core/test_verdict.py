@@ -22,7 +22,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.offline.datasets.queries import load_queries
+from cliploc_ros.offline.datasets.observations import load_queries
 from cliploc_ros.offline.evaluation.trials import make_queries
 
 OPTIONS = RelocalizerOptions()

@@ -28,10 +28,10 @@ from cliploc_ros.offline.datasets.map_formats.given_map import (
     GivenMap,
     place,
     read_class_names,
+    read_msgloc,
+    read_table,
 )
-from cliploc_ros.offline.datasets.map_formats.msgloc import read_msgloc
 from cliploc_ros.offline.datasets.map_formats.quadric_maps import read_goreloc, read_oaslam
-from cliploc_ros.offline.datasets.map_formats.table import read_table
 
 HERE = ('map', 1.0, np.eye(4))
 CUP = COCO.index('cup')

@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.observations import load_observations, save_observations
-from cliploc_ros.offline.datasets.queries import load_queries, save_queries
+from cliploc_ros.offline.datasets.observations import (
+    load_observations,
+    load_queries,
+    save_observations,
+    save_queries,
+)
 
 
 def frame_arrays() -> dict[str, np.ndarray]:

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.captures import placing
-from cliploc_ros.offline.datasets.captures.capture import StampedPoses
 from cliploc_ros.offline.datasets.captures.placing import AXES, check_axes
 from cliploc_ros.offline.datasets.folders import FolderOptions, find_layout, read_folder
 from cliploc_ros.offline.mapping.tilt import find_vertical
@@ -37,13 +36,13 @@ def test_real_images_tell_the_axes(folder, shared_data, monkeypatch):
     # each image is looked at once; looking is most of the time
     monkeypatch.setattr(placing, 'extract', lru_by_pixels(placing.extract))
     for stored_as, given in itertools.product(AXES, AXES):
-        stored = StampedPoses({file.stamp_ns: STORED[stored_as](pose) for file in capture.files
-                               if (pose := capture.poses.pose_at(file.stamp_ns)) is not None})
+        stored = [file._replace(pose=STORED[stored_as](file.pose)) for file in capture.files
+                  if file.pose is not None]
         if given == stored_as:
-            assert check_axes(capture.files, stored, given, folder) == ''
+            assert check_axes(stored, given, folder) == ''
             continue
         with pytest.raises(DatasetError, match=f'poses as {given} .*`axes` {stored_as}$'):
-            check_axes(capture.files, stored, given, folder)
+            check_axes(stored, given, folder)
 
 
 def lru_by_pixels(function):

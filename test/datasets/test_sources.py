@@ -19,10 +19,8 @@ from cliploc_ros.offline.datasets.bag_frames import (
     BagTopics,
     bag_frames,
     bag_odometry,
-    find_topics,
-)
-from cliploc_ros.offline.datasets.bag_poses import (
     find_poses,
+    find_topics,
     poses_of_tf,
     poses_of_topic,
 )

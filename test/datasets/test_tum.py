@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.captures.capture import pose_of
 from cliploc_ros.offline.datasets.intrinsics import PRESETS, find_camera, read_camera
+from cliploc_ros.offline.datasets.parsing import parse_stamp_ns, pose_of
 from cliploc_ros.offline.datasets.poses import TimedPoses, mount_from_numbers
-from cliploc_ros.offline.datasets.tum import parse_stamp_ns, read_tum, read_tum_trajectory
+from cliploc_ros.offline.datasets.tum import read_tum, read_tum_trajectory
 from cliploc_ros.offline.datasets.tum_conversion import read_recorded_detections
 
 MS = 1_000_000

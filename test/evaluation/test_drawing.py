@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 from scene import make_room
 
-from cliploc_ros.offline.evaluation.drawing import draw_map, png_of, spread_names
+from cliploc_ros.offline.evaluation.figures import draw_map, png_of, spread_names
 
 
 @pytest.mark.parametrize('inches', [8.0, 1.5], ids=['large', 'small'])

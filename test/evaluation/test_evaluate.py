@@ -20,7 +20,7 @@ import yaml
 from cliploc_ros.cli.evaluate import main
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.offline.datasets.map_recording import MapRecording, save_recording
-from cliploc_ros.offline.datasets.queries import load_queries
+from cliploc_ros.offline.datasets.observations import load_queries
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
 
 PROJECT = Path(__file__).resolve().parents[2]

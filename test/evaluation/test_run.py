@@ -14,7 +14,7 @@ import pytest
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.log import Log
-from cliploc_ros.offline.datasets.queries import Queries
+from cliploc_ros.offline.datasets.observations import Queries
 from cliploc_ros.offline.evaluation.methods import parse_methods
 from cliploc_ros.offline.evaluation.run import count_trials, read_results, run_methods
 from cliploc_ros.offline.evaluation.summary import notes, summarize

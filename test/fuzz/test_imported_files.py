@@ -23,10 +23,8 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.map_formats.given_map import COCO, place
-from cliploc_ros.offline.datasets.map_formats.msgloc import read_msgloc
+from cliploc_ros.offline.datasets.map_formats.given_map import COCO, place, read_msgloc, read_table
 from cliploc_ros.offline.datasets.map_formats.quadric_maps import read_goreloc, read_oaslam
-from cliploc_ros.offline.datasets.map_formats.table import read_table
 
 SOUND = LandmarkMap('map', ('a', 'b'), ('a', 'b'), ('cup', 'book'),
                     np.array([[1.0, 2.0, 3.0], [-1.0, 0.5, 0.0]]), np.full((2, 3), 0.2),

@@ -17,7 +17,7 @@ from cliploc_ros.core.acceptance.confidence import (
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.offline.datasets.queries import load_queries
+from cliploc_ros.offline.datasets.observations import load_queries
 from cliploc_ros.offline.evaluation.figures import within_ellipsoid
 from cliploc_ros.offline.evaluation.methods import Method
 from cliploc_ros.offline.evaluation.run import run_methods

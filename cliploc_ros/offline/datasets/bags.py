@@ -10,7 +10,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -274,15 +274,14 @@ class BagWriter:
         """Begin the recording beside its final path."""
         self._check_free()
         try:
-            self._staging = Path(tempfile.mkdtemp(
-                prefix=f'.{self.path.name}.', suffix='.partial', dir=self.path.parent))
-            writer = Writer(self._staging / self.path.name, version=9,
-                            storage_plugin=self._storage)
-            writer.open()
-        except BaseException as error:  # Ctrl-C, too
+            with self._naming_failures():
+                self._staging = Path(tempfile.mkdtemp(
+                    prefix=f'.{self.path.name}.', suffix='.partial', dir=self.path.parent))
+                writer = Writer(self._staging / self.path.name, version=9,
+                                storage_plugin=self._storage)
+                writer.open()
+        except BaseException:  # Ctrl-C, too
             self._discard()
-            if isinstance(error, OSError | sqlite3.Error | WriterError):
-                raise self._unwritable(error) from error
             raise
         self._writer = writer
         return self
@@ -292,19 +291,18 @@ class BagWriter:
         """Complete the recording and move it to its final path, or remove it."""
         writer, self._writer = self._writer, None
         assert writer is not None and self._staging is not None
+        is_complete = False
         try:
             if kind is None:
-                writer.close()
-                self._check_free()  # another process may have written it meanwhile
-                (self._staging / self.path.name).rename(self.path)
-            else:
-                with suppress(Exception):  # the block's own exception is the one to report
-                    writer.abort()
-        except (OSError, sqlite3.Error) as problem:
-            with suppress(Exception):
-                writer.abort()
-            raise self._unwritable(problem) from problem
+                with self._naming_failures():
+                    writer.close()
+                    self._check_free()  # another process may have written it meanwhile
+                    (self._staging / self.path.name).rename(self.path)
+                is_complete = True
         finally:
+            if not is_complete:
+                with suppress(Exception):  # the first exception is the one to report
+                    writer.abort()
             self._discard()
 
     def add_topic(self, name: str, msgtype: str, qos: Qos = RELIABLE_QOS) -> None:
@@ -317,21 +315,17 @@ class BagWriter:
         qos : Qos
             What its publisher would offer.
         """
-        try:
+        with self._naming_failures():
             self._connections[name] = self._open_writer.add_connection(
                 name, msgtype, typestore=typestore(), offered_qos_profiles=[qos])
-        except (OSError, sqlite3.Error) as error:
-            raise self._unwritable(error) from error
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Append a message of a declared topic, or its bytes, as recorded at a stamp [ns]."""
         connection = self._connections[topic]
         data = (message if isinstance(message, bytes)
                 else typestore().serialize_cdr(message, connection.msgtype))
-        try:
+        with self._naming_failures():
             self._open_writer.write(connection, stamp_ns, data)
-        except (OSError, sqlite3.Error) as error:
-            raise self._unwritable(error) from error
 
     @property
     def _open_writer(self) -> Writer:
@@ -350,6 +344,11 @@ class BagWriter:
             shutil.rmtree(self._staging, ignore_errors=True)
             self._staging = None
 
-    def _unwritable(self, error: Exception) -> DatasetError:
-        reason = getattr(error, 'strerror', None) or str(error)
-        return DatasetError(f'{self.path}: cannot be written: {reason}; no partial file remains')
+    @contextmanager
+    def _naming_failures(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, sqlite3.Error, WriterError) as error:
+            reason = getattr(error, 'strerror', None) or str(error)
+            raise DatasetError(f'{self.path}: cannot be written: {reason}; no partial file '
+                               'remains') from error

@@ -7,8 +7,9 @@ TUM RGB-D, with or without depth, and 7-Scenes are read here, the others in ``ca
 
 import hashlib
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,38 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.depth_image import MILLIMETRE, TUM_UNIT, DepthCamera
+from cliploc_ros.core.geometry import transforms
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import (
-    invert_transform,
-    is_rigid,
-    make_transform,
-    quaternion_from_transform,
-)
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.captures.capture import Capture, StampedPoses
-from cliploc_ros.offline.datasets.captures.colmap import is_colmap, read_colmap
-from cliploc_ros.offline.datasets.captures.devices import (
-    is_arkitscenes,
-    is_hololens,
-    is_polycam,
-    is_record3d,
-    is_stray,
-    read_arkitscenes,
-    read_hololens,
-    read_polycam,
-    read_record3d,
-    read_stray,
-)
-from cliploc_ros.offline.datasets.captures.nerf import is_nerf, read_nerf
-from cliploc_ros.offline.datasets.captures.placing import (
-    UP,
-    PlacedPoses,
-    check_axes,
-    find_scale,
-)
+from cliploc_ros.offline.datasets.captures import colmap, devices, placing
+from cliploc_ros.offline.datasets.captures.capture import Capture, FolderOptions
 from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, ImageFile, folder_frames
 from cliploc_ros.offline.datasets.intrinsics import find_camera, read_camera
-from cliploc_ros.offline.datasets.poses import Poses, TimedPoses
+from cliploc_ros.offline.datasets.parsing import naming, read_numbers
+from cliploc_ros.offline.datasets.poses import TimedPoses, check_clock
 from cliploc_ros.offline.datasets.tum import TumSequence, read_image_list, read_tum
 from cliploc_ros.offline.mapping.tilt import NO_VERTICAL, find_tilt, tilt_note
 from cliploc_ros.units import NS_PER_S
@@ -55,34 +33,12 @@ from cliploc_ros.units import NS_PER_S
 # Colour images of 7-Scenes are not registered, and its authors give no intrinsics for them. These
 # values make the edges of colour and depth agree best (measured for this project on RedKitchen).
 _SEVEN_SCENES_COLOR = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
-_SEVEN_SCENES_DEPTH = DepthCamera(585.0, 585.0, 320.0, 240.0,
-                                  make_transform(np.eye(3), np.array([-0.025, 0.0, 0.0])))
+_SEVEN_SCENES_DEPTH = DepthCamera(
+    585.0, 585.0, 320.0, 240.0,
+    transforms.make_transform(np.eye(3), np.array([-0.025, 0.0, 0.0])))
 _SEVEN_SCENES_NAME = re.compile(r'frame-(\d+)\.color\.(?:jpe?g|png)')
 _SEVEN_SCENES_HZ = 30
 _MAX_DEPTH_DELAY_NS = 20_000_000
-_NO_CHANGE = DepthFormat()
-
-
-@dataclass(frozen=True)
-class FolderOptions:
-    """What a folder does not say itself."""
-
-    intrinsics: str | None = None  #: Name of a preset, or a camera.json; None: the folder's own
-    trajectory: TimedPoses | None = None  #: Poses instead of the folder's own
-    max_gap_ns: int = 0  #: Greatest gap between two poses to interpolate over [ns]
-    #: (4, 4): how the camera is mounted on what the poses are of
-    body_from_camera: NDArray[np.float64] | None = None
-    depth: DepthFormat = _NO_CHANGE  #: What differs from the folder's usual format
-    layout: str = ''  #: Key of one of LAYOUTS; '': the one whose files are there
-    images: Path | None = None  #: Folder of the images of colmap and nerf
-    axes: str | None = None  #: What the stored poses are, one of AXES; None: by the layout
-    scale: float | None = None  #: Metres of a stored unit
-    #: Two images, and the distance between their cameras [m]: another way to say the scale
-    known_distance: tuple[str, str, float] | None = None
-    any_unit: bool = False  #: Take an unknown unit for the metre
-    level: bool = False  #: Turn the map so that z is up, by the tilt of the cameras
-
-
 _NO_OPTIONS = FolderOptions()
 
 
@@ -122,10 +78,8 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
             able = sorted({one.name for one in LAYOUTS if name in one.takes})
             raise DatasetError(f'{folder}: {layout.name} takes no `{name}`: it is for '
                                f'{" and ".join(able)}')
-    try:
+    with naming(folder, OSError, what='cannot be read: '):
         return _placed(folder, layout, layout.read(folder, options), options)
-    except OSError as error:
-        raise DatasetError(f'{folder}: cannot be read: {error}') from error
 
 
 def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Camera, str]:
@@ -142,13 +96,14 @@ def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Ca
             one.number is not None for one in capture.files):
         raise DatasetError(f'{folder}: {layout.name} with {len(cameras)} cameras: a recording '
                            'needs image files of one camera, and poses in metres')
-    posed = PlacedPoses(capture.poses, capture.axes, map_from_stored=UP[capture.up or 'z']
-                        ).all_of(capture.files)
+    files = placing.place_images(capture.files, capture.axes,
+                                 map_from_stored=placing.UP[capture.up or 'z'])
+    posed = {one.stamp_ns: one.pose for one in files if one.pose is not None}
     trajectory = TimedPoses.from_samples(
-        [one.stamp_ns for one, _ in posed],
-        [[*pose[:3, 3], *quaternion_from_transform(pose)] for _, pose in posed], str(folder))
-    return (TumSequence(folder, tuple(one.stamp_ns for one in capture.files),
-                        tuple(one.color for one in capture.files), trajectory), cameras.pop(),
+        list(posed), [[*pose[:3, 3], *transforms.quaternion_from_transform(pose)]
+                      for pose in posed.values()], str(folder))
+    return (TumSequence(folder, tuple(one.stamp_ns for one in files),
+                        tuple(one.color for one in files), trajectory), cameras.pop(),
             intrinsics or f'those of {layout.name}')
 
 
@@ -165,45 +120,35 @@ def find_layout(folder: Path, key: str = '') -> Layout | None:
 
 def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptions) -> Frames:
     """Return the frames of a capture, in the map's coordinate frame."""
-    _check_poses(folder, capture.poses)
-    axes = options.axes or capture.axes
-    files, poses = list(capture.files), PlacedPoses(capture.poses, axes)
-    posed = poses.all_of(files)
-    count = max(len(files), capture.images)
-    notes = [f'read as {layout.name}: {len(posed)} of {count} images have poses', *capture.notes,
-             check_axes(files, capture.poses, axes, folder)]
-    scale = options.scale
+    axes, scale, turn = options.axes or capture.axes, options.scale, placing.UP[capture.up or 'z']
+    files = placing.place_images(capture.files, axes)
+    notes = [f'read as {layout.name}: {sum(one.pose is not None for one in files)} of '
+             f'{max(len(files), capture.images)} images have poses', *capture.notes,
+             placing.check_axes(capture.files, axes, folder)]
     if options.known_distance is not None:
-        scale = find_scale(posed, *options.known_distance, str(folder))
+        scale = placing.find_scale(files, *options.known_distance, folder)
         notes.append(f'a unit is {scale:.5g} m, by the known distance')
     if scale is None and not capture.is_metric and not options.any_unit:
         raise DatasetError(f'{folder}: {layout.name} does not know its unit: give the `scale` '
                            'of a unit (1 where they are metres), a `known_distance` or an '
                            '`object_size`')
-    poses = replace(poses, scale=scale or 1.0, map_from_stored=UP[capture.up or 'z'])
-    poses, note = _levelled(folder, poses, files, options.level, bool(capture.up))
-    notes.append(note)
-    frames = folder_frames(folder, files, poses, replace(
-        capture.depth, unit_m=options.depth.unit_m or capture.depth.unit_m,
-        camera=options.depth.camera or capture.depth.camera))
-    known = [(file.color.name, file.camera, np.round(pose, 6).tolist())
-             for file, pose in poses.all_of(files)]
-    return replace(frames, digest=hashlib.sha256(repr(known).encode()).hexdigest()[:12],
-                   notes=(*filter(None, notes), *frames.notes))
-
-
-def _levelled(folder: Path, poses: PlacedPoses, files: Sequence[ImageFile], level: bool,
-              is_known: bool) -> tuple[PlacedPoses, str]:
-    """Return poses with z up where that is asked for, and a note on the vertical, or ''."""
-    placed = np.array([pose for _, pose in poses.all_of(files)]).reshape(-1, 4, 4)
-    if level:
-        found = find_tilt(placed)
+    files = placing.place_images(capture.files, axes, scale or 1.0, turn)
+    poses = np.array([one.pose for one in files if one.pose is not None]).reshape(-1, 4, 4)
+    if options.level:
+        found = find_tilt(poses)
         if found is None:
             raise DatasetError(f'{folder}: {NO_VERTICAL}')
-        rotation, tilt_deg = found
-        return (replace(poses, map_from_stored=rotation @ poses.map_from_stored),
-                f'levelled: the vertical of the cameras was {tilt_deg:.1f} degrees off z')
-    return poses, '' if is_known else tilt_note(placed)
+        files = placing.place_images(capture.files, axes, scale or 1.0, found[0] @ turn)
+        notes.append(f'levelled: the vertical of the cameras was {found[1]:.1f} degrees off z')
+    elif not capture.up:
+        notes.append(tilt_note(poses))
+    frames = folder_frames(folder, files, replace(
+        capture.depth, unit_m=options.depth.unit_m or capture.depth.unit_m,
+        camera=options.depth.camera or capture.depth.camera))
+    known = [(one.color.name, one.camera, np.round(one.pose, 6).tolist())
+             for one in files if one.pose is not None]
+    return replace(frames, digest=hashlib.sha256(repr(known).encode()).hexdigest()[:12],
+                   notes=(*filter(None, notes), *frames.notes))
 
 
 def tum_frames(sequence: TumSequence, camera: Camera) -> Frames:
@@ -211,10 +156,7 @@ def tum_frames(sequence: TumSequence, camera: Camera) -> Frames:
 
     DatasetError: there are no poses, or they are of another time.
     """
-    files = [ImageFile(stamp, path, camera) for stamp, path in
-             zip(sequence.stamps_ns, sequence.image_paths, strict=True)]
-    _check_poses(sequence.folder, sequence.trajectory)
-    return folder_frames(sequence.folder, files, sequence.trajectory)
+    return folder_frames(sequence.folder, _tum_files(sequence, camera, sequence.trajectory, {}))
 
 
 def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
@@ -239,10 +181,22 @@ def _tum(folder: Path, options: FolderOptions, with_depth: bool = True) -> Captu
             nearest = int(np.argmin(np.abs(times - stamp)))
             if abs(stamps[nearest] - stamp) <= _MAX_DEPTH_DELAY_NS:
                 depths[stamp] = paths[nearest]
-    return Capture(tuple(
-        ImageFile(stamp, path, camera, depths.get(stamp)) for stamp, path in
-        zip(sequence.stamps_ns, sequence.image_paths, strict=True)),
-        _poses(sequence, options), depth=DepthFormat(TUM_UNIT))
+    trajectory = sequence.trajectory if options.trajectory is None else options.trajectory
+    return Capture(_tum_files(sequence, camera, replace(
+        trajectory, max_gap_ns=options.max_gap_ns, body_from_camera=options.body_from_camera),
+        depths), depth=DepthFormat(TUM_UNIT))
+
+
+def _tum_files(sequence: TumSequence, camera: Camera, trajectory: TimedPoses,
+               depths: Mapping[int, Path]) -> tuple[ImageFile, ...]:
+    """Return the images of a folder, each with the pose at its stamp."""
+    if not len(trajectory):
+        raise DatasetError(f'{sequence.folder}: there are no poses: no groundtruth.txt here; give '
+                           'a `trajectory`')
+    stamps_ns = sequence.stamps_ns
+    check_clock(trajectory, stamps_ns[0], stamps_ns[-1], str(sequence.folder))
+    return tuple(ImageFile(stamp, path, camera, trajectory.pose_at(stamp), depths.get(stamp))
+                 for stamp, path in zip(stamps_ns, sequence.image_paths, strict=True))
 
 
 def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
@@ -254,67 +208,56 @@ def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
     if not images:
         raise DatasetError(f'{folder}: has neither rgb.txt (TUM RGB-D) nor frame-000000.color.jpg '
                            '(7-Scenes); give a folder of one of these layouts')
-    files, poses = [], {}
+    files = []
     form = DepthFormat(options.depth.unit_m or MILLIMETRE,
                        options.depth.camera or _SEVEN_SCENES_DEPTH)
     assert form.camera is not None
-    depth_from_color = invert_transform(form.camera.color_from_depth)
+    depth_from_color = transforms.invert_transform(form.camera.color_from_depth)
     for number, path in sorted(images.items()):
         stem = path.name.partition('.')[0]
         depth, pose = folder / f'{stem}.depth.png', folder / f'{stem}.pose.txt'
         stamp = number * NS_PER_S // _SEVEN_SCENES_HZ
-        files.append(ImageFile(stamp, path, camera, depth if depth.exists() else None))
         map_from_depth = _read_pose(pose) if pose.exists() else None
-        if map_from_depth is not None:
-            poses[stamp] = map_from_depth @ depth_from_color
-    if not poses:
+        files.append(ImageFile(
+            stamp, path, camera, None if map_from_depth is None
+            else map_from_depth @ depth_from_color, depth if depth.exists() else None))
+    if all(one.pose is None for one in files):
         raise DatasetError(f'{folder}: no image has a valid .pose.txt beside it')
-    return Capture(tuple(files), StampedPoses(poses), depth=form)
+    return Capture(tuple(files), depth=form)
 
 
 def _read_pose(path: Path) -> NDArray[np.float64] | None:
     """Return a pose (4, 4); None where tracking was lost, which is written as NaN or infinite."""
-    try:
-        pose = np.loadtxt(path, dtype=np.float64)
-    except (OSError, ValueError) as error:
-        raise DatasetError(f'{path}: is no 4x4 matrix: {error}') from error
+    pose = np.array([row[:4] for row in read_numbers(path, '0 1 2 3')])
     if pose.shape != (4, 4):
         raise DatasetError(f'{path}: is no 4x4 matrix, its shape is {pose.shape}')
     if not np.isfinite(pose).all():
         return None
-    if not is_rigid(pose, tolerance=1e-3):
+    if not transforms.is_rigid(pose, tolerance=1e-3):
         raise DatasetError(f'{path}: is no rigid transform (rotation and translation [m])')
     return pose
-
-
-def _poses(sequence: TumSequence, options: FolderOptions) -> Poses:
-    trajectory = sequence.trajectory if options.trajectory is None else options.trajectory
-    return replace(trajectory, max_gap_ns=options.max_gap_ns,
-                   body_from_camera=options.body_from_camera)
-
-
-def _check_poses(folder: Path, poses: Poses) -> None:
-    if poses.span_ns is None:
-        raise DatasetError(f'{folder}: there are no poses: no groundtruth.txt here; give '
-                           'a `trajectory`')
 
 
 _TUM_TAKES = 'intrinsics', 'trajectory', 'mount'
 #: The first one whose files are there is read. TUM RGB-D without depth only where asked for.
 LAYOUTS = (
-    Layout('rgbd', 'TUM RGB-D', lambda folder: (folder / 'rgb.txt').is_file(), _tum,
-           _TUM_TAKES),
+    Layout('rgbd', 'TUM RGB-D', lambda folder: (folder / 'rgb.txt').is_file(), _tum, _TUM_TAKES),
     Layout('7scenes', '7-Scenes', lambda folder: any(folder.glob('frame-*.color.*')),
            _seven_scenes, ('intrinsics',)),
-    Layout('polycam', 'Polycam', is_polycam, lambda folder, _: read_polycam(folder)),
-    Layout('stray', 'Stray Scanner', is_stray, lambda folder, _: read_stray(folder)),
-    Layout('record3d', 'Record3D', is_record3d, lambda folder, _: read_record3d(folder)),
-    Layout('arkitscenes', 'ARKitScenes', is_arkitscenes,
-           lambda folder, _: read_arkitscenes(folder)),
-    Layout('hololens', 'HoloLens 2', is_hololens, lambda folder, _: read_hololens(folder)),
-    Layout('nerf', 'transforms.json', is_nerf,
-           lambda folder, options: read_nerf(folder, options.images), ('images',)),
-    Layout('colmap', 'COLMAP model', is_colmap,
-           lambda folder, options: read_colmap(folder, options.images), ('images',)),
-    Layout('tum', 'TUM RGB-D', lambda folder: False,
-           lambda folder, options: _tum(folder, options, with_depth=False), _TUM_TAKES))
+    Layout('polycam', 'Polycam', lambda folder: (folder / 'keyframes').is_dir(),
+           devices.read_polycam),
+    Layout('stray', 'Stray Scanner', lambda folder: (folder / 'odometry.csv').is_file(),
+           devices.read_stray),
+    Layout('record3d', 'Record3D', lambda folder: bool(devices.metadata_of_record3d(folder)),
+           devices.read_record3d),
+    Layout('arkitscenes', 'ARKitScenes', lambda folder: (folder / 'lowres_wide.traj').is_file(),
+           devices.read_arkitscenes),
+    # of HoloLens2ForCV's StreamRecorder
+    Layout('hololens', 'HoloLens 2', lambda folder: any(folder.glob('*_pv.txt')),
+           devices.read_hololens),
+    Layout('nerf', 'transforms.json', lambda folder: folder.name.endswith('.json') or
+           (folder / devices.TRANSFORMS).is_file(), devices.read_nerf, ('images',)),
+    Layout('colmap', 'COLMAP model', lambda folder: bool(colmap.models_of(folder)),
+           colmap.read_colmap, ('images',)),
+    Layout('tum', 'TUM RGB-D', lambda folder: False, partial(_tum, with_depth=False),
+           _TUM_TAKES))

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -22,7 +23,6 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.camera_faults import camera_faults
 from cliploc_ros.core.geometry.transforms import move_poses
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.poses import Poses, check_clock
 from cliploc_ros.units import NS_PER_S
 
 _MOST_NOTES = 5  # on cameras, of which each image may have its own
@@ -106,8 +106,7 @@ class Frames:
         def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
             return self.read_raw(lambda place, stamp_ns, pose: place in chosen
                                  and is_wanted(place, stamp_ns, pose))
-        return Frames(self.source, len(chosen), read_raw, varies=self.varies, digest=self.digest,
-                      notes=self.notes)
+        return replace(self, count=len(chosen), read_raw=read_raw, camera='', of_cameras=())
 
 
 def move_frames(frames: Frames, scale: float, rotation: NDArray[np.float64]) -> Frames:
@@ -138,13 +137,18 @@ def join_frames(of_cameras: Mapping[str, Frames]) -> Frames:
         notes=tuple(note for part in parts for note in part.notes))
 
 
-@dataclass(frozen=True)
-class ImageFile:
-    """An image of a folder, and its depth image if there is one."""
+#: The stamp of an image whose time nothing says.
+NO_STAMP = -2**63
 
-    stamp_ns: int
+
+class ImageFile(NamedTuple):
+    """An image of a folder, with its camera, its pose, and its depth image if there is one."""
+
+    stamp_ns: int  #: NO_STAMP where the layout has none
     color: Path  #: An image, or a video
     camera: Camera
+    #: (4, 4): as the folder stores it, or map_from_camera; None where it is not known
+    pose: NDArray[np.float64] | None = None
     depth: Path | None = None
     confidence: Path | None = None  #: Of the depth: an image of its size, 0 where it is a guess
     number: int | None = None  #: Of the image in a video
@@ -159,20 +163,15 @@ class DepthFormat:
     camera: DepthCamera | None = None  #: None: registered to the colour image
 
 
-def folder_frames(folder: Path, files: Sequence[ImageFile], poses: Poses,
-                  depth: DepthFormat | None = None) -> Frames:
-    """Return the frames of image files.
-
-    DatasetError: the poses are of another time than the images.
-    """
-    check_clock(poses, files[0].stamp_ns, files[-1].stamp_ns, str(folder))
+def folder_frames(folder: Path, files: Sequence[ImageFile], depth: DepthFormat | None = None
+                  ) -> Frames:
+    """Return the frames of image files, whose poses are map_from_camera."""
     form = depth or DepthFormat()
 
     def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
         for place, file in enumerate(files):
-            pose = poses.pose_at(file.stamp_ns)
-            if is_wanted(place, file.stamp_ns, pose):
-                yield RawFrame(place, file.stamp_ns, pose, partial(read_color, file),
+            if is_wanted(place, file.stamp_ns, file.pose):
+                yield RawFrame(place, file.stamp_ns, file.pose, partial(read_color, file),
                                None if file.depth is None else partial(read_depth, file, form))
     cameras = dict.fromkeys(file.camera for file in files)
     # pictures may be cut out of larger ones, which no file tells: no fault is certain

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.captures.capture import Fields, camera_of
+from cliploc_ros.offline.datasets.parsing import Fields, camera_of
 
 
 def _tum_camera(fx: float, fy: float, cx: float, cy: float, *distortion: float) -> Camera:

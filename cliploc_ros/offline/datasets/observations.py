@@ -1,11 +1,15 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Observation files: what a detector said about a recording, and where the camera was.
+"""Observation and query files: recorded boxes, and where the camera was.
 
-Mapping, evaluation and the map editor read the same file, so that the networks run once.
+Mapping, evaluation and the map editor read the same observations, so that the networks run once.
+A query file has the similarities of a map, too: identical input for every method.
 """
 
+import math
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,46 +19,243 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import are_rigid
 from cliploc_ros.errors import CameraError, DatasetError
-from cliploc_ros.files.arrays import FINITE, UNIQUE, ArrayError, Arrays, Check, Field, Schema
-from cliploc_ros.offline.datasets.queries import FRAME_FIELDS
+from cliploc_ros.files import arrays as npz
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.units import NS_PER_S
+
+_STAGES = ('detector_ms', 'clip_ms')
+#: Of files of frames with boxes: F frames, n boxes.
+FRAME_FIELDS = {
+    'intrinsics_fx_fy_cx_cy': npz.Field('numbers', (4,), (npz.FINITE,)),
+    'boxes_xyxy': npz.Field('numbers', ('n', 4), (npz.FINITE, npz.BOX)),
+    'frame_offsets': npz.Field('integers', ('F+1',), (npz.Offsets('boxes_xyxy', 'boxes'),)),
+    'class_ids': npz.Field('text', ('n',)),
+    'scores': npz.Field('numbers', ('n',), (npz.FINITE, npz.SHARE)),
+    'timestamps': npz.Field('numbers', ('F',), (npz.FINITE,)),
+    'map_from_camera': npz.Field('numbers', ('F', 4, 4), (npz.FINITE, npz.Check(
+        'is no rigid transform', lambda poses: ~are_rigid(poses)))),
+    # NaN where unknown [m]
+    'depths': npz.Field('floats', ('n',), (
+        npz.Check('is not positive', lambda depths: depths <= 0.0),), is_optional=True),
+    # exact, which a float64 of seconds is not [ns]
+    'stamps_ns': npz.Field('integers', ('F',), is_optional=True),
+    # time that the networks took [ms], NaN where unknown
+    **dict.fromkeys(_STAGES, npz.Field('numbers', ('F',), is_optional=True)),
+}
+
+
+def _check_truth(name: str, arrays: npz.Arrays) -> None:
+    landmarks = len(arrays['landmark_ids'])
+    npz.Check('is no landmark', lambda rows: (rows < -1) | (rows >= landmarks))(name, arrays)
+
+
+def _check_stamps(name: str, arrays: npz.Arrays) -> None:
+    seconds = arrays['timestamps']
+    npz.Check('contradicts timestamps',
+              lambda stamps_ns: np.abs(stamps_ns / NS_PER_S - seconds) > 1e-6)(name, arrays)
+
+
+def _check_groups(name: str, arrays: npz.Arrays) -> None:
+    groups = arrays['query_group']
+    for group in np.unique(groups):
+        mains = int(arrays[name][groups == group].sum())
+        if mains != 1:
+            raise npz.ArrayError(f'array {name} marks {mains} frames of query_group {group}, '
+                                 'not 1')
+
+
+# F frames, n boxes, L landmarks.
+_QUERIES = npz.Schema('query file', {
+    'landmark_ids': npz.Field('text', ('L',), (
+        npz.UNIQUE, npz.Check('is empty', lambda ids: ids == ''))),
+    **FRAME_FIELDS,
+    'intrinsics_fx_fy_cx_cy': npz.Field('numbers', (4,), (npz.FINITE, npz.Check(
+        'is a focal length that is not above 0',
+        lambda numbers: (numbers <= 0) & (np.arange(4) < 2)))),
+    # half precision rounds some cosines to just above 1
+    'similarities': npz.Field('numbers', ('n', 'L'), (npz.FINITE, npz.Check(
+        'is no cosine, outside -1 to 1', lambda rows: (np.abs(rows) > 1.001).any(axis=1)))),
+    'true_landmark': npz.Field('integers', ('n',), (_check_truth,)),
+    'timestamps': npz.Field('numbers', ('F',), (
+        npz.FINITE, npz.Check('is negative', lambda seconds: seconds < 0))),
+    'query_group': npz.Field('integers', ('F',)),
+    'is_main': npz.Field('booleans', ('F',), (_check_groups,)),
+    'stamps_ns': npz.Field('integers', ('F',), (_check_stamps,), is_optional=True),
+}, DatasetError, not_empty={'F': 'frames', 'L': 'landmarks'})
+
+
+@dataclass(frozen=True)
+class QueryFrame:
+    """One frame of a query file: n boxes, L landmarks."""
+
+    stamp_ns: int  #: Time of the image [ns]
+    bboxes_xyxy: NDArray[np.float64]  #: (n, 4): Left, top, right, bottom [px], undistorted
+    class_ids: tuple[str, ...]  #: Detector classes
+    scores: NDArray[np.float64]  #: (n,): detector confidences
+    #: (n, L): cosine similarity of each crop and each landmark's label
+    similarities: NDArray[np.float64]
+    #: (n,): index into the landmarks, -1 where unknown. For evaluation only.
+    true_landmark: NDArray[np.int64]
+    map_from_camera: NDArray[np.float64]  #: (4, 4): ground truth
+    group: int  #: The query to which the frame belongs
+    is_main: bool  #: Whether the frame is the query itself and not one of its neighbours
+    #: Processing time of the image [ms]; NaN if not recorded
+    detector_ms: float = math.nan
+    clip_ms: float = math.nan
+    #: (n,): depth of what each box shows [m], NaN where unknown; None without a depth camera
+    depths: NDArray[np.float64] | None = None
+
+    def __len__(self) -> int:
+        """Return the number of boxes."""
+        return len(self.class_ids)
+
+
+@dataclass(frozen=True)
+class Queries:
+    """The content of a query file."""
+
+    landmark_ids: tuple[str, ...]  #: The landmarks of the columns of the similarities
+    intrinsics_fx_fy_cx_cy: tuple[float, float, float, float]  #: Of the undistorted camera [px]
+    frames: tuple[QueryFrame, ...]  #: In the file's order
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.frames)
+
+    def __iter__(self) -> Iterator[QueryFrame]:
+        """Iterate over the frames."""
+        return iter(self.frames)
+
+    def __getitem__(self, index: int) -> QueryFrame:
+        """Return a frame."""
+        return self.frames[index]
+
+    def main_frames(self) -> tuple[QueryFrame, ...]:
+        """Return the main frame of each query."""
+        return tuple(frame for frame in self.frames if frame.is_main)
+
+    def group(self, group: int) -> tuple[QueryFrame, ...]:
+        """Return all frames of one query, in the file's order."""
+        return tuple(frame for frame in self.frames if frame.group == group)
+
+
+def _stamps_ns(arrays: npz.Arrays) -> NDArray[np.int64]:
+    """Return exact stamps [ns], or the microseconds of a float64 of seconds, which it still holds.
+
+    A float64 of today's seconds resolves 0.24 us.
+    """
+    rounded = np.round(arrays['timestamps'].astype(np.float64) * 1e6).astype(np.int64) * 1000
+    return arrays.get('stamps_ns', rounded).astype(np.int64)
+
+
+def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) -> Queries:
+    """Read and validate a query file.
+
+    With `landmark_ids`, those of a map, the file must contain no others. DatasetError: the message
+    names file, array and error.
+    """
+    path = Path(path)
+    arrays = _QUERIES.read(path)
+    unknown = [one for one in map(str, arrays['landmark_ids'])
+               if landmark_ids is not None and one not in landmark_ids]
+    if unknown:
+        more = f' (and {len(unknown) - 1} more)' if len(unknown) > 1 else ''
+        raise DatasetError(f'{path}: array landmark_ids has {unknown[0]!r}, which the map does '
+                           f'not know{more}')
+    fx, fy, cx, cy = map(float, arrays['intrinsics_fx_fy_cx_cy'])
+    frames, stamps_ns = [], _stamps_ns(arrays)
+    for index, (begin, end) in enumerate(pairwise(map(int, arrays['frame_offsets']))):
+        rows = slice(begin, end)
+        frames.append(QueryFrame(
+            stamp_ns=int(stamps_ns[index]),
+            bboxes_xyxy=arrays['boxes_xyxy'][rows].astype(np.float64),
+            class_ids=tuple(map(str, arrays['class_ids'][rows])),
+            scores=arrays['scores'][rows].astype(np.float64),
+            similarities=arrays['similarities'][rows].astype(np.float64),
+            true_landmark=arrays['true_landmark'][rows].astype(np.int64),
+            map_from_camera=arrays['map_from_camera'][index].astype(np.float64),
+            group=int(arrays['query_group'][index]), is_main=bool(arrays['is_main'][index]),
+            depths=arrays['depths'][rows].astype(np.float64) if 'depths' in arrays else None,
+            **{name: float(arrays[name][index]) for name in _STAGES if name in arrays}))
+    return Queries(tuple(map(str, arrays['landmark_ids'])), (fx, fy, cx, cy), tuple(frames))
+
+
+def save_queries(path: str | Path, queries: Queries) -> None:
+    """Write a query file atomically; an existing one is replaced.
+
+    DatasetError: the queries are invalid or the file cannot be written.
+    """
+    path = Path(path)
+    frames = queries.frames
+
+    def rows(name: str, none: NDArray[Any]) -> NDArray[Any]:
+        return np.concatenate([none, *(getattr(one, name) for one in frames)])
+
+    try:
+        arrays = {
+            'landmark_ids': np.array(queries.landmark_ids, dtype=np.str_),
+            'intrinsics_fx_fy_cx_cy': np.array(queries.intrinsics_fx_fy_cx_cy, dtype=np.float64),
+            'frame_offsets': np.cumsum([0, *map(len, frames)], dtype=np.int64),
+            'boxes_xyxy': rows('bboxes_xyxy', np.empty((0, 4))),
+            'class_ids': np.array([name for one in frames for name in one.class_ids],
+                                  dtype=np.str_),
+            'scores': rows('scores', np.empty(0)),
+            'similarities': rows('similarities', np.empty((0, len(queries.landmark_ids)))
+                                 ).astype(np.float32),
+            'true_landmark': rows('true_landmark', np.empty(0, dtype=np.int64)),
+            'map_from_camera': np.array([one.map_from_camera for one in frames]).reshape(-1, 4, 4),
+            # Python's division of integers rounds once, NumPy's twice.
+            'timestamps': np.array([frame.stamp_ns / NS_PER_S for frame in frames]),
+            'query_group': np.array([one.group for one in frames], dtype=np.int64),
+            'is_main': np.array([one.is_main for one in frames], dtype=np.bool_),
+            'stamps_ns': np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
+            **{name: np.array([getattr(one, name) for one in frames]) for name in _STAGES},
+        }
+        if any(one.depths is not None for one in frames):
+            arrays['depths'] = np.concatenate([
+                np.full(len(one), np.nan) if one.depths is None else one.depths for one in frames])
+    except ValueError as error:  # arrays of different widths
+        raise DatasetError(f'{path}: cannot be written: {error}') from error
+    _QUERIES.write(path, arrays, compress=True)
+
 
 _OF_CAMERAS = ('camera_names', 'camera_sizes', 'camera_intrinsics', 'camera_rows')
 
 
-def _check_cameras(name: str, arrays: Arrays) -> None:
+def _check_cameras(name: str, arrays: npz.Arrays) -> None:
     if missing := [one for one in _OF_CAMERAS if one not in arrays]:
-        raise ArrayError(f'array {missing[0]} is missing next to {name}')
+        raise npz.ArrayError(f'array {missing[0]} is missing next to {name}')
     if name != 'camera_rows':
         return
     count = len(arrays['camera_names'])
-    Check(f'names none of the {count} cameras', lambda rows: (rows < 0) | (rows >= count)
-          )(name, arrays)
+    npz.Check(f'names none of the {count} cameras', lambda rows: (rows < 0) | (rows >= count)
+              )(name, arrays)
     if unseen := sorted({*range(count)} - {*arrays[name].tolist()}):
-        raise ArrayError(f"no frame is of the camera '{arrays['camera_names'][unseen[0]]}'")
+        raise npz.ArrayError(f"no frame is of the camera '{arrays['camera_names'][unseen[0]]}'")
 
 
 # F frames, n boxes, d numbers of an embedding, C cameras.
-_SCHEMA = Schema('observation file', {
+_OBSERVATIONS = npz.Schema('observation file', {
     **FRAME_FIELDS,
-    'image_size': Field('integers', (2,)),
-    'depth_spreads': Field('floats', ('n',), is_optional=True),
-    'open_edges': Field('booleans', ('n', 4), is_optional=True),
+    'image_size': npz.Field('integers', (2,)),
+    'depth_spreads': npz.Field('floats', ('n',), is_optional=True),
+    'open_edges': npz.Field('booleans', ('n', 4), is_optional=True),
     # large, and few of the rows are in use at once
-    'embeddings': Field('floats', ('n', 'd'), (FINITE,), is_optional=True, stays=True),
-    'encoder_key': Field('text', is_optional=True),
+    'embeddings': npz.Field('floats', ('n', 'd'), (npz.FINITE,), is_optional=True, stays=True),
+    'encoder_key': npz.Field('text', is_optional=True),
     # a row without odometry is NaN
-    'odom_from_camera': Field('floats', ('F', 4, 4), (Check(
+    'odom_from_camera': npz.Field('floats', ('F', 4, 4), (npz.Check(
         'is no rigid transform',
         lambda poses: ~np.isnan(poses).all(axis=(1, 2)) & ~are_rigid(poses)),), is_optional=True),
-    'image_counts': Field('integers', (2,), is_optional=True),
+    'image_counts': npz.Field('integers', (2,), is_optional=True),
     # of several cameras: their names, width and height, fx, fy, cx, cy, and the camera of each
     # frame; image_size and intrinsics_fx_fy_cx_cy are the first one's
-    'camera_names': Field('text', ('C',), (UNIQUE, _check_cameras), is_optional=True),
-    'camera_sizes': Field('integers', ('C', 2), (_check_cameras,), is_optional=True),
-    'camera_intrinsics': Field('numbers', ('C', 4), (FINITE, _check_cameras), is_optional=True),
-    'camera_rows': Field('integers', ('F',), (_check_cameras,), is_optional=True),
-    'described': Field('text', is_optional=True),
+    'camera_names': npz.Field('text', ('C',), (npz.UNIQUE, _check_cameras), is_optional=True),
+    'camera_sizes': npz.Field('integers', ('C', 2), (_check_cameras,), is_optional=True),
+    'camera_intrinsics': npz.Field('numbers', ('C', 4), (npz.FINITE, _check_cameras),
+                                   is_optional=True),
+    'camera_rows': npz.Field('integers', ('F',), (_check_cameras,), is_optional=True),
+    'described': npz.Field('text', is_optional=True),
 }, DatasetError, 'record the observations again', {'F': 'frames'},
     {'similarities': 'this is a query file: map from an observation file'})
 
@@ -98,13 +299,13 @@ def load_observations(path: str | Path) -> PosedDetections:
 
 def load_recorded(path: str | Path) -> Recorded:
     """Read and validate an observation file, and how it came about; see load_observations."""
-    arrays = _SCHEMA.read(Path(path))
+    arrays = _OBSERVATIONS.read(Path(path))
     try:
         cameras = tuple(camera_from_numbers(*numbers) for numbers in zip(
             arrays.get('camera_sizes', arrays['image_size'][None]),
             arrays.get('camera_intrinsics', arrays['intrinsics_fx_fy_cx_cy'][None]), strict=True))
     except CameraError as error:
-        raise _SCHEMA.invalid(Path(path), error) from error
+        raise _OBSERVATIONS.invalid(Path(path), error) from error
     names, classes = np.unique(arrays['class_ids'], return_inverse=True)
     detections = PosedDetections(
         cameras=cameras, map_from_camera=arrays['map_from_camera'].astype(np.float64),
@@ -123,13 +324,11 @@ def load_recorded(path: str | Path) -> Recorded:
     if (order != np.arange(len(order))).any():
         detections = detections.select_frames(order)
     frames = len(order)
-    # a float64 of today's seconds resolves 0.24 us: microseconds are what it still knows
-    rounded = np.round(arrays['timestamps'] * 1e6).astype(np.int64) * 1000
     detector_ms, clip_ms = (arrays.get(name, np.full(frames, np.nan)).astype(np.float64)[order]
                             for name in ('detector_ms', 'clip_ms'))
     images, without_pose = arrays.get('image_counts', (frames, 0))
     return Recorded(
-        detections, arrays.get('stamps_ns', rounded).astype(np.int64)[order], detector_ms,
+        detections, _stamps_ns(arrays)[order], detector_ms,
         clip_ms, int(images), int(without_pose), str(arrays.get('described', '')))
 
 
@@ -149,7 +348,7 @@ def save_recorded(path: str | Path, recorded: Recorded) -> None:
         'image_counts': np.array([recorded.images, recorded.without_pose])})
 
 
-def _write(path: Path, detections: PosedDetections, more: Arrays) -> None:
+def _write(path: Path, detections: PosedDetections, more: npz.Arrays) -> None:
     sizes = np.array([[one.width, one.height] for one in detections.cameras])
     intrinsics = np.array([[one.fx, one.fy, one.cx, one.cy] for one in detections.cameras])
     names = np.array(detections.class_names, dtype=np.str_)
@@ -171,4 +370,4 @@ def _write(path: Path, detections: PosedDetections, more: Arrays) -> None:
     if detections.encoder_key:
         arrays['encoder_key'] = np.array(detections.encoder_key)
     # embeddings do not compress, and take minutes to try
-    _SCHEMA.write(path, arrays, compress='embeddings' not in arrays)
+    _OBSERVATIONS.write(path, arrays, compress='embeddings' not in arrays)

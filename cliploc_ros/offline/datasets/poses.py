@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a camera was: poses over time, with interpolation between them."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.parsing import unit_quaternion
 from cliploc_ros.units import NS_PER_S
 
 # A stamp has a pose only if a sample lies this close to it.
@@ -47,8 +47,8 @@ class TimedPoses:
     body_from_camera: NDArray[np.float64] | None = None
 
     @classmethod
-    def from_samples(cls, stamps_ns: Sequence[int], rows: Sequence[Sequence[float]], where: str
-                     ) -> 'TimedPoses':
+    def from_samples(cls, stamps_ns: Sequence[int], rows: Sequence[Sequence[float]], where: str,
+                     tolerance: float = _MAX_NORM_ERROR) -> 'TimedPoses':
         """Return the poses of unsorted samples (x, y, z, qx, qy, qz, qw).
 
         Of equal stamps the first counts. DatasetError: a sample is not finite or has no unit
@@ -58,7 +58,7 @@ class TimedPoses:
         samples = np.array(rows, dtype=np.float64).reshape(-1, 7)[order]
         with np.errstate(over='ignore', invalid='ignore'):
             norms = np.linalg.norm(samples[:, 3:], axis=1)
-            sound = np.isfinite(samples).all(axis=1) & (np.abs(norms - 1.0) < _MAX_NORM_ERROR)
+            sound = np.isfinite(samples).all(axis=1) & (np.abs(norms - 1.0) <= tolerance)
         if not sound.all():
             raise DatasetError(f'{where}: {int((~sound).sum())} of {len(sound)} poses are not '
                                'finite or have no unit quaternion')
@@ -118,11 +118,11 @@ def mount_from_numbers(numbers: Sequence[float]) -> NDArray[np.float64]:
 
     DatasetError: the quaternion is far from unit.
     """
-    norm = math.hypot(*numbers[3:])
-    if not (np.isfinite(numbers).all() and abs(norm - 1.0) < _MAX_NORM_ERROR):
+    if not np.isfinite(numbers).all():
         raise DatasetError(f'mount {list(numbers)}: needs x y z and a unit quaternion '
                            'qx qy qz qw')
-    return transform_from_pose(np.array(numbers[:3]), np.array(numbers[3:]) / norm)
+    return transform_from_pose(np.array(numbers[:3]), unit_quaternion(
+        numbers[3:], f'mount {list(numbers)}', _MAX_NORM_ERROR))
 
 
 def check_clock(poses: Poses, first_ns: int, last_ns: int, where: str) -> None:

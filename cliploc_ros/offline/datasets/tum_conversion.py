@@ -2,14 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Convert a TUM RGB-D sequence and recorded detections into a recording with the nodes' topics."""
 
-import json
-import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from decimal import Decimal
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +16,8 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import BagWriter
-from cliploc_ros.offline.datasets.tum import TumSequence, parse_stamp_ns, read_tum_accelerometer
+from cliploc_ros.offline.datasets.parsing import Fields, naming, parse_stamp_ns
+from cliploc_ros.offline.datasets.tum import TumSequence, read_tum_accelerometer
 
 #: Passes on an iterable of stamp [ns] and file of each image, and shows progress.
 Progress = Callable[[Iterable[tuple[int, Path]]], Iterable[tuple[int, Path]]]
@@ -130,10 +128,8 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
 def _image_message(stamp_ns: int, frame_id: str, path: Path, camera: Camera, is_compressed: bool
                    ) -> Any:
     """Return an image file as message; DatasetError: it is damaged, or of another size."""
-    try:
+    with naming(path, OSError, what='cannot be read: '):
         data = path.read_bytes()
-    except OSError as error:
-        raise DatasetError(f'{path}: cannot be read: {error.strerror}') from error
     # Compressed images are decoded too: this refuses a damaged file before a node receives it.
     try:
         pixels_bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
@@ -166,32 +162,22 @@ def read_recorded_detections(path: str | Path, image_size: tuple[int, int] | Non
     names file, frame and field.
     """
     path = Path(path)
-
-    def refuse(name: str) -> NoReturn:
-        raise DatasetError(f'{path}: contains {name}; expected finite numbers')
-    try:
-        # Decimal keeps a timestamp's digits; a float would round them to 0.2 us.
-        content = json.loads(path.read_text(encoding='utf-8'), parse_float=Decimal,
-                             parse_constant=refuse)
-    except FileNotFoundError:
-        raise DatasetError(f'{path}: no such file of recorded detections') from None
-    except (OSError, ValueError) as error:
-        raise DatasetError(f'{path}: cannot be read as JSON: {error}') from error
-    if not isinstance(content, dict):
-        raise DatasetError(f'{path}: expected a mapping with frames')
-    recorded = content.get('image_size')
+    if not path.is_file():
+        raise DatasetError(f'{path}: no such file of recorded detections')
+    content = Fields.of_file(path)
+    recorded = content.values.get('image_size')
     if None not in (recorded, image_size) and recorded != list(image_size or ()):
         raise DatasetError(
             f'{path}: image_size is {recorded}, but the images are {list(image_size or ())}')
     detections: dict[int, Detections] = {}
-    for index, frame in enumerate(_field(content, 'frames', list, str(path))):
-        where = f'{path}: frame {index}'
-        timestamp = _field(frame, 'timestamp', (str, int, Decimal), where)
-        stamp_ns = parse_stamp_ns(str(timestamp), where)
+    for index, entry in enumerate(content.entries('frames')):
+        frame = Fields(entry, f'{path}: frame {index}')
+        timestamp = str(frame.values.get('timestamp'))
+        stamp_ns = parse_stamp_ns(timestamp, frame.where)
         if stamp_ns in detections:
-            raise DatasetError(f'{where}: timestamp {timestamp} is a repetition')
-        found = [_parse_detection(item, f'{where}, detection {number}') for number, item
-                 in enumerate(_field(frame, 'detections', list, where))]
+            raise DatasetError(f'{frame.where}: timestamp {timestamp} is a repetition')
+        found = [_parse_detection(Fields(one, f'{frame.where}, detection {number}'))
+                 for number, one in enumerate(frame.entries('detections'))]
         detections[stamp_ns] = Detections(
             np.array([box for box, _, _ in found], dtype=np.float64).reshape(-1, 4),
             tuple(class_id for _, class_id, _ in found),
@@ -199,26 +185,12 @@ def read_recorded_detections(path: str | Path, image_size: tuple[int, int] | Non
     return detections
 
 
-def _parse_detection(item: Any, where: str) -> tuple[list[float], str, float]:
+def _parse_detection(one: Fields) -> tuple[list[float], str, float]:
     """Return box, class and score."""
-    class_id = _field(item, 'class_id', str, where)
-    score = float(_field(item, 'score', (int, Decimal), where))
+    class_id, score = one.text('class_id'), one.number('score')
     if not 0 <= score <= 1:
-        raise DatasetError(f'{where}: score is {score}, outside 0 to 1')
-    values = _field(item, 'bbox_xyxy', list, where)
-    if len(values) != 4 or not all(isinstance(value, int | Decimal) and not isinstance(value, bool)
-                                   for value in values):
-        raise DatasetError(f'{where}: bbox_xyxy is not four numbers')
-    box = [float(value) for value in values]
-    if not all(map(math.isfinite, box)) or box[0] >= box[2] or box[1] >= box[3]:
-        raise DatasetError(f'{where}: bbox_xyxy {box} is not left, top, right, bottom')
+        raise DatasetError(f'{one.where}: score is {score}, outside 0 to 1')
+    left, top, right, bottom = box = one.numbers('bbox_xyxy', (4,)).tolist()
+    if left >= right or top >= bottom:
+        raise DatasetError(f'{one.where}: bbox_xyxy {box} is not left, top, right, bottom')
     return box, class_id, score
-
-
-def _field(mapping: Any, name: str, kind: type | tuple[type, ...], where: str) -> Any:
-    if not isinstance(mapping, dict) or name not in mapping:
-        raise DatasetError(f'{where}: field {name!r} is missing')
-    value = mapping[name]
-    if not isinstance(value, kind) or isinstance(value, bool):
-        raise DatasetError(f'{where}: field {name!r} has the wrong type: {value!r:.60}')
-    return value

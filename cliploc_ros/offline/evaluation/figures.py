@@ -1,25 +1,120 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's figures and others, as PNG and SVG."""
+"""The paper's figures and others, as PNG and SVG; maps from above with names."""
 
-from collections.abc import Mapping, Sequence
-from itertools import cycle
+import io
+from collections.abc import Callable, Mapping, Sequence
+from itertools import cycle, product
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib import color_sequences
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from numpy.typing import NDArray
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
+from matplotlib.patheffects import withStroke
+from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
+from cliploc_ros.core.geometry.ellipsoid import outline_points
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.files.storage import write_file
-from cliploc_ros.offline.evaluation.drawing import draw_map, spread_names
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
 from cliploc_ros.offline.evaluation.summary import Summary, find_best, wilson_interval
 from cliploc_ros.offline.evaluation.trials import PosedQuery, Result
+
+#: Outlines text, so that it is legible on any background.
+EDGED = (withStroke(linewidth=2.0, foreground='white'),)
+_MOST_NAMES = 100
+_NAME = 'name'
+# Steps of a name from its place, in half widths and in heights, the nearest first.
+_STEPS = sorted(product((0.0, 1.1, -1.1, 2.2, -2.2), np.arange(-4, 5) * 1.05),
+                key=lambda step: (abs(step[0]) + abs(step[1]), -step[1]))
+
+
+def draw_map(axes: Axes, landmark_map: LandmarkMap) -> dict[str, tuple[float, ...]]:
+    """Draw each landmark from above, with its name if there are few.
+
+    Parameters
+    ----------
+    axes : Axes
+        x and y of the map [m], with equal scales.
+
+    Returns
+    -------
+    dict of str to tuple of float
+        Colour of each class.
+    """
+    classes = sorted(set(landmark_map.class_ids))
+    palette = color_sequences['tab20'][::2] + color_sequences['tab20'][1::2]
+    colors = {name: palette[i % len(palette)] for i, name in enumerate(classes)}
+    for center, shape, class_id in zip(landmark_map.centers, landmark_map.shapes,
+                                       landmark_map.class_ids, strict=True):
+        draw_outline(axes, center, shape, facecolor=colors[class_id], edgecolor='#333333',
+                     linewidth=0.5, alpha=0.55, zorder=3)
+    if len(landmark_map) <= _MOST_NAMES:
+        # the highest first: they hide the others
+        for row in np.argsort(-landmark_map.centers[:, 2], kind='stable'):
+            write_name(axes, landmark_map.centers[row, :2], landmark_map.landmark_ids[row], 6)
+    return colors
+
+
+def draw_outline(axes: Axes, center: NDArray[np.float64], shape: NDArray[np.float64],
+                 **style: object) -> None:
+    """Draw an ellipsoid, of center (3,) and shape (6,), from above."""
+    outline = np.array([center[0], center[1], shape[0], shape[1], shape[3]])
+    axes.add_patch(Polygon(outline_points(outline), closed=True, **style))
+
+
+def write_name(axes: Axes, xy: ArrayLike, text: str, size: float = 8,
+               color: str = '#222222') -> None:
+    """Write a name at a place (2,); see spread_names."""
+    x, y = np.asarray(xy)
+    axes.text(x, y, text, fontsize=size, color=color, ha='center', va='center', zorder=9,
+              path_effects=EDGED, parse_math=False, clip_on=True, gid=_NAME).set_in_layout(False)
+
+
+def spread_names(figure: Figure) -> None:
+    """Move names that would cover each other, and hide those that have no room.
+
+    A line joins a name that was moved with its place. The names that were written first stay.
+    """
+    figure.draw_without_rendering()
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    for axes in figure.axes:
+        taken: list[NDArray[np.float64]] = []
+        for name in [one for one in axes.texts if one.get_gid() == _NAME]:
+            box = np.reshape(name.get_window_extent(renderer).extents, (2, 2))
+            size, place = box[1] - box[0], name.get_position()
+            for across, up in _STEPS:
+                moved = box + size * (across / 2, up)
+                if (moved[0] >= axes.bbox.min).all() and (moved[1] <= axes.bbox.max).all() \
+                        and not any((moved[0] < other[1]).all() and (other[0] < moved[1]).all()
+                                    for other in taken):
+                    break
+            else:
+                name.set_visible(False)
+                continue
+            taken.append(moved)
+            x, y = axes.transData.inverted().transform(moved.mean(axis=0)).tolist()
+            name.set_position((x, y))
+            if abs(up) > 1.5 or abs(across) > 1.5:
+                axes.add_artist(Line2D((place[0], x), (place[1], y), color='#666666',
+                                       linewidth=0.5, zorder=8))
+
+
+def png_of(figure: Figure, dpi: int) -> bytes:
+    """Return a figure as PNG, its names spread."""
+    spread_names(figure)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format='png', dpi=dpi)
+    return buffer.getvalue()
+
 
 # The colours of Okabe and Ito, which the colour-blind can distinguish: one for each matching, the
 # others for other methods. Line style and marker show the algorithm.
@@ -37,6 +132,7 @@ _BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.0)
 _FREEDOM = 6  # of a pose
 _JUDGED_COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 _MARKERS = 'osD^vP'
+_STAGE_COLORS = {'detector': '#BBBBBB', 'CLIP': '#888888', 'keyframes': '#56B4E9'}
 
 
 def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
@@ -61,24 +157,43 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
     list of Path
         The PNG files; each has an SVG beside it.
     """
-    sampled = [one for one in summaries if _style(one.method)[2] is not None
-               and not one.method.endswith('_bf')]
     best = find_best(summaries)
+    found = np.isfinite(best.errors_m)
+    reliable = {best.method: (best.confidence[found], best.errors_m[found] < _SUCCESS_M)}
+    success = f'success (within {_SUCCESS_M:g} m)'
     figures = {
-        'success_over_threshold': _success_over_threshold(summaries),
-        'success_by_boxes': _success_by_boxes(summaries),
-        'precision_over_recall': _precision_over_recall(summaries),
-        'reliability': _reliability(best),
-        'consistency': _consistency(summaries),
-        'time_by_stage': _time_by_stage(summaries, observing_ms),
+        'success_over_threshold': _drawn('error threshold [m]', 'success',
+                                         _success_over_threshold, summaries),
+        'success_by_boxes': _drawn('detections in the image', success, _success_by_boxes,
+                                   summaries),
+        'precision_over_recall': _drawn(
+            'recall: right poses that are accepted',
+            f'precision: accepted poses within {_SUCCESS_M:g} m', _precision_over_recall,
+            summaries),
+        'reliability': _drawn('confidence', f'share of poses within {_SUCCESS_M:g} m',
+                              draw_reliability, reliable, 'installed calibration'),
+        'consistency': _drawn('squared error in its own covariance (NEES)',
+                              'share of accepted poses below', _consistency, summaries),
+        'time_by_stage': _drawn('mean time [ms]', '', _time_by_stage, summaries, observing_ms),
         'top_view': _top_view(landmark_map, queries,
                               [one for one in results if one.method == best.method], best.method),
     }
-    if sampled:
-        figures['best_iteration'] = _best_iteration(sampled)
+    if sampled := [one for one in summaries if not one.method.endswith('_bf')]:
+        figures['best_iteration'] = _drawn('iteration that found the best pose', '',
+                                           _best_iteration, sampled)
     if sweep:
-        figures['success_over_iterations'] = _success_over_iterations(sweep)
+        figures['success_over_iterations'] = _drawn('iterations', success,
+                                                    _success_over_iterations, sweep)
     return [save_figure(figure, folder / f'{name}.png') for name, figure in figures.items()]
+
+
+def _drawn(xlabel: str, ylabel: str, draw: Callable[..., None], *values: Any) -> Figure:
+    """Return a figure in which a function draws values, with a legend of what has a label."""
+    figure, axes = new_axes(xlabel, ylabel)
+    draw(axes, *values)
+    if axes.get_legend_handles_labels()[0]:
+        add_legend(figure)
+    return figure
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
@@ -115,8 +230,7 @@ def add_legend(figure: Figure) -> None:
     figure.legend(loc='outside right upper', frameon=False, fontsize=8)
 
 
-def _success_over_threshold(summaries: Sequence[Summary]) -> Figure:
-    figure, axes = new_axes('error threshold [m]', 'success')
+def _success_over_threshold(axes: Axes, summaries: Sequence[Summary]) -> None:
     limits = np.linspace(0.0, _MAX_ERROR_M, 401)
     for one in summaries:
         color, line, _ = _style(one.method)
@@ -124,12 +238,9 @@ def _success_over_threshold(summaries: Sequence[Summary]) -> Figure:
         axes.plot(limits, np.searchsorted(errors, limits) / errors.size, color=color,
                   linestyle=line, linewidth=1.4, label=one.method)
     axes.set(xlim=(0, _MAX_ERROR_M), ylim=(0, 1))
-    add_legend(figure)
-    return figure
 
 
-def _success_over_iterations(sweep: Mapping[str, Mapping[int, Summary]]) -> Figure:
-    figure, axes = new_axes('iterations', f'success (within {_SUCCESS_M:g} m)')
+def _success_over_iterations(axes: Axes, sweep: Mapping[str, Mapping[int, Summary]]) -> None:
     for method, by_count in sweep.items():
         color, line, marker = _style(method)
         rates = [one.success(_SUCCESS_M) for one in by_count.values()]
@@ -140,12 +251,9 @@ def _success_over_iterations(sweep: Mapping[str, Mapping[int, Summary]]) -> Figu
     axes.set_xticks(counts, [f'{count:,}' for count in counts])
     axes.set_xticks([], minor=True)
     axes.set_ylim(0, 1)
-    add_legend(figure)
-    return figure
 
 
-def _best_iteration(summaries: Sequence[Summary]) -> Figure:
-    figure, axes = new_axes('iteration that found the best pose', '')
+def _best_iteration(axes: Axes, summaries: Sequence[Summary]) -> None:
     found = [one.best_iterations[np.isfinite(one.errors_m)] for one in summaries]
     boxes = axes.boxplot(found, orientation='horizontal', widths=0.6, showfliers=False,
                          patch_artist=True, medianprops={'color': 'black'})
@@ -154,11 +262,9 @@ def _best_iteration(summaries: Sequence[Summary]) -> Figure:
     axes.set_yticks(range(1, len(summaries) + 1), [one.method for one in summaries])
     axes.invert_yaxis()
     axes.set_title('median, quartiles, and 1.5 of their distance', fontsize=9)
-    return figure
 
 
-def _success_by_boxes(summaries: Sequence[Summary]) -> Figure:
-    figure, axes = new_axes('detections in the image', f'success (within {_SUCCESS_M:g} m)')
+def _success_by_boxes(axes: Axes, summaries: Sequence[Summary]) -> None:
     boxes = summaries[0].boxes
     bins = [(low, high, (boxes >= low) & (boxes <= high)) for low, high in _BOX_BINS]
     bins = [one for one in bins if one[2].any()]
@@ -173,13 +279,9 @@ def _success_by_boxes(summaries: Sequence[Summary]) -> Figure:
                                        for name, (*_, chosen) in zip(names, bins, strict=True)],
                     fontsize=8)
     axes.set_ylim(-0.02, 1.02)
-    add_legend(figure)
-    return figure
 
 
-def _precision_over_recall(summaries: Sequence[Summary]) -> Figure:
-    figure, axes = new_axes('recall: right poses that are accepted',
-                        f'precision: accepted poses within {_SUCCESS_M:g} m')
+def _precision_over_recall(axes: Axes, summaries: Sequence[Summary]) -> None:
     for one in summaries:
         color, line, marker = _style(one.method)
         recall, precision = precision_recall(one)
@@ -192,8 +294,6 @@ def _precision_over_recall(summaries: Sequence[Summary]) -> Figure:
                       markeredgecolor='black', linestyle='none')
     axes.set(xlim=(-0.02, 1.02))
     axes.set_title('lines: all least confidences; markers: as run', fontsize=9)
-    add_legend(figure)
-    return figure
 
 
 def precision_recall(one: Summary, limit_m: float = _SUCCESS_M
@@ -221,21 +321,8 @@ def precision_recall(one: Summary, limit_m: float = _SUCCESS_M
     return (accepted / right.sum())[last], (accepted / np.arange(1, right.size + 1))[last]
 
 
-def _reliability(one: Summary) -> Figure:
-    """Draw the reliability of the installed calibration."""
-    figure, axes = new_axes('confidence', f'share of poses within {_SUCCESS_M:g} m')
-    solved = np.isfinite(one.errors_m)
-    draw_reliability(axes, {one.method: (one.confidence[solved],
-                                         one.errors_m[solved] < _SUCCESS_M)})
-    axes.set_title('installed calibration', fontsize=9)
-    add_legend(figure)
-    return figure
-
-
-def _consistency(summaries: Sequence[Summary]) -> Figure:
+def _consistency(axes: Axes, summaries: Sequence[Summary]) -> None:
     """Draw the distribution of the normalized squared errors of accepted poses."""
-    figure, axes = new_axes('squared error in its own covariance (NEES)',
-                            'share of accepted poses below')
     levels = np.linspace(0.0, float(chi2.ppf(0.999, _FREEDOM)), 400)
     axes.plot(levels, chi2.cdf(levels, _FREEDOM), color='#888888', linewidth=1.6,
               label='ideal')
@@ -248,23 +335,19 @@ def _consistency(summaries: Sequence[Summary]) -> Figure:
                   color=color, linewidth=1.4,
                   label=f'{name}: {within_ellipsoid(squares):.3f} within')
     axes.set(xlim=(0, levels[-1]), ylim=(0, 1.02))
-    add_legend(figure)
-    return figure
 
 
-def _time_by_stage(summaries: Sequence[Summary], observing_ms: Mapping[str, float]) -> Figure:
-    figure, axes = new_axes('mean time [ms]', '')
+def _time_by_stage(axes: Axes, summaries: Sequence[Summary], observing_ms: Mapping[str, float]
+                   ) -> None:
     rows = np.arange(len(summaries))
     start = np.zeros(len(summaries))
-    for (stage, duration), shade in zip(observing_ms.items(), ('#BBBBBB', '#888888'),
-                                        strict=False):
-        axes.barh(rows, duration, left=start, color=shade, label=stage)
+    stages: dict[str, Any] = dict(observing_ms)
+    if any(one.has_keyframes for one in summaries):
+        stages['keyframes'] = np.array([one.keyframes_ms.mean() if one.has_keyframes else 0.0
+                                        for one in summaries])
+    for stage, duration in stages.items():
+        axes.barh(rows, duration, left=start, color=_STAGE_COLORS[stage], label=stage)
         start += duration
-    keyframes = np.array([one.keyframes_ms.mean() if one.has_keyframes else 0.0
-                          for one in summaries])
-    if keyframes.any():
-        axes.barh(rows, keyframes, left=start, color='#56B4E9', label='keyframes')
-        start += keyframes
     search = np.array([one.mean_search_ms for one in summaries])
     axes.barh(rows, search, left=start, color=[_style(one.method)[0] for one in summaries])
     for row, total, own in zip(rows, start + search, search, strict=True):
@@ -273,13 +356,9 @@ def _time_by_stage(summaries: Sequence[Summary], observing_ms: Mapping[str, floa
                       textcoords='offset points')
     axes.set_yticks(rows, [one.method for one in summaries])
     axes.invert_yaxis()
-    has_stages = bool(observing_ms) or keyframes.any()
-    if (start + search).max() > 50 * (start + search).min() and not has_stages:
+    if not stages and search.max() > 50 * search.min():
         axes.set_xscale('log')
     axes.margins(x=0.4)
-    if has_stages:
-        add_legend(figure)
-    return figure
 
 
 def _top_view(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], results: Sequence[Result],
@@ -315,11 +394,14 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], results:
 
 
 def draw_reliability(axes: Axes, judged: Mapping[str, tuple[NDArray[np.float64],
-                                                            NDArray[np.bool_]]]) -> None:
+                                                            NDArray[np.bool_]]],
+                     title: str = '') -> None:
     """Draw the share of right poses over confidence, with 95 % intervals.
 
     `judged` maps names to confidences (n,) and to whether each pose is right (n,).
     """
+    if title:
+        axes.set_title(title, fontsize=9)
     axes.plot([0, 1], [0, 1], color='#888888', linewidth=1.0, label='ideal')
     for number, (name, (confidence, right)) in enumerate(judged.items()):
         bins = np.clip(np.digitize(confidence, _BINS) - 1, 0, len(_BINS) - 2)

@@ -19,8 +19,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.models.map_rows import embed_map
 from cliploc_ros.offline.datasets.frames import Frames
-from cliploc_ros.offline.datasets.observations import Recorded
-from cliploc_ros.offline.datasets.queries import Queries, QueryFrame
+from cliploc_ros.offline.datasets.observations import Queries, QueryFrame, Recorded
 from cliploc_ros.offline.evaluation.trials import ImageFeatures, PosedQuery
 from cliploc_ros.offline.recording.recorder import RecordingOptions, observation_file, record_once
 

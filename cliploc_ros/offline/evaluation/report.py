@@ -6,18 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cliploc_ros.files.storage import write_text
+from cliploc_ros.offline import page as html
 from cliploc_ros.offline.evaluation.summary import Summary, find_best
-from cliploc_ros.offline.page import (
-    figure,
-    first_screen,
-    fold,
-    note,
-    page,
-    side_by_side,
-    table,
-    tiles,
-    verdict,
-)
 
 PAGE = 'report.html'
 _TOP_VIEW = 'top_view'
@@ -40,18 +30,19 @@ def write_report(folder: Path, summaries: Sequence[Summary], rows: Sequence[Sequ
     """Write the page, with the table's rows, its header first, and embedded PNG files."""
     best = find_best(summaries)
     wrong, count = best.false_accepts(), best.errors_m.size
-    said = verdict(f'{best.method} is the best of {len(summaries)} methods on '
-                   f'{len(best.queries)} images' if len(summaries) > 1 else
-                   f'{best.method} on {len(best.queries)} images', not wrong)
-    numbers = tiles([
+    said = html.verdict(f'{best.method} is the best of {len(summaries)} methods on '
+                        f'{len(best.queries)} images' if len(summaries) > 1 else
+                        f'{best.method} on {len(best.queries)} images', not wrong)
+    numbers = html.tiles([
         (f'{100 * best.success(1.0):.0f} %', 'of the poses within 1 m of the truth', True),
         (f'{int(best.accepted.sum())} of {count}', 'accepted', bool(best.accepted.any())),
         (str(wrong), 'accepted, but wrong by more than 1 m', not wrong)])
-    drawn = {one.stem: figure(one.read_bytes(), _CAPTIONS[one.stem], one.stem) for one in pictures}
+    drawn = {one.stem: html.figure(one.read_bytes(), _CAPTIONS[one.stem], one.stem)
+             for one in pictures}
     head, *brief = [[row[column] for column in _BRIEF] for row in rows]
     top_view = drawn.pop(_TOP_VIEW, '')
-    write_text(folder / PAGE, page(
+    write_text(folder / PAGE, html.page(
         'Evaluation',
-        first_screen([said, numbers, table(head, brief)], [top_view]),
-        fold('The whole table', table(rows[0], rows[1:]), *map(note, remarks)),
-        fold('Figures', side_by_side(drawn.values()), is_open=True)))
+        html.first_screen([said, numbers, html.table(head, brief)], [top_view]),
+        html.fold('The whole table', html.table(rows[0], rows[1:]), *map(html.note, remarks)),
+        html.fold('Figures', html.side_by_side(drawn.values()), is_open=True)))

@@ -25,19 +25,10 @@ from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.files.storage import make_folder, write_text
-from cliploc_ros.offline.datasets.queries import QueryFrame
+from cliploc_ros.offline.datasets.observations import QueryFrame
+from cliploc_ros.offline.evaluation import summary
 from cliploc_ros.offline.evaluation.methods import Method
 from cliploc_ros.offline.evaluation.report import PAGE, write_report
-from cliploc_ros.offline.evaluation.summary import (
-    Summary,
-    as_csv,
-    as_json,
-    as_markdown,
-    as_text,
-    notes,
-    summarize,
-    table_rows,
-)
 from cliploc_ros.offline.evaluation.trials import PosedQuery, Result, run_trial
 from cliploc_ros.units import NS_PER_S
 
@@ -154,7 +145,7 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
                     methods: Sequence[Method], out: Path, *, sweep: Sequence[int] = (),
                     resume: bool = False, figures: bool = True,
                     frames: Sequence[QueryFrame] = (), remarks: Sequence[str] = (),
-                    **running: Any) -> list[Summary]:
+                    **running: Any) -> list[summary.Summary]:
     """Run methods, print the table, write all files to a folder; return their summaries.
 
     CliplocError: the run cannot be resumed, or a file cannot be written.
@@ -197,14 +188,14 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
             results = run_methods(landmark_map, everything, queries, done=done, advance=advance,
                                   **running)
         own = [one for one in results if _AT not in one.method]
-        summaries = summarize(own)
-        rows = table_rows(summaries)
+        summaries = summary.summarize(own)
+        rows = summary.table_rows(summaries)
         write_trajectories(out / 'trajectories', queries, own)
-        remarks = [*remarks, *notes(summaries)]
-        print('\n'.join(['', as_text(rows), *remarks, '']), flush=True)
-        write_text(out / 'table.md', '\n\n'.join([as_markdown(rows), *remarks]) + '\n')
-        write_text(out / 'results.json', as_json(own))
-        write_text(out / 'summary.csv', as_csv(summaries))
+        remarks = [*remarks, *summary.notes(summaries)]
+        print('\n'.join(['', summary.as_text(rows), *remarks, '']), flush=True)
+        write_text(out / 'table.md', '\n\n'.join([summary.as_markdown(rows), *remarks]) + '\n')
+        write_text(out / 'results.json', summary.as_json(own))
+        write_text(out / 'summary.csv', summary.as_csv(summaries))
         pictures = _draw(out, parts_of(landmark_map)[0].landmark_map, queries, results,
                          summaries, methods, frames) if figures else []
         write_report(out, summaries, rows, remarks, pictures)
@@ -241,46 +232,44 @@ def describe(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], methods: 
              trials: int, layer: KeyframeLayer | None, noisy: Sequence[Sequence[PosedQuery]]
              ) -> dict[str, Any]:
     """Return what identifies a run, as JSON keeps it."""
+    asked = _digest(part for query in chain(queries, *noisy) for part in (
+        *(part for one in (*query.neighbours, query.observation) for part in (
+            one.similarities, one.detections.bboxes_xyxy, one.detections.class_ids,
+            one.up_in_camera, one.odom_from_camera)), query.map_from_camera, query.number))
+    world = _digest([landmark_map.landmark_ids, landmark_map.class_ids,
+                     landmark_map.classes.members, landmark_map.centers, landmark_map.shapes])
+    return {
+        'queries': asked, 'map': world, 'trials': trials,
+        'methods': {one.name: {name: str(value) for name, value in asdict(one.options).items()}
+                    for one in methods},
+        'keyframes': None if layer is None else {
+            'digest': _digest([*(query.image.features.descriptors for query in queries
+                                 if query.image is not None),
+                               layer.map_from_camera, layer.points, layer.descriptors]),
+            'methods': [one.name for one in methods if one.keyframes]}}
+
+
+def _digest(parts: Iterable[object]) -> str:
+    """Return a hash of arrays and of what has a representation."""
     digest = hashlib.sha256()
-    for query in chain(queries, *noisy):
-        for one in (*query.neighbours, query.observation):
-            for part in (one.similarities, one.detections.bboxes_xyxy):
-                digest.update(np.ascontiguousarray(part).tobytes())
-            digest.update(repr((one.detections.class_ids, one.up_in_camera,
-                                one.odom_from_camera)).encode())
-        digest.update(np.ascontiguousarray(query.map_from_camera).tobytes())
-        digest.update(repr(query.number).encode())
-    world = hashlib.sha256(repr((landmark_map.landmark_ids, landmark_map.class_ids,
-                                 landmark_map.classes.members.tolist(),
-                                 landmark_map.centers.tolist(),
-                                 landmark_map.shapes.tolist())).encode())
-    run = {'queries': digest.hexdigest(), 'map': world.hexdigest(), 'trials': trials,
-           'methods': {one.name: {name: str(value) for name, value in asdict(one.options).items()}
-                       for one in methods}, 'keyframes': None}
-    if layer is not None:
-        digest = hashlib.sha256()
-        for query in queries:
-            if query.image is not None:
-                digest.update(query.image.features.descriptors.tobytes())
-        for array in (layer.map_from_camera, layer.points, layer.descriptors):
-            digest.update(np.ascontiguousarray(array).tobytes())
-        run['keyframes'] = {'digest': digest.hexdigest(),
-                            'methods': [one.name for one in methods if one.keyframes]}
-    return run
+    for part in parts:
+        digest.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray)
+                      else repr(part).encode())
+    return digest.hexdigest()
 
 
 def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
-          results: Sequence[Result], summaries: Sequence[Summary], methods: Sequence[Method],
-          frames: Sequence[QueryFrame]) -> list[Path]:
+          results: Sequence[Result], summaries: Sequence[summary.Summary],
+          methods: Sequence[Method], frames: Sequence[QueryFrame]) -> list[Path]:
     try:
         from cliploc_ros.offline.evaluation.figures import draw_all
     except ImportError as error:
         print(f'no figures: {error}; install matplotlib', flush=True)
         return []
     # the summaries of each sampling method, by their number of iterations
-    sweep: dict[str, dict[int, Summary]] = {}
+    sweep: dict[str, dict[int, summary.Summary]] = {}
     iterations = {one.name: one.options.iterations for one in methods if not one.draws_nothing}
-    for one in summarize(results):
+    for one in summary.summarize(results):
         name, _, count = one.method.partition(_AT)
         if name in iterations:
             sweep.setdefault(name, {})[int(count or iterations[name])] = one

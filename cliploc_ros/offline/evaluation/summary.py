@@ -269,28 +269,31 @@ def as_markdown(rows: Sequence[Sequence[str]]) -> str:
 def as_csv(summaries: Sequence[Summary]) -> str:
     """Return a line of figures for each method."""
     best = find_best(summaries)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator='\n')
-    writer.writerow(['method', 'queries', 'trials', *(f'success_{limit:g}m' for limit in LIMITS_M),
-                     *(f'success_{limit:g}m_std' for limit in LIMITS_M), 'median_error_m',
-                     'mean_error_m', 'mean_search_ms', 'coverage', 'accepted', 'precision_1m',
-                     'precision_1m_low', 'precision_1m_high', 'recall_1m', 'wrongly_accepted',
-                     'less_than_best_1m', 'less_than_best_low', 'less_than_best_high',
-                     'crops_share', 'refused_by_kind', *(f'from_{source}' for source in _SOURCES),
-                     'keyframe_inliers', 'keyframes_ms'])
+    rows: list[dict[str, Any]] = []
     for one in summaries:
-        difference = compare(one, best)
-        writer.writerow([
-            one.method, len(one.queries), len(one.errors_m),
-            *(one.success(limit) for limit in LIMITS_M),
-            *(one.success_deviation(limit) for limit in LIMITS_M), one.median_error_m,
-            one.mean_error_m, one.mean_search_ms, float(one.coverage.mean()),
-            float(one.accepted.mean()), one.precision(), *one.precision_interval(), one.recall(),
-            one.false_accepts(), difference.mean, difference.low, difference.high,
-            one.crops_share, _kinds(one),
-            *([*(float((one.sources == source).mean()) for source in _SOURCES),
-               float(np.median(one.keyframe_inliers)), float(one.keyframes_ms.mean())]
-              if one.has_keyframes else [''] * 5)])
+        difference, (low, high) = compare(one, best), one.precision_interval()
+        rows.append({
+            'method': one.method, 'queries': len(one.queries), 'trials': len(one.errors_m),
+            **{f'success_{limit:g}m': one.success(limit) for limit in LIMITS_M},
+            **{f'success_{limit:g}m_std': one.success_deviation(limit) for limit in LIMITS_M},
+            'median_error_m': one.median_error_m, 'mean_error_m': one.mean_error_m,
+            'mean_search_ms': one.mean_search_ms, 'coverage': float(one.coverage.mean()),
+            'accepted': float(one.accepted.mean()), 'precision_1m': one.precision(),
+            'precision_1m_low': low, 'precision_1m_high': high, 'recall_1m': one.recall(),
+            'wrongly_accepted': one.false_accepts(), 'less_than_best_1m': difference.mean,
+            'less_than_best_low': difference.low, 'less_than_best_high': difference.high,
+            'crops_share': one.crops_share, 'refused_by_kind': _kinds(one),
+            **dict.fromkeys([*(f'from_{source}' for source in _SOURCES), 'keyframe_inliers',
+                             'keyframes_ms'], '')})
+        if one.has_keyframes:
+            rows[-1] |= {f'from_{source}': float((one.sources == source).mean())
+                         for source in _SOURCES}
+            rows[-1] |= {'keyframe_inliers': float(np.median(one.keyframe_inliers)),
+                         'keyframes_ms': float(one.keyframes_ms.mean())}
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0], lineterminator='\n')
+    writer.writeheader()
+    writer.writerows(rows)
     return text.getvalue()
 
 

@@ -1,24 +1,22 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the reader of each layout returns: images in the order of time, with cameras and poses."""
+"""What a reader of a layout takes and returns: images in the order of time, with their poses."""
 
-import json
-import math
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import is_rigid, transform_from_pose
-from cliploc_ros.errors import CameraError, DatasetError
-from cliploc_ros.offline.datasets.frames import DepthFormat, ImageFile
-from cliploc_ros.offline.datasets.poses import Poses
-from cliploc_ros.offline.datasets.tum import MAX_STAMP_S
+from cliploc_ros.core.geometry.transforms import is_rigid
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.frames import NO_STAMP, DepthFormat, ImageFile
+from cliploc_ros.offline.datasets.parsing import MAX_STAMP_S
+from cliploc_ros.offline.datasets.poses import TimedPoses
 from cliploc_ros.units import NS_PER_S
 
 #: Endings of image files.
@@ -28,29 +26,36 @@ _INVENTED_STEP_NS = NS_PER_S
 # Files write their rotations with a few digits.
 _ROTATION_TOLERANCE = 1e-2
 _MOST_M = 1e6
-_NO_FORM = DepthFormat()
+_AS_USUAL = DepthFormat()
 
 
-class Shot(NamedTuple):
-    """An image as a layout names it."""
+@dataclass(frozen=True)
+class FolderOptions:
+    """What a folder does not say itself."""
 
-    color: Path
-    camera: Camera
-    pose: NDArray[np.float64] | None  #: (4, 4) as stored; None or not finite where unknown
-    stamp_ns: int | None = None
-    depth: Path | None = None
-    confidence: Path | None = None
-    number: int | None = None  #: In a video
+    intrinsics: str | None = None  #: Name of a preset, or a camera.json; None: the folder's own
+    trajectory: TimedPoses | None = None  #: Poses instead of the folder's own
+    max_gap_ns: int = 0  #: Greatest gap between two poses to interpolate over [ns]
+    #: (4, 4): how the camera is mounted on what the poses are of
+    body_from_camera: NDArray[np.float64] | None = None
+    depth: DepthFormat = _AS_USUAL  #: What differs from the folder's usual format
+    layout: str = ''  #: Key of one of LAYOUTS; '': the one whose files are there
+    images: Path | None = None  #: Folder of the images of colmap and nerf
+    axes: str | None = None  #: What the stored poses are, one of AXES; None: by the layout
+    scale: float | None = None  #: Metres of a stored unit
+    #: Two images, and the distance between their cameras [m]: another way to say the scale
+    known_distance: tuple[str, str, float] | None = None
+    any_unit: bool = False  #: Take an unknown unit for the metre
+    level: bool = False  #: Turn the map so that z is up, by the tilt of the cameras
 
 
 @dataclass(frozen=True)
 class Capture:
-    """Images in the order of time, and the poses that are stored with them."""
+    """Images in the order of time, with the poses that are stored for them."""
 
     files: tuple[ImageFile, ...]
-    poses: Poses  #: As stored, see axes
     axes: str = 'opencv'  #: What a stored pose is: one of placing.AXES
-    depth: DepthFormat = _NO_FORM
+    depth: DepthFormat = _AS_USUAL
     #: Axis of the poses' coordinate frame that points up by the definition of the layout: 'y' or
     #: 'z'; '' where it defines none
     up: str = ''
@@ -59,24 +64,8 @@ class Capture:
     images: int = 0  #: How many there are, where more than the files have no pose
 
 
-@dataclass(frozen=True)
-class StampedPoses:
-    """Poses of the images themselves, which need no interpolation."""
-
-    poses: dict[int, NDArray[np.float64]]
-
-    @property
-    def span_ns(self) -> tuple[int, int] | None:
-        """Return the first and last stamp with a pose [ns]."""
-        return (min(self.poses), max(self.poses)) if self.poses else None
-
-    def pose_at(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        """Return the pose of the image of a stamp [ns]."""
-        return self.poses.get(stamp_ns)
-
-
-def arrange(shots: Sequence[Shot], where: str) -> tuple[tuple[ImageFile, ...], StampedPoses]:
-    """Return images in the order of time, and their poses.
+def arrange(files: Sequence[ImageFile], where: object) -> tuple[ImageFile, ...]:
+    """Return images in the order of time, with rigid poses.
 
     Without stamps, images are in the order of their names, numbers in them by value. Images whose
     file is missing are left out.
@@ -86,34 +75,33 @@ def arrange(shots: Sequence[Shot], where: str) -> tuple[tuple[ImageFile, ...], S
     DatasetError
         No image is there or has a pose, two are one file, or a pose is no rigid transform.
     """
-    present = [one for one in shots if beside(one.color) is not None]
+    present = [one for one in files if beside(one.color) is not None]
     if not present:
-        raise DatasetError(f'{where}: none of {len(shots)} images is there' + (
-            f', such as {shots[0].color}; give the folder of the images with `images`'
-            if shots else ''))
-    seen: set[tuple[Path, int | None]] = set()
-    for one in present:
-        if (one.color, one.number) in seen:
-            raise DatasetError(f'{where}: lists the image {one.color.name} twice')
-        seen.add((one.color, one.number))
+        raise DatasetError(f'{where}: none of {len(files)} images is there' + (
+            f', such as {files[0].color}; give the folder of the images with `images`'
+            if files else ''))
+    counts = Counter((one.color, one.number) for one in present)
+    (first, _), count = counts.most_common(1)[0]
+    if count > 1:
+        raise DatasetError(f'{where}: lists the image {first.name} twice')
     stamps = {one.stamp_ns for one in present}
-    if None in stamps or len(stamps) < len(present):
+    if NO_STAMP in stamps or len(stamps) < len(present):
         present.sort(key=lambda one: re.sub(
             '[0-9]+', lambda number: number[0].zfill(20), str(one.color)))
         times = [place * _INVENTED_STEP_NS for place in range(len(present))]
     else:
-        present.sort(key=lambda one: one.stamp_ns or 0)
-        times = [one.stamp_ns or 0 for one in present]
+        present.sort(key=lambda one: one.stamp_ns)
+        times = [one.stamp_ns for one in present]
         if times[0] < 0 or times[-1] > MAX_STAMP_S * NS_PER_S:
             times = [time - times[0] for time in times]
     if times[-1] > MAX_STAMP_S * NS_PER_S:
         raise DatasetError(f'{where}: its stamps span {times[-1] / NS_PER_S:.3g} s')
-    poses = {stamp: pose for stamp, one in zip(times, present, strict=True)
-             if (pose := _sound(one.pose, f'{where}: pose of {one.color.name}')) is not None}
-    if not poses:
+    arranged = tuple(
+        one._replace(stamp_ns=time, pose=_sound(one.pose, f'{where}: pose of {one.color.name}'))
+        for time, one in zip(times, present, strict=True))
+    if all(one.pose is None for one in arranged):
         raise DatasetError(f'{where}: none of {len(present)} images has a pose')
-    return tuple(ImageFile(stamp, one.color, one.camera, one.depth, one.confidence, one.number)
-                 for stamp, one in zip(times, present, strict=True)), StampedPoses(poses)
+    return arranged
 
 
 def _sound(pose: NDArray[np.float64] | None, where: str) -> NDArray[np.float64] | None:
@@ -133,25 +121,15 @@ def _sound(pose: NDArray[np.float64] | None, where: str) -> NDArray[np.float64] 
     return sound
 
 
-def pose_of(position: Sequence[float], quat_xyzw: Sequence[float], where: str
-            ) -> NDArray[np.float64] | None:
-    """Return the transform (4, 4) of a position and a quaternion; None where they are not finite.
-
-    DatasetError: the quaternion is far from unit.
-    """
-    if not np.isfinite([*position, *quat_xyzw]).all():
-        return None
-    if abs(math.hypot(*quat_xyzw) - 1.0) > _ROTATION_TOLERANCE:
-        raise DatasetError(f'{where}: the quaternion {list(quat_xyzw)} has no unit length')
-    return transform_from_pose(np.array(position), np.array(quat_xyzw))
+def first_image(folder: Path, stem: str) -> Path | None:
+    """Return the image of a name without its ending; None where there is none."""
+    return next((found for end in IMAGES if (found := beside(folder / f'{stem}{end}'))), None)
 
 
-def camera_of(where: str, *values: Any) -> Camera:
-    """Return a camera; DatasetError: no camera can have these values."""
-    try:
-        return Camera(*values)
-    except CameraError as error:
-        raise DatasetError(f'{where}: {error}') from error
+def size_of_image(path: Path) -> tuple[int, int] | None:
+    """Return width and height of an image [px]; None where it cannot be read."""
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return None if image is None else (image.shape[1], image.shape[0])
 
 
 def beside(path: Path) -> Path | None:
@@ -160,85 +138,3 @@ def beside(path: Path) -> Path | None:
         return path if path.is_file() else None
     except OSError:  # too long
         return None
-
-
-def read_text(path: Path) -> str:
-    """Return the text of a file; DatasetError: it cannot be read."""
-    try:
-        return path.read_text(encoding='utf-8')
-    except (OSError, ValueError) as error:
-        raise DatasetError(f'{path}: cannot be read: {error}') from error
-
-
-def read_rows(path: Path, columns: int, separator: str | None = None, header: int = 0
-              ) -> list[list[float]]:
-    """Return the rows of numbers of a table; DatasetError: one has too few, or no numbers."""
-    rows = []
-    for number, line in enumerate(read_text(path).splitlines()[header:], start=header + 1):
-        try:
-            row = [float(cell) for cell in line.split(separator)] if line.strip() else None
-        except ValueError:
-            row = []
-        if row is not None and len(row) < columns:
-            raise DatasetError(f'{path}:{number}: expected {columns} numbers, got {line[:60]!r}')
-        if row is not None:
-            rows.append(row)
-    return rows
-
-
-class Fields:
-    """A JSON mapping whose fields are checked as they are read."""
-
-    def __init__(self, values: Any, where: str) -> None:
-        if not isinstance(values, dict):
-            raise DatasetError(f'{where}: expected a mapping, got {str(values)[:40]!r}')
-        self.values: dict[str, Any] = values
-        self.where = where
-
-    @classmethod
-    def of_file(cls, path: Path) -> 'Fields':
-        """Return the mapping that a file holds."""
-        try:
-            return cls(json.loads(read_text(path)), str(path))
-        except (ValueError, RecursionError) as error:
-            raise DatasetError(f'{path}: cannot be read as JSON: {error}') from error
-
-    def __contains__(self, name: str) -> bool:
-        """Return whether a field is there."""
-        return name in self.values
-
-    def number(self, name: str, default: float | None = None) -> float:
-        """Return a finite number; DatasetError: it is missing without a default, or is none."""
-        return float(self.numbers(name, (), default))
-
-    def numbers(self, name: str, shape: tuple[int, ...], default: Any = None
-                ) -> NDArray[np.float64]:
-        """Return finite numbers; a length of -1 is any. DatasetError: they are others."""
-        value = self.values.get(name, default)
-        if value is None:
-            raise DatasetError(f'{self.where}: field {name!r} is missing')
-        try:
-            found = np.array(value)
-            if found.size and found.dtype.kind not in 'iuf':
-                raise ValueError
-            found = found.astype(np.float64)
-        except (ValueError, OverflowError, TypeError):
-            found = np.array([np.nan])
-        fits = len(found.shape) == len(shape) and all(
-            length in (-1, there) for length, there in zip(shape, found.shape, strict=True))
-        if not fits or not np.isfinite(found).all():
-            raise DatasetError(f'{self.where}: {name} is {str(value)[:60]}, not ' + (
-                f'numbers of shape {shape}' if shape else 'a finite number'))
-        return found
-
-    def text(self, name: str, default: str | None = None) -> str:
-        """Return a text."""
-        value = self.values.get(name, default)
-        if not isinstance(value, str):
-            raise DatasetError(f'{self.where}: field {name!r} ' + (
-                'is missing' if value is None else f'is {str(value)[:40]!r}, not a text'))
-        return value
-
-    def size(self, width: str, height: str) -> tuple[int, int]:
-        """Return width and height [px]."""
-        return round(self.number(width)), round(self.number(height))

@@ -4,7 +4,7 @@
 
 import mmap
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,15 +14,9 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.captures.capture import (
-    IMAGES,
-    Capture,
-    Shot,
-    arrange,
-    camera_of,
-    pose_of,
-    read_text,
-)
+from cliploc_ros.offline.datasets import parsing
+from cliploc_ros.offline.datasets.captures import capture
+from cliploc_ros.offline.datasets.frames import NO_STAMP, ImageFile
 
 _PLACES = ('.', 'sparse', 'sparse/0', 'sparse/1', 'colmap/sparse/0', 'model', 'colmap')
 _MOST_NAME = 4096
@@ -67,27 +61,14 @@ class _Posed(NamedTuple):
     pose: NDArray[np.float64] | None  #: (4, 4): map_from_camera
 
 
-def is_colmap(folder: Path) -> bool:
-    """Return whether a folder holds a model, or is a project with one."""
-    return bool(_models(folder))
-
-
-def read_colmap(folder: Path, images: Path | None) -> Capture:
+def read_colmap(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     """Return the images of a model, or of the largest one of a project.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the model (cameras and images, .bin or .txt), or of the project around it.
-    images : Path, optional
-        Folder of the images; None: ``images/`` beside the model or above it.
-
-    Raises
-    ------
-    DatasetError
-        The model cannot be used; names what to mend.
+    The folder is that of the model (cameras and images, .bin or .txt), or of the project around
+    it. Without a folder of images, they are in ``images/`` beside the model or above it.
+    DatasetError: the model cannot be used; names what to mend.
     """
-    models = _models(folder)
+    models = models_of(folder)
     if not models:
         raise DatasetError(f'{folder}: no COLMAP model here: it has cameras.bin and images.bin, '
                            'or .txt; run the mapper of COLMAP first')
@@ -99,25 +80,23 @@ def read_colmap(folder: Path, images: Path | None) -> Capture:
         rest = sum(map(len, found.values())) - len(found[model])
         notes.append(f'the model is in {len(models)} pieces: {model.name} with '
                      f'{len(found[model])} images is used, {rest} images of the others are not')
-    root = images or next((one / 'images' for one in (folder, *model.resolve().parents[:3])
+    root = options.images or next((one / 'images' for one in (folder, *model.resolve().parents[:3])
                            if (one / 'images').is_dir()), folder)
-    shots = []
+    files = []
     for one in found[model]:
         if one.camera_id not in cameras:
             raise DatasetError(f'{model}: image {one.name} is of camera {one.camera_id}, which '
                                'the model does not have')
-        shots.append(Shot(root / one.name, cameras[one.camera_id], one.pose))
-    if len({one.color for one in shots}) < len(shots):
-        raise DatasetError(f'{model}: has two images of one name; give each its own')
-    files, poses = arrange(shots, str(model))
-    if len(files) < len(shots):
-        notes.append(f'{len(shots) - len(files)} of {len(shots)} images of the model are not in '
-                     f'{root}')
-    there = sum(one.suffix.lower() in IMAGES for one in root.rglob('*'))
-    return Capture(files, poses, is_metric=False, notes=tuple(notes), images=there)
+        files.append(ImageFile(NO_STAMP, root / one.name, cameras[one.camera_id], one.pose))
+    arranged = capture.arrange(files, model)
+    if len(arranged) < len(files):
+        notes.append(f'{len(files) - len(arranged)} of {len(files)} images of the model are not '
+                     f'in {root}')
+    there = sum(one.suffix.lower() in capture.IMAGES for one in root.rglob('*'))
+    return capture.Capture(arranged, is_metric=False, notes=tuple(notes), images=there)
 
 
-def _models(folder: Path) -> list[Path]:
+def models_of(folder: Path) -> list[Path]:
     """Return the folders of models in a folder."""
     places = [folder / place for place in _PLACES]
     sparse = folder / 'sparse'
@@ -134,16 +113,11 @@ def _cameras(model: Path) -> Iterator[tuple[int, Camera]]:
     """Yield the cameras of a model by their ids."""
     binary = model / 'cameras.bin'
     if not _has(model, 'bin'):
-        path = model / 'cameras.txt'
-        for line_number, line in enumerate(read_text(path).splitlines(), start=1):
-            where, cells = f'{path}:{line_number}', line.split()
-            if not cells or cells[0].startswith('#'):
-                continue
-            if len(cells) < 4:
-                raise DatasetError(f'{where}: expected 4 values, got {line[:60]!r}')
-            camera_id, width, height = (_parsed(cells[place], int, where) for place in (0, 2, 3))
-            yield camera_id, _camera(where, _BY_NAME.get(cells[1], -1), cells[1], (width, height),
-                                     _numbers(cells[4:], where))
+        lines = parsing.read_cells(model / 'cameras.txt', 'CAMERA_ID MODEL WIDTH HEIGHT ...')
+        for where, (camera_id, name, *cells) in lines:
+            number, width, height = parsing.parse_all([camera_id, *cells[:2]], int, where)
+            yield number, _camera(where, _BY_NAME.get(name, -1), name, (width, height),
+                                  parsing.parse_all(cells[2:], float, where))
         return
     with _Bytes(binary) as data:
         for place in range(data.count(24)):
@@ -154,7 +128,7 @@ def _cameras(model: Path) -> Iterator[tuple[int, Camera]]:
                                      values)
 
 
-def _camera(where: str, number: int, name: str, size: tuple[int, int], values: tuple[float, ...]
+def _camera(where: str, number: int, name: str, size: tuple[int, int], values: Sequence[float]
             ) -> Camera:
     model = _MODELS.get(number)
     if model is None:
@@ -165,8 +139,8 @@ def _camera(where: str, number: int, name: str, size: tuple[int, int], values: t
     fx, fy, (cx, cy) = values[0], values[model.focals - 1], values[model.focals:model.focals + 2]
     distortion = np.zeros(_LENGTHS[model.distortion])
     distortion[list(model.places)] = values[model.focals + 2:]
-    return camera_of(where, *size, fx, fy, cx - 0.5, cy - 0.5, model.distortion,
-                     tuple(distortion.tolist()))
+    return parsing.camera_of(where, *size, fx, fy, cx - 0.5, cy - 0.5, model.distortion,
+                             tuple(distortion.tolist()))
 
 
 def _images(model: Path) -> Iterator[_Posed]:
@@ -185,7 +159,7 @@ def _images(model: Path) -> Iterator[_Posed]:
 
 def _text_images(path: Path) -> Iterator[_Posed]:
     """Yield the images of a text file: two lines each, the second one may be empty."""
-    lines = [line for line in read_text(path).split('\n') if not line.startswith('#')]
+    lines = [line for line in parsing.read_text(path).split('\n') if not line.startswith('#')]
     for number, line in enumerate(lines[::2]):
         cells = line.strip().split(maxsplit=9)
         where = f'{path}: image {number}'
@@ -194,25 +168,15 @@ def _text_images(path: Path) -> Iterator[_Posed]:
         if len(cells) != 10:
             raise DatasetError(f'{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, '
                                f'got {line[:60]!r}')
-        yield _posed(cells[9], _parsed(cells[8], int, where), _numbers(cells[1:8], where), where)
+        yield _posed(cells[9], parsing.parse_all(cells[8:9], int, where)[0],
+                     parsing.parse_all(cells[1:8], float, where), where)
 
 
 def _posed(name: str, camera_id: int, numbers: Sequence[float], where: str) -> _Posed:
     w, x, y, z, *position = numbers
-    camera_from_map = pose_of(position, (x, y, z, w), where)
+    camera_from_map = parsing.pose_of(position, (x, y, z, w), where)
     return _Posed(name, camera_id,
                   None if camera_from_map is None else invert_transform(camera_from_map))
-
-
-def _numbers(cells: list[str], where: str) -> tuple[float, ...]:
-    return tuple(_parsed(cell, float, where) for cell in cells)
-
-
-def _parsed[T](cell: str, kind: Callable[[str], T], where: str) -> T:
-    try:
-        return kind(cell)
-    except ValueError:
-        raise DatasetError(f'{where}: {cell[:40]!r} is no number') from None
 
 
 class _Bytes:
@@ -220,11 +184,10 @@ class _Bytes:
 
     def __init__(self, path: Path) -> None:
         self._path, self._place = path, 0
-        try:
-            with path.open('rb') as file:
-                self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        except (OSError, ValueError) as error:  # ValueError: it is empty
-            raise DatasetError(f'{path}: cannot be read: {error}') from error
+        # ValueError: it is empty
+        with (parsing.naming(path, OSError, ValueError, what='cannot be read: '),
+              path.open('rb') as file):
+            self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
     def __enter__(self) -> '_Bytes':
         return self

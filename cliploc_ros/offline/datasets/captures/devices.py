@@ -1,12 +1,16 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of phones and headsets: Polycam, Record3D, Stray Scanner, ARKitScenes, HoloLens 2.
+"""Recordings of phones and headsets, and the transforms.json of nerfstudio and Instant-NGP.
 
-Their trackers measure in metres and know the vertical: ARKit and HoloLens have y up.
+Polycam, Record3D, Stray Scanner, ARKitScenes, HoloLens 2: their trackers measure in metres and
+know the vertical: ARKit and HoloLens have y up. Camera axes of a transforms.json are OpenGL's: x
+right, y up, z back. Fields that are not used here are ignored.
 """
 
+import math
 from dataclasses import replace
-from pathlib import Path
+from itertools import islice
+from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
@@ -16,19 +20,9 @@ from cliploc_ros.core.depth_image import MILLIMETRE
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.captures.capture import (
-    IMAGES,
-    Capture,
-    Fields,
-    Shot,
-    arrange,
-    beside,
-    camera_of,
-    pose_of,
-    read_rows,
-    read_text,
-)
-from cliploc_ros.offline.datasets.frames import DepthFormat
+from cliploc_ros.offline.datasets import parsing
+from cliploc_ros.offline.datasets.captures import capture
+from cliploc_ros.offline.datasets.frames import NO_STAMP, DepthFormat, ImageFile
 from cliploc_ros.offline.datasets.poses import TimedPoses
 from cliploc_ros.units import NS_PER_S
 
@@ -41,45 +35,41 @@ _ROUNDING_S = 0.001
 _MAX_GAP_NS = 200_000_000
 
 
-def is_polycam(folder: Path) -> bool:
-    """Return whether a folder is Polycam's raw data."""
-    return (folder / 'keyframes').is_dir()
-
-
-def read_polycam(folder: Path) -> Capture:
+def read_polycam(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     """Return the keyframes of Polycam's raw data, the optimized ones where there are any."""
     root, kind = folder / 'keyframes', 'corrected_'
     if not ((root / 'corrected_images').is_dir() and (root / 'corrected_cameras').is_dir()):
         kind = ''
-    shots = []
+    files = []
     for path in sorted((root / f'{kind}cameras').glob('*.json')):
-        fields = Fields.of_file(path)
+        fields = parsing.Fields.of_file(path)
         pose = np.eye(4)
         pose[:3] = [[fields.number(f't_{row}{column}') for column in range(4)]
                     for row in range(3)]
-        camera = camera_of(str(path), *fields.size('width', 'height'), *(
+        camera = parsing.camera_of(str(path), *fields.size('width', 'height'), *(
             fields.number(name) for name in ('fx', 'fy', 'cx', 'cy')))
-        depth = beside(root / 'depth' / f'{path.stem}.png')
-        shots.append(Shot(
-            root / f'{kind}images' / f'{path.stem}.jpg', camera, pose, 1000 * int(path.stem)
-            if path.stem.isdecimal() and len(path.stem) < 20 else None, depth,
-            depth and beside(root / 'confidence' / f'{path.stem}.png')))
-    files, poses = arrange(shots, str(root))
+        is_stamp = path.stem.isdecimal() and len(path.stem) < 20
+        files.append(_with_depth(
+            ImageFile(1000 * int(path.stem) if is_stamp else NO_STAMP,
+                      root / f'{kind}images' / f'{path.stem}.jpg', camera, pose),
+            root / 'depth', root / 'confidence', path.stem))
     notes = () if kind else ('its poses are not optimized: they drift as ARKit does',)
-    return Capture(files, poses, 'opengl', _IN_MILLIMETRES, 'y', notes=notes)
+    return capture.Capture(capture.arrange(files, root), 'opengl', _IN_MILLIMETRES, 'y',
+                           notes=notes)
 
 
-def is_record3d(folder: Path) -> bool:
-    """Return whether a folder is an unpacked .r3d file, or an export of Record3D."""
-    return _metadata(folder) is not None and any(
-        (folder / name).is_dir() for name in ('rgbd', 'rgb'))
+def _with_depth(image: ImageFile, depths: Path, confidences: Path, stem: str) -> ImageFile:
+    """Return an image with the depth image of its name, where there is one."""
+    depth = capture.beside(depths / f'{stem}.png')
+    return image._replace(depth=depth,
+                          confidence=depth and capture.beside(confidences / f'{stem}.png'))
 
 
-def read_record3d(folder: Path) -> Capture:
+def read_record3d(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     """Return the images of Record3D. Its depth is compressed in a way that is not read here."""
-    path = _metadata(folder)
+    path = metadata_of_record3d(folder)
     assert path is not None
-    meta = Fields.of_file(path)
+    meta = parsing.Fields.of_file(path)
     size = meta.size('w', 'h')
     matrix = meta.numbers('K', (-1,), [])
     rows = meta.numbers('poses', (-1, 7))
@@ -91,151 +81,213 @@ def read_record3d(folder: Path) -> Capture:
         own = np.tile(matrix[[0, 4, 6, 7]], (len(rows), 1))  # K is column after column
     times = meta.numbers('frameTimestamps', (-1,), [])
     images = folder / ('rgbd' if (folder / 'rgbd').is_dir() else 'rgb')
-    shots = []
-    for place, (pose, (fx, fy, cx, cy)) in enumerate(zip(rows, own, strict=False)):
-        color = next((found for end in IMAGES if (found := beside(images / f'{place}{end}'))),
-                     images / f'{place}.jpg')
+    files = []
+    for place, (pose, intrinsics) in enumerate(zip(rows, own, strict=False)):
         where = f'{path}: frame {place}'
-        shots.append(Shot(
-            color, camera_of(where, *size, float(fx), float(fy), float(cx), float(cy)),
-            pose_of(pose[4:], pose[:4], where),
-            _stamp_ns(times[place]) if place < len(times) else None))
-    files, poses = arrange(shots, str(path))
-    return Capture(files, poses, 'opengl', up='y', notes=(
+        files.append(ImageFile(
+            _stamp_ns(times[place]) if place < len(times) else NO_STAMP,
+            capture.first_image(images, str(place)) or images / f'{place}.jpg',
+            parsing.camera_of(where, *size, *intrinsics.tolist()),
+            parsing.pose_of(pose[4:], pose[:4], where)))
+    return capture.Capture(capture.arrange(files, path), 'opengl', up='y', notes=(
         'the depth of Record3D is not read: it is compressed by LZFSE or EXR',))
 
 
-def _metadata(folder: Path) -> Path | None:
-    return beside(folder / 'metadata') or beside(folder / 'metadata.json')
+def metadata_of_record3d(folder: Path) -> Path | None:
+    """Return the file of an unpacked .r3d file, or of an export of Record3D; None without one."""
+    if not any((folder / name).is_dir() for name in ('rgbd', 'rgb')):
+        return None
+    return capture.beside(folder / 'metadata') or capture.beside(folder / 'metadata.json')
 
 
-def is_stray(folder: Path) -> bool:
-    """Return whether a folder is of Stray Scanner."""
-    return (folder / 'odometry.csv').is_file()
-
-
-def read_stray(folder: Path) -> Capture:
+def read_stray(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     """Return the images of Stray Scanner: of its video, or of rgb/, where they were unpacked to.
 
     Its quaternions are of OpenCV's camera axes.
     """
-    table, path = read_rows(folder / 'odometry.csv', 9, ',', header=1), folder / 'odometry.csv'
-    matrix = read_rows(folder / 'camera_matrix.csv', 3, ',')
+    path, lens = folder / 'odometry.csv', folder / 'camera_matrix.csv'
+    table = parsing.read_cells(path, 'timestamp frame x y z qx qy qz qw ...')
+    matrix = parsing.read_numbers(lens, 'fx 0 cx ...')
     if len(matrix) != 3:
-        raise DatasetError(f'{folder}/camera_matrix.csv has {len(matrix)} rows, expected 3')
-    video = beside(folder / 'rgb.mp4')
-    camera = camera_of(str(folder / 'camera_matrix.csv'), *_size_of(folder, video),
-                       matrix[0][0], matrix[1][1], matrix[0][2], matrix[1][2])
-    shots = []
-    for place, (time_s, frame, *numbers) in enumerate(table):
+        raise DatasetError(f'{lens} has {len(matrix)} rows, expected 3')
+    video = capture.beside(folder / 'rgb.mp4')
+    camera = parsing.camera_of(str(lens), *_size_of(folder, video), matrix[0][0], matrix[1][1],
+                               matrix[0][2], matrix[1][2])
+    files = []
+    for place, (where, cells) in enumerate(islice(table, 1, None)):
+        time_s, frame, *numbers = parsing.parse_all(cells, float, where)
         stem = f'{frame:06.0f}'
-        image = next((found for end in IMAGES
-                      if (found := beside(folder / 'rgb' / f'{stem}{end}'))), None)
-        depth = beside(folder / 'depth' / f'{stem}.png')
-        shots.append(Shot(
-            image or video or folder / 'rgb' / f'{stem}.jpg', camera,
-            pose_of(numbers[:3], numbers[3:7], f'{path}: row {place}'), _stamp_ns(time_s), depth,
-            depth and beside(folder / 'confidence' / f'{stem}.png'),
-            place if image is None and video is not None else None))
-    files, poses = arrange(shots, str(path))
-    return Capture(files, poses, 'opencv', _IN_MILLIMETRES, 'y')
+        image = capture.first_image(folder / 'rgb', stem)
+        files.append(_with_depth(
+            ImageFile(_stamp_ns(time_s), image or video or folder / 'rgb' / f'{stem}.jpg', camera,
+                      parsing.pose_of(numbers[:3], numbers[3:7], where),
+                      number=place if image is None and video is not None else None),
+            folder / 'depth', folder / 'confidence', stem))
+    return capture.Capture(capture.arrange(files, path), 'opencv', _IN_MILLIMETRES, 'y')
 
 
 def _size_of(folder: Path, video: Path | None) -> tuple[int, int]:
     """Return width and height of the images of Stray Scanner, which no file tells."""
     first = next((one for one in sorted((folder / 'rgb').glob('*.*'))
-                  if one.suffix in IMAGES), None)
-    image = None
+                  if one.suffix in capture.IMAGES), None)
+    size = None
     if first is not None:
-        image = cv2.imread(str(first), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    elif video is not None:
-        image = cv2.VideoCapture(str(video)).read()[1]
-    if image is None:
+        size = capture.size_of_image(first)
+    elif video is not None and (image := cv2.VideoCapture(str(video)).read()[1]) is not None:
+        size = image.shape[1], image.shape[0]
+    if size is None:
         raise DatasetError(f'{folder}: has no images that can be read: neither rgb.mp4 nor rgb/')
-    return image.shape[1], image.shape[0]
+    return size
 
 
-def is_arkitscenes(folder: Path) -> bool:
-    """Return whether a folder is a scan of ARKitScenes."""
-    return (folder / 'lowres_wide.traj').is_file()
-
-
-def read_arkitscenes(folder: Path) -> Capture:
+def read_arkitscenes(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     """Return a scan of ARKitScenes: camera_from_map of OpenCV's axes as axis and angle, z up."""
     path = folder / 'lowres_wide.traj'
-    rows = np.array([row[:7] for row in read_rows(path, 7)]).reshape(-1, 7)
+    lines = parsing.read_numbers(path, 'timestamp rx ry rz tx ty tz ...')
+    rows = np.array([line[:7] for line in lines]).reshape(-1, 7)
     if not np.isfinite(rows).all():
         raise DatasetError(f'{path}: has numbers that are not finite')
     poses = [invert_transform(make_transform(Rotation.from_rotvec(row[1:4]).as_matrix(), row[4:]))
              for row in rows]
     known = TimedPoses.from_samples(
-        [_stamp_ns(row[0]) or 0 for row in rows],
+        [max(0, _stamp_ns(row[0])) for row in rows],
         [[*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()] for pose in poses],
         str(path))
     known = replace(known, max_gap_ns=_MAX_GAP_NS)
     kind = 'vga_wide' if (folder / 'vga_wide').is_dir() else 'lowres_wide'
-    shots = []
+    files = []
     for color in sorted((folder / kind).glob('*.png')):
         scan, _, time = color.stem.rpartition('_')
-        stamp = _stamp_ns(float(time)) if time.replace('.', '', 1).isdecimal() else None
-        camera = _pincam(folder / f'{kind}_intrinsics', scan, float(time)
-                         ) if stamp is not None else None
-        if stamp is None or camera is None:
+        if not time.replace('.', '', 1).isdecimal():
             continue
-        depth = beside(folder / 'lowres_depth' / color.name)
-        shots.append(Shot(color, camera, known.pose_at(stamp), stamp, depth,
-                          depth and beside(folder / 'confidence' / color.name)))
-    files, stamped = arrange(shots, str(folder))
-    return Capture(files, stamped, 'opencv', _IN_MILLIMETRES, 'z')
+        stamp = _stamp_ns(float(time))
+        camera = _pincam(folder / f'{kind}_intrinsics', scan, float(time))
+        if stamp != NO_STAMP and camera is not None:
+            files.append(_with_depth(ImageFile(stamp, color, camera, known.pose_at(stamp)),
+                                     folder / 'lowres_depth', folder / 'confidence', color.stem))
+    return capture.Capture(capture.arrange(files, folder), 'opencv', _IN_MILLIMETRES, 'z')
 
 
 def _pincam(folder: Path, scan: str, time_s: float) -> Camera | None:
     """Return the camera of an image; None without its file, whose time may be rounded."""
     for shift_s in (0.0, -_ROUNDING_S, _ROUNDING_S):
-        path = beside(folder / f'{scan}_{time_s + shift_s:.3f}.pincam')
+        path = capture.beside(folder / f'{scan}_{time_s + shift_s:.3f}.pincam')
         if path is not None:
-            rows = read_rows(path, 6)
+            rows = parsing.read_numbers(path, 'width height fx fy cx cy ...')
             if not rows or not np.isfinite(rows[0]).all():
                 raise DatasetError(f'{path}: expected width height fx fy cx cy')
             width, height, *intrinsics = rows[0][:6]
-            return camera_of(str(path), round(width), round(height), *intrinsics)
+            return parsing.camera_of(str(path), round(width), round(height), *intrinsics)
     return None
 
 
-def is_hololens(folder: Path) -> bool:
-    """Return whether a folder is of HoloLens2ForCV's StreamRecorder."""
-    return next(folder.glob('*_pv.txt'), None) is not None
-
-
-def read_hololens(folder: Path) -> Capture:
+def read_hololens(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     """Return the images of the photo-video camera, unpacked and converted to PNG by the sample.
 
     Its long-throw depth needs a table of rays and is not read here.
     """
     path = min(folder.glob('*_pv.txt'))
     images = folder / ('PV' if (folder / 'PV').is_dir() else 'rgb')
-    header, *rows = read_rows(path, 4, ',') or [[]]
-    if not rows or not np.isfinite(header).all():
+    lines = list(parsing.read_cells(path, 'cx cy width height ...'))
+    header = parsing.parse_all(lines[0][1], float, lines[0][0]) if lines else []
+    if len(lines) < 2 or not np.isfinite(header).all():
         raise DatasetError(f'{path}: expected cx,cy,width,height and a row for each image')
     cx, cy, width, height = header[:4]
-    # a float does not hold their 18 digits, which name the images
-    times = [line.partition(',')[0].strip() for line in read_text(path).splitlines()
-             if line.strip()][1:]
-    shots = []
-    for place, (time, row) in enumerate(zip(times, rows, strict=True), start=2):
-        if len(row) < 19 or not (time.isdecimal() and len(time) < 20):
-            raise DatasetError(f'{path}: row {place}: expected time, fx, fy and the 16 numbers of '
-                               'the pose')
-        camera = camera_of(f'{path}: row {place}', round(width), round(height), row[1], row[2],
-                           cx, cy)
-        pose = np.array(row[3:19]).reshape(4, 4)
-        shots.append(Shot(images / f'{time}.png', camera, pose if pose.any() else None,
-                          _TICK_NS * (int(time) - _TICKS_TO_1970)))
-    files, poses = arrange(shots, str(path))
-    return Capture(files, poses, 'opengl', up='y', notes=(
+    files = []
+    for where, (time, *cells) in lines[1:]:
+        row = parsing.parse_all(cells, float, where)
+        # a float does not hold the 18 digits of the time, which names the image
+        if len(row) < 18 or not (time.isdecimal() and len(time) < 20):
+            raise DatasetError(f'{where}: expected time, fx, fy and the 16 numbers of the pose')
+        pose = np.array(row[2:18]).reshape(4, 4)
+        files.append(ImageFile(
+            _TICK_NS * (int(time) - _TICKS_TO_1970), images / f'{time}.png',
+            parsing.camera_of(where, round(width), round(height), row[0], row[1], cx, cy),
+            pose if pose.any() else None))
+    return capture.Capture(capture.arrange(files, path), 'opengl', up='y', notes=(
         'the depth of the HoloLens is not read: it needs its table of rays',))
 
 
-def _stamp_ns(time_s: float) -> int | None:
-    """Return a time [s] in nanoseconds; None where it is none."""
-    return round(time_s * NS_PER_S) if abs(time_s) < 1e15 else None
+def _stamp_ns(time_s: float) -> int:
+    """Return a time [s] in nanoseconds; NO_STAMP where it is none."""
+    return round(time_s * NS_PER_S) if abs(time_s) < 1e15 else NO_STAMP
+
+
+TRANSFORMS = 'transforms.json'
+_PERSPECTIVE = ('PINHOLE', 'SIMPLE_PINHOLE', 'SIMPLE_RADIAL', 'RADIAL', 'OPENCV', 'PERSPECTIVE')
+_FISHEYE = ('OPENCV_FISHEYE', 'FISHEYE')
+_INTRINSICS = ('w', 'h', 'fl_x', 'fl_y', 'cx', 'cy', 'camera_angle_x', 'k1', 'k2', 'k3', 'k4',
+               'p1', 'p2', 'camera_model', 'is_fisheye')
+_ENDINGS = ('.png', '.jpg', '.jpeg', '.JPG', '.PNG')
+
+
+def read_nerf(folder: Path, options: capture.FolderOptions) -> capture.Capture:
+    """Return the images that a transforms.json lists; the folder may be this file.
+
+    It is of nerfstudio, Instant-NGP or the original NeRF.
+    The folder of images holds them by their names alone; None: they are where the file says.
+    DatasetError: a field cannot be used; names it.
+    """
+    path = folder if folder.name.endswith('.json') else folder / TRANSFORMS
+    meta = parsing.Fields.of_file(path)
+    frames = meta.entries('frames') if 'frames' in meta else []
+    if not frames:
+        raise DatasetError(f'{path}: lists no frames')
+    scale = meta.number('applied_scale', 1.0)
+    if scale <= 0.0:
+        raise DatasetError(f'{path}: applied_scale is {scale:g}, not above 0')
+    files, cameras, images = [], dict[str, Camera](), options.images
+    for place, values in enumerate(frames):
+        # a frame's own values come before those of all
+        frame = parsing.Fields(values, f'{path}: frame {place}')
+        both = parsing.Fields({**meta.values, 'frames': None, **frame.values}, frame.where)
+        name = frame.text('file_path')
+        color = path.parent / name if images is None else images / PurePosixPath(name).name
+        # the original NeRF leaves the ending of an image away
+        endings = [color.with_name(color.name + end) for end in ('', *_ENDINGS)]
+        color = next(filter(None, map(capture.beside, endings)), color)
+        shown = repr([both.values.get(name) for name in _INTRINSICS])
+        if shown not in cameras:
+            cameras[shown] = _camera(both, color)
+        pose = both.numbers('transform_matrix', (-1, 4))
+        if pose.shape[0] not in (3, 4):
+            raise DatasetError(f'{frame.where}: transform_matrix has {pose.shape[0]} rows')
+        full = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])[:4]
+        full[:3, 3] /= scale
+        depth = frame.text('depth_file_path', '')
+        files.append(ImageFile(NO_STAMP, color, cameras[shown], full,
+                               capture.beside(path.parent / depth) if depth else None))
+    arranged = capture.arrange(files, path)
+    # depth is in metres, and so are the poses that it goes with
+    return capture.Capture(arranged, 'opengl', is_metric=all(one.depth for one in arranged))
+
+
+def _camera(values: parsing.Fields, image: Path) -> Camera:
+    """Return the camera of a frame. Pixels are counted from the corner of the first one."""
+    where = values.where
+    model = values.text('camera_model', 'OPENCV')
+    if 'w' in values and 'h' in values:
+        width, height = values.size('w', 'h')
+    else:
+        size = capture.size_of_image(image)
+        if size is None:
+            raise DatasetError(f'{where}: fields w and h are missing, and {image} cannot be read')
+        width, height = size
+    if 'fl_x' in values:
+        fx = values.number('fl_x')
+    elif 'camera_angle_x' in values:
+        fx = 0.5 * width / math.tan(0.5 * values.number('camera_angle_x') or math.nan)
+    else:
+        raise DatasetError(f'{where}: has no intrinsics: neither fl_x nor camera_angle_x')
+    fy = values.number('fl_y', fx)
+    cx, cy = values.number('cx', 0.5 * width) - 0.5, values.number('cy', 0.5 * height) - 0.5
+    k1, k2, k3, k4, p1, p2 = (values.number(name, 0.0)
+                              for name in ('k1', 'k2', 'k3', 'k4', 'p1', 'p2'))
+    if model in _FISHEYE or values.values.get('is_fisheye') is True:
+        return parsing.camera_of(where, width, height, fx, fy, cx, cy, 'equidistant',
+                                 (k1, k2, k3, k4))
+    if model not in _PERSPECTIVE or k4:
+        raise DatasetError(f'{where}: camera_model {model} ' + ('with k4 ' if k4 else '')
+                           + 'is not known here; undistort the images to PINHOLE')
+    return parsing.camera_of(where, width, height, fx, fy, cx, cy, 'plumb_bob',
+                             (k1, k2, p1, p2, k3))

@@ -6,8 +6,6 @@ A wrong choice of axes is found by the images: what two of them both show lies o
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +18,6 @@ from cliploc_ros.core.geometry.transforms import (
 from cliploc_ros.core.keyframes.features import Features, extract, match, unit_rows
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.frames import ImageFile, read_color
-from cliploc_ros.offline.datasets.poses import Poses
 
 _Pose = NDArray[np.float64]
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -43,44 +40,34 @@ _LEAST_MATCHES = 25
 _GOOD_PX, _WRONG_PX, _BETTER = 3.0, 4.0, 0.35
 
 
-@dataclass(frozen=True)
-class PlacedPoses:
-    """Poses map_from_camera (4, 4) of stored poses."""
+def place_images(files: Sequence[ImageFile], axes: str, scale: float = 1.0,
+                 map_from_stored: _Pose = UP['z']) -> tuple[ImageFile, ...]:
+    """Return images with poses map_from_camera instead of stored ones.
 
-    stored: Poses
-    axes: str = 'opencv'  #: One of AXES
-    scale: float = 1.0  #: Metres of a stored unit
-    map_from_stored: _Pose = field(default_factory=lambda: np.eye(3))  #: (3, 3)
-
-    @property
-    def span_ns(self) -> tuple[int, int] | None:
-        """Return the first and last stamp with a pose [ns]."""
-        return self.stored.span_ns
-
-    def pose_at(self, stamp_ns: int) -> _Pose | None:
-        """Return ``map_from_camera`` (4, 4) at a stamp [ns]; None where it is not known."""
-        stored = self.stored.pose_at(stamp_ns)
-        if stored is None:
-            return None
-        pose = np.array(AXES[self.axes](stored))
-        return move_poses(pose[None], self.scale, self.map_from_stored)[0]
-
-    def all_of(self, files: Sequence[ImageFile]) -> list[tuple[ImageFile, _Pose]]:
-        """Return the images that have a pose, each with it."""
-        return [(one, pose) for one in files if (pose := self.pose_at(one.stamp_ns)) is not None]
+    Parameters
+    ----------
+    axes : str
+        One of AXES.
+    scale : float
+        Metres of a stored unit.
+    map_from_stored : ndarray (3, 3)
+    """
+    return tuple(one if one.pose is None else one._replace(pose=move_poses(
+        np.array(AXES[axes](one.pose))[None], scale, map_from_stored)[0]) for one in files)
 
 
-def find_scale(posed: Sequence[tuple[ImageFile, _Pose]], first: str, second: str, metres: float,
-               where: str) -> float:
-    """Return metres of a stored unit, by the distance between the cameras of two images [m].
+def find_scale(files: Sequence[ImageFile], first: str, second: str, metres: float, where: object
+               ) -> float:
+    """Return metres of a unit of the poses, by the distance between the cameras of two images [m].
 
     DatasetError: an image is unknown, or both were taken at one place.
     """
     places = []
     for name in (first, second):
-        found = [pose[:3, 3] for file, pose in posed if str(file.color).endswith(f'/{name}')]
+        found = [one.pose[:3, 3] for one in files
+                 if one.pose is not None and str(one.color).endswith(f'/{name}')]
         if len(found) != 1:
-            shown = ', '.join(file.color.name for file, _ in posed[:3])
+            shown = ', '.join(one.color.name for one in files[:3])
             raise DatasetError(f'{where}: {len(found) or "no"} images with a pose are named {name}'
                                f'; there are {shown} and so on')
         places.append(found[0])
@@ -91,15 +78,14 @@ def find_scale(posed: Sequence[tuple[ImageFile, _Pose]], first: str, second: str
     return metres / distance
 
 
-def check_axes(files: Sequence[ImageFile], stored: Poses, axes: str, where: Path) -> str:
-    """Return a note where images and poses do not fit; '' where they do, or do not tell.
+def check_axes(files: Sequence[ImageFile], axes: str, where: object) -> str:
+    """Return a note where images and stored poses do not fit; '' where they do, or do not tell.
 
     DatasetError: they fit well with other axes; says which.
     """
     found: dict[str, list[float]] = {name: [] for name in AXES}
-    placed = PlacedPoses(stored, axes).all_of(files)
-    for first, second in _pairs(placed):
-        for name, error_px in _epipolar_errors(first, second, stored).items():
+    for first, second in _pairs([one for one in files if one.pose is not None], axes):
+        for name, error_px in _epipolar_errors(first, second).items():
             found[name].append(error_px)
         if len(found[axes]) == _PAIRS:
             break
@@ -117,20 +103,20 @@ def check_axes(files: Sequence[ImageFile], stored: Poses, axes: str, where: Path
             f'{errors[best]:.1f} px at best ({best})')
 
 
-def _pairs(placed: Sequence[tuple[ImageFile, _Pose]]
-           ) -> Iterator[tuple[ImageFile, ImageFile]]:
-    """Yield pairs of images that are near each other in order, and turned."""
-    last = len(placed) - 1
+def _pairs(files: Sequence[ImageFile], axes: str) -> Iterator[tuple[ImageFile, ImageFile]]:
+    """Yield pairs of images with poses that are near each other in order, and turned."""
+    turns = [np.array(AXES[axes](one.pose))[:3, :3] for one in files if one.pose is not None]
+    last = len(files) - 1
     for start in np.unique(np.linspace(0, max(0, last - 1), _TRIED).astype(int)).tolist():
-        angles = [rotation_angle_deg(placed[start][1][:3, :3].T @ pose[:3, :3])
-                  for _, pose in placed[start + 1:start + 1 + _REACH]]
+        angles = [rotation_angle_deg(turns[start].T @ turn)
+                  for turn in turns[start + 1:start + 1 + _REACH]]
         fit = [place for place, angle in enumerate(angles)
                if _TURN_DEG[0] < angle < _TURN_DEG[1]]
         if fit:
-            yield placed[start][0], placed[start + 1 + fit[0]][0]
+            yield files[start], files[start + 1 + fit[0]]
 
 
-def _epipolar_errors(first: ImageFile, second: ImageFile, stored: Poses) -> dict[str, float]:
+def _epipolar_errors(first: ImageFile, second: ImageFile) -> dict[str, float]:
     """Return the median epipolar error of two images by the name of the axes [px].
 
     Empty where too few features match.
@@ -147,12 +133,11 @@ def _epipolar_errors(first: ImageFile, second: ImageFile, stored: Poses) -> dict
     if known.sum() < _LEAST_MATCHES:
         return {}
     ours, theirs = points[0][known], points[1][known]
-    poses = [stored.pose_at(file.stamp_ns) for file in (first, second)]
-    assert poses[0] is not None and poses[1] is not None
+    assert first.pose is not None and second.pose is not None
     focal_px = first.camera.fx * _LONGEST_PX / max(first.camera.width, first.camera.height)
     errors = {}
     for name, convert in AXES.items():
-        step = invert_transform(convert(poses[1])) @ convert(poses[0])
+        step = invert_transform(convert(second.pose)) @ convert(first.pose)
         x, y, z = step[:3, 3] / max(float(np.linalg.norm(step[:3, 3])), 1e-12)
         essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ step[:3, :3]
         lines, back = ours @ essential.T, theirs @ essential

@@ -1,13 +1,16 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a reader of a map format returns, and how it becomes a map of ours."""
+"""What a reader of a map format returns, how it becomes a map of ours, and readers of texts."""
 
+import codecs
+import csv
+import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from stat import S_ISREG
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,24 +20,16 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, MappingError
 from cliploc_ros.offline.datasets.observations import load_observations
+from cliploc_ros.offline.datasets.parsing import FieldError, Fields, naming, unit_quaternion
 from cliploc_ros.offline.mapping.refit import refit_map
+from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
 
 # A landmark with a thinner semi-axis is a fit that collapsed; a larger one is no object. Guesses.
 _SEMI_AXIS_RANGE_M = (1e-3, 100.0)
 _MAX_COORDINATE_M = 1e6
 _MAX_NORM_ERROR = 0.01
 MAX_FILE_BYTES = 512 * 1024 * 1024
-COCO = (
-    'person', 'bicycle', 'car', 'motorcycle', 'airplane', 'bus', 'train', 'truck', 'boat',
-    'traffic light', 'fire hydrant', 'stop sign', 'parking meter', 'bench', 'bird', 'cat', 'dog',
-    'horse', 'sheep', 'cow', 'elephant', 'bear', 'zebra', 'giraffe', 'backpack', 'umbrella',
-    'handbag', 'tie', 'suitcase', 'frisbee', 'skis', 'snowboard', 'sports ball', 'kite',
-    'baseball bat', 'baseball glove', 'skateboard', 'surfboard', 'tennis racket', 'bottle',
-    'wine glass', 'cup', 'fork', 'knife', 'spoon', 'bowl', 'banana', 'apple', 'sandwich',
-    'orange', 'broccoli', 'carrot', 'hot dog', 'pizza', 'donut', 'cake', 'chair', 'couch',
-    'potted plant', 'bed', 'dining table', 'toilet', 'tv', 'laptop', 'mouse', 'remote',
-    'keyboard', 'cell phone', 'microwave', 'oven', 'toaster', 'sink', 'refrigerator', 'book',
-    'clock', 'vase', 'scissors', 'teddy bear', 'hair drier', 'toothbrush')
+COCO = shipped_classes()
 _MAX_LENGTH = 1000
 # A map file holds four decimals of a weight. A class with less means nothing.
 _LEAST_SHARE = 0.001
@@ -190,13 +185,11 @@ def read_bytes(path: Path) -> bytes:
 
     DatasetError: the message names the file and what is wrong with it.
     """
-    try:
+    with naming(path, OSError, what='cannot be read: '):
         if not S_ISREG(path.stat().st_mode):
             raise DatasetError(f'{path}: is no file; name the file of the map')
         with path.open('rb') as file:
             content = file.read(MAX_FILE_BYTES + 1)
-    except OSError as error:
-        raise DatasetError(f'{path}: cannot be read: {error.strerror}') from error
     if len(content) > MAX_FILE_BYTES:
         raise DatasetError(f'{path}: is larger than {MAX_FILE_BYTES // 2**20} MiB; split it')
     if not content:
@@ -209,10 +202,8 @@ def read_class_names(path: Path) -> tuple[str, ...]:
 
     DatasetError: the message names the file and the line to correct.
     """
-    try:
+    with naming(path, UnicodeDecodeError, what='not a text file in UTF-8: '):
         lines = read_bytes(path).decode('utf-8-sig').splitlines()
-    except UnicodeDecodeError as error:
-        raise DatasetError(f'{path}: not a text file in UTF-8') from error
     names = tuple(line.strip() for line in lines)
     for number, name in enumerate(names, 1):
         if not name or len(name) > _MAX_LENGTH:
@@ -235,3 +226,222 @@ def shares(weights: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
                     key=lambda pair: -pair[1])
     total = sum(weight for _, weight in ranked)
     return tuple((name, weight / total) for name, weight in ranked)
+
+
+_NUMBER_OF_SYMBOL = (1 << 56) - 1
+# Where a file has likelihoods alone, classes below this share of the greatest one are left out.
+# A guess.
+_LEAST_LIKELIHOOD = 0.5
+_MOST_SHARE = 1e300  # sums of more are infinite
+
+
+def read_msgloc(path: Path, class_names: Sequence[str]) -> GivenMap:
+    """Read a map of MSG-Loc: JSON with a list of nodes.
+
+    | field of a node | content |
+    |---|---|
+    | id | a symbol of GTSAM: the letter q in the highest byte, and a number |
+    | translation, radii | centre and semi-axes; signs of radii have no meaning |
+    | orientation | quaternion w, x, y, z |
+    | baseline_label | class to [share of the detections by score, ...] |
+    | msgloc_label | class to [likelihood]: how often the class was proposed by the detector |
+
+    Class weights are the shares of the detections. Likelihoods serve where a node lacks them: they
+    sum to more than 1, and say which classes the detector confuses. DatasetError: the message
+    names the file and what is wrong with it.
+
+    Parameters
+    ----------
+    path : Path
+        A JSON file.
+    class_names : sequence of str
+        Of the class indices; a file may also name classes.
+    """
+    given = GivenMap([], [], [])
+    negative = 0
+    for place, values in enumerate(Fields.of_file(path, read_bytes).entries('nodes')):
+        try:
+            node = Fields(values, f'node {place}')
+            given.landmarks.append(_landmark_of_node(node, place, class_names))
+            negative += any(radius < 0.0 for radius in node.values['radii'])
+        except FieldError as error:
+            given.left_out.append(Skipped(f'node {place}', str(error)))
+    if negative:
+        given.notes.append(f'{negative} landmarks have negative radii; their signs are ignored')
+    return given
+
+
+def _landmark_of_node(node: Fields, place: int, class_names: Sequence[str]) -> GivenLandmark:
+    center, radii = (node.numbers(name, (3,)).tolist() for name in ('translation', 'radii'))
+    w, x, y, z = node.numbers('orientation', (4,)).tolist()
+    weights = _class_weights(node, class_names)
+    number = node.values.get('id', place)
+    if not isinstance(number, int):
+        raise FieldError(f"{node.where}: 'id' is {str(number)[:40]!r}, not an integer")
+    name = weights[0][0]
+    return GivenLandmark(
+        make_id(name, number & _NUMBER_OF_SYMBOL), name, name, center,
+        [abs(radius) for radius in radii], (x, y, z, w),
+        LandmarkDetails(class_weights=weights if len(weights) > 1 else None))
+
+
+def _class_weights(node: Fields, class_names: Sequence[str]) -> tuple[tuple[str, float], ...]:
+    """Return the classes of a node with their shares, the greatest first."""
+    weights = shares(_labels(node, 'baseline_label', class_names))
+    if not weights:
+        likely = _labels(node, 'msgloc_label', class_names)
+        least = _LEAST_LIKELIHOOD * max(likely.values(), default=0.0)
+        weights = shares({name: value for name, value in likely.items() if value >= least})
+    if not weights:
+        raise FieldError(f"{node.where}: has no class: neither 'baseline_label' nor "
+                         "'msgloc_label'")
+    return weights
+
+
+def _labels(node: Fields, field: str, class_names: Sequence[str]) -> Mapping[str, float]:
+    """Return the first number of each class of a field."""
+    found: dict[str, float] = {}
+    for key, values in node.mapping(field).items():
+        where = f"{node.where}: '{field}' of class {key[:40]!r}"
+        first = Fields({'share': values[0] if isinstance(values, list) and values else None},
+                       where).number('share')
+        if not 0.0 <= first < _MOST_SHARE:
+            raise FieldError(f'{where} is {first:g}, not a number from 0')
+        name = _name_of(key, class_names, where)
+        found[name] = found.get(name, 0.0) + first
+    return found
+
+
+def _name_of(key: str, class_names: Sequence[str], where: str) -> str:
+    """Return the class of a key: an index, written as a float, or a name."""
+    try:
+        index = float(key)
+    except ValueError:
+        if not key.strip() or len(key) > 1000:
+            raise FieldError(f'{where}: the class has no name') from None
+        return key
+    if not index.is_integer():
+        raise FieldError(f'{where}: the class is no index')
+    return class_name(class_names, int(index))
+
+
+_CENTER, _SEMI_AXES, _QUATERNION = ('x', 'y', 'z'), ('a', 'b', 'c'), ('qx', 'qy', 'qz', 'qw')
+_REQUIRED = ('class_id', *_CENTER, *_SEMI_AXES)
+_DETAILS = ('position_sigma', 'support', 'seen_ratio', 'baseline_deg', 'last_seen')
+_NUMBERS = (*_CENTER, *_SEMI_AXES, *_QUATERNION, *_DETAILS)
+#: Columns that a table may have; the others are ignored.
+COLUMNS = ('id', 'label', *_REQUIRED, *_QUATERNION, *_DETAILS)
+_NO_TURN = [0.0, 0.0, 0.0, 1.0]
+
+
+def read_table(path: Path) -> GivenMap:
+    """Read a map from a table: CSV of an editor or a spreadsheet, with a header.
+
+    Separators are commas, semicolons or tabs. Next to semicolons and tabs, numbers may have
+    decimal commas.
+
+    A row without an id gets its class and number as one, a row without a label its class. A table
+    without qx, qy, qz and qw has ellipsoids along the axes of its coordinate frame. DatasetError:
+    the message names the file, the line and the column to correct.
+    """
+    content = read_bytes(path)
+    is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # of a spreadsheet
+    try:
+        text = content.decode('utf-16' if is_utf16 else 'utf-8-sig').lstrip()
+    except UnicodeDecodeError as error:
+        raise DatasetError(f'{path}: not a text file in UTF-8 (byte {error.start}); save the '
+                           'table as CSV in UTF-8') from error
+    delimiter = max(',;\t', key=text.split('\n', 1)[0].count)
+    reader = csv.reader(io.StringIO(text, newline=''), delimiter=delimiter, strict=True)
+    given = GivenMap([], [], [])
+    lines: dict[str, int] = {}
+    try:
+        header = _read_header(next(reader, []), path)
+        if ignored := [name for name in header if name not in COLUMNS]:
+            given.notes.append(f'ignored columns: {", ".join(ignored)[:200]}')
+        for cells in reader:
+            if not any(cell.strip() for cell in cells):
+                continue
+            where = f'{path}: line {reader.line_num}'
+            row = _row(header, cells, delimiter, where)
+            landmark = _landmark_of_row(row, len(given.landmarks) + 1, where)
+            first = lines.setdefault(landmark.landmark_id, reader.line_num)
+            if first != reader.line_num:
+                raise DatasetError(f"{where}: id '{landmark.landmark_id}' is that of line {first}")
+            given.landmarks.append(landmark)
+    except csv.Error as error:
+        raise DatasetError(f'{path}: line {reader.line_num}: {error}') from error
+    return given
+
+
+def _read_header(cells: Sequence[str], path: Path) -> list[str]:
+    header = [cell.strip().lower() for cell in cells]
+    if missing := [name for name in _REQUIRED if name not in header]:
+        raise DatasetError(f'{path}: the header lacks {", ".join(missing)}; its first line must '
+                           f'name the columns, of {", ".join(COLUMNS)}')
+    if repeated := [name for name in COLUMNS if header.count(name) > 1]:
+        raise DatasetError(f'{path}: the header has {repeated[0]} more than once')
+    missing = [name for name in _QUATERNION if name not in header]
+    if 0 < len(missing) < len(_QUATERNION):
+        raise DatasetError(f'{path}: the header lacks {", ".join(missing)} of the quaternion')
+    return header
+
+
+def _row(header: Sequence[str], cells: Sequence[str], delimiter: str, where: str
+         ) -> dict[str, str]:
+    """Return the values of a line by their column; numbers with decimal points."""
+    if any(cell.strip() for cell in cells[len(header):]):
+        raise DatasetError(f'{where}: has {len(cells)} values for {len(header)} columns; quote '
+                           f'text that has a {delimiter!r}')
+    row = dict.fromkeys(header, '') | {
+        name: cell.strip() for name, cell in zip(header, cells, strict=False)}
+    if delimiter != ',':
+        row |= {name: row[name].replace(',', '.') for name in _NUMBERS if name in row}
+    return row
+
+
+def _landmark_of_row(row: Mapping[str, str], number: int, where: str
+                     ) -> GivenLandmark:
+    class_id = _text(row, 'class_id', where)
+    landmark_id = row.get('id') or make_id(class_id, number)
+    if '.' in landmark_id or len(landmark_id) > _MAX_LENGTH:
+        raise DatasetError(f'{where}: column id: an id must be short text without dots')
+    label = _text(row, 'label', where) if row.get('label') else class_id
+    has_turn = _QUATERNION[0] in row
+    quat_xyzw = [_number(row, name, where) for name in _QUATERNION] if has_turn else _NO_TURN
+    unit_quaternion(quat_xyzw, f'{where}: columns qx to qw', _MAX_NORM_ERROR)
+    semi_axes = [_number(row, name, where) for name in _SEMI_AXES]
+    for name, value in zip(_SEMI_AXES, semi_axes, strict=True):
+        if value <= 0.0:
+            raise DatasetError(f'{where}: column {name}: {value:g} must be above 0')
+    return GivenLandmark(landmark_id, label, class_id,
+                         [_number(row, name, where) for name in _CENTER], semi_axes, quat_xyzw,
+                         _details(row, where))
+
+
+def _details(row: Mapping[str, str], where: str) -> LandmarkDetails:
+    values: dict[str, Any] = {name: _number(row, name, where) for name in _DETAILS
+                              if row.get(name)}
+    for name, value in values.items():
+        if value < 0.0:
+            raise DatasetError(f'{where}: column {name}: {value:g} must not be negative')
+    if 'support' in values:
+        values['support'] = int(values['support'])
+    return LandmarkDetails(**values)
+
+
+def _text(row: Mapping[str, str], name: str, where: str) -> str:
+    if not row[name] or len(row[name]) > _MAX_LENGTH:
+        raise DatasetError(f'{where}: column {name}: must be text of 1 to {_MAX_LENGTH} '
+                           'characters')
+    return row[name]
+
+
+def _number(row: Mapping[str, str], name: str, where: str) -> float:
+    try:
+        value = float(row[name])
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise DatasetError(f'{where}: column {name}: {row[name][:40]!r} is not a finite number')
+    return value

@@ -24,21 +24,15 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.map_formats.given_map import (
-    GivenLandmark,
-    GivenMap,
-    Skipped,
-    class_name,
-    make_id,
-    read_bytes,
-    shares,
-)
+from cliploc_ros.offline.datasets.map_formats import given_map
+from cliploc_ros.offline.datasets.parsing import naming, parse_all
 
 _MAX_ASYMMETRY = 1e-3
 _LEAST_SCALE = 1e-9
 _NOTE = ('a monocular map of OA-SLAM has no metric scale, and its axes are those of the first '
          'camera: give its scale and transform')
 _NUMBERS_IN_A_LINE = 18
+_NO_DETAILS = LandmarkDetails()
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _MAX_VARINT_BYTES = 10
 
@@ -51,37 +45,33 @@ class WireError(Exception):
     """What is wrong with a protocol buffer; the caller adds the file's name."""
 
 
-def read_goreloc(path: Path, class_names: Sequence[str]) -> GivenMap:
+def read_goreloc(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
     """Read the objects of a GOReloc map, NAME.objects.
 
     Class weights are the counts of its categories. An object without a category, or that is no
     ellipsoid, is left out. `class_names` are those of the category indices. DatasetError: the
     message names the file and what is wrong with it.
     """
-    given = GivenMap([], [], [])
-    try:
+    given = given_map.GivenMap([], [], [])
+    with naming(path, WireError, what='is no complete NAME.objects of GOReloc: '):
         for item in _messages(path):
-            number = _integer(item, 2)
-            categories = [one for value in item.get(3, ()) for one in _integers(value)]
-            counts = [one for value in item.get(4, ()) for one in _integers(value)]
-            quadric = _quadric(item)
+            number, quadric = _integer(item, 2), _quadric(item)
+            categories, counts = _integers(item, 3), _integers(item, 4)
             if len(categories) != len(counts) or not sum(counts):
-                given.left_out.append(Skipped(
+                given.left_out.append(given_map.Skipped(
                     f'object {number}',
                     f'it has {len(categories)} categories with the counts {counts[:5]}'))
                 continue
             votes: Counter[str] = Counter()
             for category, count in zip(categories, counts, strict=True):
-                votes[class_name(class_names, category)] += count
-            weights = shares(votes)
-            _add(given, f'object {number}', make_id(weights[0][0], number), weights[0][0], quadric,
-                 LandmarkDetails(class_weights=weights if len(weights) > 1 else None))
-    except WireError as error:
-        raise DatasetError(f'{path}: is no complete NAME.objects of GOReloc: {error}') from error
+                votes[given_map.class_name(class_names, category)] += count
+            weights = given_map.shares(votes)
+            _add(given, weights[0][0], number, quadric, LandmarkDetails(
+                class_weights=weights if len(weights) > 1 else None), f'object {number}')
     return given
 
 
-def read_oaslam(path: Path, class_names: Sequence[str]) -> GivenMap:
+def read_oaslam(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
     """Read the objects of an OA-SLAM map.
 
     DatasetError: the message names the file and what is wrong with it.
@@ -95,64 +85,58 @@ def read_oaslam(path: Path, class_names: Sequence[str]) -> GivenMap:
     """
     if path.suffix == '.mapobjects':
         return _read_saved_map(path, class_names)
-    given = GivenMap([], [], [_NOTE])
-    try:
-        lines = read_bytes(path).decode('ascii').splitlines()
-    except UnicodeDecodeError as error:
-        raise DatasetError(f'{path}: is no map_objects_NAME.txt of OA-SLAM: not a text; a '
-                           'saved map must end in .mapobjects') from error
+    given = given_map.GivenMap([], [], [_NOTE])
+    with naming(path, UnicodeDecodeError, what='is no map_objects_NAME.txt of OA-SLAM, nor ends '
+                'in .mapobjects as a saved map: '):
+        lines = given_map.read_bytes(path).decode('ascii').splitlines()
     for line_number, line in enumerate(lines, 1):
         words = line.split()
         if not words:
             continue
-        try:
-            if len(words) != _NUMBERS_IN_A_LINE:
-                raise ValueError
-            track, category = int(words[0]), int(words[1])
-            quadric = [float(word) for word in words[2:]]
-        except ValueError as error:
-            raise DatasetError(f'{path}: line {line_number}: expected track id, category and the '
-                               f'16 numbers of a dual quadric, not {line[:40]!r}') from error
-        name = class_name(class_names, category)
-        _add(given, make_id(name, track), make_id(name, track), name, quadric, LandmarkDetails())
+        where = f'{path}: line {line_number}: expected track id, category and the 16 numbers of ' \
+                'a dual quadric'
+        if len(words) != _NUMBERS_IN_A_LINE:
+            raise DatasetError(f'{where}, not {line[:40]!r}')
+        track, category = parse_all(words[:2], int, where)
+        _add(given, given_map.class_name(class_names, category), track,
+             parse_all(words[2:], float, where))
     return given
 
 
-def _read_saved_map(path: Path, class_names: Sequence[str]) -> GivenMap:
+def _read_saved_map(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
     tracks_path = path.with_suffix('.objecttracks')
     if not tracks_path.is_file():
         raise DatasetError(f'{tracks_path} is missing: it holds the classes of {path.name}')
-    given = GivenMap([], [], [_NOTE])
-    reading = tracks_path
-    try:
+    given = given_map.GivenMap([], [], [_NOTE])
+    broken = 'is no complete map of OA-SLAM: '
+    with naming(tracks_path, WireError, what=broken):
         # category and number of keyframes of each track
         tracks = {_integer(item, 1): (_integer(item, 2), len(item.get(8, ())))
                   for item in _messages(tracks_path, is_strict=False)}
-        reading = path
+    with naming(path, WireError, what=broken):
         for item in _messages(path):
             track, quadric = _integer(item, 2), _quadric(item)
             if track not in tracks:
-                given.left_out.append(Skipped(
+                given.left_out.append(given_map.Skipped(
                     f'track {track}', f'{tracks_path.name} has no such track, and so no class'))
                 continue
             category, support = tracks[track]
-            name = class_name(class_names, category)
-            _add(given, make_id(name, track), make_id(name, track), name, quadric,
+            _add(given, given_map.class_name(class_names, category), track, quadric,
                  LandmarkDetails(support=support))
-    except WireError as error:
-        raise DatasetError(f'{reading}: is no complete map of OA-SLAM: {error}') from error
     return given
 
 
-def _add(given: GivenMap, shown: str, landmark_id: str, name: str, quadric: list[float],
-         details: LandmarkDetails) -> None:
+def _add(given: given_map.GivenMap, name: str, number: int, quadric: list[float],
+         details: LandmarkDetails = _NO_DETAILS, shown: str = '') -> None:
     """Append an object to the content of a file; one that is no ellipsoid is left out."""
+    landmark_id = given_map.make_id(name, number)
     try:
         ellipsoid = decompose(quadric)
     except QuadricError as error:
-        given.left_out.append(Skipped(shown, str(error)))
+        given.left_out.append(given_map.Skipped(shown or landmark_id, str(error)))
     else:
-        given.landmarks.append(GivenLandmark(landmark_id, name, name, *ellipsoid, details))
+        given.landmarks.append(
+            given_map.GivenLandmark(landmark_id, name, name, *ellipsoid, details))
 
 
 def decompose(numbers: list[float]) -> tuple[list[float], list[float], list[float]]:
@@ -193,7 +177,7 @@ _Fields = Mapping[int, list[int | memoryview]]
 
 def _messages(path: Path, is_strict: bool = True) -> Iterator[_Fields]:
     """Yield the messages of a file; WireError: a strict one has other fields."""
-    fields = _fields(memoryview(read_bytes(path)))
+    fields = _fields(memoryview(given_map.read_bytes(path)))
     for number in fields:
         if is_strict and number != 1:
             raise WireError(f'field {number} is unknown')
@@ -227,14 +211,17 @@ def _integer(item: _Fields, number: int) -> int:
     return value
 
 
-def _integers(value: int | memoryview) -> list[int]:
+def _integers(item: _Fields, number: int) -> list[int]:
     """Return the numbers of a repeated field, packed or not."""
-    if isinstance(value, int):
-        return [value]
-    numbers, place = [], 0
-    while place < len(value):
-        number, place = _read_varint(value, place)
-        numbers.append(number)
+    numbers = []
+    for value in item.get(number, ()):
+        if isinstance(value, int):
+            numbers.append(value)
+            continue
+        place = 0
+        while place < len(value):
+            one, place = _read_varint(value, place)
+            numbers.append(one)
     return numbers
 
 

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The files of a check: figures as JSON; a page whose first screen says all, the rest folded."""
+"""The files of a check: figures as JSON; a page whose first screen says all, the rest folded.
+
+Beside an advice are the room's own images: a landmark in its best view, or the nearest view.
+"""
 
 import json
 import math
@@ -9,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cliploc_ros.files.storage import write_text
+from cliploc_ros.offline import page as html
 from cliploc_ros.offline.evaluation.map_check.views import ViewPainter
 from cliploc_ros.offline.mapping.check.landmark_faults import LandmarkCheck
 from cliploc_ros.offline.mapping.check.relocalization import Trial, count_verdicts
@@ -21,28 +25,11 @@ from cliploc_ros.offline.mapping.check.report import (
     count_by_objects,
     share,
 )
-from cliploc_ros.offline.page import (
-    ACCEPTED,
-    MISLED,
-    REFUSED,
-    Bar,
-    bars,
-    card,
-    figure,
-    first_screen,
-    fold,
-    items,
-    note,
-    page,
-    table,
-    tiles,
-    verdict,
-)
 
 PAGE, DATA = 'check.html', 'check.json'
 LOOK_ALIKE = '#CC79A7'
-VERDICT_COLORS = {'accepted': ACCEPTED, 'refused': REFUSED, 'misled': MISLED}
-GRADE_COLORS = {'faulty': MISLED, 'minor': REFUSED, 'sound': '#009E73'}
+VERDICT_COLORS = {'accepted': html.ACCEPTED, 'refused': html.REFUSED, 'misled': html.MISLED}
+GRADE_COLORS = {'faulty': html.MISLED, 'minor': html.REFUSED, 'sound': '#009E73'}
 GRADE_NAMES = {'faulty': 'serious fault', 'minor': 'minor fault', 'sound': 'sound'}
 _MOST_LANDMARKS = 300
 _MOST_MATCHED = 12
@@ -85,51 +72,52 @@ def _finite(value: Any) -> Any:
 def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, bytes]],
           views: ViewPainter | None) -> str:
     missed = len(report.failures)
-    said = verdict('The map reaches all thresholds.' if report.passed else
-                   f'The map misses {missed} of {len(report.measures)} thresholds.', report.passed)
+    said = html.verdict('The map reaches all thresholds.' if report.passed else
+                        f'The map misses {missed} of {len(report.measures)} thresholds.',
+                        report.passed)
     told = [one for name in _TELLING for one in report.measures if one.name.startswith(name)
             ][:_NUMBERS]
-    first, *others = (figure(png, caption, picture) for picture, caption, png in pictures)
+    first, *others = (html.figure(png, caption, picture) for picture, caption, png in pictures)
     cards = [_card(number, one, views) for number, one in enumerate(report.to_do, start=1)]
-    parts = [first_screen(
-        [said, tiles((one.show(one.value), one.name, not one.is_missed) for one in told),
-         bars(_bar(one) for one in report.measures),
+    parts = [html.first_screen(
+        [said, html.tiles((one.show(one.value), one.name, not one.is_missed) for one in told),
+         html.bars(_bar(one) for one in report.measures),
          '<h2>What to do first</h2>', *cards[:FIRST_ADVICE]], [first])]
     if rest := cards[FIRST_ADVICE:]:
-        parts.append(fold(f'{len(rest)} more to do', *rest))
+        parts.append(html.fold(f'{len(rest)} more to do', *rest))
     faulty = sum(grade(one) == 'faulty' for one in report.landmarks)
-    parts += [fold('All figures', table(('', ''), _figures(report))),
-              fold('Pictures', *others),
-              fold(f'Landmarks, worst first: {faulty} of {len(report.landmarks)} with a serious '
-                   'fault', _landmarks(report.landmarks))]
+    parts += [html.fold('All figures', html.table(('', ''), _figures(report))),
+              html.fold('Pictures', *others),
+              html.fold(f'Landmarks, worst first: {faulty} of {len(report.landmarks)} with a '
+                        'serious fault', _landmarks(report.landmarks))]
     if report.look_alikes:
-        parts.append(fold(f'{len(report.look_alikes)} pairs of places that look alike',
-                          _look_alikes(report)))
+        parts.append(html.fold(f'{len(report.look_alikes)} pairs of places that look alike',
+                               _look_alikes(report)))
     if report.recording is not None:
         rows = [(str(number), str(one.frames), str(one.landmarks), str(one.boxes.boxes),
                  f'{one.boxes.explained:.1%}', f'{one.boxes.median_iou:.3f}')
                 for number, one in enumerate(report.recording.folds, start=1)]
-        parts += [fold('Held-out boxes', note(
+        parts += [html.fold('Held-out boxes', html.note(
             'Blocks of time take turns in being judged; landmarks are fitted to the other '
-            'blocks.'), table(('#fold', '#frames', '#landmarks', '#boxes', '#explained',
-                               '#median IoU'), rows)),
-                  fold('Systematic residuals', _corrections(report.recording))]
-    return page(f'Check of {name}', *parts,
-                fold('What these figures rest on', items(report.notes)))
+            'blocks.'), html.table(('#fold', '#frames', '#landmarks', '#boxes', '#explained',
+                                    '#median IoU'), rows)),
+                  html.fold('Systematic residuals', _corrections(report.recording))]
+    return html.page(f'Check of {name}', *parts,
+                     html.fold('What these figures rest on', html.items(report.notes)))
 
 
 def _card(number: int, advice: Advice, views: ViewPainter | None) -> str:
     view = None if views is None else views.of(advice)
     text = f'{number}. {advice.text}'
-    return card(text) if view is None else card(text, view.jpeg, view.caption)
+    return html.card(text) if view is None else html.card(text, view.jpeg, view.caption)
 
 
-def _bar(one: Measure) -> Bar:
+def _bar(one: Measure) -> html.Bar:
     """Return the bar of a figure; a count's bar has room for its limit and one more."""
     scale = max(one.limit + 1.0, one.value) if one.unit == 'count' else 1.0
     word = 'at most' if one.is_most else 'at least'
-    return Bar(one.name, f'{one.show(one.value)} ({word} {one.show(one.limit)})',
-               one.value / scale, one.limit / scale, not one.is_missed)
+    return html.Bar(one.name, f'{one.show(one.value)} ({word} {one.show(one.limit)})',
+                    one.value / scale, one.limit / scale, not one.is_missed)
 
 
 def summary_lines(report: CheckReport) -> list[str]:
@@ -202,12 +190,12 @@ def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
             (one.landmark_id, grade(one)), (label, 'text'), (faults, 'text'), *texts,
             ', '.join(f'{name} ({distance:.2f})' for name, distance in one.overlaps)])
     rest = len(landmarks) - _MOST_LANDMARKS
-    return (table(head, rows) + (note(f'and {rest} more in the JSON file') if rest > 0 else '')
-            + note('frames: with the landmark, of those that should show it. seen: their share. '
-                   'baseline: greatest angle between two views. deviation: of the centre on its '
-                   'worst axis. offset: from the centre to where its boxes put it. IoU: median of '
-                   'its boxes. thinness: least by greatest semi-axis. In brackets: the normalized '
-                   'distance of an overlap.'))
+    more = html.note(f'and {rest} more in the JSON file') if rest > 0 else ''
+    return html.table(head, rows) + more + html.note(
+        'frames: with the landmark, of those that should show it. seen: their share. baseline: '
+        'greatest angle between two views. deviation: of the centre on its worst axis. offset: '
+        'from the centre to where its boxes put it. IoU: median of its boxes. thinness: least by '
+        'greatest semi-axis. In brackets: the normalized distance of an overlap.')
 
 
 def _look_alikes(report: CheckReport) -> str:
@@ -219,21 +207,20 @@ def _look_alikes(report: CheckReport) -> str:
         rows.append((str(number), f'{one.first[0]:.1f}, {one.first[1]:.1f}',
                      f'{one.second[0]:.1f}, {one.second[1]:.1f}', f'{one.turn_deg:.0f}',
                      f'{len(one.matched)} of {one.landmarks}', str(one.same_labels), pairs))
-    return table(('#pair', 'a: x, y [m]', 'b: x, y [m]', '#turn [deg]', '#landmarks alike',
-                  '#with equal labels', 'which'), rows)
+    return html.table(('#pair', 'a: x, y [m]', 'b: x, y [m]', '#turn [deg]', '#landmarks alike',
+                       '#with equal labels', 'which'), rows)
 
 
 def _corrections(recording: RecordingCheck) -> str:
     if not recording.corrections:
-        return note('Too few boxes to tell.')
+        return html.note('Too few boxes to tell.')
     rows = [(one.cause, one.name, f'{one.value:+.2f} {one.unit}',
              f'{one.deviation:.2f} {one.unit}', f'{one.effect_px:.1f}',
              f'{one.explained:.1%}', '' if not one.is_significant else (
                  'may follow from the cause that explains most' if one.follows
                  else 'significant'))
             for one in recording.corrections]
-    return (note('The correction that fits the edges of the boxes best, each cause on its own. A '
-                 'turned mount and a shifted principal point look much the same.')
-            + table(('cause', 'what', '#correction', '#deviation', '#effect [px]',
-                     '#cost that the cause explains', ''), rows))
-
+    return (html.note('The correction that fits the edges of the boxes best, each cause on its '
+                      'own. A turned mount and a shifted principal point look much the same.')
+            + html.table(('cause', 'what', '#correction', '#deviation', '#effect [px]',
+                          '#cost that the cause explains', ''), rows))

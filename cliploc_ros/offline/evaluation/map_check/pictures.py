@@ -17,20 +17,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.evaluation.drawing import EDGED, draw_outline, png_of, write_name
-from cliploc_ros.offline.evaluation.map_check.page import (
-    FIRST_ADVICE,
-    GRADE_COLORS,
-    GRADE_NAMES,
-    LOOK_ALIKE,
-    MISLED,
-    VERDICT_COLORS,
-    grade,
-)
+from cliploc_ros.offline import page as html
+from cliploc_ros.offline.evaluation.figures import EDGED, draw_outline, png_of, write_name
+from cliploc_ros.offline.evaluation.map_check import page
 from cliploc_ros.offline.mapping.check.places import RADIUS_M
 from cliploc_ros.offline.mapping.check.relocalization import Trial, count_verdicts, refused_spans
 from cliploc_ros.offline.mapping.check.report import CheckReport
-from cliploc_ros.offline.page import FAINT
 
 _DPI = 120
 _MARGIN_M = 0.4
@@ -145,13 +137,13 @@ def _grid_figure(canvas: _Canvas) -> Figure:
         x, y = one.position[:2]
         ahead = one.forward[:2] / max(float(np.linalg.norm(one.forward[:2])), 1e-9)
         dx, dy = 0.45 * side * ahead
-        axes.plot([x, x + dx], [y, y + dy], color=MISLED, linewidth=2.5, zorder=7,
+        axes.plot([x, x + dx], [y, y + dy], color=html.MISLED, linewidth=2.5, zorder=7,
                   path_effects=EDGED)
-        axes.plot(x, y, 'X', color=MISLED, markersize=9, markeredgecolor='white', zorder=8)
-    handles.append(Line2D([], [], color=MISLED, marker='X', linewidth=2.5,
+        axes.plot(x, y, 'X', color=html.MISLED, markersize=9, markeredgecolor='white', zorder=8)
+    handles.append(Line2D([], [], color=html.MISLED, marker='X', linewidth=2.5,
                           label=f'misled ({len(wrong)} of {len(grid.trials)} views)'))
     rows = {name: row for row, name in enumerate(canvas.map.landmark_ids)}
-    for number, advice in enumerate(canvas.report.to_do[:FIRST_ADVICE], start=1):
+    for number, advice in enumerate(canvas.report.to_do[:page.FIRST_ADVICE], start=1):
         place = (canvas.map.centers[rows[advice.landmarks[0]]] if advice.landmarks
                  else None if advice.view is None else advice.view.position)
         if place is not None:
@@ -169,7 +161,7 @@ def _frames_figure(canvas: _Canvas, trials: Sequence[Trial]) -> Figure:
     figure, axes = canvas.figure('Recorded frames, cross-validated', '#BBBBBB')
     size = 0.035 * canvas.size
     for one in trials:
-        ahead, tip, color = one.forward[:2], one.position[:2], VERDICT_COLORS[one.verdict]
+        ahead, tip, color = one.forward[:2], one.position[:2], page.VERDICT_COLORS[one.verdict]
         side, is_refused = np.array([-ahead[1], ahead[0]]) * 0.5, one.verdict == 'refused'
         axes.add_patch(Polygon(
             [tip, tip + size * (ahead + side), tip + size * (ahead - side)], closed=True,
@@ -178,7 +170,7 @@ def _frames_figure(canvas: _Canvas, trials: Sequence[Trial]) -> Figure:
         axes.plot(tip[0], tip[1], marker='s' if is_refused else 'o', color=color, markersize=4,
                   zorder=6)
         if one.verdict == 'misled' and one.estimate is not None:
-            axes.plot([tip[0], one.estimate[0]], [tip[1], one.estimate[1]], color=MISLED,
+            axes.plot([tip[0], one.estimate[0]], [tip[1], one.estimate[1]], color=html.MISLED,
                       linewidth=1.5, zorder=7)
     first = trials[0].stamp_s or 0.0
     for run in [run for run in refused_spans(trials) if len(run) > 1][:8]:
@@ -189,7 +181,7 @@ def _frames_figure(canvas: _Canvas, trials: Sequence[Trial]) -> Figure:
     _add_legend(figure, [
         *(Line2D([], [], color=color, label=f'{verdict} ({counts[verdict]})', markersize=5,
                  marker='s' if verdict == 'refused' else 'o')
-          for verdict, color in VERDICT_COLORS.items()),
+          for verdict, color in page.VERDICT_COLORS.items()),
         Patch(facecolor='#BBBBBB', edgecolor='#444444', alpha=0.5, label='landmark')])
     return figure
 
@@ -201,7 +193,7 @@ def _time_figure(trials: Sequence[Trial]) -> Figure:
     stamps -= stamps[0]
     width = 0.8 * (float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0)
     handles: list[Line2D | Patch] = []
-    for verdict, color in VERDICT_COLORS.items():
+    for verdict, color in page.VERDICT_COLORS.items():
         chosen = np.array([one.verdict == verdict for one in trials])
         counts = np.array([one.landmarks for one in trials])
         style: dict[str, Any] = {
@@ -221,20 +213,20 @@ def _time_figure(trials: Sequence[Trial]) -> Figure:
 
 def _landmarks_figure(canvas: _Canvas) -> Figure:
     landmark_map, checks = canvas.map, canvas.report.landmarks
-    grades = {one.landmark_id: grade(one) for one in checks}
-    colors = [GRADE_COLORS[grades[name]] for name in landmark_map.landmark_ids]
+    grades = {one.landmark_id: page.grade(one) for one in checks}
+    colors = [page.GRADE_COLORS[grades[name]] for name in landmark_map.landmark_ids]
     figure, axes = canvas.figure('Landmarks', colors, alpha=0.6)
     named = [one for one in checks if one.faults]
     if len(named) > _MOST_NAMES:
-        named = [one for one in named if grade(one) == 'faulty'][:_MOST_NAMES]
+        named = [one for one in named if page.grade(one) == 'faulty'][:_MOST_NAMES]
     for one in named:
         write_name(axes, one.center[:2], one.landmark_id)
     if canvas.path is not None:
-        axes.plot(*canvas.path.T, color=FAINT, linewidth=0.8, zorder=2)
+        axes.plot(*canvas.path.T, color=html.FAINT, linewidth=0.8, zorder=2)
     counts = Counter(grades.values())
     _add_legend(figure, [Patch(facecolor=color, edgecolor='#444444', alpha=0.6,
-                               label=f'{GRADE_NAMES[name]} ({counts[name]})')
-                         for name, color in GRADE_COLORS.items()])
+                               label=f'{page.GRADE_NAMES[name]} ({counts[name]})')
+                         for name, color in page.GRADE_COLORS.items()])
     return figure
 
 
@@ -242,15 +234,15 @@ def _look_alikes_figure(canvas: _Canvas) -> Figure:
     figure, axes = canvas.figure('Places that look alike', '#BBBBBB')
     for number, one in enumerate(canvas.report.look_alikes[:_MOST_LOOK_ALIKES], start=1):
         for letter, place in (('a', one.first), ('b', one.second)):
-            axes.add_patch(Circle(place[:2], RADIUS_M, fill=False, edgecolor=LOOK_ALIKE,
+            axes.add_patch(Circle(place[:2], RADIUS_M, fill=False, edgecolor=page.LOOK_ALIKE,
                                   linewidth=1.8, zorder=5))
             axes.text(place[0], place[1] + 0.8 * RADIUS_M, f'{number}{letter}', fontsize=11,
                       fontweight='bold', color=INK, ha='center', va='center', zorder=9,
                       path_effects=EDGED, clip_on=True)
         axes.plot([one.first[0], one.second[0]], [one.first[1], one.second[1]],
-                  color=LOOK_ALIKE, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4)
+                  color=page.LOOK_ALIKE, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4)
     _add_legend(figure, [
-        Line2D([], [], color=LOOK_ALIKE, marker='o', markersize=12, markerfacecolor='none',
+        Line2D([], [], color=page.LOOK_ALIKE, marker='o', markersize=12, markerfacecolor='none',
                linestyle=(0, (4, 2)), label=f'pair of places, {RADIUS_M:g} m around'),
         Patch(facecolor='#BBBBBB', edgecolor='#444444', alpha=0.5, label='landmark')])
     return figure

@@ -24,8 +24,7 @@ from cliploc_ros.core.keyframes.localization import (
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.offline.mapping.check.landmark_faults import Witness
 from cliploc_ros.offline.mapping.evidence import REACH, best_ious, explained, is_expected
 from cliploc_ros.offline.mapping.fitting import fit_landmarks

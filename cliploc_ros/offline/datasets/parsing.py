@@ -1,0 +1,219 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Texts, tables and JSON of other programs, checked as they are read.
+
+Whatever a file holds, the error is a DatasetError that names the file and the line or field.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import transform_from_pose
+from cliploc_ros.errors import CameraError, DatasetError
+from cliploc_ros.units import NS_PER_S
+
+#: builtin_interfaces/Time holds seconds in an int32.
+MAX_STAMP_S = 2**31 - 1
+
+
+class FieldError(DatasetError):
+    """A field of a mapping is missing or invalid."""
+
+
+@contextmanager
+def naming(where: object, *kinds: type[Exception], what: str = '') -> Iterator[None]:
+    """Turn exceptions of some kinds into a DatasetError that names a file or a place in it."""
+    try:
+        yield
+    except kinds as error:
+        reason = getattr(error, 'strerror', None) or error
+        raise DatasetError(f'{where}: {what}{reason}') from error
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file; DatasetError: it cannot be read."""
+    with naming(path, OSError, ValueError, what='cannot be read: '):
+        return path.read_text(encoding='utf-8')
+
+
+def read_lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield 'file:line' and the text of each line that is neither blank nor a comment."""
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        stripped = line.strip()
+        if stripped and not stripped.startswith('#'):
+            yield f'{path}:{number}', stripped
+
+
+def read_cells(path: Path, expected: str) -> Iterator[tuple[str, list[str]]]:
+    """Yield 'file:line' and the cells of each line, between spaces or commas.
+
+    DatasetError: the file cannot be read, or a line has other cells than the expected names, of
+    which '...' stands for any number.
+    """
+    names = expected.split()
+    for where, line in read_lines(path):
+        cells = line.replace(',', ' ').split()
+        if len(cells) < len(names) - 1 or (names[-1] != '...' and len(cells) != len(names)):
+            raise DatasetError(f'{where}: expected {expected}, got {len(cells)} fields: '
+                               f'{line[:60]!r}')
+        yield where, cells
+
+
+def read_numbers(path: Path, expected: str) -> list[list[float]]:
+    """Return the numbers of each line of a table, see read_cells; they may be infinite or NaN."""
+    return [parse_all(cells, float, where) for where, cells in read_cells(path, expected)]
+
+
+def parse_all[T](cells: Sequence[str], kind: Callable[[str], T], where: str) -> list[T]:
+    """Return cells as numbers of a kind; DatasetError: a cell is none."""
+    try:
+        return [kind(cell) for cell in cells]
+    except ValueError:
+        raise DatasetError(f'{where}: {" ".join(cells)[:60]!r} are no numbers') from None
+
+
+def parse_stamp_ns(text: str, where: str) -> int:
+    """Convert decimal seconds to nanoseconds exactly, without a float.
+
+    DatasetError: the text is no number, or outside the range of a ROS time.
+
+    Parameters
+    ----------
+    text : str
+        Seconds, as ``1341847980.722988`` or ``1.341847980722988e9``.
+    where : str
+        File and line, for the message.
+    """
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation:
+        raise DatasetError(f'{where}: {text!r} is no timestamp in seconds') from None
+    if not seconds.is_finite() or not 0 <= seconds <= MAX_STAMP_S:
+        raise DatasetError(f'{where}: timestamp {text} is outside 0 to {MAX_STAMP_S} s')
+    return int((seconds * NS_PER_S).to_integral_value())
+
+
+def unit_quaternion(quat: Sequence[float], where: str, tolerance: float
+                    ) -> NDArray[np.float64]:
+    """Return a quaternion (4,) of unit length; DatasetError: it is far from it."""
+    norm = math.hypot(*quat)
+    if not abs(norm - 1.0) <= tolerance:
+        raise DatasetError(f'{where}: quaternion {list(quat)} has norm {norm:.3g}, not 1')
+    return np.array(quat, dtype=np.float64) / norm
+
+
+def pose_of(position: Sequence[float], quat_xyzw: Sequence[float], where: str
+            ) -> NDArray[np.float64] | None:
+    """Return the transform (4, 4) of a position and a quaternion; None where they are not finite.
+
+    DatasetError: the quaternion is far from unit.
+    """
+    if not np.isfinite([*position, *quat_xyzw]).all():
+        return None
+    unit_quaternion(quat_xyzw, where, 1e-2)
+    return transform_from_pose(np.array(position), np.array(quat_xyzw))
+
+
+def camera_of(where: str, *values: Any) -> Camera:
+    """Return a camera; DatasetError: no camera can have these values."""
+    with naming(where, CameraError):
+        return Camera(*values)
+
+
+class WrittenFloat(float):
+    """A float that keeps how a file writes it, for stamps that a float would round."""
+
+    def __new__(cls, text: str) -> Self:
+        """Keep the text."""
+        made = super().__new__(cls, text)
+        made.text = text
+        return made
+
+    text: str
+
+    def __str__(self) -> str:
+        """Return the text."""
+        return self.text
+
+
+class Fields:
+    """A JSON mapping whose fields are checked as they are read.
+
+    FieldError: a field is missing without a default, or is of another type or shape.
+    """
+
+    def __init__(self, values: Any, where: str) -> None:
+        if not isinstance(values, dict):
+            raise FieldError(f'{where}: expected a mapping, got {str(values)[:40]!r}')
+        self.values: dict[str, Any] = values
+        self.where = where
+
+    @classmethod
+    def of_file(cls, path: Path, read: Callable[[Path], str | bytes] = read_text) -> 'Fields':
+        """Return the mapping that a file holds."""
+        text = read(path)
+        with naming(path, ValueError, RecursionError, what='is no JSON: '):
+            return cls(json.loads(text, parse_float=WrittenFloat), str(path))
+
+    def __contains__(self, name: str) -> bool:
+        """Return whether a field is there."""
+        return name in self.values
+
+    def number(self, name: str, default: float | None = None) -> float:
+        """Return a finite number."""
+        return float(self.numbers(name, (), default))
+
+    def numbers(self, name: str, shape: tuple[int, ...], default: Any = None
+                ) -> NDArray[np.float64]:
+        """Return finite numbers; a length of -1 is any."""
+        value = self._value(name, default)
+        try:
+            found = np.array(value)
+            if found.size and found.dtype.kind not in 'iuf':
+                raise ValueError
+            found = found.astype(np.float64)
+        except (ValueError, OverflowError, TypeError):
+            found = np.array([np.nan])
+        fits = len(found.shape) == len(shape) and all(
+            length in (-1, there) for length, there in zip(shape, found.shape, strict=True))
+        if not fits or not np.isfinite(found).all():
+            raise FieldError(f'{self.where}: {name} is {str(value)[:60]}, not ' + (
+                f'numbers of shape {shape}' if shape else 'a finite number'))
+        return found
+
+    def text(self, name: str, default: str | None = None) -> str:
+        """Return a text."""
+        return self._typed(name, str, 'a text', default)
+
+    def entries(self, name: str) -> list[Any]:
+        """Return a list."""
+        return self._typed(name, list, 'a list')
+
+    def mapping(self, name: str) -> dict[str, Any]:
+        """Return a mapping, which is empty where it is missing."""
+        return self._typed(name, dict, 'a mapping', {})
+
+    def size(self, width: str, height: str) -> tuple[int, int]:
+        """Return width and height [px]."""
+        return round(self.number(width)), round(self.number(height))
+
+    def _typed[T](self, name: str, kind: type[T], what: str, default: T | None = None) -> T:
+        value = self._value(name, default)
+        if not isinstance(value, kind):
+            raise FieldError(f'{self.where}: field {name!r} is {str(value)[:40]!r}, not {what}')
+        return value
+
+    def _value(self, name: str, default: Any) -> Any:
+        value = self.values.get(name, default)
+        if value is None:
+            raise FieldError(f'{self.where}: field {name!r} is missing')
+        return value
