@@ -27,10 +27,9 @@ from cliploc_ros.offline.datasets.tum import read_tum_trajectory
 from cliploc_ros.offline.mapping.building import build_map
 from studies.acceptance.fit import FITTED_KINDS
 from studies.watch import fit
-from studies.watch.judge import Alarm, Right, alarm_table, judge, right_table
+from studies.watch.judge import Alarm, Right, alarm_table, judge, mount_table, right_table
 from studies.watch.localizers import Drive, recorded_drive, simulated_drive
 from studies.watch.recordings import watch_recording, write_watch
-from studies.watch.sensors import mount_table
 from studies.worlds.places import KINDS
 
 # Frames of a recording at 30 Hz between two looks.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the watch says on drives: of a right localizer, a wrong one, and in a changed place."""
+"""What the watch says on drives: of a right localizer, a wrong one, and of a turned camera."""
 
 import copy
 from collections.abc import Iterator, Sequence
@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from cliploc_ros.core.geometry.transforms import Tolerance, invert_transform, make_transform
@@ -18,7 +19,14 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.expectation import expect
 from cliploc_ros.core.watch.watch import Watch, WatchReport, WatchState
 from studies.reports import table
-from studies.watch.localizers import LOOK_S, Drive, drifting, kidnapped
+from studies.watch.localizers import (
+    LOOK_S,
+    Drive,
+    drifting,
+    kidnapped,
+    simulated_drive,
+    turned_camera,
+)
 
 #: Displacements [m] [deg] against odometry.
 DISPLACED = ((1.0, 0.0), (2.0, 0.0), (5.0, 0.0), (0.0, 30.0), (0.0, 90.0), (0.0, 180.0))
@@ -32,6 +40,10 @@ _FAR = Tolerance(2.0, 30.0)
 _GAP_M = 1.5
 # A landmark counts where this many looks should show it.
 _EXPECTED = 5
+_TURNS_DEG = (0.0, 2.0, 3.0, 5.0, 7.0, 10.0)
+# Images of a drive with a turned camera, and looks that match three objects after which the turn
+# is judged.
+_IMAGES, _TURN_LOOKS = 200, 20
 
 
 class Alarm(NamedTuple):
@@ -174,3 +186,49 @@ def _share(some: Sequence[Alarm]) -> str:
         return ''
     return (f'{np.mean([one.lost for one in some]):.2f}; '
             f'{np.mean([one.noticed for one in some]):.2f}; {len(some)}')
+
+
+def mount_table(kinds: Sequence[str], seeds: Sequence[int]) -> str:
+    """Return a table of how well the turn of a camera is known after some looks."""
+    rows = []
+    for degrees in _TURNS_DEG:
+        found = [one for kind in kinds for seed in seeds
+                 if (one := _turn_after_looks(kind, seed, degrees)) is not None]
+        named = np.array([one[1:] for one in found if one[0]]).reshape(-1, 3)
+        errors, level, sigmas = named.T if len(named) else np.zeros((3, 1))
+        rows.append([f'{degrees:g}', len(found), len(named), f'{np.median(errors):.2f}',
+                     f'{np.quantile(errors, 0.9):.2f}', f'{(errors < 0.5).mean():.2f}',
+                     f'{(level < 0.5).mean():.2f}', f'{np.median(sigmas):.2f}',
+                     f'{(errors < 2.5 * sigmas).mean():.2f}'])
+    return table(['camera turned by [deg]', 'drives', 'named', 'error, median [deg]', '90 %',
+                  'within .5 deg', 'roll and pitch within .5 deg', 'stated deviation, median',
+                  'error within 2.5 deviations'], rows)
+
+
+def _turn_after_looks(kind: str, seed: int, degrees: float
+                      ) -> tuple[bool, float, float, float] | None:
+    """Return whether a turn is named after _TURN_LOOKS looks, its errors and deviation [deg].
+
+    The second error is that without the part about the vertical. None: the drive has fewer looks
+    at three objects.
+    """
+    drive, rng = simulated_drive(kind, seed, _IMAGES), np.random.default_rng([seed, 13])
+    watch, turn = watch_of(drive), turned_camera(degrees, rng)
+    poses = drifting(drive.poses, rng, 0.1)
+    count = 0
+    for observation, pose in zip(drive.observations, poses, strict=True):
+        # the stated mount puts the camera where it would be without the turn
+        given = pose @ invert_transform(turn)
+        report = watch.look(observation, given)
+        count += report.matched >= _OBJECTS
+        if count < _TURN_LOOKS:
+            continue
+        if report.camera_turn is None:
+            return False, 0.0, 0.0, 0.0
+        error = Rotation.from_matrix(turn[:3, :3].T @ report.camera_turn.stated_from_true[
+            :3, :3]).as_rotvec(degrees=True)
+        up = drive.poses[0][2, :3]
+        level = error - up * (up @ error)
+        return (True, float(np.linalg.norm(error)), float(np.linalg.norm(level)),
+                report.camera_turn.sigma_deg)
+    return None
