@@ -4,7 +4,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
+from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.files.parallel import MakeWork, run_tasks
 from cliploc_ros.files.storage import make_folder
@@ -34,6 +35,7 @@ from cliploc_ros.offline.evaluation.summary import wilson_interval
 SUCCESS_M = (0.1, 0.25, 0.5, 1.0)
 #: Errors of poses that lead a robot astray, though they may be no false accepts.
 FAR_M, FAR_DEG = 0.5, 20.0
+_PRECISION = 0.99
 #: Confidences (n,), and whether each pose is right (n,).
 Judged = tuple[NDArray[np.float64], NDArray[np.bool_]]
 
@@ -69,6 +71,7 @@ class Answer:
     error_m: float = inf
     error_deg: float = inf
     nees: float = inf
+    min_confidence: float = RelocalizerOptions.min_confidence  #: Of the acceptance
 
     @property
     def right(self) -> bool:
@@ -122,6 +125,28 @@ def answer_table[One: Answer](answers: Iterable[One], by: Sequence[str],
                   'accepted', 'false', '95 % of accepted', '95 % of n',
                   f'{FAR_M:g} m or {FAR_DEG:g} deg off', 'recall', 'in 95 %',
                   *(name.replace('_', ' ') for name in more)], rows)
+
+
+def confidence_table(answers: Iterable[Answer], by: Sequence[str], thresholds: Sequence[float]
+                     ) -> str:
+    """Return what several values of min_confidence accept, and the best recall that any reaches.
+
+    At a precision of .99.
+    """
+    return answer_table(
+        [replace(one, min_confidence=least, accepted=one.confidence >= least) for one in answers
+         for least in thresholds], [*by, 'min_confidence'],
+        best_recall=lambda its: f'{best_recall(*judged_of(its))[0]:.2f}')
+
+
+def best_recall(likely: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return the best recall of any threshold with a precision of .99, and the threshold."""
+    order = np.argsort(-likely, kind='stable')
+    hits = np.cumsum(right[order])
+    precise = np.nonzero(hits >= _PRECISION * np.arange(1, len(hits) + 1))[0]
+    if not len(precise):
+        return 0.0, 1.0
+    return float(hits[precise[-1]] / hits[-1]), float(likely[order[precise[-1]]])
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

@@ -37,7 +37,7 @@ from studies.acceptance.searches import (
     tasks_of,
 )
 from studies.acceptance.troubles import BY_LABELS, FAMILIES, PRIORS, TROUBLES, exchange_landmarks
-from studies.reports import answer_table, draw_judged, judged_by, judged_of, run_all, table
+from studies.reports import answer_table, confidence_table, draw_judged, judged_by, run_all, table
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
 
@@ -92,10 +92,7 @@ def _recorded(options: argparse.Namespace) -> None:
     for some, by in ((here, ('place', 'matching', 'mode')), (here, ('matching', 'mode')),
                      (there, ('trouble', 'place')), (there, ('trouble', 'matching', 'mode')),
                      (there, ('trouble',))):
-        print(answer_table(
-            [replace(one, min_confidence=least, accepted=one.confidence >= least) for one in some
-             for least in options.min_confidence], (*by, 'min_confidence'),
-            best_recall=lambda its: f'{fit.best_recall(*judged_of(its))[0]:.2f}'), end='\n\n')
+        print(confidence_table(some, by, options.min_confidence), end='\n\n')
     if options.out is not None:
         make_folder(options.out)
         (options.out / 'outcomes.json').write_text(
@@ -169,9 +166,8 @@ def _fit(options: argparse.Namespace) -> None:
     if options.out is not None:
         plain = [one for one in searched if one.kind in fit.FITTED_KINDS
                  and not one.case.is_elsewhere]
-        draw_judged(options.out / 'reliability.png', 'worlds, each kind left out of the fit', {
-            mode: fit.judged([one for one in plain if one.mode == mode], calibrations)
-            for mode in MODES})
+        draw_judged(options.out / 'reliability.png', 'worlds, each kind left out of the fit',
+                    judged_by(fit.answers(plain, calibrations), 'mode'))
     fitted = fit.fit([one.case for one in searched if one.kind in fit.FITTED_KINDS],
                      'depth' if options.depth else '')
     print('\nfitted on all of them, for calibration.yaml, objects:\n' + ', '.join(

@@ -61,7 +61,6 @@ class Outcome(Answer):
     trouble: str
     level: float
     looks: str = 'alone'  # or which of the looks of one localizer this is
-    min_confidence: float = RelocalizerOptions.min_confidence
 
 
 def make_search() -> Callable[[Task], list[Outcome]]:

@@ -23,9 +23,19 @@ from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.parallel import run_tasks
 from studies.keyframes.cases import cases
-from studies.keyframes.fit import GENUINE, POINTS, Row, fit, left_out, make_rows, paste
-from studies.keyframes.judge import WAYS, Outcome, make_judge
 from studies.keyframes.records import make_collect, read_places
+from studies.keyframes.verdicts import (
+    GENUINE,
+    POINTS,
+    WAYS,
+    Outcome,
+    Row,
+    fit,
+    left_out,
+    make_judge,
+    make_rows,
+    paste,
+)
 from studies.reports import answer_table, draw_judged, judged_by, run_all
 
 _FAMILIES = list(dict.fromkeys(name.partition(':')[0] for name in cases()))

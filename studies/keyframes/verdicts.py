@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Fit to stored records what points of keyframes say, and the signs of pictures.
+"""Judge stored records by the package's verdict, and fit what it says of keyframes.
 
-Both are logistic models, fitted by maximum likelihood. First the odds of a place by its points,
-against a place by chance: images as they are, or darker, blurred and covered, and other rooms.
-Then the signs that a place is there, in all records, given what the verdict says without them.
+What points of keyframes say, and the signs of pictures, are logistic models, fitted by maximum
+likelihood. First the odds of a place by its points, against a place by chance: images as they are,
+or darker, blurred and covered, and other rooms. Then the signs that a place is there, in all
+records, given what the verdict says without them.
 
 Robots see places far more often than pictures of them, so untroubled images weigh more than there
 are. Their weight is a choice: so large that of the pictures on up to 30 % of the image one of a
@@ -14,6 +15,7 @@ hundred is accepted, in rooms that did not fit.
 import pickle
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import inf
 from pathlib import Path
 
@@ -24,10 +26,13 @@ from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.contenders import contenders_of, join_frames, unrefined
 from cliploc_ros.core.acceptance.genuine import Signs
 from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.options import RelocalizerOptions
-from studies.keyframes.judge import decide
-from studies.keyframes.records import Record, StoredCase
-from studies.reports import Answer, chance, fit_logistic
+from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalizer
+from studies.keyframes.records import Record, StoredCase, StoredRecognizer, localize
+from studies.reports import Answer, chance, fit_logistic, judged
+from studies.rooms.rooms import without_boxes
 
 Floats = NDArray[np.float64]
 
@@ -40,6 +45,57 @@ _UNTROUBLED = ('plain', 'image', 'classes', 'features')
 _WEIGHT = 4.0
 # Deviations of the Gaussian prior of all coefficients but the first, for signs of deviation 1.
 _PRIOR = 3.0
+#: What answers.
+WAYS = ('objects', 'keyframes', 'both')
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome(Answer):
+    """One way's answer to a query, by one of its true poses."""
+
+    site: str
+    place: str
+    family: str
+    case: str
+    number: int
+    way: str
+    truth: int = 0  #: Which of the true poses: 1 is that by a moved half
+    refusal: str
+
+
+def decide(case: StoredCase, record: Record, way: str) -> Relocalization:
+    """Return the package's answer to a record by objects, by keyframes, or by both."""
+    searched, keyframes = [one.searched for one in record.looks], _keyframes(case)
+    if way == 'keyframes':
+        relocalizer = Relocalizer(case.landmark_map, record.options)
+        searched = [relocalizer.search(without_boxes(one.observation)) for one in searched]
+    return localize(case.landmark_map, record.options, searched, [
+        None if way == 'objects' else StoredRecognizer(
+            one.seen, keyframes, one.searched.observation.camera) for one in record.looks])
+
+
+@lru_cache(maxsize=1)
+def _keyframes(case: StoredCase) -> KeyframeLocalizer:
+    return KeyframeLocalizer(case.layer)
+
+
+def make_judge(ways: Sequence[str] = WAYS) -> Callable[[Path], list[Outcome]]:
+    """Return what judges the records of a file in some ways."""
+    def judge(path: Path) -> list[Outcome]:
+        case: StoredCase = pickle.loads(path.read_bytes())
+        return [one for record in case.records for way in ways
+                for one in _outcomes(case, record, way)]
+    return judge
+
+
+def _outcomes(case: StoredCase, record: Record, way: str) -> list[Outcome]:
+    found = decide(case, record, way)
+    first, *others = [Outcome(
+        site=case.place.partition('/')[0], place=case.place, family=case.name.partition(':')[0],
+        case=case.name, number=record.number, way=way, truth=number,
+        refusal='' if found.accepted else str(found.refusal_kind or way), **judged(found, truth))
+        for number, truth in enumerate(record.truths or (None,))]
+    return [first, *(replace(one, nees=inf) for one in others)]
 
 
 @dataclass(frozen=True, kw_only=True)
