@@ -25,17 +25,8 @@ from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.storage import make_folder
-from studies.acceptance import fit
+from studies.acceptance import fit, searches
 from studies.acceptance.places import MODES, ONE, Simulated, add_arguments, chosen_places
-from studies.acceptance.searches import (
-    LOOKS,
-    Outcome,
-    Task,
-    make_search,
-    retries_row,
-    retry,
-    tasks_of,
-)
 from studies.acceptance.troubles import BY_LABELS, FAMILIES, PRIORS, TROUBLES, exchange_landmarks
 from studies.reports import answer_table, confidence_table, draw_judged, judged_by, run_all, table
 from studies.worlds.cameras import GROUP_SIZE
@@ -48,10 +39,11 @@ _QUERIES = 4  # of a simulated world
 _EXCHANGED = 'share of the landmarks that have exchanged places'
 
 
-def _searched(options: argparse.Namespace, tasks: Sequence[Task], *tables: Sequence[str]
-              ) -> list[Outcome]:
+def _searched(options: argparse.Namespace, tasks: Sequence[searches.Task], *tables: Sequence[str]
+              ) -> list[searches.Outcome]:
     """Return the outcomes of tasks; print a table of them by each of some fields."""
-    found: list[Outcome] = run_all(make_search, tasks, 'searches', options.workers)
+    found: list[searches.Outcome] = run_all(searches.make_search, tasks, 'searches',
+                                            options.workers)
     for by in tables:
         print(answer_table(found, by), end='\n\n')
     return found
@@ -68,7 +60,7 @@ def _judge(options: argparse.Namespace) -> None:
     plain = RelocalizerOptions(matching=options.matching, crops='all',
                                min_confidence=options.min_confidence)
     found = _searched(options, [
-        Task(place, mode, plain, seed=place.seed)
+        searches.Task(place, mode, plain, seed=place.seed)
         for place in chosen_places(options) for mode in MODES], ('place', 'mode'), ('mode',))
     if options.out is not None:
         draw_judged(options.out / 'reliability.png', 'confidence of the best pose',
@@ -78,8 +70,8 @@ def _judge(options: argparse.Namespace) -> None:
 def _recorded(options: argparse.Namespace) -> None:
     if not all(0.0 <= one <= 1.0 for one in options.min_confidence):
         raise OptionsError('--min-confidence must be from 0 to 1')
-    found: list[Outcome] = run_all(make_search, [
-        Task(place, mode, RelocalizerOptions(matching=matching, min_confidence=_LOWEST,
+    found: list[searches.Outcome] = run_all(searches.make_search, [
+        searches.Task(place, mode, RelocalizerOptions(matching=matching, min_confidence=_LOWEST,
                                              crops='all'), *trouble)
         for place in chosen_places(options) for matching in fit.MATCHINGS for mode in MODES
         for trouble in (('none', 0.0), (_EXCHANGED, 1.0))], 'searches', options.workers)
@@ -102,13 +94,13 @@ def _recorded(options: argparse.Namespace) -> None:
 
 
 def _stress(options: argparse.Namespace) -> None:
-    _searched(options, tasks_of(
+    _searched(options, searches.tasks_of(
         chosen_places(options), RelocalizerOptions(matching=options.matching),
         _named(TROUBLES, options)), ('trouble', 'level', 'mode'))
 
 
 def _families(options: argparse.Namespace) -> None:
-    tasks: list[Task] = []
+    tasks: list[searches.Task] = []
     for name in _named(FAMILIES, options):
         family = FAMILIES[name]
         searched = RelocalizerOptions(matching=options.matching or (
@@ -118,21 +110,22 @@ def _families(options: argparse.Namespace) -> None:
         worlds = [Simulated(kind, options.first_seed + number)
                   for number in range(ceil(share / (_QUERIES * len(family.kinds))))
                   for kind in family.kinds]
-        own = [task for task in tasks_of([*recorded, *worlds], searched, [name])
+        own = [task for task in searches.tasks_of([*recorded, *worlds], searched, [name])
                if task.mode == ONE or not family.in_order]
         if family.in_order:
             few = worlds[:ceil(share / (_QUERIES * GROUP_SIZE))]
             own += [task._replace(in_order=True)
-                    for task in tasks_of([*recorded, *few], searched, [name])]
+                    for task in searches.tasks_of([*recorded, *few], searched, [name])]
         tasks += [task._replace(seed=task.seed + task.place.seed, most=share) for task in own]
     _searched(options, tasks, ('trouble', 'level', 'mode', 'looks'), ('trouble', 'place'),
               ('trouble', 'looks'))
 
 
 def _priors(options: argparse.Namespace) -> None:
+    plain = RelocalizerOptions(matching=options.matching)
     _searched(options, [
         task._replace(seed=task.seed + place.seed) for place in chosen_places(options)
-        for task in tasks_of([place], RelocalizerOptions(matching=options.matching), [*PRIORS])],
+        for task in searches.tasks_of([place], plain, [*PRIORS])],
         ('place', 'trouble', 'level'), ('trouble', 'level'))
 
 
@@ -148,12 +141,12 @@ def _retries(options: argparse.Namespace) -> None:
                 (RelocalizerOptions.min_confidence, 0.5)):
             plain = RelocalizerOptions(matching=options.matching, min_confidence=least,
                                        k=min(RelocalizerOptions.k, len(its_map)))
-            robots = list(tqdm(retry(its_map, queries, plain, options.seed), name, len(queries),
-                               disable=None))
-            rows.append(retries_row(f'{one.name}, {name}', least, robots))
+            robots = list(tqdm(searches.retry(its_map, queries, plain, options.seed), name,
+                               len(queries), disable=None))
+            rows.append(searches.retries_row(f'{one.name}, {name}', least, robots))
     print(table(['map', 'min_confidence', 'accepted at the first look',
-                 f'within {LOOKS} looks, each alone', f'within {LOOKS} looks that agree',
-                 'more than 1 m off'], rows))
+                 f'within {searches.LOOKS} looks, each alone',
+                 f'within {searches.LOOKS} looks that agree', 'more than 1 m off'], rows))
 
 
 def _fit(options: argparse.Namespace) -> None:
@@ -207,7 +200,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
                           help='(by labels for changed maps, else by classes)')
     priors = add('priors', _priors, 'what regions known before add, right and wrong', worlds=20,
                  first_seed=1100)
-    retries = add('retries', _retries, f'{LOOKS} looks of a robot that does not move',
+    retries = add('retries', _retries, f'{searches.LOOKS} looks of a robot that does not move',
                   kinds=ordinary, first_seed=1000)
     retries.set_defaults(frames='main')
     retries.add_argument('--seed', type=int, default=0, help='of the changes (%(default)s)')

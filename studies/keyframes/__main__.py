@@ -22,20 +22,9 @@ from tqdm import tqdm
 from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.parallel import run_tasks
+from studies.keyframes import verdicts
 from studies.keyframes.cases import cases
 from studies.keyframes.records import make_collect, read_places
-from studies.keyframes.verdicts import (
-    GENUINE,
-    POINTS,
-    WAYS,
-    Outcome,
-    Row,
-    fit,
-    left_out,
-    make_judge,
-    make_rows,
-    paste,
-)
 from studies.reports import answer_table, draw_judged, judged_by, run_all
 
 _FAMILIES = list(dict.fromkeys(name.partition(':')[0] for name in cases()))
@@ -68,21 +57,21 @@ def _stored(options: argparse.Namespace) -> list[Path]:
 
 
 def _fit(options: argparse.Namespace) -> int:
-    found: list[tuple[list[Row], list[Row]]] = run_all(make_rows, _stored(options), 'cases',
-                                                       options.workers)
+    found: list[tuple[list[verdicts.Row], list[verdicts.Row]]] = run_all(
+        verdicts.make_rows, _stored(options), 'cases', options.workers)
     places, signs = ([row for rows in found for row in rows[part]] for part in range(2))
     if len({one.site for one in places}) < 2:
         raise OptionsError(f'{options.out}: records of two rooms are needed; collect them first')
     for rows in (places, signs):
-        print(answer_table(left_out(rows), ['case']), end='\n\n')
-    print('\n'.join([*paste('keyframes', POINTS, fit(places)),
-                     *paste('genuine', GENUINE, fit(signs))]))
+        print(answer_table(verdicts.left_out(rows), ['case']), end='\n\n')
+    print('\n'.join([*verdicts.paste('keyframes', verdicts.POINTS, verdicts.fit(places)),
+                     *verdicts.paste('genuine', verdicts.GENUINE, verdicts.fit(signs))]))
     return 0
 
 
 def _judge(options: argparse.Namespace) -> int:
-    found: list[Outcome] = run_all(partial(make_judge, options.ways), _stored(options), 'cases',
-                                   options.workers)
+    found: list[verdicts.Outcome] = run_all(
+        partial(verdicts.make_judge, options.ways), _stored(options), 'cases', options.workers)
     for by in options.by or [['family'], ['case']]:
         print(answer_table(found, [*by, 'way', 'truth'], refused=_refused), end='\n\n')
     if options.figure:
@@ -91,7 +80,7 @@ def _judge(options: argparse.Namespace) -> int:
     return 0
 
 
-def _refused(outcomes: Sequence[Outcome]) -> str:
+def _refused(outcomes: Sequence[verdicts.Outcome]) -> str:
     kinds = Counter(one.refusal for one in outcomes if one.refusal).most_common()
     return ', '.join(f'{count} {kind}' for kind, count in kinds)
 
@@ -122,8 +111,8 @@ def main() -> int:
     fits.set_defaults(command=_fit)
     judges = commands.add_parser('judge', parents=[common], help='decide, and print tables')
     judges.set_defaults(command=_judge)
-    judges.add_argument('--ways', nargs='+', default=WAYS, choices=WAYS, metavar='WAY',
-                        help=f'what answers: {", ".join(WAYS)} (all)')
+    judges.add_argument('--ways', nargs='+', default=verdicts.WAYS, choices=verdicts.WAYS,
+                        metavar='WAY', help=f'what answers: {", ".join(verdicts.WAYS)} (all)')
     judges.add_argument('--by', nargs='+', action='append',
                         choices=['site', 'place', 'family', 'case'],
                         help='what a line of a table is about (a table by family, one by case)')

@@ -30,17 +30,7 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.storage import make_folder, write_text
 from studies.blame import CAUSES
 from studies.reports import answer_table, run_all, table
-from studies.rooms.asking import (
-    KNOWN,
-    NOTHING,
-    OBJECTS,
-    SIFT,
-    WAYS,
-    Answers,
-    Outcome,
-    make_ask,
-    tasks_of,
-)
+from studies.rooms import asking
 from studies.rooms.rooms import ROBOT, Room, RoomOptions, read_room
 
 _KINDS = 'in turn', 'halves', 'directions', 'heights', ROBOT
@@ -61,8 +51,8 @@ def run() -> int:
                         help=f'of splits: {", ".join(_KINDS)} (all)')
     parser.add_argument('--images', type=positive_int, default=10_000, metavar='N',
                         help='the most images that a part is asked (all)')
-    parser.add_argument('--known', nargs='+', choices=KNOWN, default=KNOWN, metavar='WHAT',
-                        help=f'besides the image: {", ".join(KNOWN)} (all)')
+    parser.add_argument('--known', nargs='+', choices=asking.KNOWN, default=asking.KNOWN,
+                        metavar='WHAT', help=f'besides the image: {", ".join(asking.KNOWN)} (all)')
     parser.add_argument('--elsewhere', type=int, default=20, metavar='N',
                         help="images of each other room that a part's map is asked (%(default)s)")
     parser.add_argument('--baseline', action='store_true', help='SIFT with PnP, too')
@@ -83,10 +73,11 @@ def run() -> int:
             if room.has_poses:
                 room.by_robot  # noqa: B018
     tasks = [task for room in rooms
-             for task in tasks_of(room, options.kinds, options.images, options.elsewhere,
+             for task in asking.tasks_of(room, options.kinds, options.images, options.elsewhere,
                                   options.known)]
-    found: list[Answers] = run_all(partial(make_ask, options.folders, reading, options.baseline),
-                                   tasks, 'parts', options.workers)
+    found: list[asking.Answers] = run_all(
+        partial(asking.make_ask, options.folders, reading, options.baseline), tasks, 'parts',
+        options.workers)
     for heading, text in _tables(found, rooms):
         print(f'## {heading}\n\n{text}\n')
     write_text(options.out / 'outcomes.json', json.dumps(
@@ -94,20 +85,20 @@ def run() -> int:
     return 0
 
 
-def _tables(answers: Sequence[Answers], rooms: Sequence[Room]) -> Iterator[tuple[str, str]]:
+def _tables(answers: Sequence[asking.Answers], rooms: Sequence[Room]) -> Iterator[tuple[str, str]]:
     """Yield all tables with their headings, ways and what is known in their own order."""
     failures = [(one.task.room, one.task.part, one.failure) for one in answers if one.failure]
     if failures:
         yield 'Not mapped', table(['room', 'part', 'why'], failures)
     outcomes = sorted((one for answer in answers for one in answer.outcomes), key=lambda one: (
-        [room.name for room in rooms].index(one.room), WAYS.index(one.way),
-        KNOWN.index(one.known)))
+        [room.name for room in rooms].index(one.room), asking.WAYS.index(one.way),
+        asking.KNOWN.index(one.known)))
     here = [one for one in outcomes if one.is_here]
-    objects = [one for one in here if one.way == OBJECTS]
+    objects = [one for one in here if one.way == asking.OBJECTS]
     yield 'Rooms', _room_table(answers, rooms)
     yield 'Success and acceptance', answer_table(here, ['room', 'kind', 'way', 'known'])
     yield 'All splits of a room', answer_table(here, ['room', 'way', 'known'])
-    posed = [one for one in here if one.error_m < inf and one.way != SIFT]
+    posed = [one for one in here if one.error_m < inf and one.way != asking.SIFT]
     for by in (['source'], ['source', 'room']):
         yield f'Poses by {" and ".join(by)}; of each confidence those that are right', \
             answer_table(posed, by, **{f'from_{low:g}_on': _share_right(low, high)
@@ -116,26 +107,26 @@ def _tables(answers: Sequence[Answers], rooms: Sequence[Room]) -> Iterator[tuple
     yield 'Images of other rooms: all accepted are false', '\n\n'.join(
         answer_table(elsewhere, by) for by in (['room', 'way'], ['way']))
     yield 'Why objects fail by more than .5 m', answer_table(
-        [one for one in objects if one.known == NOTHING], ['room', 'kind'],
+        [one for one in objects if one.known == asking.NOTHING], ['room', 'kind'],
         **{cause: _count(cause) for cause in CAUSES})
     yield 'Boxes that an image needs', answer_table(
         sorted(objects, key=lambda one: one.boxes_from), ['room', 'known', 'boxes_from'])
 
 
-def _share_right(low: float, high: float) -> Callable[[Sequence[Outcome]], str]:
+def _share_right(low: float, high: float) -> Callable[[Sequence[asking.Outcome]], str]:
     """Return the column of the share that is right, of poses of some confidence."""
-    def share(outcomes: Sequence[Outcome]) -> str:
+    def share(outcomes: Sequence[asking.Outcome]) -> str:
         own = [one.right for one in outcomes if low <= one.confidence < high]
         return f'{np.mean(own):.2f} of {len(own)}' if own else ''
 
     return share
 
 
-def _count(cause: str) -> Callable[[Sequence[Outcome]], int]:
+def _count(cause: str) -> Callable[[Sequence[asking.Outcome]], int]:
     return lambda outcomes: sum(one.cause == cause for one in outcomes)
 
 
-def _room_table(answers: Sequence[Answers], rooms: Sequence[Room]) -> str:
+def _room_table(answers: Sequence[asking.Answers], rooms: Sequence[Room]) -> str:
     rows = []
     for room in rooms:
         maps = [one for one in answers if one.task.room == room.name and one.landmarks]

@@ -14,7 +14,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.watch.alignment import align, look_at
 from cliploc_ros.core.watch.evidence import LookEvidence, log_odds, measure
 from studies.reports import fit_logistic, table
-from studies.watch.localizers import (
+from studies.watch.judge import (
     displaced,
     drifting,
     kidnapped,
