@@ -11,7 +11,6 @@ import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
@@ -20,14 +19,18 @@ from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.evaluation.sensors import with_vertical
 from cliploc_ros.offline.evaluation.trials import PosedQuery
 from studies import wrong_sensors
-from studies.acceptance.places import VERTICAL_DEG, Recording
+from studies.acceptance.places import (
+    VERTICAL_DEG,
+    AnyPlace,
+    Simulated,
+    add_arguments,
+    chosen_places,
+)
 from studies.acceptance.searches import look_on
 from studies.reports import Answer, answer_table, grouped
-from studies.worlds.places import KINDS
 from studies.worlds.world import make_drive
 
 #: What is wrong with all images, from nothing to much: a change and its level.
@@ -57,20 +60,19 @@ class Look(Answer):
     is_called_wrong: bool  #: The camera, by then
 
 
-def _drives(options: argparse.Namespace) -> Iterator[tuple[LandmarkMap, Sequence[PosedQuery]]]:
-    """Yield maps, and queries in order."""
-    for path, map_path in zip(options.queries, options.map, strict=True):
-        place = Recording(path, map_path).load()
-        in_order = sorted(place.frames, key=lambda one: one.observation.stamp_ns)
-        # query files do not hold the size of the images
-        yield place.landmark_map, [replace(one, observation=replace(
-            one.observation, camera=replace(one.observation.camera, width=options.size[0],
-                                            height=options.size[1])))
-            for one in in_order[::options.every]]
-    for kind in options.kinds:
-        for seed in range(options.first_seed, options.first_seed + options.worlds):
-            world = make_drive(kind, seed, options.images).world
-            yield world.landmark_map, world.queries
+def _drive(place: AnyPlace, options: argparse.Namespace
+           ) -> tuple[LandmarkMap, Sequence[PosedQuery]]:
+    """Return a map, and queries in order."""
+    if isinstance(place, Simulated):
+        world = make_drive(place.kind, place.seed, options.images).world
+        return world.landmark_map, world.queries
+    found = place.load()
+    in_order = sorted(found.frames, key=lambda one: one.observation.stamp_ns)
+    # query files do not hold the size of the images
+    return found.landmark_map, [replace(one, observation=replace(
+        one.observation, camera=replace(one.observation.camera, width=options.size[0],
+                                        height=options.size[1])))
+        for one in in_order[::options.every]]
 
 
 def _looks(number: int, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
@@ -102,28 +104,23 @@ def run(arguments: Sequence[str]) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--queries', type=Path, default=[], nargs='*', metavar='NPZ')
-    parser.add_argument('--map', type=Path, default=[], nargs='*', metavar='YAML',
-                        help='of each query file')
+    add_arguments(parser, worlds=4, first_seed=3000)
     parser.add_argument('--size', type=positive_int, nargs=2, default=(640, 480),
                         metavar=('W', 'H'), help='of the images of the query files [px]')
     parser.add_argument('--every', type=positive_int, default=1, metavar='N',
                         help='take each N-th image of a query file')
-    parser.add_argument('--kinds', nargs='*', choices=KINDS, default=[], help='of worlds')
-    parser.add_argument('--worlds', type=positive_int, default=4, metavar='N',
-                        help='of each kind')
-    parser.add_argument('--first-seed', type=int, default=3000, metavar='N')
     parser.add_argument('--images', type=positive_int, default=60, metavar='N',
                         help='of a drive')
-    parser.add_argument('--cameras', nargs='+', choices=CAMERAS, default=[*CAMERAS])
+    parser.add_argument('--wrong', nargs='+', choices=CAMERAS, default=[*CAMERAS],
+                        metavar='WHAT', help=f'{", ".join(CAMERAS)} (all)')
     parser.add_argument('--vertical', action='store_true', help='it is known to a degree')
     options = parser.parse_args(arguments)
-    if len(options.queries) != len(options.map):
-        raise OptionsError('give as many maps as query files, in the same order')
-    looks = [look for number, (landmark_map, queries) in enumerate(
-        tqdm(list(_drives(options)), 'drives', disable=None)) for look in _looks(
-            number, landmark_map, with_vertical(queries, VERTICAL_DEG) if options.vertical
-            else queries, options.cameras)]
+    looks: list[Look] = []
+    for number, place in enumerate(tqdm(chosen_places(options), 'drives', disable=None)):
+        landmark_map, queries = _drive(place, options)
+        if options.vertical:
+            queries = with_vertical(queries, VERTICAL_DEG)
+        looks += _looks(number, landmark_map, queries, options.wrong)
     print(answer_table(
         looks, ['camera', 'localizer'], called_wrong=lambda its: ' of '.join(
             map(str, (sum(map(bool, _alarms(its))), len(_alarms(its))))),

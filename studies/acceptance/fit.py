@@ -292,7 +292,7 @@ def answers(searched: Sequence[Searched], calibrations: Mapping[str, Calibration
         (likely,), (right,) = outcomes([one.case], calibrations[one.kind])
         found.append(FittedAnswer(
             kind=one.kind, mode=one.mode, matching=one.matching, accepted=False,
-            confidence=float(likely), error_m=0.0 if right else math.inf))
+            confidence=float(likely), **({'error_m': 0.0, 'error_deg': 0.0} if right else {})))
     return found
 
 

@@ -139,10 +139,10 @@ def sign_rows(case: StoredCase) -> list[Row]:
 
 def _row(case: StoredCase, record: Record, pose: Floats, predictors: Sequence[float],
          ceiling: float = 1.0) -> Row:
+    error_m, error_deg = pose_error(pose, record.truths[0]) if record.truths else (inf, inf)
     return Row(site=case.place.partition('/')[0], family=case.name.partition(':')[0],
                case=case.name, predictors=np.array([1.0, *predictors]), ceiling=ceiling,
-               accepted=False, confidence=0.0, error_m=min(
-                   (pose_error(pose, truth)[0] for truth in record.truths[:1]), default=inf))
+               accepted=False, confidence=0.0, error_m=error_m, error_deg=error_deg)
 
 
 def make_rows() -> Callable[[Path], list[tuple[list[Row], list[Row]]]]:

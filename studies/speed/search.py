@@ -37,17 +37,12 @@ from cliploc_ros.core.map.similarities import (
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search import strategies
 from cliploc_ros.core.search.candidates import match_frame
 from cliploc_ros.core.search.sampling import compatible_pairs, draw_ransac
 from cliploc_ros.core.search.scene import Scene, make_scene
 from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
-from cliploc_ros.core.search.strategies import (
-    Leaders,
-    Progress,
-    search_exhaustively,
-    search_progressively,
-    search_samples,
-)
+from cliploc_ros.core.search.strategies import Leaders, Progress
 from studies.acceptance.places import ONE, Recording
 from studies.reports import table
 
@@ -78,9 +73,9 @@ def run(arguments: Sequence[str]) -> int:
             paper = RelocalizerOptions(matching=matching, algorithm=algorithm)
             scenes = [match_frame(place.landmark_map, one.observation, paper)[0]
                       for one in place.ask(ONE)]
-            _measure_whole(f'{matching}, every sample', scenes, search_exhaustively)
+            _measure_whole(f'{matching}, every sample', scenes, strategies.search_exhaustively)
             _measure_whole(f'{matching}, every compatible sample', scenes,
-                           lambda scene, leaders: search_progressively(
+                           lambda scene, leaders: strategies.search_progressively(
                                scene, compatible_pairs(scene), leaders))
     return 0
 
@@ -109,7 +104,7 @@ def _measure_hypotheses(scene: Scene) -> None:
     five_hundred_ms = 1e3 * least_s(partial(_search, scene, samples[:500]))
     plain_us, plain_score = _plain(scene, samples[:_PLAIN_HYPOTHESES])
     leaders = Leaders.none_yet()
-    drain(search_samples(scene, samples[:_PLAIN_HYPOTHESES], leaders))
+    drain(strategies.search_samples(scene, samples[:_PLAIN_HYPOTHESES], leaders))
     print(f'{len(scene.bearings)} boxes, {len(scene.potential.detections)} pairs, one core:\n'
           f'  {whole_us / solved:7.2f} us a hypothesis, P3P to whole verification\n'
           f'  {searched_us / len(samples):7.2f} us a sample, in a search\n'
@@ -315,7 +310,7 @@ def _frame(landmark_map: LandmarkMap, observation: Observation, scene: Scene) ->
 
 
 def _search(scene: Scene, samples: NDArray[np.int64]) -> None:
-    drain(search_samples(scene, samples, Leaders.none_yet()))
+    drain(strategies.search_samples(scene, samples, Leaders.none_yet()))
 
 
 def drain(search: Iterator[Progress]) -> int:

@@ -141,12 +141,12 @@ def _in_view(objects: Objects, shapes: NDArray[np.float64], camera: Camera,
     extents = clipped[:, 2:] - clipped[:, :2]
     seen = (extents >= _LEAST_SIDE_PX).all(axis=1)  # never true of NaN
     seen &= extents.prod(axis=1) > _SHOWN_SHARE * (full[:, 2:] - full[:, :2]).prod(axis=1)
-    seen[seen] = ~hidden(clipped[seen], _HIDDEN_SHARE, objects.wholes[near][seen])
+    seen[seen] = ~_hidden(clipped[seen], _HIDDEN_SHARE, objects.wholes[near][seen])
     return near[seen], full[seen]
 
 
-def hidden(boxes: NDArray[np.float64], most: float, wholes: NDArray[np.int64]
-           ) -> NDArray[np.bool_]:
+def _hidden(boxes: NDArray[np.float64], most: float, wholes: NDArray[np.int64]
+            ) -> NDArray[np.bool_]:
     """Return of which of m boxes (m, 4) a nearer one covers more than a share; nearest first.
 
     Parts of one thing do not hide one another; wholes (m,) are of Objects.
