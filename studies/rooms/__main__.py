@@ -72,12 +72,11 @@ def run() -> int:
         for room in rooms:
             if room.has_poses:
                 room.by_robot  # noqa: B018
-    tasks = [task for room in rooms
-             for task in asking.tasks_of(room, options.kinds, options.images, options.elsewhere,
-                                  options.known)]
+    asked = asking.AskOptions(options.images, options.elsewhere, options.known, options.baseline)
     found: list[asking.Answers] = run_all(
-        partial(asking.make_ask, options.folders, reading, options.baseline), tasks, 'parts',
-        options.workers)
+        partial(asking.make_ask, options.folders, reading, asked),
+        [asking.Task(room.name, kind, part) for room in rooms for kind, part, *_ in room.parts()
+         if kind in options.kinds], 'parts', options.workers)
     for heading, text in _tables(found, rooms):
         print(f'## {heading}\n\n{text}\n')
     write_text(options.out / 'outcomes.json', json.dumps(

@@ -43,14 +43,20 @@ _FAILED_M = 0.5
 
 
 class Task(NamedTuple):
-    """A part of a room, by its name, and how many images to ask of its map at most."""
+    """A part of a room, by its name."""
 
     room: str
     kind: str
     part: str
+
+
+class AskOptions(NamedTuple):
+    """How many images to ask of a map at most, and how."""
+
     images: int  # of the rest of the room
     elsewhere: int  # of each other room
-    known: tuple[str, ...] = KNOWN  # in turn
+    known: Sequence[str]  # in turn
+    with_sift: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,14 +98,14 @@ class Answers:
     failure: str = ''  #: Why there is no map
 
 
-def make_ask(folders: Sequence[str], options: RoomOptions, with_sift: bool
+def make_ask(folders: Sequence[str], reading: RoomOptions, options: AskOptions
              ) -> Callable[[Task], list[Answers]]:
     """Return the function that maps a part and asks its map, for a worker."""
     cv2.setNumThreads(1)
 
     @lru_cache
     def rooms() -> dict[str, Room]:
-        return {room.name: room for room in (read_room(one, options) for one in folders)}
+        return {room.name: room for room in (read_room(one, reading) for one in folders)}
 
     def ask(task: Task) -> list[Answers]:
         room = rooms()[task.room]
@@ -111,27 +117,31 @@ def make_ask(folders: Sequence[str], options: RoomOptions, with_sift: bool
         except MappingError as error:
             return [Answers(task, failure=str(error))]
         keyframes, sift = KeyframeLocalizer(layer), None
-        if with_sift and room.has_depth:
+        if options.with_sift and room.has_depth:
             sift = SiftMap(room.raws[row].decode() for row in mapped)
         asking = room.by_robot if task.kind == ROBOT else room
-        if len(asked) > task.images:  # evenly spread over the time
-            asked = asked[np.linspace(0, len(asked) - 1, task.images).astype(np.int64)]
+        if len(asked) > options.images:  # evenly spread over the time
+            asked = asked[np.linspace(0, len(asked) - 1, options.images).astype(np.int64)]
         found = [one for row in asked for one in _ask_here(
-            task, asking, landmark_map, keyframes, sift, asking.queries[row])]
+            task, options.known, asking, landmark_map, keyframes, sift, asking.queries[row])]
         rng = np.random.default_rng(len(task.part))
         for other in rooms().values():
             if other.name != room.name:
-                some = rng.permutation(len(other))[:task.elsewhere]
-                found += [one for row in some for one in _ask_elsewhere(
-                    task, other, landmark_map, keyframes, other.queries[row])]
+                some = rng.permutation(len(other))[:options.elsewhere]
+                # all of these should be refused
+                found += [_outcome(task, other.name, other.queries[row], way, known, landmark_map,
+                                   keyframes)
+                          for row in some for way, known in product(WAYS[:3], options.known)
+                          if known == NOTHING or (known == VERTICAL and other.has_poses)]
         return [Answers(task, len(landmark_map), len(layer), tuple(found))]
     return ask
 
 
-def _ask_here(task: Task, room: Room, landmark_map: LandmarkMap, keyframes: KeyframeLocalizer,
-              sift: SiftMap | None, query: PosedQuery) -> Iterator[Outcome]:
+def _ask_here(task: Task, names: Sequence[str], room: Room, landmark_map: LandmarkMap,
+              keyframes: KeyframeLocalizer, sift: SiftMap | None, query: PosedQuery
+              ) -> Iterator[Outcome]:
     """Yield the answers to an image of the mapped room."""
-    for way, known in product((OBJECTS, BOTH, KEYFRAMES), task.known):
+    for way, known in product((OBJECTS, BOTH, KEYFRAMES), names):
         if known not in (NOTHING, VERTICAL) and (way == KEYFRAMES or not room.has_depth):
             continue
         yield _outcome(task, room.name, query, way, known, landmark_map, keyframes)
@@ -143,14 +153,6 @@ def _ask_here(task: Task, room: Room, landmark_map: LandmarkMap, keyframes: Keyf
         yield Outcome(room=task.room, kind=task.kind, part=task.part, asked=room.name,
                       number=query.number, way=SIFT, known=NOTHING, accepted=False,
                       confidence=0.0, source=SIFT, reason='', boxes=0, inliers=0, **errors)
-
-
-def _ask_elsewhere(task: Task, other: Room, landmark_map: LandmarkMap,
-                   keyframes: KeyframeLocalizer, query: PosedQuery) -> Iterator[Outcome]:
-    """Yield the answers to an image of another room, all of which should be refusals."""
-    for way, known in product((OBJECTS, KEYFRAMES, BOTH), task.known):
-        if known == NOTHING or (known == VERTICAL and other.has_poses):
-            yield _outcome(task, other.name, query, way, known, landmark_map, keyframes)
 
 
 def _outcome(task: Task, asked: str, query: PosedQuery, way: str, known: str,
@@ -172,10 +174,3 @@ def _outcome(task: Task, asked: str, query: PosedQuery, way: str, known: str,
         return replace(outcome, cause=blame(
             landmark_map, relocalizer, replace(query, observation=observation), _FAILED_M).cause)
     return outcome
-
-
-def tasks_of(room: Room, kinds: Sequence[str], images: int, elsewhere: int,
-             known: Sequence[str]) -> list[Task]:
-    """Return a task for each part of a room in some kinds of splits."""
-    return [Task(room.name, kind, part, images, elsewhere, tuple(known))
-            for kind, part, _, _ in room.parts() if kind in kinds]

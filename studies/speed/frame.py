@@ -27,7 +27,6 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,9 +43,9 @@ from cliploc_ros.models.observer import Observer
 from cliploc_ros.models.profiles import PROFILES, load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_weights import import_ultralytics
-from cliploc_ros.offline.datasets.intrinsics import find_camera
 from demo import ASSETS
 from studies.reports import table
+from studies.rooms.rooms import open_folder, posed
 
 _ENGINES = ('pytorch', 'openvino')
 _STAGES = ('detection', 'CLIP', 'search')
@@ -156,11 +155,8 @@ def _measure(engine: str, yolo: str, clip: str, folder: str, *, crops: int, roun
 def _demo_frame(crops: int, folder: str) -> tuple[NDArray[np.uint8], Observation]:
     """Return an image of the demo with enough boxes, and what the demo's networks say of it."""
     detector = load_detector(DetectorOptions(str(ASSETS / 'yolo.pt'), inference='pytorch'))
-    camera, _ = find_camera(None, ASSETS / 'sequence')
-    for file in sorted((ASSETS / 'sequence' / 'rgb').iterdir()):
-        pixels_bgr = cv2.imread(str(file))
-        assert pixels_bgr is not None
-        image_rgb = np.ascontiguousarray(pixels_bgr[..., ::-1], dtype=np.uint8)
+    for raw in posed(open_folder(str(ASSETS / 'sequence'))[1]):
+        image_rgb, camera = raw.color()
         detections = detector.detect(image_rgb).usable(camera.width, camera.height, crops)
         if len(detections) == crops:
             break
