@@ -95,6 +95,11 @@ def _alarms(looks: Sequence[Look]) -> list[int]:
             if its[0].localizer == 'one']
 
 
+def _called_wrong(looks: Sequence[Look]) -> str:
+    alarms = _alarms(looks)
+    return f'{sum(map(bool, alarms))} of {len(alarms)}' if alarms else ''
+
+
 def _after(looks: Sequence[Look]) -> str:
     alarms = [one for one in _alarms(looks) if one]
     return f'{np.median(alarms):.0f}, {max(alarms)}' if alarms else ''
@@ -121,10 +126,8 @@ def run(arguments: Sequence[str]) -> int:
         if options.vertical:
             queries = with_vertical(queries, VERTICAL_DEG)
         looks += _looks(number, landmark_map, queries, options.wrong)
-    print(answer_table(
-        looks, ['camera', 'localizer'], called_wrong=lambda its: ' of '.join(
-            map(str, (sum(map(bool, _alarms(its))), len(_alarms(its))))),
-        after_looks_median_most=_after))
+    print(answer_table(looks, ['camera', 'localizer'], called_wrong=_called_wrong,
+                       after_looks_median_most=_after))
     return 0
 
 

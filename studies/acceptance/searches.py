@@ -96,10 +96,9 @@ def search(task: Task) -> list[Outcome]:
 
 def look_on(relocalizer: Relocalizer, queries: Iterable[PosedQuery], is_one: bool = True
             ) -> Iterator[tuple[dict[str, Any], bool]]:
-    """Yield the fields of the answers of one localizer that has all queries in order.
+    """Yield the fields of the answer to each query, and whether the camera is called wrong by then.
 
-    And if it calls the camera wrong by then. Without odometry; a new localizer for each query
-    where it is not one.
+    One localizer gets all queries in order, without odometry; or each query gets a new one.
     """
     localizer = Localizer(relocalizer)
     for query in queries:
