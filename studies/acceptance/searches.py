@@ -96,7 +96,7 @@ def search(task: Task) -> list[Outcome]:
 
 def look_on(relocalizer: Relocalizer, queries: Iterable[PosedQuery], is_one: bool = True
             ) -> Iterator[tuple[dict[str, Any], bool]]:
-    """Yield the fields of the answer to each query, and whether the camera is called wrong by then.
+    """Yield the fields of each answer, and whether the camera is called wrong by then.
 
     One localizer gets all queries in order, without odometry; or each query gets a new one.
     """
