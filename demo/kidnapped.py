@@ -36,7 +36,12 @@ from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.poses import slerp
 from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.conversions import pose_to_msg, pose_with_covariance_msg, stamp_ns
+from cliploc_ros.ros.conversions import (
+    pose_from_msg,
+    pose_to_msg,
+    pose_with_covariance_msg,
+    stamp_ns,
+)
 from cliploc_ros.ros.visualization import image_to_msg
 from demo.pictures import Moment, Step, draw_kidnapped
 from demo.processes import DemoError, own_ros_domain
@@ -177,7 +182,9 @@ class KidnappedRobot(Node):
 
     def _take(self, msg: PoseWithCovarianceStamped) -> None:
         """Take a pose, as AMCL does at rest."""
-        self._map_from_odom = _pose_of(msg) @ invert_transform(self._odom_from_camera)
+        pose = pose_from_msg(msg.pose.pose)
+        assert pose is not None
+        self._map_from_odom = pose @ invert_transform(self._odom_from_camera)
         self._show_at = 0.0
         self.delivered_s.append(self.now_s)
 
@@ -273,8 +280,3 @@ def _between(one: NDArray[np.float64], other: NDArray[np.float64], share: float
     quat = slerp(quaternion_from_transform(one), quaternion_from_transform(other), share)
     place = one[:3, 3] + share * (other[:3, 3] - one[:3, 3])
     return transform_from_pose(place, quat)
-
-
-def _pose_of(msg: PoseWithCovarianceStamped) -> NDArray[np.float64]:
-    p, q = msg.pose.pose.position, msg.pose.pose.orientation
-    return transform_from_pose(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))

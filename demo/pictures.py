@@ -3,7 +3,7 @@
 """Draw the demo's picture of a wake-up: the camera image, and its matches."""
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,17 +90,8 @@ def _draw_image(axes: Axes, review: Review, landmark_map: LandmarkMap, numbers: 
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
     pose = review.judged.pose
     if pose is not None and review.repeated:
-        # the outlines of all landmarks as seen from the pose
-        matched = {match.landmark for match in review.matches}
-        for landmark, outline in enumerate(project_ellipsoids(
-                invert_transform(pose), landmark_map.centers, landmark_map.shapes)):
-            if np.isfinite(outline).all():
-                points = review.camera.project_normalized(outline_points(outline))
-                own = landmark in matched
-                axes.add_patch(Polygon(
-                    points, closed=True, fill=False, edgecolor=_ELLIPSE if own else _EXPECTED,
-                    linewidth=1.8 if own else 0.9, linestyle='-' if own else ':',
-                    path_effects=_EDGED if own else None))
+        _draw_outlines(axes, review.camera, landmark_map, pose,
+                       {match.landmark for match in review.matches})
     matched = {match.detection for match in review.matches}
     for row, number in numbers.items():
         left, top, right, bottom = review.detections.bboxes_xyxy[row]
@@ -113,6 +104,19 @@ def _draw_image(axes: Axes, review: Review, landmark_map: LandmarkMap, numbers: 
         axes.text(max(left, 2) + 1, max(top, 2) + 1, str(number), fontsize=7.5, color='black',
                   ha='left', va='top', clip_on=True,
                   bbox={'boxstyle': 'square,pad=0.12', 'facecolor': color, 'edgecolor': 'none'})
+
+
+def _draw_outlines(axes: Axes, camera: Camera, landmark_map: LandmarkMap,
+                   pose: NDArray[np.float64], matched: Set[int]) -> None:
+    """Draw the outlines of all landmarks as seen from a pose, those of the matched ones bold."""
+    for landmark, outline in enumerate(project_ellipsoids(
+            invert_transform(pose), landmark_map.centers, landmark_map.shapes)):
+        if np.isfinite(outline).all():
+            own = landmark in matched
+            axes.add_patch(Polygon(
+                camera.project_normalized(outline_points(outline)), closed=True, fill=False,
+                edgecolor=_ELLIPSE if own else _EXPECTED, linewidth=1.8 if own else 0.9,
+                linestyle='-' if own else ':', path_effects=_EDGED if own else None))
 
 
 def _list_matches(panel: Axes, review: Review, landmark_map: LandmarkMap, numbers: dict[int, int]
@@ -285,12 +289,7 @@ def _draw_expected(axes: Axes, file: Path, camera: Camera, detections: Detection
     for left, top, right, bottom in detections.bboxes_xyxy:
         axes.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False,
                                  edgecolor=_BOX, linewidth=1.5, path_effects=_EDGED))
-    for outline in project_ellipsoids(invert_transform(pose), landmark_map.centers,
-                                      landmark_map.shapes):
-        if np.isfinite(outline).all():
-            axes.add_patch(Polygon(
-                camera.project_normalized(outline_points(outline)), closed=True, fill=False,
-                edgecolor=_EXPECTED, linewidth=1.5, linestyle=':', path_effects=_EDGED))
+    _draw_outlines(axes, camera, landmark_map, pose, frozenset())
 
 
 def _draw_ways(axes: Axes, landmark_map: LandmarkMap, moments: Sequence[Moment]) -> None:

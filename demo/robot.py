@@ -18,13 +18,12 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 from vision_msgs.msg import Detection2DArray
 
-from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.messages import detections_from_msg
 from cliploc_ros.offline.datasets.bags import BagMessage, BagReader
 from cliploc_ros.offline.replay import create_publisher
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.conversions import of_camera, stamp_ns
+from cliploc_ros.ros.conversions import of_camera, pose_from_msg, stamp_ns
 from cliploc_ros.units import NS_PER_S
 from demo.processes import DemoError
 
@@ -171,7 +170,6 @@ class Robot(Node):
         self._detections[camera][stamp_ns(msg.header.stamp)] = detections_from_msg(msg)
 
     def _on_hypotheses(self, msg: PoseArray) -> None:
-        self._hypotheses[stamp_ns(msg.header.stamp)] = tuple(transform_from_pose(
-            np.array([pose.position.x, pose.position.y, pose.position.z]),
-            np.array([pose.orientation.x, pose.orientation.y, pose.orientation.z,
-                      pose.orientation.w])) for pose in msg.poses)
+        poses = map(pose_from_msg, msg.poses)
+        self._hypotheses[stamp_ns(msg.header.stamp)] = tuple(
+            pose for pose in poses if pose is not None)

@@ -14,7 +14,8 @@ from cliploc_ros.errors import DatasetError
 
 #: A detector need not find a box that shows less of its object than this share.
 LEAST_VISIBILITY = 0.3
-_SAME_OBJECT_IOU = 0.5
+#: Boxes that overlap more show one object.
+SAME_OBJECT_IOU = 0.5
 
 
 @dataclass(frozen=True)
@@ -85,14 +86,16 @@ def true_ids(bboxes_xyxy: npt.NDArray[np.float64], true_boxes: Sequence[TrueBox]
     """Return the object whose visible part fills each box (n, 4), or ''."""
     ids = []
     for bbox in bboxes_xyxy:
-        ious = [_box_iou(bbox, true.bbox_xyxy) for true in true_boxes]
-        best = int(np.argmax(ious)) if ious else -1
-        ids.append(true_boxes[best].object_id if ious and ious[best] > _SAME_OBJECT_IOU else '')
+        ious = overlaps(bbox, np.array([one.bbox_xyxy for one in true_boxes]).reshape(-1, 4))
+        ids.append(true_boxes[int(np.argmax(ious))].object_id
+                   if ious.max(initial=0.0) > SAME_OBJECT_IOU else '')
     return tuple(ids)
 
 
-def _box_iou(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64]) -> float:
-    sides = np.minimum(first[2:], second[2:]) - np.maximum(first[:2], second[:2])
-    shared = float(np.prod(np.maximum(sides, 0.0)))
-    return shared / float(np.prod(first[2:] - first[:2]) + np.prod(second[2:] - second[:2])
-                          - shared)
+def overlaps(bbox: npt.NDArray[np.float64], others: npt.NDArray[np.float64]
+             ) -> npt.NDArray[np.float64]:
+    """Return the IoU (n,) of a box (4,) with others (n, 4)."""
+    shared = (np.minimum(bbox[2:], others[:, 2:]) - np.maximum(bbox[:2], others[:, :2])
+              ).clip(0.0).prod(axis=1)
+    areas = (others[:, 2:] - others[:, :2]).prod(axis=1) + (bbox[2:] - bbox[:2]).prod()
+    return np.asarray(shared / (areas - shared))

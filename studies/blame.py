@@ -18,7 +18,6 @@ of a box: there association allows a right pose. In several images an object cou
 import argparse
 import sys
 from collections import Counter
-from collections.abc import Sequence
 from itertools import product
 from typing import NamedTuple
 
@@ -27,21 +26,17 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from cliploc_ros.command import run_command
-from cliploc_ros.core.acceptance.confidence import (
-    Support,
-    compared_frame,
-    support,
-    tilt_handicaps,
-    utilities,
+from cliploc_ros.core.acceptance.confidence import Support, tilt_handicaps, utilities
+from cliploc_ros.core.acceptance.contenders import (
+    contenders_of,
+    join_frames,
+    refined,
+    unrefined,
 )
-from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
-from cliploc_ros.core.fit.refinement import refine_rig
-from cliploc_ros.core.fit.verification import cameras_from_last, make_rig
-from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.offline.evaluation.trials import PosedQuery
 from studies.acceptance.places import MODES, add_arguments, chosen_places
 from studies.reports import table
@@ -74,51 +69,27 @@ def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: PosedQuery
     found = relocalizer.locate(frames)
     errors = [pose_error(one.map_from_camera, query.map_from_camera)[0]
               for one in found.hypotheses]
-    true_pose, matches = _refined(frames, query.map_from_camera, landmark_map.position_sigmas)
+    joined = join_frames(landmark_map, relocalizer.options, frames)
+    true, = contenders_of(joined, [refined(joined, unrefined(query.map_from_camera))], [True])
     candidates = [{one.landmark for one in its
                    if [one.detection, one.landmark] in frame.scene.pairs.tolist()}
-                  for frame, its in zip(frames, matches, strict=True)]
+                  for frame, its in zip(frames, true.matches, strict=True)]
     least = frames[-1].sample_size
     if errors and errors[0] <= limit_m:
         cause = ''
-    elif len({one.landmark for its in matches for one in its}) < least:
+    elif len(true.landmarks) < least:
         cause = 'objects'
-    elif pose_error(true_pose, query.map_from_camera)[0] > limit_m:
+    elif pose_error(true.pose, query.map_from_camera)[0] > limit_m:
         cause = 'map'
     elif max(map(len, candidates)) < least:
         cause = 'candidates'
     elif any(error <= limit_m for error in errors):
         cause = 'choice'
     else:
-        its = _support(landmark_map, frames, true_pose, matches)
         best = [(one.support, one.map_from_camera) for one in found.hypotheses[:1]]
-        leads = [_lead(*one, relocalizer.options) for one in ((its, true_pose), *best)]
+        leads = [_lead(*one, relocalizer.options) for one in ((true.support, true.pose), *best)]
         cause = 'search' if int(np.argmax(leads)) == 0 else 'choice'
     return Blame(cause, len(set().union(*candidates)))
-
-
-def _refined(frames: Sequence[SearchedFrame], map_from_camera: NDArray[np.float64],
-             sigmas: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[tuple[Match, ...]]]:
-    """Return a pose (4, 4) of the last frame after refinement, and what it explains in each."""
-    rig = make_rig([one.scene for one in frames],
-                   cameras_from_last([one.observation for one in frames]),
-                   np.stack([one.vertical for one in frames]), sigmas)
-    camera_from_map = invert_transform(map_from_camera)
-    refined = refine_rig(rig, np.ascontiguousarray(camera_from_map[:3, :3]),
-                         np.ascontiguousarray(camera_from_map[:3, 3]))
-    pose = Finalist(refined.rotation, refined.translation, refined.score, 0, 0,
-                    np.empty(0, dtype=np.int64))
-    return pose.map_from_camera, matches_of(rig, pose)
-
-
-def _support(landmark_map: LandmarkMap, frames: Sequence[SearchedFrame],
-             pose: NDArray[np.float64], matches: Sequence[tuple[Match, ...]]) -> Support:
-    """Return the support of a pose of the last frame."""
-    compared = [compared_frame(
-        landmark_map, frame.observation.detections, frame.scene, frame.observation.similarities,
-        frame.observation.similarity_rows) for frame in frames]
-    cameras = cameras_from_last([one.observation for one in frames])
-    return support(landmark_map, compared, pose @ np.linalg.inv(cameras), matches)
 
 
 def _lead(its: Support, pose: NDArray[np.float64], options: RelocalizerOptions) -> float:

@@ -9,146 +9,124 @@ some rules. Poses that are accepted are counted, and the looks until the camera 
 
 import argparse
 import sys
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from pathlib import Path
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from tqdm import tqdm
 
 from cliploc_ros.command import positive_int, run_command
-from cliploc_ros.core.geometry.transforms import RIGHT_M
-from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.errors import OptionsError
-from cliploc_ros.offline.datasets.observations import load_queries
-from cliploc_ros.offline.evaluation.figures import within_ellipsoid
-from cliploc_ros.offline.evaluation.trials import PosedQuery, make_queries, with_vertical
+from cliploc_ros.offline.evaluation.trials import PosedQuery, with_vertical
 from studies import wrong_sensors
-from studies.reports import errors_of, interval, table
-from studies.worlds.places import KINDS
+from studies.acceptance.places import (
+    VERTICAL_DEG,
+    AnyPlace,
+    Simulated,
+    add_arguments,
+    chosen_places,
+)
+from studies.acceptance.searches import look_on
+from studies.reports import Answer, answer_table, grouped
 from studies.worlds.world import make_drive
 
-_VERTICAL_DEG = 1.0
-#: What is wrong with all images, from nothing to much.
-CAMERAS: dict[str, Callable[[Sequence[PosedQuery]], Sequence[PosedQuery]]] = {
-    'right': lambda some: some,
-    'focal length x 1.03': lambda some: wrong_sensors.scaled_focal(some, 1.03),
-    'focal length x .97': lambda some: wrong_sensors.scaled_focal(some, 0.97),
-    'focal length x 1.3': lambda some: wrong_sensors.scaled_focal(some, 1.3),
-    'focal length x .8': lambda some: wrong_sensors.scaled_focal(some, 0.8),
-    'K x 2': lambda some: wrong_sensors.scaled_camera(some, 2.0),
-    'K x .5': lambda some: wrong_sensors.scaled_camera(some, 0.5),
-    'principal point + .2 widths': lambda some: wrong_sensors.shifted_center(some, 0.2),
-    'boxes of a crop, 300 px': lambda some: wrong_sensors.middle_crop(some, 300.0),
-    'boxes of a crop, 416 px': lambda some: wrong_sensors.middle_crop(some, 416.0),
-    'boxes x .5': lambda some: wrong_sensors.scaled_boxes(some, 0.5),
-    'boxes x 1.5': lambda some: wrong_sensors.scaled_boxes(some, 1.5),
-    'boxes + .15 widths': lambda some: wrong_sensors.shifted_boxes(some, 0.15)}
+#: What is wrong with all images, from nothing to much: a change and its level.
+CAMERAS: dict[str, tuple[wrong_sensors.Change, float]] = {
+    'right': (wrong_sensors.scaled_focal, 1.0),
+    'focal length x 1.03': (wrong_sensors.scaled_focal, 1.03),
+    'focal length x .97': (wrong_sensors.scaled_focal, 0.97),
+    'focal length x 1.3': (wrong_sensors.scaled_focal, 1.3),
+    'focal length x .8': (wrong_sensors.scaled_focal, 0.8),
+    'K x 2': (wrong_sensors.scaled_camera, 2.0),
+    'K x .5': (wrong_sensors.scaled_camera, 0.5),
+    'principal point + .2 widths': (wrong_sensors.shifted_center, 0.2),
+    'boxes of a crop, 300 px': (wrong_sensors.middle_crop, 300.0),
+    'boxes of a crop, 416 px': (wrong_sensors.middle_crop, 416.0),
+    'boxes x .5': (wrong_sensors.scaled_boxes, 0.5),
+    'boxes x 1.5': (wrong_sensors.scaled_boxes, 1.5),
+    'boxes + .15 widths': (wrong_sensors.shifted_boxes, 0.15)}
 
 
-class Place(NamedTuple):
-    """A map and queries in order."""
+@dataclass(frozen=True, kw_only=True)
+class Look(Answer):
+    """The answer to one image."""
 
-    landmark_map: LandmarkMap
-    queries: Sequence[PosedQuery]
-    size: tuple[int, int]  #: Of the images [px]
-
-
-class Answer(NamedTuple):
-    """The answer to one request."""
-
-    accepted: bool
-    error_m: float
-    square: float
+    camera: str
+    localizer: str  #: 'one', or 'new' for each image
+    drive: int
     is_called_wrong: bool  #: The camera, by then
 
 
-def answers(place: Place, change: Callable[[Sequence[PosedQuery]], Sequence[PosedQuery]],
-            is_one: bool) -> Iterator[Answer]:
-    """Yield the answers of one localizer, or of a new one for each query."""
-    options = RelocalizerOptions(k=min(3, len(place.landmark_map)))
-    relocalizer = Relocalizer(place.landmark_map, options)
-    localizer = Localizer(relocalizer)
-    for query in change([_of_size(one, place.size) for one in place.queries]):
-        if not is_one:
-            localizer = Localizer(relocalizer)
-        found = localizer.answer(Query((query.observation,), run=None))
-        error_m, _, square = errors_of(found, query.map_from_camera)
-        yield Answer(found.accepted, error_m, square, bool(localizer.cameras.faults))
+def _drive(place: AnyPlace, options: argparse.Namespace
+           ) -> tuple[LandmarkMap, Sequence[PosedQuery]]:
+    """Return a map, and queries in order."""
+    if isinstance(place, Simulated):
+        world = make_drive(place.kind, place.seed, options.images).world
+        return world.landmark_map, world.queries
+    found = place.load()
+    in_order = sorted(found.frames, key=lambda one: one.observation.stamp_ns)
+    # query files do not hold the size of the images
+    return found.landmark_map, [replace(one, observation=replace(
+        one.observation, camera=replace(one.observation.camera, width=options.size[0],
+                                        height=options.size[1])))
+        for one in in_order[::options.every]]
 
 
-def _of_size(query: PosedQuery, size: tuple[int, int]) -> PosedQuery:
-    """Return a query with the size of its image, which query files do not hold."""
-    camera = replace(query.observation.camera, width=size[0], height=size[1])
-    return replace(query, observation=replace(query.observation, camera=camera))
+def _looks(number: int, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
+           cameras: Sequence[str]) -> Iterator[Look]:
+    """Yield the answers on a drive by each of some cameras."""
+    relocalizer = Relocalizer(landmark_map, RelocalizerOptions(k=min(3, len(landmark_map))))
+    for name in cameras:
+        change, level = CAMERAS[name]
+        for localizer in ('new', 'one'):
+            for fields, is_called_wrong in look_on(relocalizer, change(queries, level),
+                                                   localizer == 'one'):
+                yield Look(camera=name, localizer=localizer, drive=number,
+                           is_called_wrong=is_called_wrong, **fields)
 
 
-def _places(options: argparse.Namespace) -> Iterator[Place]:
-    for path, map_path in zip(options.queries, options.map, strict=True):
-        landmark_map = LandmarkMap.from_file(map_path)
-        queries = make_queries(load_queries(path, landmark_map.landmark_ids), landmark_map, True)
-        yield Place(landmark_map, sorted(queries, key=lambda one: one.observation.stamp_ns)
-                    [::options.every], tuple(options.size))
-    for kind in options.kinds:
-        for seed in range(options.first_seed, options.first_seed + options.worlds):
-            world = make_drive(kind, seed, options.images).world
-            yield Place(world.landmark_map, world.queries, (640, 480))
+def _alarms(looks: Sequence[Look]) -> list[int]:
+    """Return after how many looks the camera of each drive is called wrong; 0: never."""
+    return [next((count for count, one in enumerate(its, start=1) if one.is_called_wrong), 0)
+            for its in grouped(looks, ['localizer', 'drive']).values()
+            if its[0].localizer == 'one']
 
 
-def row_of(name: str, way: str, runs: Sequence[Sequence[Answer]]) -> list[object]:
-    """Return a row of the table: what became of some runs."""
-    every = [one for run in runs for one in run]
-    accepted = [one for one in every if one.accepted]
-    wrong = sum(one.error_m > RIGHT_M for one in accepted)
-    called = [next((number for number, one in enumerate(run, start=1) if one.is_called_wrong), 0)
-              for run in runs]
-    alarms = [number for number in called if number]
-    return [name, way, len(every), len(accepted), wrong, interval(wrong, len(every), 3),
-            f'{within_ellipsoid(np.array([one.square for one in accepted])):.2f}'
-            if accepted else '',
-            f'{len(alarms)} of {len(runs)}' if way == 'one' else '',
-            f'{np.median(alarms):.0f}, {max(alarms)}' if alarms and way == 'one' else '']
+def _called_wrong(looks: Sequence[Look]) -> str:
+    alarms = _alarms(looks)
+    return f'{sum(map(bool, alarms))} of {len(alarms)}' if alarms else ''
+
+
+def _after(looks: Sequence[Look]) -> str:
+    alarms = [one for one in _alarms(looks) if one]
+    return f'{np.median(alarms):.0f}, {max(alarms)}' if alarms else ''
 
 
 def run(arguments: Sequence[str]) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--queries', type=Path, default=[], nargs='*', metavar='NPZ')
-    parser.add_argument('--map', type=Path, default=[], nargs='*', metavar='YAML',
-                        help='of each query file')
+    add_arguments(parser, worlds=4, first_seed=3000)
     parser.add_argument('--size', type=positive_int, nargs=2, default=(640, 480),
                         metavar=('W', 'H'), help='of the images of the query files [px]')
     parser.add_argument('--every', type=positive_int, default=1, metavar='N',
                         help='take each N-th image of a query file')
-    parser.add_argument('--kinds', nargs='*', choices=KINDS, default=[], help='of worlds')
-    parser.add_argument('--worlds', type=positive_int, default=4, metavar='N',
-                        help='of each kind')
-    parser.add_argument('--first-seed', type=int, default=3000, metavar='N')
     parser.add_argument('--images', type=positive_int, default=60, metavar='N',
                         help='of a drive')
-    parser.add_argument('--cameras', nargs='+', choices=CAMERAS, default=[*CAMERAS])
+    parser.add_argument('--wrong', nargs='+', choices=CAMERAS, default=[*CAMERAS],
+                        metavar='WHAT', help=f'{", ".join(CAMERAS)} (all)')
     parser.add_argument('--vertical', action='store_true', help='it is known to a degree')
     options = parser.parse_args(arguments)
-    if len(options.queries) != len(options.map):
-        raise OptionsError('give as many maps as query files, in the same order')
-    runs: dict[tuple[str, str], list[list[Answer]]] = defaultdict(list)
-    for place in tqdm(list(_places(options)), 'places', disable=None):
-        queries = with_vertical(place.queries, _VERTICAL_DEG) if options.vertical \
-            else place.queries
-        for name in options.cameras:
-            for way in ('new', 'one'):
-                runs[name, way].append([*answers(place._replace(queries=queries), CAMERAS[name],
-                                                 way == 'one')])
-    print(table(['camera', 'localizer', 'n', 'accepted', 'wrong', '95 % of n', 'in 95 %',
-                 'called wrong', 'after looks: median, most'],
-                [row_of(*key, some) for key, some in runs.items()]))
+    looks: list[Look] = []
+    for number, place in enumerate(tqdm(chosen_places(options), 'drives', disable=None)):
+        landmark_map, queries = _drive(place, options)
+        if options.vertical:
+            queries = with_vertical(queries, VERTICAL_DEG)
+        looks += _looks(number, landmark_map, queries, options.wrong)
+    print(answer_table(looks, ['camera', 'localizer'], called_wrong=_called_wrong,
+                       after_looks_median_most=_after))
     return 0
 
 

@@ -8,11 +8,10 @@ finds the right ones less often. Labels still distinguish the objects.
 """
 
 import argparse
-import multiprocessing
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +20,7 @@ from tqdm import tqdm
 from cliploc_ros.command import run_command
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.files.storage import make_folder
 from cliploc_ros.offline.evaluation.methods import parse_methods
 from cliploc_ros.offline.evaluation.run import run_methods
@@ -51,6 +51,10 @@ def render(folder: Path, count: int, images: int, seed: int) -> None:
     room = make_room(seed, counts, unknown=0)
     record_walk(folder, room, Renderer(room, CAMERA, Light()), query_walk(images), seed=seed)
     write_true_map(folder / 'map.yaml', room)
+
+
+def _make_work(folder: Path, images: int, seed: int) -> Callable[[int], None]:
+    return lambda count: render(folder / str(count), count, images, seed)
 
 
 def _whole_search_s(one: Summary) -> float:
@@ -99,14 +103,12 @@ def run(arguments: list[str]) -> int:
     make_folder(options.out)
     summaries: dict[int, list[Summary]] = {}
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_growth_') as name:
-        rooms = {count: Path(name) / str(count) for count in COUNTS}
         # In other processes: Mesa and PyTorch each load an LLVM, and the two conflict.
-        with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context('spawn')) as pool:
-            made = [pool.submit(render, folder, count, options.images, options.seed)
-                    for count, folder in rooms.items()]
-            for room in tqdm(made, 'rendering', unit='room'):
-                room.result()
-        for count, folder in rooms.items():
+        for _ in tqdm(run_tasks(partial(_make_work, Path(name), options.images, options.seed),
+                                COUNTS, workers=2), 'rendering', len(COUNTS), unit='room'):
+            pass
+        for count in COUNTS:
+            folder = Path(name, str(count))
             landmark_map = LandmarkMap.from_file(folder / 'map.yaml')
             queries = make_queries(record(folder, landmark_map, folder), landmark_map)
             summaries[count] = summarize(run_methods(
@@ -119,10 +121,5 @@ def run(arguments: list[str]) -> int:
     return 0
 
 
-def main() -> int:
-    """Run from the command line; return the exit code."""
-    return run_command(lambda: run(sys.argv[1:]))
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run_command(lambda: run(sys.argv[1:])))

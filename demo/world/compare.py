@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cliploc_ros.command import run_command
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -36,7 +35,7 @@ from cliploc_ros.offline.evaluation.trials import make_queries
 from cliploc_ros.offline.recording.networks import RunNetworks
 from cliploc_ros.offline.recording.recorder import record_every_frame
 from demo import ASSETS
-from demo.truth import TrueFrame, read_frames
+from demo.truth import SAME_OBJECT_IOU, TrueFrame, overlaps, read_frames
 from demo.world import train_detector
 
 
@@ -70,23 +69,13 @@ def score_clip(frames: Sequence[QueryFrame], truth: Sequence[TrueFrame],
     ranks = []
     for frame, true_frame in zip(frames, truth, strict=True):
         for box in true_frame.boxes:
-            overlaps = _overlaps(box.bbox_xyxy, frame.bboxes_xyxy)
-            if box.object_id in landmark_ids and overlaps.max(initial=0.0) > 0.5:
-                similarities = frame.similarities[int(np.argmax(overlaps))]
+            ious = overlaps(box.bbox_xyxy, frame.bboxes_xyxy)
+            if box.object_id in landmark_ids and ious.max(initial=0.0) > SAME_OBJECT_IOU:
+                similarities = frame.similarities[int(np.argmax(ious))]
                 own = similarities[landmark_ids.index(box.object_id)]
                 ranks.append(int((similarities > own).sum()))
     counted, number = np.array(ranks), max(len(ranks), 1)
     return int((counted < 1).sum()) / number, int((counted < 3).sum()) / number, len(ranks)
-
-
-def _overlaps(bbox: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the IoU (n,) of a box (4,) with others (n, 4)."""
-    def area(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(np.clip(boxes[..., 2:] - boxes[..., :2], 0, None).prod(-1))
-
-    shared = area(np.concatenate([np.maximum(bbox[:2], others[:, :2]),
-                                  np.minimum(bbox[2:], others[:, 2:])], axis=1))
-    return np.asarray(shared / (area(bbox) + area(others) - shared))
 
 
 def run(arguments: list[str]) -> int:
@@ -118,10 +107,5 @@ def run(arguments: list[str]) -> int:
     return 0
 
 
-def main() -> int:
-    """Run from the command line; return the exit code."""
-    return run_command(lambda: run(sys.argv[1:]))
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run_command(lambda: run(sys.argv[1:])))

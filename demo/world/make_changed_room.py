@@ -15,12 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from tqdm import tqdm
 
 from demo.world.appearance import CLASSES
 from demo.world.make_demo_world import SEED
 from demo.world.recording import record, write_true_map
-from demo.world.renderer import Light, Renderer
+from demo.world.renderer import FIRST_LIGHT, LATER_LIGHT, Renderer
 from demo.world.room import Room, find_places, make_room, move_objects
 from demo.world.trajectories import CAMERA, walk
 
@@ -28,8 +27,6 @@ _COUNTS = dict.fromkeys(CLASSES, 8)
 _MOVED, _REMOVED, _NEW = 4, 2, 3
 # Objects stand this near to their places.
 _JITTER_M = 0.05
-_LIGHT_BEFORE = Light()
-_LIGHT_AFTER = Light(lamp=0.5, ambient=0.5, position=(4.2, 1.8), warmth=0.08)
 
 
 def change_room(seed: int, free_places: bool = False) -> tuple[Room, Room, dict[str, list[str]]]:
@@ -95,11 +92,10 @@ def make_changed_room(folder: Path, images: int, seed: int, free_places: bool = 
         after, objects=tuple(replace(o, in_map=True) for o in after.objects)))
     (folder / 'changes.json').write_text(json.dumps(changes, indent=1))
     for number, (name, room, light, poses) in enumerate((
-            ('before', before, _LIGHT_BEFORE, round_walk(images, 0.0, 1.45)),
-            ('after', after, _LIGHT_AFTER, round_walk(images, 0.7, 1.3)))):
-        with tqdm(total=images, desc=name, unit='image') as bar:
-            record(folder / name, room, Renderer(room, CAMERA, light), poses,
-                   seed=seed + 5 + number, rate_hz=2.0, advance=bar.update)
+            ('before', before, FIRST_LIGHT, round_walk(images, 0.0, 1.45)),
+            ('after', after, LATER_LIGHT, round_walk(images, 0.7, 1.3)))):
+        record(folder / name, room, Renderer(room, CAMERA, light), poses, seed=seed + 5 + number,
+               rate_hz=2.0)
 
 
 def main() -> None:

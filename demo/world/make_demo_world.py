@@ -12,11 +12,10 @@ import json
 from pathlib import Path
 
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
 from demo.world.appearance import CLASSES
 from demo.world.recording import record, write_fitted_map
-from demo.world.renderer import Light, Renderer
+from demo.world.renderer import FIRST_LIGHT, LATER_LIGHT, Renderer
 from demo.world.room import Room, make_room, move_objects
 from demo.world.trajectories import (
     CAMERA,
@@ -29,37 +28,27 @@ from demo.world.trajectories import (
 
 #: Not among the seeds of the training worlds, which start at 1000.
 SEED = 7
-_MAPPING_LIGHT = Light()
-_QUERY_LIGHT = Light(lamp=0.5, ambient=0.5, position=(4.2, 1.8), warmth=0.08)
 
 
 def make_demo_world(folder: Path, images: int, mapping_images: int, seed: int = SEED) -> None:
     """Write the true map (map.yaml), the mapping walk (mapping/) and the wake-ups (sequence/)."""
     room = make_room(seed, dict.fromkeys(CLASSES, 8))
-    renderer = Renderer(room, CAMERA, _MAPPING_LIGHT)
+    renderer = Renderer(room, CAMERA, FIRST_LIGHT)
     folder.mkdir(parents=True, exist_ok=True)
-    poses = true_map_walk(120)
-    with tqdm(total=len(poses), desc='true map', unit='image') as bar:
-        write_fitted_map(folder / 'map.yaml', room, renderer, poses, seed=seed,
-                         advance=bar.update)
-    with tqdm(total=mapping_images, desc='mapping', unit='image') as bar:
-        record(folder / 'mapping', room, renderer, mapping_walk(mapping_images), seed=seed + 5,
-               advance=bar.update)
+    write_fitted_map(folder / 'map.yaml', room, renderer, true_map_walk(120), seed=seed)
+    record(folder / 'mapping', room, renderer, mapping_walk(mapping_images), seed=seed + 5)
     later = move_objects(room, 4, seed + 1)
-    with tqdm(total=images, desc='waking up', unit='image') as bar:
-        record(folder / 'sequence', later, Renderer(later, CAMERA, _QUERY_LIGHT),
-               query_walk(images), seed=seed + 2, rate_hz=2.0, advance=bar.update)
+    record(folder / 'sequence', later, Renderer(later, CAMERA, LATER_LIGHT), query_walk(images),
+           seed=seed + 2, rate_hz=2.0)
     make_rig(folder / 'rig', later, seed + 3)
 
 
 def make_rig(folder: Path, room: Room, seed: int) -> None:
     """Write what the cameras of a rig see (NAME/), and how they are mounted (mounts.json)."""
     mounts, poses = rig_mounts(), rig_walk()
-    renderer = Renderer(room, CAMERA, _QUERY_LIGHT)
-    with tqdm(total=len(mounts) * len(poses), desc='four cameras', unit='image') as bar:
-        for number, (name, mount) in enumerate(mounts.items()):
-            record(folder / name, room, renderer, poses @ mount, seed=seed + number,
-                   advance=bar.update)
+    renderer = Renderer(room, CAMERA, LATER_LIGHT)
+    for number, (name, mount) in enumerate(mounts.items()):
+        record(folder / name, room, renderer, poses @ mount, seed=seed + number)
     (folder / 'mounts.json').write_text(json.dumps({name: [
         *mount[:3, 3], *Rotation.from_matrix(mount[:3, :3]).as_quat()]
         for name, mount in mounts.items()}))

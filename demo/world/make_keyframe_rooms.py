@@ -15,18 +15,15 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from demo.world.appearance import CLASSES
 from demo.world.make_changed_room import round_walk
 from demo.world.recording import record, write_true_map
-from demo.world.renderer import Light, Renderer
+from demo.world.renderer import FIRST_LIGHT, LATER_LIGHT, Renderer
 from demo.world.room import make_room, move_objects
 from demo.world.trajectories import CAMERA, mapping_walk, query_walk
 
-_MAPPING_LIGHT = Light()
-_QUERY_LIGHT = Light(lamp=0.5, ambient=0.5, position=(4.2, 1.8), warmth=0.08)
 _MAPPING_IMAGES, _SIDE_IMAGES = 30, 24
 # 20 cm to the right, turned by 5 degrees to the left.
 _ASIDE = make_transform(Rotation.from_euler('y', -5.0, degrees=True).as_matrix(),
@@ -37,8 +34,8 @@ def make_keyframe_room(folder: Path, seed: int, queries: int) -> None:
     """Write the map and the walks of a room."""
     room = make_room(seed, dict.fromkeys(CLASSES, 8))
     later = move_objects(room, 4, seed + 1)
-    renderer = Renderer(room, CAMERA, _MAPPING_LIGHT)
-    changed = Renderer(later, CAMERA, _QUERY_LIGHT)
+    renderer = Renderer(room, CAMERA, FIRST_LIGHT)
+    changed = Renderer(later, CAMERA, LATER_LIGHT)
     sides = round_walk(2 * _SIDE_IMAGES, 0.0, 1.45)
     walks = {'mapping': mapping_walk(_MAPPING_IMAGES), 'one_side': sides[:_SIDE_IMAGES],
              'other_side': sides[_SIDE_IMAGES:][:: max(1, _SIDE_IMAGES // queries)],
@@ -48,9 +45,7 @@ def make_keyframe_room(folder: Path, seed: int, queries: int) -> None:
     write_true_map(folder / 'map.yaml', room)
     for number, (name, poses) in enumerate(walks.items()):
         shown = (later, changed) if name.startswith('other_light') else (room, renderer)
-        with tqdm(total=len(poses), desc=name, unit='image') as bar:
-            record(folder / name, *shown, poses, seed=seed + 5 + number, rate_hz=2.0,
-                   advance=bar.update)
+        record(folder / name, *shown, poses, seed=seed + 5 + number, rate_hz=2.0)
 
 
 def main() -> None:

@@ -3,13 +3,15 @@
 """Make worlds for training: ``python -m demo.world.make_worlds DIR --count 100``."""
 
 import argparse
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor, as_completed
+import os
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
+from cliploc_ros.files.parallel import run_tasks
 from demo.world.recording import record, write_true_map
 from demo.world.renderer import Light, Renderer
 from demo.world.room import make_room
@@ -34,17 +36,17 @@ def main() -> None:
     parser.add_argument('--count', type=int, default=90, help='number of worlds (%(default)s)')
     parser.add_argument('--frames', type=int, default=10, help='images each (%(default)s)')
     parser.add_argument('--seed', type=int, default=1000, help='seed of the first (%(default)s)')
-    parser.add_argument('--jobs', type=int, default=multiprocessing.cpu_count(),
+    parser.add_argument('--jobs', type=int, default=os.cpu_count(),
                         help='parallel processes (%(default)s)')
     options = parser.parse_args()
-    # VTK's contexts do not survive a fork.
-    context = multiprocessing.get_context('spawn')
-    with ProcessPoolExecutor(options.jobs, mp_context=context) as pool:
-        made = [pool.submit(make_world, options.folder / f'world_{number:03d}',
-                            options.seed + number, options.frames)
-                for number in range(options.count)]
-        for world in tqdm(as_completed(made), total=options.count, unit='world'):
-            world.result()
+    for _ in tqdm(run_tasks(partial(_make_work, options.folder, options.seed, options.frames),
+                            range(options.count), workers=options.jobs),
+                  total=options.count, unit='world'):
+        pass
+
+
+def _make_work(folder: Path, seed: int, frames: int) -> Callable[[int], None]:
+    return lambda number: make_world(folder / f'world_{number:03d}', seed + number, frames)
 
 
 if __name__ == '__main__':

@@ -3,7 +3,8 @@
 """Record a walk through a world as a TUM folder with ground truth, and write maps."""
 
 import json
-from collections.abc import Callable, Iterable
+import multiprocessing
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy.typing as npt
 import yaml
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from tqdm import tqdm
 
 from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
@@ -36,7 +38,7 @@ Box = dict[str, Any]
 
 
 def record(folder: Path, room: Room, renderer: Renderer, poses: npt.NDArray[np.float64], *,
-           seed: int, rate_hz: float = 1.0, advance: Callable[[], object] = lambda: None) -> None:
+           seed: int, rate_hz: float = 1.0) -> None:
     """Render a walk and write its images and ground truth as a TUM folder.
 
     Parameters
@@ -53,13 +55,11 @@ def record(folder: Path, room: Room, renderer: Renderer, poses: npt.NDArray[np.f
         Seed of the camera's errors.
     rate_hz : float
         Rate of the stamps [Hz].
-    advance : callable, optional
-        Called after each image.
     """
     rng = np.random.default_rng(seed)
     (folder / 'rgb').mkdir(parents=True, exist_ok=True)
     rgb, truth, frames = ['# timestamp filename'], ['# timestamp tx ty tz qx qy qz qw'], []
-    for number, pose in enumerate(poses):
+    for number, pose in enumerate(_with_progress(poses, folder.name)):
         stamp = f'{1000 + number / rate_hz:.6f}'
         image = expose(renderer.render(pose), rng)
         cv2.imwrite(str(folder / 'rgb' / f'{stamp}.jpg'), image[..., ::-1], _JPEG)
@@ -67,7 +67,6 @@ def record(folder: Path, room: Room, renderer: Renderer, poses: npt.NDArray[np.f
         quat = Rotation.from_matrix(pose[:3, :3]).as_quat()
         truth.append(' '.join([stamp, *(f'{value:.6f}' for value in (*pose[:3, 3], *quat))]))
         frames.append({'timestamp': stamp, 'boxes': find_boxes(room, renderer, pose)})
-        advance()
     (folder / 'rgb.txt').write_text('\n'.join(rgb) + '\n')
     (folder / 'groundtruth.txt').write_text('\n'.join(truth) + '\n')
     objects = [{'id': o.name, **o.landmark(), 'in_map': o.in_map, 'moved': o.moved}
@@ -76,6 +75,12 @@ def record(folder: Path, room: Room, renderer: Renderer, poses: npt.NDArray[np.f
     (folder / 'camera.json').write_text(json.dumps({
         'width': CAMERA.width, 'height': CAMERA.height, 'fx': CAMERA.fx, 'fy': CAMERA.fy,
         'cx': CAMERA.cx, 'cy': CAMERA.cy}))
+
+
+def _with_progress(poses: npt.NDArray[np.float64], what: str) -> Iterable[Any]:
+    """Return poses with a progress bar, unless this is one of several processes."""
+    is_worker = multiprocessing.parent_process() is not None
+    return tqdm(poses, what, unit='image', disable=is_worker or None)
 
 
 def find_boxes(room: Room, renderer: Renderer, map_from_camera: npt.NDArray[np.float64]) -> \
@@ -124,8 +129,7 @@ def write_true_map(path: Path, room: Room) -> None:
 
 
 def write_fitted_map(path: Path, room: Room, renderer: Renderer,
-                     poses: npt.NDArray[np.float64], *, seed: int,
-                     advance: Callable[[], object] = lambda: None) -> None:
+                     poses: npt.NDArray[np.float64], *, seed: int) -> None:
     """Write a map as a mapping run makes it: ellipsoids fitted to the boxes of many views.
 
     The fit uses views that show an object whole and hardly covered, with boxes perturbed by a
@@ -133,7 +137,7 @@ def write_fitted_map(path: Path, room: Room, renderer: Renderer,
     """
     rng = np.random.default_rng(seed)
     views: dict[str, list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]]] = {}
-    for pose in poses:
+    for pose in _with_progress(poses, 'true map'):
         for seen in find_boxes(room, renderer, pose):
             bbox = np.array(seen['bbox_xyxy'])
             inside = bbox[:2].min() > 2 and bbox[2] < CAMERA.width - 3 and \
@@ -141,39 +145,29 @@ def write_fitted_map(path: Path, room: Room, renderer: Renderer,
             if seen['visibility'] > 0.8 and inside:
                 views.setdefault(seen['object'], []).append(
                     (invert_transform(pose), bbox + rng.normal(0, 1.0, 4)))
-        advance()
     _write_map(path, {o.name: _fit(o.landmark(), views.get(o.name, ()))
                       for o in room.objects if o.in_map})
 
 
-def _fit(entry: dict[str, Any], views: Iterable[tuple[npt.NDArray[np.float64], ...]]) -> \
+def _fit(entry: dict[str, Any], views: Sequence[tuple[npt.NDArray[np.float64], ...]]) -> \
         dict[str, Any]:
     """Fit centre and axes of an ellipsoid to its boxes."""
-    views = list(views)
     if len(views) < 3:
         return entry
     poses = np.array([pose for pose, _ in views])
     bboxes = np.array([bbox for _, bbox in views])
-    quats = np.tile(entry['orientation'], (len(views), 1))
     start = np.concatenate([entry['center'], np.log(entry['semi_axes'])])
 
     def residuals(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        outlines = _outline_boxes(x[:3], np.exp(x[3:]), quats, poses)
+        shape = shape_matrices(np.exp(x[None, 3:]), np.array([entry['orientation']]))
+        conics = np.concatenate([project_ellipsoids(pose, x[None, :3], shape) for pose in poses])
+        # An ellipsoid that reaches the camera has no outline: a large finite residual.
+        outlines = np.nan_to_num(ellipse_bboxes(ellipses_in_pixels(conics, CAMERA)), nan=1e4)
         # Views from one side leave the depth undetermined: then the prior decides.
         return np.concatenate([(outlines - bboxes).ravel(), (x - start) / _USUAL_SPREAD])
 
     found = least_squares(residuals, start, loss='soft_l1', f_scale=3.0).x
     return {**entry, 'center': found[:3].tolist(), 'semi_axes': np.exp(found[3:]).tolist()}
-
-
-def _outline_boxes(center: npt.NDArray[np.float64], semi_axes: npt.NDArray[np.float64],
-                   quats_xyzw: npt.NDArray[np.float64], poses: npt.NDArray[np.float64]) -> \
-        npt.NDArray[np.float64]:
-    """Return the boxes (n, 4) [px] around the outlines of an ellipsoid in n views."""
-    shape = shape_matrices(semi_axes[None], quats_xyzw[:1])
-    outlines = np.concatenate([project_ellipsoids(pose, center[None], shape) for pose in poses])
-    # An ellipsoid that reaches the camera has no outline: a large finite residual.
-    return np.nan_to_num(ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA)), nan=1e4)
 
 
 def _write_map(path: Path, landmarks: dict[str, dict[str, Any]]) -> None:

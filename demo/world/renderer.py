@@ -37,6 +37,11 @@ class Light:
                      rng.uniform(-0.06, 0.12))
 
 
+#: While a room is mapped, and after some of it has changed.
+FIRST_LIGHT = Light()
+LATER_LIGHT = Light(lamp=0.5, ambient=0.5, position=(4.2, 1.8), warmth=0.08)
+
+
 class Renderer:
     """Renders the image of a room, and the index of the object at each pixel.
 

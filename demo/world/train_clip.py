@@ -21,6 +21,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from cliploc_ros.command import run_command
+from cliploc_ros.files.storage import write_file
 from demo import ASSETS
 from demo.truth import read_frames
 from demo.world.worlds import find_worlds, hold_out
@@ -150,9 +151,7 @@ def save(model: Any, path: Path) -> None:
 
     state = {name: (tensor.half() if tensor.is_floating_point() else tensor).contiguous()
              for name, tensor in model.state_dict().items()}
-    partial = path.with_name(path.name + '.partial')
-    save_file(state, partial)
-    partial.replace(path)
+    write_file(path, lambda partial: save_file(state, partial))
 
 
 def run(arguments: list[str]) -> int:
@@ -182,10 +181,5 @@ def run(arguments: list[str]) -> int:
     return 0
 
 
-def main() -> int:
-    """Run from the command line; return the exit code."""
-    return run_command(lambda: run(sys.argv[1:]))
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run_command(lambda: run(sys.argv[1:])))

@@ -16,6 +16,7 @@ import yaml
 from tqdm import tqdm
 
 from cliploc_ros.command import run_command
+from cliploc_ros.files.storage import write_file
 from cliploc_ros.models.yolo_weights import import_ultralytics
 from demo.truth import TrueFrame, read_frames
 from demo.world.appearance import CLASSES
@@ -104,9 +105,7 @@ def save(model: Any, path: Path) -> None:
         if hasattr(checkpoint['model'], name):
             setattr(checkpoint['model'], name, {} if name == 'args' else '')
     checkpoint['model'].yaml.pop('yaml_file', None)
-    partial = path.with_name(path.name + '.partial')
-    torch.save(checkpoint, partial)
-    partial.replace(path)
+    write_file(path, lambda partial: torch.save(checkpoint, partial))
 
 
 def run(arguments: list[str]) -> int:
@@ -137,10 +136,5 @@ def run(arguments: list[str]) -> int:
     return 0
 
 
-def main() -> int:
-    """Run from the command line; return the exit code."""
-    return run_command(lambda: run(sys.argv[1:]))
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run_command(lambda: run(sys.argv[1:])))

@@ -11,10 +11,10 @@ where it is. In ``retries`` it looks up to 20 times. ``fit`` fits the confidence
 import argparse
 import json
 import sys
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, replace
 from itertools import product
-from math import ceil
+from math import ceil, inf
 from pathlib import Path
 from typing import Any
 
@@ -24,28 +24,11 @@ from tqdm import tqdm
 from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.files.parallel import MakeWork, run_tasks
 from cliploc_ros.files.storage import make_folder
-from cliploc_ros.offline.evaluation.run import RunError
-from studies.acceptance import fit
-from studies.acceptance.looks import (
-    LOOKS,
-    retries_row,
-    retry,
-)
+from studies.acceptance import fit, searches
 from studies.acceptance.places import MODES, ONE, Simulated, add_arguments, chosen_places
-from studies.acceptance.priors import PRIORS
-from studies.acceptance.searches import (
-    Outcome,
-    Task,
-    acceptance_table,
-    confidences_of,
-    false_table,
-    make_search,
-    tasks_of,
-)
-from studies.acceptance.troubles import BY_LABELS, FAMILIES, TROUBLES, exchange_landmarks
-from studies.reports import draw_judged, table
+from studies.acceptance.troubles import BY_LABELS, FAMILIES, PRIORS, TROUBLES, exchange_landmarks
+from studies.reports import answer_table, confidence_table, draw_judged, judged_by, run_all, table
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
 
@@ -56,81 +39,69 @@ _QUERIES = 4  # of a simulated world
 _EXCHANGED = 'share of the landmarks that have exchanged places'
 
 
-def run_all(make_search: MakeWork, tasks: Sequence[Any], what: str, workers: int) -> list[Any]:
-    """Return the outcomes of all tasks, in their order; show a progress bar.
+def _searched(options: argparse.Namespace, tasks: Sequence[searches.Task], *tables: Sequence[str]
+              ) -> list[searches.Outcome]:
+    """Return the outcomes of tasks; print a table of them by each of some fields."""
+    found: list[searches.Outcome] = run_all(searches.make_search, tasks, 'searches',
+                                            options.workers)
+    for by in tables:
+        print(answer_table(found, by), end='\n\n')
+    return found
 
-    RunError: workers died at a task: without its outcomes the rest would not be a fair sample.
 
-    Parameters
-    ----------
-    make_search : MakeWork
-        Makes the function that returns the outcomes of a task, a sequence.
-    what : str
-        Name of the tasks in the plural.
-    """
-    found = {}
-    with closing(run_tasks(make_search, tasks, workers=workers)) as results:
-        for task, outcomes in tqdm(results, what, len(tasks), disable=None):
-            if outcomes is None:
-                raise RunError(f'workers died again and again at one of the {what}; use fewer '
-                               '--workers')
-            found[task] = outcomes
-    return [one for task in tasks for one in found[task]]
+def _named(names: Iterable[str], options: argparse.Namespace) -> list[str]:
+    chosen = [name for name in names if any(text in name for text in options.only)]
+    if not chosen:
+        raise OptionsError('nothing to test: --only must be a part of a name')
+    return chosen
 
 
 def _judge(options: argparse.Namespace) -> None:
     plain = RelocalizerOptions(matching=options.matching, crops='all',
                                min_confidence=options.min_confidence)
-    found: list[Outcome] = run_all(make_search, [
-        Task(place, mode, plain, seed=place.seed)
-        for place in chosen_places(options) for mode in MODES], 'searches', options.workers)
-    for by in (('place', 'mode'), ('mode',)):
-        print(acceptance_table(found, by), end='\n\n')
+    found = _searched(options, [
+        searches.Task(place, mode, plain, seed=place.seed)
+        for place in chosen_places(options) for mode in MODES], ('place', 'mode'), ('mode',))
     if options.out is not None:
-        draw_judged(options.out / 'reliability.png', 'confidence of the best pose', {
-            mode: (np.array([one.confidence for one in found if one.mode == mode]),
-                   np.array([one.right for one in found if one.mode == mode])) for mode in MODES})
+        draw_judged(options.out / 'reliability.png', 'confidence of the best pose',
+                    judged_by(found, 'mode'))
 
 
 def _recorded(options: argparse.Namespace) -> None:
     if not all(0.0 <= one <= 1.0 for one in options.min_confidence):
         raise OptionsError('--min-confidence must be from 0 to 1')
-    tasks = [Task(place, mode, RelocalizerOptions(matching=matching, min_confidence=_LOWEST,
-                                                  crops='all'), *trouble)
-             for place in chosen_places(options) for matching in fit.MATCHINGS for mode in MODES
-             for trouble in (('none', 0.0), (_EXCHANGED, 1.0))]
-    found: list[Outcome] = run_all(make_search, tasks, 'searches', options.workers)
+    found: list[searches.Outcome] = run_all(searches.make_search, [
+        searches.Task(place, mode, RelocalizerOptions(matching=matching, min_confidence=_LOWEST,
+                                             crops='all'), *trouble)
+        for place in chosen_places(options) for matching in fit.MATCHINGS for mode in MODES
+        for trouble in (('none', 0.0), (_EXCHANGED, 1.0))], 'searches', options.workers)
+    # another rule than that of the confidence refuses a pose for certain
+    found = [replace(one, confidence=one.confidence * one.accepted) for one in found]
     here = [one for one in found if one.trouble == 'none']
     # in another place no pose is right
-    there = [one._replace(right=False, trouble='all objects exchanged')
+    there = [replace(one, error_m=inf, nees=inf, trouble='all objects exchanged')
              for one in found if one.trouble != 'none']
     for some, by in ((here, ('place', 'matching', 'mode')), (here, ('matching', 'mode')),
                      (there, ('trouble', 'place')), (there, ('trouble', 'matching', 'mode')),
                      (there, ('trouble',))):
-        print(acceptance_table(some, by, options.min_confidence), end='\n\n')
+        print(confidence_table(some, by, options.min_confidence), end='\n\n')
     if options.out is not None:
         make_folder(options.out)
         (options.out / 'outcomes.json').write_text(
-            json.dumps([one._asdict() for one in (*here, *there)]))
-        draw_judged(options.out / 'reliability.png', 'poses that at least three objects support', {
-            mode: confidences_of([one for one in here if one.mode == mode]) for mode in MODES})
+            json.dumps([asdict(one) for one in (*here, *there)]))
+        draw_judged(options.out / 'reliability.png', 'poses that at least three objects support',
+                    judged_by(here, 'mode'))
 
 
 def _stress(options: argparse.Namespace) -> None:
-    names = [name for name in TROUBLES if any(text in name for text in options.only)]
-    if not names:
-        raise OptionsError('nothing to test: --only must name a trouble')
-    tasks = tasks_of(chosen_places(options), RelocalizerOptions(matching=options.matching), names)
-    print(acceptance_table(run_all(make_search, tasks, 'searches', options.workers),
-                           ('trouble', 'level', 'mode')))
+    _searched(options, searches.tasks_of(
+        chosen_places(options), RelocalizerOptions(matching=options.matching),
+        _named(TROUBLES, options)), ('trouble', 'level', 'mode'))
 
 
 def _families(options: argparse.Namespace) -> None:
-    names = [name for name in FAMILIES if any(text in name for text in options.only)]
-    if not names:
-        raise OptionsError('nothing to test: --only must name a family')
-    tasks: list[Task] = []
-    for name in names:
+    tasks: list[searches.Task] = []
+    for name in _named(FAMILIES, options):
         family = FAMILIES[name]
         searched = RelocalizerOptions(matching=options.matching or (
             'hybrid' if name in BY_LABELS else 'class'))
@@ -139,25 +110,23 @@ def _families(options: argparse.Namespace) -> None:
         worlds = [Simulated(kind, options.first_seed + number)
                   for number in range(ceil(share / (_QUERIES * len(family.kinds))))
                   for kind in family.kinds]
-        own = [task for task in tasks_of([*recorded, *worlds], searched, [name])
+        own = [task for task in searches.tasks_of([*recorded, *worlds], searched, [name])
                if task.mode == ONE or not family.in_order]
         if family.in_order:
             few = worlds[:ceil(share / (_QUERIES * GROUP_SIZE))]
             own += [task._replace(in_order=True)
-                    for task in tasks_of([*recorded, *few], searched, [name])]
+                    for task in searches.tasks_of([*recorded, *few], searched, [name])]
         tasks += [task._replace(seed=task.seed + task.place.seed, most=share) for task in own]
-    found: list[Outcome] = run_all(make_search, tasks, 'searches', options.workers)
-    for by in (('trouble', 'level', 'mode', 'looks'), ('trouble', 'place'), ('trouble', 'looks')):
-        print(false_table(found, by), end='\n\n')
+    _searched(options, tasks, ('trouble', 'level', 'mode', 'looks'), ('trouble', 'place'),
+              ('trouble', 'looks'))
 
 
 def _priors(options: argparse.Namespace) -> None:
-    tasks = [task._replace(seed=task.seed + place.seed) for place in chosen_places(options)
-             for task in tasks_of([place], RelocalizerOptions(matching=options.matching),
-                                  [*PRIORS])]
-    found: list[Outcome] = run_all(make_search, tasks, 'searches', options.workers)
-    for by in (('place', 'trouble', 'level'), ('trouble', 'level')):
-        print(acceptance_table(found, by), end='\n\n')
+    plain = RelocalizerOptions(matching=options.matching)
+    _searched(options, [
+        task._replace(seed=task.seed + place.seed) for place in chosen_places(options)
+        for task in searches.tasks_of([place], plain, [*PRIORS])],
+        ('place', 'trouble', 'level'), ('trouble', 'level'))
 
 
 def _retries(options: argparse.Namespace) -> None:
@@ -172,12 +141,12 @@ def _retries(options: argparse.Namespace) -> None:
                 (RelocalizerOptions.min_confidence, 0.5)):
             plain = RelocalizerOptions(matching=options.matching, min_confidence=least,
                                        k=min(RelocalizerOptions.k, len(its_map)))
-            robots = list(tqdm(retry(its_map, queries, plain, options.seed), name, len(queries),
-                               disable=None))
-            rows.append(retries_row(f'{one.name}, {name}', least, robots))
+            robots = list(tqdm(searches.retry(its_map, queries, plain, options.seed), name,
+                               len(queries), disable=None))
+            rows.append(searches.retries_row(f'{one.name}, {name}', least, robots))
     print(table(['map', 'min_confidence', 'accepted at the first look',
-                 f'within {LOOKS} looks, each alone', f'within {LOOKS} looks that agree',
-                 'more than 1 m off'], rows))
+                 f'within {searches.LOOKS} looks, each alone',
+                 f'within {searches.LOOKS} looks that agree', 'more than 1 m off'], rows))
 
 
 def _fit(options: argparse.Namespace) -> None:
@@ -190,9 +159,8 @@ def _fit(options: argparse.Namespace) -> None:
     if options.out is not None:
         plain = [one for one in searched if one.kind in fit.FITTED_KINDS
                  and not one.case.is_elsewhere]
-        draw_judged(options.out / 'reliability.png', 'worlds, each kind left out of the fit', {
-            mode: fit.judged([one for one in plain if one.mode == mode], calibrations)
-            for mode in MODES})
+        draw_judged(options.out / 'reliability.png', 'worlds, each kind left out of the fit',
+                    judged_by(fit.answers(plain, calibrations), 'mode'))
     fitted = fit.fit([one.case for one in searched if one.kind in fit.FITTED_KINDS],
                      'depth' if options.depth else '')
     print('\nfitted on all of them, for calibration.yaml, objects:\n' + ', '.join(
@@ -205,47 +173,47 @@ def run(arguments: Sequence[str] | None = None) -> int:
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
 
-    def add(name: str, command: object, summary: str, out: str = '') -> argparse.ArgumentParser:
+    def add(name: str, command: object, summary: str, **places: Any) -> argparse.ArgumentParser:
         own = commands.add_parser(name, help=summary, description=summary)
         own.set_defaults(command=command)
-        if out:
-            own.add_argument('--out', type=Path, metavar='DIR', help=f'{out} there')
+        if command is not _fit:
+            add_arguments(own, **places)
         return own
 
     judge = add('judge', _judge, 'precision and recall in simulated worlds or recordings',
-                'draw a reliability diagram')
-    add_arguments(judge, worlds=50)
+                worlds=50)
     judge.add_argument('--min-confidence', type=float, default=RelocalizerOptions.min_confidence)
     recorded = add('recorded', _recorded, 'precision and recall for several min_confidence',
-                   'write outcomes.json and draw a reliability diagram')
-    add_arguments(recorded, fit.FITTED_KINDS, first_seed=1000)
+                   kinds=fit.FITTED_KINDS, first_seed=1000)
     recorded.add_argument('--min-confidence', type=float, nargs='+',
                           default=(0.99, 0.97, 0.95, 0.9))
-    stress = add('stress', _stress, 'false accepts in a list of troubles')
-    add_arguments(stress, ('room', 'office', 'shop'), first_seed=1000)
-    stress.add_argument('--only', nargs='+', default=[''], metavar='TEXT',
-                        help='troubles whose name contains one of these')
-    families = add('families', _families, 'false accepts where many objects share an error')
-    add_arguments(families, first_seed=2000)
+    ordinary = ('room', 'office', 'shop')
+    stress = add('stress', _stress, 'false accepts in a list of troubles', kinds=ordinary,
+                 first_seed=1000)
+    families = add('families', _families, 'false accepts where many objects share an error',
+                   first_seed=2000)
     families.add_argument('--requests', type=positive_int, default=200, metavar='N',
                           help='at each level of a family, in each mode, about (%(default)s)')
     families.add_argument('--quick', dest='requests', action='store_const', const=24,
                           help='few requests')
-    families.add_argument('--only', nargs='+', default=[''], metavar='TEXT',
-                          help='families whose name contains one of these')
     families.add_argument('--matching', choices=fit.MATCHINGS,
                           help='(by labels for changed maps, else by classes)')
-    priors = add('priors', _priors, 'what regions known before add, right and wrong')
-    add_arguments(priors, worlds=20, first_seed=1100)
-    retries = add('retries', _retries, f'{LOOKS} looks of a robot that does not move')
-    add_arguments(retries, ('room', 'office', 'shop'), first_seed=1000)
+    priors = add('priors', _priors, 'what regions known before add, right and wrong', worlds=20,
+                 first_seed=1100)
+    retries = add('retries', _retries, f'{searches.LOOKS} looks of a robot that does not move',
+                  kinds=ordinary, first_seed=1000)
     retries.set_defaults(frames='main')
     retries.add_argument('--seed', type=int, default=0, help='of the changes (%(default)s)')
-    fits = add('fit', _fit, 'the fit of the confidence to simulated worlds',
-               'draw a reliability diagram')
+    fits = add('fit', _fit, 'the fit of the confidence to simulated worlds')
     fits.add_argument('--worlds', type=positive_int, default=24, metavar='N', help='of each kind')
     fits.add_argument('--depth', action='store_true', help='fit the coefficient of depth alone')
     fits.add_argument('--workers', type=positive_int, default=1, metavar='N')
+    for own in (stress, families):
+        own.add_argument('--only', nargs='+', default=[''], metavar='TEXT',
+                         help='what has one of these in its name')
+    for own in (judge, recorded, fits):
+        own.add_argument('--out', type=Path, metavar='DIR',
+                         help='draw a reliability diagram there; recorded: outcomes.json, too')
     for own in (judge, stress, priors, retries):
         own.add_argument('--matching', choices=fit.MATCHINGS, default='hybrid')
     options = parser.parse_args(arguments)

@@ -33,7 +33,7 @@ from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.errors import OptionsError
 from studies.acceptance.places import ALL, MODES, ONE, Simulated
 from studies.acceptance.troubles import FAMILIES, exchange_landmarks
-from studies.reports import Judged, interval
+from studies.reports import Answer, Judged, confidence_table
 
 #: The kinds that fit; the others have places that look alike.
 FITTED_KINDS = ('room', 'office', 'shop', 'bare room')
@@ -46,7 +46,6 @@ _IN_DOUBT = 0.3
 _SHARED = {'B focal length off by a factor': 0.03, 'C map scaled by': 0.05,
            'C half of the map moved by [m]': 0.3, 'A landmarks under other classes, copies': 1}
 _THRESHOLDS = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995)
-_PRECISION = 0.99
 _FIELDS = ('score', 'misfit', 'likeness', 'rarity', 'unlabelled', 'unexplained', 'depth')
 _TERMS = (*_FIELDS, 'none_right', 'map_size', 'vertical')
 # Support must not count against a pose, whatever a small data set says. A larger map has more
@@ -280,45 +279,34 @@ def cross_fitted(searched: Sequence[Searched]) -> dict[str, Calibration]:
                        if one.kind in FITTED_KINDS and one.kind != kind]) for kind in kinds}
 
 
-def judged(searched: Sequence[Searched], calibrations: Mapping[str, Calibration]) -> Judged:
-    """Return confidences and outcomes, by the coefficients for each kind."""
-    parts = [outcomes([one.case for one in searched if one.kind == kind], calibration)
-             for kind, calibration in calibrations.items()
-             if any(one.kind == kind for one in searched)]
-    return (np.concatenate([part[0] for part in parts]),
-            np.concatenate([part[1] for part in parts]))
+@dataclass(frozen=True, kw_only=True)
+class FittedAnswer(Answer):
+    """The leading hypothesis of a case, with its confidence by some coefficients."""
+
+    kind: str
+    mode: str
+    matching: str
+
+
+def answers(searched: Sequence[Searched], calibrations: Mapping[str, Calibration]
+            ) -> list[FittedAnswer]:
+    """Return the answers of searches, by the coefficients for each kind."""
+    found = []
+    for one in searched:
+        (likely,), (right,) = outcomes([one.case], calibrations[one.kind])
+        found.append(FittedAnswer(
+            kind=one.kind, mode=one.mode, matching=one.matching, accepted=False,
+            confidence=float(likely), **({'error_m': 0.0, 'error_deg': 0.0} if right else {})))
+    return found
 
 
 def print_report(searched: Sequence[Searched], calibrations: Mapping[str, Calibration]) -> None:
     """Print precision and recall of each kind, mode and matching, and elsewhere."""
-    here = [one for one in searched if not one.case.is_elsewhere]
+    here = answers([one for one in searched if not one.case.is_elsewhere], calibrations)
     plain = [one for one in here if one.kind in FITTED_KINDS]
-    parts = {f'{kind}, left out': [one for one in here if one.kind == kind]
-             for kind in calibrations}
-    parts |= {f'{mode}, {matching}, kinds that fit, each left out': [
-        one for one in plain if (one.mode, one.matching) == (mode, matching)]
-        for matching in MATCHINGS for mode in MODES}
-    parts |= {'kinds that fit, each left out': plain,
-              'another place, all kinds': [one for one in searched if one.case.is_elsewhere]}
-    for name, some in parts.items():
-        likely, right = judged(some, calibrations)
-        print(f'{name}: {len(right)} poses, {right.sum()} of them within {RIGHT_M:g} m')
-        for least in _THRESHOLDS:
-            accepted = likely >= least
-            false, count = int((accepted & ~right).sum()), int(accepted.sum())
-            print(f'  min_confidence {least:5}: {count:4} accepted, {false} of them wrong, '
-                  f'precision {interval(count - false, count, 3)} (95 %), '
-                  f'recall {(accepted & right).sum() / max(int(right.sum()), 1):.3f}')
-        if right.any():
-            recall, least = best_recall(likely, right)
-            print(f'  best at precision {_PRECISION}: {least:5.3f}, recall {recall:.3f}')
-
-
-def best_recall(likely: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[float, float]:
-    """Return the best recall of any threshold with a precision of .99, and the threshold."""
-    order = np.argsort(-likely, kind='stable')
-    hits = np.cumsum(right[order])
-    precise = np.nonzero(hits >= _PRECISION * np.arange(1, len(hits) + 1))[0]
-    if not len(precise):
-        return 0.0, 1.0
-    return float(hits[precise[-1]] / hits[-1]), float(likely[order[precise[-1]]])
+    there = answers([one for one in searched if one.case.is_elsewhere], calibrations)
+    for name, some, by in (('each kind left out of the fit', here, ['kind']),
+                           ('kinds that fit, each left out', plain, ['mode', 'matching']),
+                           ('kinds that fit, each left out', plain, []),
+                           ('another place, all kinds', there, [])):
+        print(f'{name}\n\n{confidence_table(some, by, _THRESHOLDS)}\n')

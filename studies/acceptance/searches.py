@@ -1,35 +1,40 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Searches over places, modes, matchings and troubles, and the table of what was accepted."""
+"""Searches over places, modes, matchings and troubles; robots that look again and again."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from math import ceil, inf
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.verdict import refusal
 from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.offline.evaluation.figures import within_ellipsoid
 from cliploc_ros.offline.evaluation.methods import AUTO, Method
 from cliploc_ros.offline.evaluation.trials import PosedQuery, run_trial
-from studies.acceptance.fit import best_recall
 from studies.acceptance.places import SEED, AnyPlace, Place
-from studies.acceptance.priors import PRIORS
-from studies.acceptance.troubles import FAMILIES, TROUBLES
-from studies.reports import FAR_DEG, FAR_M, SUCCESS_M, errors_of, grouped, interval, table
+from studies.acceptance.troubles import FAMILIES, PRIORS, TROUBLES, of_rows
+from studies.reports import Answer, interval, judged
 
 #: More queries than any place has.
 MANY = 1_000_000
 #: Looks of one localizer before it can tell that its camera is wrong.
 EARLY_LOOKS = 5
+#: Looks of a robot that does not move.
+LOOKS = 20
+_PERIOD_NS = 100_000_000
+# What a detector does to the same view another time. Guesses.
+_MISSED_SHARE = 0.2
+_SHIFT_SHARE = 0.02  # of the box's sides, standard deviation
 _CHANGES = TROUBLES | PRIORS | FAMILIES
 
 
@@ -46,20 +51,15 @@ class Task(NamedTuple):
     in_order: bool = False  # all frames, by one localizer
 
 
-class Outcome(NamedTuple):
-    """The best pose of one request."""
+@dataclass(frozen=True, kw_only=True)
+class Outcome(Answer):
+    """The answer to one request of a task."""
 
     place: str
     mode: str
     matching: str
     trouble: str
     level: float
-    right: bool  # within 1 m of the truth, where the map shows the place
-    accepted: bool
-    confidence: float
-    error_m: float = inf  # infinite where no pose was found
-    error_deg: float = inf
-    nees: float = inf
     looks: str = 'alone'  # or which of the looks of one localizer this is
 
 
@@ -77,31 +77,35 @@ def search(task: Task) -> list[Outcome]:
     asked = place._replace(is_main=[True] * len(place.frames)) if task.in_order else place
     queries = asked.ask(task.mode, task.seed)
     landmark_map, changed = trouble.change(
-        place.landmark_map, queries[::ceil(len(queries) / task.most)], task.level,
+        place.landmark_map, queries[::max(1, ceil(len(queries) / task.most))], task.level,
         np.random.default_rng(task.seed))
     options = place.options(task.mode, task.options)
     options = replace(options, k=min(options.k, len(landmark_map)))
-    outcome = partial(Outcome, task.place.name, task.mode, options.matching, task.trouble,
-                      task.level)
+    outcome = partial(Outcome, place=task.place.name, mode=task.mode, matching=options.matching,
+                      trouble=task.trouble, level=task.level)
     if task.in_order:
-        return _looks(landmark_map, options, changed, outcome)
-    return [outcome(one.error_m is not None and one.error_m < RIGHT_M, one.accepted,
-                    one.confidence, inf if one.error_m is None else one.error_m,
-                    inf if one.error_deg is None else one.error_deg,
-                    inf if one.nees is None else one.nees)
+        return [outcome(looks='first five' if number < EARLY_LOOKS else 'later', **fields)
+                for number, (fields, _) in enumerate(look_on(
+                    Relocalizer(landmark_map, options), changed))]
+    return [outcome(accepted=one.accepted, confidence=one.confidence,
+                    error_m=inf if one.error_m is None else one.error_m,
+                    error_deg=inf if one.error_deg is None else one.error_deg,
+                    nees=inf if one.nees is None else one.nees)
             for one in run_trial(landmark_map, Method(AUTO, options), 0, changed)]
 
 
-def _looks(landmark_map: LandmarkMap, options: RelocalizerOptions, queries: Sequence[PosedQuery],
-           outcome: Callable[..., Outcome]) -> list[Outcome]:
-    """Return the outcomes of one localizer that has all queries in order, without odometry."""
-    localizer, found = Localizer(Relocalizer(landmark_map, options)), []
-    for number, query in enumerate(queries):
-        result = localizer.answer(Query((query.observation,), run=None))
-        errors = errors_of(result, query.map_from_camera)
-        found.append(outcome(errors[0] < RIGHT_M, result.accepted, result.confidence, *errors,
-                             'first five' if number < EARLY_LOOKS else 'later'))
-    return found
+def look_on(relocalizer: Relocalizer, queries: Iterable[PosedQuery], is_one: bool = True
+            ) -> Iterator[tuple[dict[str, Any], bool]]:
+    """Yield the fields of each answer, and whether the camera is called wrong by then.
+
+    One localizer gets all queries in order, without odometry; or each query gets a new one.
+    """
+    localizer = Localizer(relocalizer)
+    for query in queries:
+        if not is_one:
+            localizer = Localizer(relocalizer)
+        found = localizer.answer(Query((query.observation,), run=None))
+        yield judged(found, query.map_from_camera), bool(localizer.cameras.faults)
 
 
 @lru_cache(maxsize=256)
@@ -117,63 +121,54 @@ def tasks_of(places: Sequence[AnyPlace], options: RelocalizerOptions,
             for mode in _CHANGES[name].modes]
 
 
-def confidences_of(outcomes: Sequence[Outcome]
-                   ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the confidence of each outcome, 0 where another rule refuses it, and if right."""
-    return (np.array([one.confidence * one.accepted for one in outcomes]),
-            np.array([one.right for one in outcomes], dtype=np.bool_))
+@dataclass(frozen=True)
+class Retries:
+    """The looks of one robot, as arrays (LOOKS,): accepted without the others or after them."""
+
+    alone: NDArray[np.bool_]
+    accepted: NDArray[np.bool_]
+    errors_m: NDArray[np.float64]  # infinite where no pose was found
+
+    @property
+    def first_error_m(self) -> float:
+        """Return the error of the first accepted pose, which ends the retries; NaN without."""
+        return float(self.errors_m[np.argmax(self.accepted)]) if self.accepted.any() else np.nan
 
 
-def acceptance_table(outcomes: Sequence[Outcome], by: Sequence[str],
-                     thresholds: Sequence[float] = ()) -> str:
-    """Return what was accepted, as Markdown: a row for each value of some fields.
-
-    A cell has accepted poses, those of them that are wrong by more than 1 m, with the 95 %
-    interval of their share of all requests, and the share of the right poses that is accepted.
-
-    Parameters
-    ----------
-    by : sequence of str
-        Fields; none for one row of all outcomes.
-    thresholds : sequence of float
-        A column for each ``min_confidence``, and one for the greatest recall that any of them
-        reaches at a precision of .99. Without, what the search itself accepted, after the success
-        at .1, .25, .5 and 1 m.
-    """
-    def figures(some: Sequence[Outcome]) -> Iterator[str]:
-        likely, right = confidences_of(some)
-        yield f'{right.sum()} of {len(right)}'
-        if not thresholds:
-            errors_m = np.array([one.error_m for one in some])
-            yield ' '.join(f'{(errors_m < limit).mean():.2f}' for limit in SUCCESS_M)
-        for accepted in [likely >= least for least in thresholds] if thresholds else [
-                np.array([one.accepted for one in some])]:
-            false = int((accepted & ~right).sum())
-            recall = f'{accepted[right].mean():.2f}' if right.any() else '-'
-            yield (f'{accepted.sum()}, {false} ({interval(false, len(some), 4)}); {recall}')
-        if thresholds:
-            yield f'{best_recall(likely, right)[0]:.2f}' if right.any() else '-'
-
-    columns = [f'{least:g}' for least in thresholds] + ['best'] if thresholds \
-        else ['success', 'accepted, wrong (95 % of all); recall']
-    return table([*by, 'within 1 m', *columns],
-                 [[*key, *figures(some)] for key, some in grouped(outcomes, by).items()])
+def retry(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], options: RelocalizerOptions,
+          seed: int = 0) -> Iterator[Retries]:
+    """Let a robot look 20 times at each query; each look misses some boxes and shifts others."""
+    relocalizer, rng = Relocalizer(landmark_map, options), np.random.default_rng(seed)
+    for query in queries:
+        session = Localizer(relocalizer)
+        alone, accepted, errors_m = [], [], []
+        for number in range(LOOKS):
+            look = replace(_flickering(query.observation, rng), odom_from_camera=np.eye(4),
+                           stamp_ns=(number + 1) * _PERIOD_NS)
+            found = session.answer(Query((look,)))
+            accepted.append(found.accepted)
+            alone.append(found.evidence is not None and not refusal(
+                replace(found.evidence, earlier=()), options))
+            errors_m.append(judged(found, query.map_from_camera).get('error_m', inf))
+        yield Retries(np.array(alone), np.array(accepted), np.array(errors_m))
 
 
-def false_table(outcomes: Sequence[Outcome], by: Sequence[str]) -> str:
-    """Return the false accepts as Markdown: a row for each value of some fields.
+def _flickering(observation: Observation, rng: np.random.Generator) -> Observation:
+    """Return an observation without some of its boxes; the others are shifted."""
+    detections = observation.detections
+    rows = np.nonzero(rng.random(len(detections)) > _MISSED_SHARE)[0]
+    sides = np.tile(np.diff(detections.bboxes_xyxy.reshape(-1, 2, 2), axis=1)[:, 0], 2)
+    shifted = detections.bboxes_xyxy + _SHIFT_SHARE * sides * rng.normal(size=sides.shape)
+    return of_rows(replace(observation, detections=replace(detections, bboxes_xyxy=shifted)),
+                   rows)
 
-    With the 95 % intervals of their share of the accepted poses and of all requests, the accepted
-    poses that are far off otherwise, and the share of those within their 95 % ellipsoid.
-    """
-    rows = []
-    for key, some in grouped(outcomes, by).items():
-        accepted = [one for one in some if one.accepted]
-        false = sum(not one.right for one in accepted)
-        rows.append([*key, len(some), sum(one.right for one in some), len(accepted), false,
-                     interval(false, len(accepted)), interval(false, len(some), 3),
-                     sum(one.error_m > FAR_M or one.error_deg > FAR_DEG for one in accepted),
-                     f'{within_ellipsoid(np.array([one.nees for one in accepted])):.2f}'
-                     if accepted else ''])
-    return table([*by, 'n', 'within 1 m', 'accepted', 'false', '95 % of accepted', '95 % of n',
-                  f'{FAR_M:g} m or {FAR_DEG:g} deg off', 'in 95 %'], rows)
+
+def retries_row(name: str, min_confidence: float, robots: Sequence[Retries]) -> list[str]:
+    """Return a row of the table of retries."""
+    counts = [sum(bool(one.accepted[0]) for one in robots),
+              sum(bool(one.alone.any()) for one in robots),
+              sum(bool(one.accepted.any()) for one in robots)]
+    wrong = sum(one.first_error_m > RIGHT_M for one in robots)
+    return [name, f'{min_confidence:g}',
+            *(f'{one} of {len(robots)} ({interval(one, len(robots))})' for one in counts),
+            f'{wrong}']

@@ -1,19 +1,21 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated errors of a map, a detector or a sensor, applied to queries."""
+"""Simulated errors of map, detector, sensors, and of what a robot is told, applied to queries."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.core.acceptance.look_alikes import find_alike
+from cliploc_ros.core.geometry.transforms import RIGHT_M, make_transform
 from cliploc_ros.core.localizer import by_classes
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Detections, Observation, Region
 from cliploc_ros.offline.evaluation.trials import PosedQuery, with_vertical
 from studies import wrong_sensors
 from studies.acceptance.places import ALL, FIVE, LEVEL, ONE, VERTICAL, VERTICAL_DEG
@@ -26,6 +28,11 @@ _MOVED_M = (0.3, 3.0)
 # both differ as a share of the sides, and how far apart its landmarks are [m].
 _SEEN_TWICE, _JITTER, _APART_M = 0.7, 0.02, 0.03
 _ELSEWHERE_M = np.array([1e3, 0.0, 0.0])
+# A wrong region is further from the truth than this, where the map is large enough [m].
+_WRONG_M, _TRIES = 2.5, 50
+# Of a region that the robot is told; deviations of x and y [m] and of the yaw [rad].
+_PROBABILITY = 0.9
+_REGION, _POSE = (1.0, 1.0, 10.0), (0.3, 0.3, np.radians(15.0))
 
 World = tuple[LandmarkMap, Sequence[PosedQuery]]
 #: A change of map and queries by a level, with a generator.
@@ -132,9 +139,7 @@ def confuse_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], 
                                        for row, by in zip(rows, step, strict=True)),
                     class_ids=renamed([landmark_map.class_ids[row] for row in rows], step),
                     centers=landmark_map.centers[rows] + offsets),
-            [replace(one, observation=confused(one.observation),
-                     neighbours=tuple(map(confused, one.neighbours)))
-             for one in _with_columns(queries, rows)])
+            _each_frame(_with_columns(queries, rows), confused))
 
 
 def unmapped_desk(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], level: float,
@@ -180,7 +185,9 @@ def random_detections(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], 
                       rng: np.random.Generator) -> World:
     """Replace the boxes of each query by random ones, each like a random landmark."""
     def drawn(observation: Observation) -> Observation:
-        boxes = _random_boxes(observation, int(count), rng)
+        corners = rng.uniform(0, (observation.camera.width, observation.camera.height),
+                              (int(count), 2))
+        boxes = np.hstack([corners, corners + rng.uniform(*_BOX_SIDE_PX, (int(count), 2))])
         shown, looks = rng.integers(len(landmark_map), size=int(count)), None
         if observation.similarities is not None:
             known = np.asarray(observation.similarities)
@@ -190,9 +197,13 @@ def random_detections(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], 
         return replace(observation, similarities=looks, depths=None, detections=Detections(
             boxes, tuple(landmark_map.class_ids[row] for row in shown), np.full(len(boxes), 0.8)))
 
-    return landmark_map, [replace(query, observation=drawn(query.observation),
-                                  neighbours=tuple(map(drawn, query.neighbours)))
-                          for query in queries]
+    return landmark_map, _each_frame(queries, drawn)
+
+
+def _each_frame(queries: Sequence[PosedQuery], change: Callable[[Observation], Observation]
+                ) -> list[PosedQuery]:
+    return [replace(one, observation=change(one.observation),
+                    neighbours=tuple(map(change, one.neighbours))) for one in queries]
 
 
 def of_rows(observation: Observation, rows: NDArray[np.int64]) -> Observation:
@@ -204,13 +215,6 @@ def of_rows(observation: Observation, rows: NDArray[np.int64]) -> Observation:
         if similarities is None else np.ascontiguousarray(np.asarray(similarities)[rows]))
 
 
-def _random_boxes(observation: Observation, count: int, rng: np.random.Generator
-                  ) -> NDArray[np.float64]:
-    camera = observation.camera
-    corners = rng.uniform(0, (camera.width, camera.height), (count, 2))
-    return np.hstack([corners, corners + rng.uniform(*_BOX_SIDE_PX, (count, 2))])
-
-
 def _with_columns(queries: Sequence[PosedQuery], columns: NDArray[np.int64]) -> list[PosedQuery]:
     """Return queries with the similarities of some landmarks."""
     def chosen(observation: Observation) -> Observation:
@@ -218,8 +222,7 @@ def _with_columns(queries: Sequence[PosedQuery], columns: NDArray[np.int64]) -> 
             observation, similarities=np.ascontiguousarray(
                 np.asarray(observation.similarities)[:, columns]))
 
-    return [replace(one, observation=chosen(one.observation),
-                    neighbours=tuple(map(chosen, one.neighbours))) for one in queries]
+    return _each_frame(queries, chosen)
 
 
 def _with_copies(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
@@ -232,6 +235,54 @@ def _with_copies(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
             _with_columns(queries, rows))
 
 
+def _told(landmark_map: LandmarkMap, query: PosedQuery, spot: NDArray[np.float64],
+          deviations: Sequence[float], rng: np.random.Generator) -> PosedQuery:
+    """Return a query with a region around a spot (3,): x, y and yaw, with an error like that."""
+    region = Region(landmark_map.frame_id, spot + rng.normal(size=3) * deviations,
+                    np.diag(deviations) ** 2, _PROBABILITY)
+    return replace(query, observation=replace(query.observation, region=region))
+
+
+def _spot_of(map_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    body = map_from_camera @ OPTICAL_FROM_BODY
+    return np.array([*body[:2, 3], np.arctan2(body[1, 0], body[0, 0])])
+
+
+def tell(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], wrong: float,
+         rng: np.random.Generator, deviations: Sequence[float]) -> World:
+    """Tell each query where it is; a share of them is told another spot of the map."""
+    low, high = landmark_map.centers[:, :2].min(axis=0), landmark_map.centers[:, :2].max(axis=0)
+    found = []
+    for query in queries:
+        spot = _spot_of(query.map_from_camera)
+        if rng.random() < wrong:
+            others = np.c_[rng.uniform(low, high, (_TRIES, 2)), rng.uniform(-np.pi, np.pi, _TRIES)]
+            away = np.linalg.norm(others[:, :2] - spot[:2], axis=1)
+            far = np.nonzero(away > _WRONG_M)[0]
+            spot = others[far[0] if len(far) else int(away.argmax())]
+        found.append(_told(landmark_map, query, spot, deviations, rng))
+    return landmark_map, found
+
+
+def tell_twin(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], wrong: float,
+              rng: np.random.Generator, deviations: Sequence[float] = ()) -> World:
+    """Keep the queries whose place has a twin; each is told, where there are deviations, the twin.
+
+    The worst case: the map cannot tell the two, and what is told is wrong.
+    """
+    found = []
+    for query in queries:
+        alike = find_alike(landmark_map, query.map_from_camera[:3, 3])
+        twins = [move @ query.map_from_camera for move in alike.moves]
+        twins = [one for one in twins if np.linalg.norm(
+            one[:2, 3] - query.map_from_camera[:2, 3]) > RIGHT_M]
+        if twins and len(deviations):
+            found.append(_told(landmark_map, query, _spot_of(twins[0]), deviations, rng))
+        elif twins:
+            found.append(query)
+    return landmark_map, found
+
+
 class Trouble(NamedTuple):
     """A change, its levels, and the modes in which it matters."""
 
@@ -242,10 +293,14 @@ class Trouble(NamedTuple):
     in_order: bool = False  #: Whether it concerns a camera, so that several looks may tell
 
 
-def _of_sensor(change: Callable[[Sequence[PosedQuery], float], Sequence[PosedQuery]]) -> Change:
-    return lambda landmark_map, queries, level, rng: (landmark_map, change(queries, level))
+def _of_sensor(change: wrong_sensors.Change, levels: tuple[float, ...], modes: tuple[str, ...],
+               in_order: bool = False) -> Trouble:
+    """Return the trouble of a sensor that is wrong."""
+    return Trouble(lambda landmark_map, queries, level, rng: (
+        landmark_map, change(queries, level)), levels, modes, in_order=in_order)
 
 
+_DEPTH = partial(_of_sensor, modes=(ONE, LEVEL))
 #: What is wrong, and the robot does not know.
 TROUBLES = {
     'none': Trouble(unchanged, modes=(ONE, LEVEL, FIVE, ALL)),
@@ -255,34 +310,17 @@ TROUBLES = {
     'every landmark twice, apart by [m]': Trouble(double_landmarks, (0.01, 0.1)),
     'two identical rooms, apart by [m]': Trouble(add_equal_room, (2.0,)),
     'share of the objects moved by .3 to 3 m': Trouble(move_objects, (0.4,)),
-    'mount off by [degrees]': Trouble(_of_sensor(wrong_sensors.wrong_mount), (5.0,),
-                                      (LEVEL, FIVE, ALL)),
-    'vertical off by [degrees]': Trouble(_of_sensor(wrong_sensors.tilted_vertical), (10.0,),
-                                         (LEVEL, ALL)),
-    'depth too large by a factor': Trouble(_of_sensor(wrong_sensors.scaled_depth),
-                                           (1000.0, 1.15, 1.0 / 1.15), (ONE, LEVEL)),
-    'share of the depths that are random': Trouble(_of_sensor(wrong_sensors.random_depth),
-                                                   (1.0,), (ONE, LEVEL)),
-    'share of the depths of something else': Trouble(_of_sensor(wrong_sensors.depth_elsewhere),
-                                                     (1.0,), (ONE, LEVEL)),
-    'share of the depths that are missing': Trouble(_of_sensor(wrong_sensors.missing_depth),
-                                                    (0.5, 1.0), (ONE, LEVEL)),
-    'odometry too long by a factor': Trouble(_of_sensor(wrong_sensors.scaled_odometry), (1.2, 0.8),
-                                             (FIVE, ALL))}
+    'mount off by [degrees]': _of_sensor(wrong_sensors.wrong_mount, (5.0,), (LEVEL, FIVE, ALL)),
+    'vertical off by [degrees]': _of_sensor(wrong_sensors.tilted_vertical, (10.0,), (LEVEL, ALL)),
+    'depth too large by a factor': _DEPTH(wrong_sensors.scaled_depth,
+                                          (1000.0, 1.15, 1.0 / 1.15)),
+    'share of the depths that are random': _DEPTH(wrong_sensors.random_depth, (1.0,)),
+    'share of the depths of something else': _DEPTH(wrong_sensors.depth_elsewhere, (1.0,)),
+    'share of the depths that are missing': _DEPTH(wrong_sensors.missing_depth, (0.5, 1.0)),
+    'odometry too long by a factor': _of_sensor(
+        wrong_sensors.scaled_odometry, (1.2, 0.8), (FIVE, ALL))}
 _BOTH = (ONE, VERTICAL)
-_OF_CAMERA: dict[str, tuple[Callable[[Sequence[PosedQuery], float], Sequence[PosedQuery]],
-                            tuple[float, ...]]] = {
-    'boxes in pixels of a middle crop of [px]': (wrong_sensors.middle_crop, (300.0, 416.0)),
-    'boxes scaled by': (wrong_sensors.scaled_boxes, (0.5, 1.5, 2.0)),
-    'boxes shifted by a share of the width': (wrong_sensors.shifted_boxes, (0.05, 0.15)),
-    'boxes turned by [degrees]': (wrong_sensors.turned_boxes, (90.0, 180.0)),
-    'boxes mirrored': (wrong_sensors.mirrored_boxes, (0.0, 1.0)),
-    'boxes of convention': (wrong_sensors.of_convention,
-                            tuple(map(float, range(len(wrong_sensors.CONVENTIONS))))),
-    'K scaled by': (wrong_sensors.scaled_camera, (2.0, 0.5)),
-    'focal length off by a factor': (wrong_sensors.scaled_focal, (1.5, 0.7)),
-    'principal point off by a share of the width': (wrong_sensors.shifted_center, (0.2, -0.2)),
-    'fisheye taken for a pinhole': (wrong_sensors.fisheye_boxes, (0.0,))}
+_CAMERA = partial(_of_sensor, modes=_BOTH, in_order=True)
 #: Errors that many objects share, by their kind: A in the map of one thing, B in the input, C in
 #: the whole map.
 FAMILIES = {
@@ -294,12 +332,22 @@ FAMILIES = {
     'A things on one line': Trouble(unchanged, (0.0,), _BOTH, ('row',)),
     'A landmarks under other classes, copies': Trouble(confuse_landmarks, (1, 2, 3), _BOTH),
     'A unmapped desk': Trouble(unmapped_desk, (0.0,), _BOTH, ('one desk', 'office', 'room')),
-    **{f'B {name}': Trouble(_of_sensor(change), levels, _BOTH, in_order=True)
-       for name, (change, levels) in _OF_CAMERA.items()},
-    'B odometry too long by a factor': Trouble(_of_sensor(wrong_sensors.scaled_odometry),
-                                               (1.2, 0.8), (FIVE,)),
-    'B mount off by [degrees]': Trouble(_of_sensor(wrong_sensors.wrong_mount), (5.0,),
-                                        (VERTICAL, FIVE)),
+    'B boxes in pixels of a middle crop of [px]': _CAMERA(wrong_sensors.middle_crop,
+                                                          (300.0, 416.0)),
+    'B boxes scaled by': _CAMERA(wrong_sensors.scaled_boxes, (0.5, 1.5, 2.0)),
+    'B boxes shifted by a share of the width': _CAMERA(wrong_sensors.shifted_boxes, (0.05, 0.15)),
+    'B boxes turned by [degrees]': _CAMERA(wrong_sensors.turned_boxes, (90.0, 180.0)),
+    'B boxes mirrored': _CAMERA(wrong_sensors.mirrored_boxes, (0.0, 1.0)),
+    'B boxes of convention': _CAMERA(wrong_sensors.of_convention, tuple(
+        map(float, range(len(wrong_sensors.CONVENTIONS))))),
+    'B K scaled by': _CAMERA(wrong_sensors.scaled_camera, (2.0, 0.5)),
+    'B focal length off by a factor': _CAMERA(wrong_sensors.scaled_focal, (1.5, 0.7)),
+    'B principal point off by a share of the width': _CAMERA(wrong_sensors.shifted_center,
+                                                             (0.2, -0.2)),
+    'B fisheye taken for a pinhole': _CAMERA(wrong_sensors.fisheye_boxes, (0.0,)),
+    'B odometry too long by a factor': _of_sensor(
+        wrong_sensors.scaled_odometry, (1.2, 0.8), (FIVE,)),
+    'B mount off by [degrees]': _of_sensor(wrong_sensors.wrong_mount, (5.0,), (VERTICAL, FIVE)),
     'C equal rooms, own out of date by a share': Trouble(add_aged_twin, (0.1, 0.2, 0.3), _BOTH),
     'C equal rooms, other out of date by a share': Trouble(add_aged_twin, (-0.2,), _BOTH),
     'C like rooms, own out of date by a share': Trouble(age_half, (0.1, 0.2, 0.3), _BOTH,
@@ -312,3 +360,10 @@ FAMILIES = {
     'C half of the map turned by [degrees]': Trouble(_distorted(_half_turned), (10.0,), _BOTH)}
 #: Classes alone accept too little in these to tell.
 BY_LABELS = [name for name in FAMILIES if name.startswith('C')]
+#: What the robot is told, and the share of queries for which that is wrong.
+PRIORS = {
+    'nothing told': Trouble(unchanged),
+    'region of 1 m': Trouble(partial(tell, deviations=_REGION), (0.0, 0.1, 1.0)),
+    'pose to .3 m and 15 degrees': Trouble(partial(tell, deviations=_POSE), (0.0, 0.1, 1.0)),
+    'a twin exists, nothing told': Trouble(tell_twin),
+    'a twin exists, told the twin': Trouble(partial(tell_twin, deviations=_POSE), (1.0,))}

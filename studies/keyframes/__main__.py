@@ -11,6 +11,8 @@ each room would accept by what the others fit.
 
 import argparse
 import sys
+from collections import Counter
+from collections.abc import Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -20,11 +22,10 @@ from tqdm import tqdm
 from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.parallel import run_tasks
+from studies.keyframes import verdicts
 from studies.keyframes.cases import cases
-from studies.keyframes.fit import GENUINE, POINTS, fit, left_out, make_rows, paste, report
-from studies.keyframes.judge import WAYS, confidences_by_way, make_judge, table
 from studies.keyframes.records import make_collect, read_places
-from studies.reports import draw_judged
+from studies.reports import answer_table, draw_judged, judged_by, run_all
 
 _FAMILIES = list(dict.fromkeys(name.partition(':')[0] for name in cases()))
 
@@ -44,36 +45,44 @@ def _collect(options: argparse.Namespace) -> int:
     return 0
 
 
+def _stored(options: argparse.Namespace) -> list[Path]:
+    """Return the files of the chosen records, case by case."""
+    order = list(cases())
+    paths = [path for path in options.out.glob('cases/*/*.pickle')
+             if path.stem.partition(':')[0] in options.families
+             and any(text in path.parent.name for text in options.places)]
+    if not paths:
+        raise OptionsError(f'{options.out}: no such records here; collect them first')
+    return sorted(paths, key=lambda path: (order.index(path.stem), path.parent.name))
+
+
 def _fit(options: argparse.Namespace) -> int:
-    paths = [path for path in sorted(options.out.glob('cases/*/*.pickle'))
-             if path.stem.partition(':')[0] in options.families]
-    found = [result for _, result in run_tasks(make_rows, paths, workers=options.workers)
-             if result]
+    found: list[tuple[list[verdicts.Row], list[verdicts.Row]]] = run_all(
+        verdicts.make_rows, _stored(options), 'cases', options.workers)
     places, signs = ([row for rows in found for row in rows[part]] for part in range(2))
     if len({one.site for one in places}) < 2:
         raise OptionsError(f'{options.out}: records of two rooms are needed; collect them first')
     for rows in (places, signs):
-        print('\n'.join([*report(rows, left_out(rows)), '']))
-    print('\n'.join([*paste('keyframes', POINTS, fit(places)),
-                     *paste('genuine', GENUINE, fit(signs))]))
+        print(answer_table(verdicts.left_out(rows), ['case']), end='\n\n')
+    print('\n'.join([*verdicts.paste('keyframes', verdicts.POINTS, verdicts.fit(places)),
+                     *verdicts.paste('genuine', verdicts.GENUINE, verdicts.fit(signs))]))
     return 0
 
 
 def _judge(options: argparse.Namespace) -> int:
-    paths = sorted(options.out.glob('cases/*/*.pickle'))
-    found = [one for _, result in run_tasks(
-        partial(make_judge, options.ways), paths, workers=options.workers)
-             for one in result or () if one.family in options.families
-             and any(text in one.place for text in options.places)]
-    if not found:
-        raise OptionsError(f'{options.out}: no such records here; collect them first')
-    order = list(cases())
-    found.sort(key=lambda one: (order.index(one.case), one.place, one.number))
+    found: list[verdicts.Outcome] = run_all(
+        partial(verdicts.make_judge, options.ways), _stored(options), 'cases', options.workers)
     for by in options.by or [['family'], ['case']]:
-        print('\n'.join([*table(found, by), '']))
+        print(answer_table(found, [*by, 'way', 'truth'], refused=_refused), end='\n\n')
     if options.figure:
-        draw_judged(options.figure, '', confidences_by_way(found))
+        draw_judged(options.figure, '', judged_by(
+            (one for one in found if one.confidence > 0.0 and not one.truth), 'way'))
     return 0
+
+
+def _refused(outcomes: Sequence[verdicts.Outcome]) -> str:
+    kinds = Counter(one.refusal for one in outcomes if one.refusal).most_common()
+    return ', '.join(f'{count} {kind}' for kind, count in kinds)
 
 
 def main() -> int:
@@ -102,8 +111,8 @@ def main() -> int:
     fits.set_defaults(command=_fit)
     judges = commands.add_parser('judge', parents=[common], help='decide, and print tables')
     judges.set_defaults(command=_judge)
-    judges.add_argument('--ways', nargs='+', default=WAYS, choices=WAYS, metavar='WAY',
-                        help=f'what answers: {", ".join(WAYS)} (all)')
+    judges.add_argument('--ways', nargs='+', default=verdicts.WAYS, choices=verdicts.WAYS,
+                        metavar='WAY', help=f'what answers: {", ".join(verdicts.WAYS)} (all)')
     judges.add_argument('--by', nargs='+', action='append',
                         choices=['site', 'place', 'family', 'case'],
                         help='what a line of a table is about (a table by family, one by case)')

@@ -2,40 +2,34 @@
 # SPDX-License-Identifier: Apache-2.0
 """Map places, and collect what objects and keyframes say about each query, without a verdict."""
 
-import hashlib
 import pickle
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.keyframes import features
 from cliploc_ros.core.keyframes.features import DIMENSIONS, Features
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import (
     NOTHING_KNOWN,
     ImageRecognizer,
     KeyframeLocalizer,
-    query_features,
 )
 from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.core.search.scene import Constraint
-from cliploc_ros.files.storage import make_folder, write_file
-from cliploc_ros.models.profiles import load_detector
-from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
-from cliploc_ros.offline.datasets.folders import FolderOptions, rgbd_frames, tum_frames
-from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, RawFrame
+from cliploc_ros.offline.datasets.folders import tum_frames
+from cliploc_ros.offline.datasets.frames import RawFrame
 from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.mapping.building import build_map
@@ -46,7 +40,6 @@ from demo import ASSETS
 from studies.keyframes.cases import (
     Case,
     Floats,
-    Image,
     Place,
     Query,
     Rng,
@@ -54,6 +47,7 @@ from studies.keyframes.cases import (
     cases,
     make_query,
 )
+from studies.rooms.rooms import Looker, frames_of_raws, keep, open_folder, posed
 
 # Of a rendered room: what is mapped, what is asked, and where second looks come from.
 _ROOM_WALKS = (('mapping', 'viewpoints', 'viewpoints_aside'),
@@ -119,34 +113,6 @@ def localize(landmark_map: LandmarkMap, options: RelocalizerOptions,
     return found
 
 
-class Looker:
-    """Detector and features; what they say of each image is kept in a folder."""
-
-    def __init__(self, folder: Path, model: str) -> None:
-        self._folder, self._model = folder, model
-        self._detector: ObjectDetector | None = None
-        self._code = hashlib.sha256(Path(features.__file__).read_bytes()).hexdigest()[:8]
-
-    def detect(self, image_rgb: Image) -> Detections:
-        """Return the boxes in an image, as an ObjectDetector does."""
-        def find() -> Detections:
-            self._detector = self._detector or load_detector(
-                DetectorOptions(self._model, conf=0.25))
-            return self._detector.detect(image_rgb)
-        return Detections(*self._kept(image_rgb, Path(self._model).stem, find))
-
-    def features(self, image_rgb: Image) -> Features:
-        """Return the features of an image."""
-        return Features(*self._kept(image_rgb, self._code, lambda: query_features(image_rgb)))
-
-    def _kept(self, image_rgb: Image, what: str, find: Callable[[], Any]) -> tuple[Any, ...]:
-        digest = hashlib.sha256(image_rgb.tobytes()).hexdigest()[:24]
-        path = self._folder / digest[:2] / f'{digest}.{what}.pickle'
-        if not path.exists():
-            _keep(path, tuple(vars(find()).values()))
-        return tuple(pickle.loads(path.read_bytes()))
-
-
 def make_collect(out: Path, places: Sequence[Place], queries: int
                  ) -> Callable[[tuple[Place, str]], None]:
     """Return what collects the records of a case at a place, or builds the place: without one.
@@ -183,7 +149,7 @@ def make_collect(out: Path, places: Sequence[Place], queries: int
                 records[number] = _ask(number, case, query, world.landmark_map, localizer, looker,
                                        rng)
         if len(records) > len(stored):
-            _keep(path, StoredCase(place.name, name, world.landmark_map, replace(
+            keep(path, StoredCase(place.name, name, world.landmark_map, replace(
                 world.layer, descriptors=np.empty((0, DIMENSIONS), np.uint8)),
                 tuple(records.values())))
     return collect
@@ -193,23 +159,16 @@ def _build(place: Place, folder: Path, looker: Looker) -> tuple[LandmarkMap, Key
     """Return map and layer of a place; the first time, they are made and kept."""
     path = folder / f'{place.name.replace("/", ".")}.pickle'
     if not path.exists():
-        frames = Frames(Path(place.name), len(place.mapped), lambda is_wanted: (
-            raw for raw in place.mapped
-            if is_wanted(raw.place, raw.stamp_ns, raw.map_from_camera)))
+        frames = frames_of_raws(Path(place.name), place.mapped)
         landmark_map = build_map(
             record_every_frame(frames, RunNetworks(looker.detect)).detections).landmark_map \
             if place.map_file is None else LandmarkMap.from_file(place.map_file)
         layer = build_layer(frames, landmark_map, LayerOptions(0.0, 0.0))
         print(f'{place.name}: {len(landmark_map)} landmarks, {len(layer)} keyframes, '
               f'{len(layer.points)} points', flush=True)
-        _keep(path, (landmark_map, layer))
+        keep(path, (landmark_map, layer))
     landmark_map, layer = pickle.loads(path.read_bytes())
     return landmark_map, layer
-
-
-def _keep(path: Path, what: Any) -> None:
-    make_folder(path.parent)
-    write_file(path, lambda partial: partial.write_bytes(pickle.dumps(what)))
 
 
 def _ask(number: int, case: Case, query: Query, landmark_map: LandmarkMap,
@@ -245,18 +204,16 @@ def read_places(where: str, model: str) -> Iterator[Place]:
     model : str
         Weights of YOLO for real images.
     """
-    path, _, unit = where.partition('@')
-    folder = Path(path)
+    folder = Path(where)
     if (folder / 'mapping').is_dir():
         for walks in _ROOM_WALKS:
             yield Place(folder.name, f'{folder.name}/{walks[1]}', str(ASSETS / 'yolo.pt'),
                         _walk(folder / walks[0]), _walk(folder / walks[1]),
                         _walk(folder / walks[2]), folder / 'map.yaml')
         return
+    folder, frames, _ = open_folder(where)
     map_file = folder / 'map.yaml' if (folder / 'map.yaml').exists() else None
-    depth = DepthFormat(float(unit) if unit else None)
-    raws = _walk(folder) if map_file else _posed(rgbd_frames(
-        folder, FolderOptions(depth=depth, level=not (folder / 'rgb.txt').exists())))
+    raws = _walk(folder) if map_file else posed(frames)
     rows = np.arange(len(raws))
     parts = {'interleaved': rows % 2 == 0, 'first half': rows < len(raws) // 2,
              'second half': rows >= len(raws) // 2}
@@ -268,8 +225,4 @@ def read_places(where: str, model: str) -> Iterator[Place]:
 
 def _walk(folder: Path) -> tuple[RawFrame, ...]:
     """Return the images of a TUM folder, without depth."""
-    return _posed(tum_frames(read_tum(folder), find_camera(None, folder)[0]))
-
-
-def _posed(frames: Frames) -> tuple[RawFrame, ...]:
-    return tuple(frames.read_raw(lambda place, stamp_ns, pose: pose is not None))
+    return posed(tum_frames(read_tum(folder), find_camera(None, folder)[0]))

@@ -10,28 +10,32 @@ each accepted pose is false; a folder of ``images`` without poses serves for tha
 are matched by classes. The vertical is that of accelerometer.txt where a folder has one, else the
 true one with an error of 1 degree.
 
-Writes rooms.html with tables and pictures, and outcomes.json.
+Prints tables, and writes outcomes.json.
 """
 
 import argparse
 import json
 import sys
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
+from itertools import pairwise
+from math import inf
 from pathlib import Path
 
-from tqdm import tqdm
+import numpy as np
 
 from cliploc_ros.command import not_negative, positive_int, run_command
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.files.storage import make_folder, write_text
-from studies.rooms.asking import KNOWN, Answers, make_ask, tasks_of
-from studies.rooms.page import write_page
-from studies.rooms.rooms import ROBOT, RoomOptions, read_room
-from studies.rooms.tables import tables
+from studies.blame import CAUSES
+from studies.reports import answer_table, run_all, table
+from studies.rooms import asking
+from studies.rooms.rooms import ROBOT, Room, RoomOptions, read_room
 
 _KINDS = 'in turn', 'halves', 'directions', 'heights', ROBOT
+# Bounds of the confidences that are counted together.
+_BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, inf)
 
 
 def run() -> int:
@@ -47,8 +51,8 @@ def run() -> int:
                         help=f'of splits: {", ".join(_KINDS)} (all)')
     parser.add_argument('--images', type=positive_int, default=10_000, metavar='N',
                         help='the most images that a part is asked (all)')
-    parser.add_argument('--known', nargs='+', choices=KNOWN, default=KNOWN, metavar='WHAT',
-                        help=f'besides the image: {", ".join(KNOWN)} (all)')
+    parser.add_argument('--known', nargs='+', choices=asking.KNOWN, default=asking.KNOWN,
+                        metavar='WHAT', help=f'besides the image: {", ".join(asking.KNOWN)} (all)')
     parser.add_argument('--elsewhere', type=int, default=20, metavar='N',
                         help="images of each other room that a part's map is asked (%(default)s)")
     parser.add_argument('--baseline', action='store_true', help='SIFT with PnP, too')
@@ -68,20 +72,71 @@ def run() -> int:
         for room in rooms:
             if room.has_poses:
                 room.by_robot  # noqa: B018
-    tasks = [task for room in rooms
-             for task in tasks_of(room, options.kinds, options.images, options.elsewhere,
-                                  options.known)]
-    found: list[Answers] = [answers for _, answers in tqdm(run_tasks(
-        partial(make_ask, options.folders, reading, options.baseline), tasks,
-        workers=options.workers), 'parts', len(tasks), disable=None) if answers is not None]
-    found.sort(key=lambda one: tasks.index(one.task))
-    text = tables(found, rooms)
-    print(text)
+    asked = asking.AskOptions(options.images, options.elsewhere, options.known, options.baseline)
+    found: list[asking.Answers] = run_all(
+        partial(asking.make_ask, options.folders, reading, asked),
+        [asking.Task(room.name, kind, part) for room in rooms for kind, part, *_ in room.parts()
+         if kind in options.kinds], 'parts', options.workers)
+    for heading, text in _tables(found, rooms):
+        print(f'## {heading}\n\n{text}\n')
     write_text(options.out / 'outcomes.json', json.dumps(
         [asdict(outcome) for one in found for outcome in one.outcomes], indent=0))
-    write_page(options.out / 'rooms.html', found, rooms, text)
-    print(f'wrote {options.out / "rooms.html"}')
     return 0
+
+
+def _tables(answers: Sequence[asking.Answers], rooms: Sequence[Room]) -> Iterator[tuple[str, str]]:
+    """Yield all tables with their headings, ways and what is known in their own order."""
+    failures = [(one.task.room, one.task.part, one.failure) for one in answers if one.failure]
+    if failures:
+        yield 'Not mapped', table(['room', 'part', 'why'], failures)
+    outcomes = sorted((one for answer in answers for one in answer.outcomes), key=lambda one: (
+        [room.name for room in rooms].index(one.room), asking.WAYS.index(one.way),
+        asking.KNOWN.index(one.known)))
+    here = [one for one in outcomes if one.is_here]
+    objects = [one for one in here if one.way == asking.OBJECTS]
+    yield 'Rooms', _room_table(answers, rooms)
+    yield 'Success and acceptance', answer_table(here, ['room', 'kind', 'way', 'known'])
+    yield 'All splits of a room', answer_table(here, ['room', 'way', 'known'])
+    posed = [one for one in here if one.error_m < inf and one.way != asking.SIFT]
+    for by in (['source'], ['source', 'room']):
+        yield f'Poses by {" and ".join(by)}; of each confidence those that are right', \
+            answer_table(posed, by, **{f'from_{low:g}_on': _share_right(low, high)
+                                       for low, high in pairwise(_BINS)})
+    elsewhere = [one for one in outcomes if not one.is_here]
+    yield 'Images of other rooms: all accepted are false', '\n\n'.join(
+        answer_table(elsewhere, by) for by in (['room', 'way'], ['way']))
+    yield 'Why objects fail by more than .5 m', answer_table(
+        [one for one in objects if one.known == asking.NOTHING], ['room', 'kind'],
+        **{cause: _count(cause) for cause in CAUSES})
+    yield 'Boxes that an image needs', answer_table(
+        sorted(objects, key=lambda one: one.boxes_from), ['room', 'known', 'boxes_from'])
+
+
+def _share_right(low: float, high: float) -> Callable[[Sequence[asking.Outcome]], str]:
+    """Return the column of the share that is right, of poses of some confidence."""
+    def share(outcomes: Sequence[asking.Outcome]) -> str:
+        own = [one.right for one in outcomes if low <= one.confidence < high]
+        return f'{np.mean(own):.2f} of {len(own)}' if own else ''
+
+    return share
+
+
+def _count(cause: str) -> Callable[[Sequence[asking.Outcome]], int]:
+    return lambda outcomes: sum(one.cause == cause for one in outcomes)
+
+
+def _room_table(answers: Sequence[asking.Answers], rooms: Sequence[Room]) -> str:
+    rows = []
+    for room in rooms:
+        maps = [one for one in answers if one.task.room == room.name and one.landmarks]
+        boxes = np.diff(room.detections.frame_offsets)
+        size = np.ptp(room.detections.map_from_camera[:, :3, 3], axis=0)
+        rows.append((room.name, len(room), f'{boxes.mean():.1f}', f'{np.mean(boxes >= 3):.2f}',
+                     ' x '.join(f'{one:.1f}' for one in size), *(
+                         f'{min(counts)} to {max(counts)}' if counts else '' for counts in (
+                             [one.landmarks for one in maps], [one.keyframes for one in maps]))))
+    return table(['room', 'images', 'boxes an image', 'with three or more', 'path [m]',
+                  'landmarks of a part', 'keyframes of a part'], rows)
 
 
 if __name__ == '__main__':

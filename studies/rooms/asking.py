@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
-from math import inf
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -15,7 +14,6 @@ import numpy as np
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.localization import ImageRecognizer, KeyframeLocalizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import MappingError
@@ -23,32 +21,46 @@ from cliploc_ros.offline.evaluation.trials import PosedQuery
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from studies.blame import blame
-from studies.reports import errors_of
+from studies.reports import Answer, judged
 from studies.rooms.baseline import SiftMap
-from studies.rooms.rooms import ROBOT, Room, RoomOptions, known_of, read_room
+from studies.rooms.rooms import (
+    ROBOT,
+    Room,
+    RoomOptions,
+    known_of,
+    read_room,
+    without_boxes,
+)
 
 #: What answers.
 WAYS = OBJECTS, KEYFRAMES, BOTH, SIFT = 'objects', 'keyframes', 'both', 'SIFT with PnP'
 #: What is known besides the image. Keyframes do not use depth.
 KNOWN = NOTHING, VERTICAL, DEPTH, ALL = '-', 'vertical', 'depth', 'vertical, depth'
-_NO_BOXES = Detections(np.empty((0, 4)), (), np.empty(0))
+# Numbers of boxes that are counted together, from each on.
+_BOXES = (0, 3, 4, 5, 7)
 # A failure by objects is one beyond this error, and is blamed on something [m].
 _FAILED_M = 0.5
 
 
 class Task(NamedTuple):
-    """A part of a room, by its name, and how many images to ask of its map at most."""
+    """A part of a room, by its name."""
 
     room: str
     kind: str
     part: str
+
+
+class AskOptions(NamedTuple):
+    """How many images to ask of a map at most, and how."""
+
     images: int  # of the rest of the room
     elsewhere: int  # of each other room
-    known: tuple[str, ...] = KNOWN  # in turn
+    known: Sequence[str]  # in turn
+    with_sift: bool
 
 
-@dataclass(frozen=True)
-class Outcome:
+@dataclass(frozen=True, kw_only=True)
+class Outcome(Answer):
     """The best pose of one query in one way."""
 
     room: str
@@ -58,22 +70,21 @@ class Outcome:
     number: int  #: Of the image in its room
     way: str
     known: str
-    error_m: float  #: Infinite without a pose, and in another room
-    error_deg: float
-    accepted: bool
-    confidence: float
-    nees: float
     source: str
     reason: str
     boxes: int
     inliers: int
     cause: str = ''  #: What the failure of objects is blamed on
-    classes: tuple[str, ...] = ()  #: Of the objects that support an accepted pose
 
     @property
     def is_here(self) -> bool:
         """Return whether the image is of the mapped room."""
         return self.asked == self.room
+
+    @property
+    def boxes_from(self) -> int:
+        """Return the least number of boxes of those that are counted with this one."""
+        return max(one for one in _BOXES if one <= self.boxes)
 
 
 @dataclass(frozen=True)
@@ -81,22 +92,22 @@ class Answers:
     """All outcomes of a part, and what it was mapped to."""
 
     task: Task
-    landmark_map: LandmarkMap | None = None
+    landmarks: int = 0
     keyframes: int = 0
     outcomes: tuple[Outcome, ...] = ()
     failure: str = ''  #: Why there is no map
 
 
-def make_ask(folders: Sequence[str], options: RoomOptions, with_sift: bool
-             ) -> Callable[[Task], Answers]:
+def make_ask(folders: Sequence[str], reading: RoomOptions, options: AskOptions
+             ) -> Callable[[Task], list[Answers]]:
     """Return the function that maps a part and asks its map, for a worker."""
     cv2.setNumThreads(1)
 
     @lru_cache
     def rooms() -> dict[str, Room]:
-        return {room.name: room for room in (read_room(one, options) for one in folders)}
+        return {room.name: room for room in (read_room(one, reading) for one in folders)}
 
-    def ask(task: Task) -> Answers:
+    def ask(task: Task) -> list[Answers]:
         room = rooms()[task.room]
         mapped, asked = next((mapped, asked) for _, part, mapped, asked in room.parts()
                              if part == task.part)
@@ -104,76 +115,62 @@ def make_ask(folders: Sequence[str], options: RoomOptions, with_sift: bool
             landmark_map = build_map(room.detections.select_frames(mapped)).landmark_map
             layer = build_layer(room.frames.select(mapped.tolist()), landmark_map, LayerOptions())
         except MappingError as error:
-            return Answers(task, failure=str(error))
+            return [Answers(task, failure=str(error))]
         keyframes, sift = KeyframeLocalizer(layer), None
-        if with_sift and room.has_depth:
+        if options.with_sift and room.has_depth:
             sift = SiftMap(room.raws[row].decode() for row in mapped)
         asking = room.by_robot if task.kind == ROBOT else room
-        if len(asked) > task.images:  # evenly spread over the time
-            asked = asked[np.linspace(0, len(asked) - 1, task.images).astype(np.int64)]
+        if len(asked) > options.images:  # evenly spread over the time
+            asked = asked[np.linspace(0, len(asked) - 1, options.images).astype(np.int64)]
         found = [one for row in asked for one in _ask_here(
-            task, asking, landmark_map, keyframes, sift, asking.queries[row])]
+            task, options.known, asking, landmark_map, keyframes, sift, asking.queries[row])]
         rng = np.random.default_rng(len(task.part))
         for other in rooms().values():
             if other.name != room.name:
-                some = rng.permutation(len(other))[:task.elsewhere]
-                found += [one for row in some for one in _ask_elsewhere(
-                    task, other, landmark_map, keyframes, other.queries[row])]
-        return Answers(task, landmark_map, len(layer), tuple(found))
+                some = rng.permutation(len(other))[:options.elsewhere]
+                # all of these should be refused
+                found += [_outcome(task, other.name, other.queries[row], way, known, landmark_map,
+                                   keyframes)
+                          for row in some for way, known in product(WAYS[:3], options.known)
+                          if known == NOTHING or (known == VERTICAL and other.has_poses)]
+        return [Answers(task, len(landmark_map), len(layer), tuple(found))]
     return ask
 
 
-def _ask_here(task: Task, room: Room, landmark_map: LandmarkMap, keyframes: KeyframeLocalizer,
-              sift: SiftMap | None, query: PosedQuery) -> Iterator[Outcome]:
+def _ask_here(task: Task, names: Sequence[str], room: Room, landmark_map: LandmarkMap,
+              keyframes: KeyframeLocalizer, sift: SiftMap | None, query: PosedQuery
+              ) -> Iterator[Outcome]:
     """Yield the answers to an image of the mapped room."""
-    for way, known in product((OBJECTS, BOTH, KEYFRAMES), task.known):
+    for way, known in product((OBJECTS, BOTH, KEYFRAMES), names):
         if known not in (NOTHING, VERTICAL) and (way == KEYFRAMES or not room.has_depth):
             continue
         yield _outcome(task, room.name, query, way, known, landmark_map, keyframes)
     if sift is not None:
         image_rgb, camera = room.raws[query.number].color()
         pose = sift.locate(image_rgb, camera)
-        error_m, error_deg = (inf, inf) if pose is None else pose_error(
-            pose, query.map_from_camera)
-        yield Outcome(task.room, task.kind, task.part, room.name, query.number, SIFT, NOTHING,
-                      error_m, error_deg, False, 0.0, inf, SIFT, '', 0, 0)
-
-
-def _ask_elsewhere(task: Task, other: Room, landmark_map: LandmarkMap,
-                   keyframes: KeyframeLocalizer, query: PosedQuery) -> Iterator[Outcome]:
-    """Yield the answers to an image of another room, all of which should be refusals."""
-    for way, known in product((OBJECTS, KEYFRAMES, BOTH), task.known):
-        if known == NOTHING or (known == VERTICAL and other.has_poses):
-            yield _outcome(task, other.name, query, way, known, landmark_map, keyframes)
+        errors: dict[str, Any] = {} if pose is None else dict(zip(
+            ('error_m', 'error_deg'), pose_error(pose, query.map_from_camera), strict=True))
+        yield Outcome(room=task.room, kind=task.kind, part=task.part, asked=room.name,
+                      number=query.number, way=SIFT, known=NOTHING, accepted=False,
+                      confidence=0.0, source=SIFT, reason='', boxes=0, inliers=0, **errors)
 
 
 def _outcome(task: Task, asked: str, query: PosedQuery, way: str, known: str,
              landmark_map: LandmarkMap, keyframes: KeyframeLocalizer) -> Outcome:
     observation = known_of(query.observation, known)
     if way == KEYFRAMES:
-        observation = replace(observation, detections=_NO_BOXES, depths=None)
+        observation = without_boxes(observation)
     relocalizer = Relocalizer(landmark_map, RelocalizerOptions(matching='class'))
     recognizer = None
     if way != OBJECTS and query.image is not None:
         recognizer = ImageRecognizer(keyframes, query.image.features, query.image.camera)
     found = relocalizer.relocalize([observation], recognizer)
-    is_here = asked == task.room
-    error_m, error_deg, nees = errors_of(found, query.map_from_camera) if is_here \
-        else (inf, inf, inf)
-    cause = ''
-    if way == OBJECTS and known == NOTHING and is_here and error_m > _FAILED_M:
-        cause = blame(landmark_map, relocalizer, replace(query, observation=observation),
-                      _FAILED_M).cause
-    return Outcome(
-        task.room, task.kind, task.part, asked, query.number, way, known, float(error_m),
-        float(error_deg), found.accepted, float(found.confidence), float(nees), found.source,
-        found.reason, len(observation.detections), len(found.matches), cause,
-        tuple(landmark_map.class_ids[one.landmark] for one in found.matches)
-        if found.accepted else ())
-
-
-def tasks_of(room: Room, kinds: Sequence[str], images: int, elsewhere: int,
-             known: Sequence[str]) -> list[Task]:
-    """Return a task for each part of a room in some kinds of splits."""
-    return [Task(room.name, kind, part, images, elsewhere, tuple(known))
-            for kind, part, _, _ in room.parts() if kind in kinds]
+    outcome = Outcome(
+        room=task.room, kind=task.kind, part=task.part, asked=asked, number=query.number, way=way,
+        known=known, source=found.source, reason=found.reason, boxes=len(observation.detections),
+        inliers=len(found.matches),
+        **judged(found, query.map_from_camera if asked == task.room else None))
+    if way == OBJECTS and known == NOTHING and outcome.is_here and outcome.error_m > _FAILED_M:
+        return replace(outcome, cause=blame(
+            landmark_map, relocalizer, replace(query, observation=observation), _FAILED_M).cause)
+    return outcome

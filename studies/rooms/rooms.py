@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of real rooms: what detector and features say of each image, and their parts."""
 
+import hashlib
 import pickle
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Iterator
@@ -17,13 +18,16 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.command import positive
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.keyframes import features
 from cliploc_ros.core.keyframes.features import Features
 from cliploc_ros.core.keyframes.localization import query_features
-from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.files.storage import make_folder, write_file
-from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.offline.datasets.folders import FolderOptions, find_layout, read_folder
+from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
+from cliploc_ros.offline.datasets.captures.capture import FolderOptions
+from cliploc_ros.offline.datasets.folders import find_layout, read_folder
 from cliploc_ros.offline.datasets.frames import (
     DepthFormat,
     Frames,
@@ -38,6 +42,7 @@ from cliploc_ros.units import NS_PER_S
 from studies.acceptance.places import observation_of
 
 Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
 Rows = NDArray[np.int64]
 #: A map by one camera, asked by another at another height.
 ROBOT = 'phone to robot'
@@ -51,6 +56,40 @@ _USUAL_VIEW_DEG = 65.0
 _ROBOT_SHARE, _ROBOT_PX = 0.8, 424
 # Parts with fewer images are no map, or no question.
 _LEAST_IMAGES = 15
+
+
+class Looker:
+    """Detector and features; what they say of each image is kept in a folder."""
+
+    def __init__(self, folder: Path, model: str) -> None:
+        self._folder, self._model = folder, model
+        self._detector: ObjectDetector | None = None
+        self._code = hashlib.sha256(Path(features.__file__).read_bytes()).hexdigest()[:8]
+
+    def detect(self, image_rgb: Image) -> Detections:
+        """Return the boxes in an image, as an ObjectDetector does."""
+        def find() -> Detections:
+            self._detector = self._detector or load_detector(
+                DetectorOptions(self._model, conf=0.25))
+            return self._detector.detect(image_rgb)
+        return Detections(*self._kept(image_rgb, Path(self._model).stem, find))
+
+    def features(self, image_rgb: Image) -> Features:
+        """Return the features of an image."""
+        return Features(*self._kept(image_rgb, self._code, lambda: query_features(image_rgb)))
+
+    def _kept(self, image_rgb: Image, what: str, find: Callable[[], Any]) -> tuple[Any, ...]:
+        digest = hashlib.sha256(image_rgb.tobytes()).hexdigest()[:24]
+        path = self._folder / digest[:2] / f'{digest}.{what}.pickle'
+        if not path.exists():
+            keep(path, tuple(vars(find()).values()))
+        return tuple(pickle.loads(path.read_bytes()))
+
+
+def keep(path: Path, what: Any) -> None:
+    """Write a file for later runs."""
+    make_folder(path.parent)
+    write_file(path, lambda partial: partial.write_bytes(pickle.dumps(what)))
 
 
 @dataclass(frozen=True)
@@ -89,7 +128,7 @@ class Room:
         """Return the room as another camera sees it: a part of each image, and coarser."""
         raws = tuple(replace(raw, color=partial(_robot_view, raw.color), depth=None)
                      for raw in self.raws)
-        frames = _frames_of_raws(self.frames.source, raws)
+        frames = frames_of_raws(self.frames.source, raws)
         return replace(self, frames=frames, raws=raws, **_seen(
             frames, raws, self.options, f'{self.name}.robot'))
 
@@ -132,22 +171,40 @@ def read_room(where: str, options: RoomOptions) -> Room:
 
     ``DIR@METRES`` gives the unit of depth.
     """
+    folder, frames, has_poses = open_folder(where)
+    raws = tuple(replace(raw, place=row) for row, raw in enumerate(posed(frames)))
+    frames = frames_of_raws(frames.source, raws)
+    make_folder(options.out)
+    return Room(folder.name, options, frames, raws, has_poses=has_poses,
+                ups=_measured_verticals(folder, raws), **_seen(frames, raws, options, folder.name))
+
+
+def open_folder(where: str) -> tuple[Path, Frames, bool]:
+    """Return a folder, its frames, z up, and whether their poses are true.
+
+    ``DIR@METRES`` gives the unit of depth.
+    """
     path, _, text = where.partition('@')
     folder = Path(path)
     try:
         unit = positive(text) if text else None
     except (ValueError, ArgumentTypeError):
         raise OptionsError(f'{where}: {text!r} is no unit of depth in metres') from None
-    frames, has_poses = _frames_of(folder, unit)
-    raws = tuple(frames.read_raw(lambda place, stamp_ns, pose: pose is not None))
-    raws = tuple(replace(raw, place=row) for row, raw in enumerate(raws))
-    frames = _frames_of_raws(frames.source, raws)
-    make_folder(options.out)
-    return Room(folder.name, options, frames, raws, has_poses=has_poses,
-                ups=_measured_verticals(folder, raws), **_seen(frames, raws, options, folder.name))
+    if find_layout(folder) is None and (folder / 'images').is_dir():
+        return folder, _without_poses(folder / 'images'), False
+    is_tum = (folder / 'rgb.txt').exists()
+    return folder, read_folder(folder, FolderOptions(
+        layout='tum' if is_tum and not (folder / 'depth.txt').exists() else '',
+        depth=DepthFormat(unit), level=not is_tum)), True
 
 
-def _frames_of_raws(source: Path, raws: tuple[RawFrame, ...]) -> Frames:
+def posed(frames: Frames) -> tuple[RawFrame, ...]:
+    """Return the frames that have a pose, not decoded."""
+    return tuple(frames.read_raw(lambda place, stamp_ns, pose: pose is not None))
+
+
+def frames_of_raws(source: Path, raws: tuple[RawFrame, ...]) -> Frames:
+    """Return frames of a list of them."""
     return Frames(source, len(raws), lambda is_wanted: (
         raw for raw in raws if is_wanted(raw.place, raw.stamp_ns, raw.map_from_camera)))
 
@@ -158,12 +215,14 @@ def _seen(frames: Frames, raws: tuple[RawFrame, ...], options: RoomOptions, name
     recorded = record_once(
         frames, RecordingOptions(DetectorOptions(options.model, conf=options.conf), None,
                                  EVERY_FRAME, reading=name), options.out / f'{name}.npz')
+    looker = Looker(options.out / 'looks', options.model)
     return {'detections': recorded.detections,
-            'features': _features_of(raws, options.out / f'{name}.features.pickle')}
+            'features': tuple((looker.features(image_rgb), camera)
+                              for image_rgb, camera in (raw.color() for raw in raws))}
 
 
-def _robot_view(color: Callable[[], tuple[NDArray[np.uint8], Camera]]
-                ) -> tuple[NDArray[np.uint8], Camera]:
+def _robot_view(color: Callable[[], tuple[Image, Camera]]
+                ) -> tuple[Image, Camera]:
     """Return a part of an image, and its camera."""
     image_rgb, camera = color()
     columns, rows = round(_ROBOT_SHARE * camera.width), round(_ROBOT_SHARE * camera.height)
@@ -177,18 +236,18 @@ def _robot_view(color: Callable[[], tuple[NDArray[np.uint8], Camera]]
         cy=(camera.cy - top + 0.5) * scale - 0.5)
 
 
-def _frames_of(folder: Path, depth_unit: float | None) -> tuple[Frames, bool]:
-    """Return the frames of a folder, z up, and whether their poses are true."""
-    if find_layout(folder) is None and (folder / 'images').is_dir():
-        return _without_poses(folder / 'images'), False
-    is_tum = (folder / 'rgb.txt').exists()
-    return read_folder(folder, FolderOptions(
-        layout='tum' if is_tum and not (folder / 'depth.txt').exists() else '',
-        depth=DepthFormat(depth_unit), level=not is_tum)), True
+@dataclass(frozen=True)
+class _Nowhere:
+    """The poses of images whose poses nobody knows."""
+
+    span_ns: tuple[int, int]
+
+    def pose_at(self, stamp_ns: int) -> Floats | None:
+        return np.eye(4)
 
 
 def _without_poses(folder: Path) -> Frames:
-    """Return images whose poses nobody knows, by a usual camera."""
+    """Return images without poses, by a usual camera."""
     paths = sorted(one for one in folder.iterdir() if one.suffix.lower() in ('.jpg', '.png'))
     if not paths:
         raise DatasetError(f'{folder}: has no images')
@@ -198,20 +257,8 @@ def _without_poses(folder: Path) -> Frames:
     height, width = first.shape[:2]
     focal = 0.5 * width / np.tan(np.radians(0.5 * _USUAL_VIEW_DEG))
     camera = Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
-    files = [ImageFile(row * NS_PER_S, path, camera, np.eye(4)) for row, path in enumerate(paths)]
-    return folder_frames(folder, files)
-
-
-def _features_of(raws: tuple[RawFrame, ...], file: Path) -> tuple[tuple[Features, Camera], ...]:
-    """Return the features of each image and the camera they are of; those of an earlier run."""
-    if not file.exists():
-        found = []
-        for raw in raws:
-            image_rgb, camera = raw.color()
-            found.append((tuple(vars(query_features(image_rgb)).values()), camera))
-        write_file(file, lambda partial: partial.write_bytes(pickle.dumps(found)))
-    return tuple((Features(*columns), camera) for columns, camera in pickle.loads(
-        file.read_bytes()))
+    files = [ImageFile(row * NS_PER_S, path, camera) for row, path in enumerate(paths)]
+    return folder_frames(folder, files, _Nowhere((0, len(files) * NS_PER_S)))
 
 
 def _measured_verticals(folder: Path, raws: tuple[RawFrame, ...]) -> Floats | None:
@@ -234,6 +281,12 @@ def _measured_verticals(folder: Path, raws: tuple[RawFrame, ...]) -> Floats | No
                      if raw.map_from_camera is not None])
     mount, _ = Rotation.align_vectors(true, ups)
     return np.asarray(mount.apply(ups))
+
+
+def without_boxes(observation: Observation) -> Observation:
+    """Return an observation for keyframes alone."""
+    return replace(observation, depths=None,
+                   detections=Detections(np.empty((0, 4)), (), np.empty(0)))
 
 
 def known_of(observation: Observation, names: str) -> Observation:

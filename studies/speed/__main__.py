@@ -11,8 +11,7 @@ from cliploc_ros.command import run_command
 STUDIES = {
     'search': 'the search, beside a plain loop in the same run, and against the map',
     'frame': 'a request by stage, for each profile, in PyTorch and OpenVINO',
-    'node_start': 'the start of the relocalizer',
-    'building': 'a building of many floors: verdicts and times'}
+    'node_start': 'the start of the relocalizer'}
 
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(

@@ -14,42 +14,20 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from demo import ASSETS
+from studies.reports import table
 
 _PROJECT = Path(__file__).resolve().parents[2]
 _READY = 'landmarks in frame'
-# 'colcon build' finds no kernels, 'script/setup' finds kernels and no labels of the map.
-STARTS = ('colcon build', 'script/setup', 'warm')
-MATCHINGS = ('class', 'hybrid')
+# What was before a start, and the folder of label embeddings: 'colcon build' finds no kernels,
+# 'script/setup' finds kernels and no labels of the map.
+_STARTS = {'colcon build': 'first', 'script/setup': 'second', 'warm': 'second'}
 
 
-@dataclass(frozen=True)
-class NodeStart:
-    """Time of one start, from the command line until the node is ready."""
-
-    #: One of MATCHINGS, one of STARTS
-    matching: str
-    kind: str
-    #: Elapsed time, and user and system time of the process [s]
-    wall_s: float
-    processor_s: float
-
-
-def measure_starts(package: Path, matching: str) -> list[NodeStart]:
-    """Start the relocalizer of a package once in each way."""
-    with tempfile.TemporaryDirectory(prefix='cliploc_ros_start_') as name:
-        folder = Path(name)
-        found = [_start(package, matching, STARTS[0], folder / 'kernels', folder / 'cache')]
-        found.append(_start(package, matching, STARTS[1], folder / 'kernels', folder / 'second'))
-        found.append(_start(package, matching, STARTS[2], folder / 'kernels', folder / 'second'))
-        return found
-
-
-def _start(package: Path, matching: str, kind: str, kernels: Path, cache: Path) -> NodeStart:
-    """Start the relocalizer with kernels of one folder and label embeddings of another."""
+def _start(package: Path, matching: str, kernels: Path, cache: Path) -> tuple[float, float]:
+    """Return processor time and elapsed time [s] until the relocalizer of a package is ready."""
     parameters = {'map_file': ASSETS / 'map.yaml', 'matching': matching, 'device': 'cpu',
                   'clip_model': ASSETS / 'clip.json', 'cache_dir': cache,
                   'clip_pretrained': ASSETS / 'clip.safetensors'}
@@ -69,25 +47,11 @@ def _start(package: Path, matching: str, kind: str, kernels: Path, cache: Path) 
                 break
         else:
             raise SystemExit(f'the relocalizer does not start:\n{"".join(lines)}')
-        wall_s, processor_s = time.monotonic() - begin, _processor_s(process.pid)
+        wall_s = time.monotonic() - begin
+        # user and system time, the 14th and 15th field of proc(5)
+        fields = Path(f'/proc/{process.pid}/stat').read_text().rsplit(')', 1)[1].split()
         process.terminate()
-    return NodeStart(matching, kind, wall_s, processor_s)
-
-
-def _processor_s(pid: int) -> float:
-    fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
-
-
-def format_starts(starts: list[NodeStart]) -> str:
-    """Return a table, with the time above that of a warm start."""
-    warm = {each.matching: each for each in starts if each.kind == STARTS[-1]}
-    lines = [f'{"matching":<9} {"first start after":<18} {"processor s":>12} {"above warm":>11} '
-             f'{"wall s":>7}']
-    lines += [f'{each.matching:<9} {each.kind:<18} {each.processor_s:12.1f} '
-              f'{each.processor_s - warm[each.matching].processor_s:11.1f} {each.wall_s:7.1f}'
-              for each in starts]
-    return '\n'.join(lines)
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK'), wall_s
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -96,6 +60,11 @@ def run(arguments: Sequence[str]) -> int:
     parser.add_argument('--package', type=Path, default=_PROJECT, metavar='FOLDER',
                         help='folder with the package to measure (default: this one)')
     package = parser.parse_args(arguments).package.resolve()
-    print(format_starts([start for matching in MATCHINGS
-                         for start in measure_starts(package, matching)]))
+    rows = []
+    for matching in ('class', 'hybrid'):
+        with tempfile.TemporaryDirectory(prefix='cliploc_ros_start_') as name:
+            rows += [[matching, kind, *(f'{time_s:.1f}' for time_s in _start(
+                package, matching, Path(name, 'kernels'), Path(name, cache)))]
+                for kind, cache in _STARTS.items()]
+    print(table(['matching', 'first start after', 'processor time [s]', 'wall time [s]'], rows))
     return 0

@@ -12,40 +12,44 @@ import os
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from math import inf
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.core.map.culling import make_groups
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.search.frame_search import (
-    balanced_order,
-    class_candidates,
-    joined,
-    nearest_candidates,
+from cliploc_ros.core.map.similarities import (
+    CropSimilarities,
+    LabelEmbeddings,
+    nearest_landmarks,
 )
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search import strategies
+from cliploc_ros.core.search.frame_search import match_frame
 from cliploc_ros.core.search.scene import Scene, make_scene
 from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
-from cliploc_ros.core.search.strategies import (
-    Leaders,
-    Progress,
-    compatible_pairs,
-    draw_ransac,
-    search_exhaustively,
-    search_progressively,
-    search_samples,
-)
-from studies.speed.maps import drain, least_s, measure_first_request, measure_maps
+from cliploc_ros.core.search.strategies import Leaders, Progress, compatible_pairs, draw_ransac
+from studies.acceptance.places import ONE, Recording
+from studies.reports import table
 
 _PLAIN_HYPOTHESES = 100
 _CHORDS = 32
-_K, _IOU_THRESHOLD = 3, 0.2
+_IOU_THRESHOLD = 0.2
+_CROPS, _DIMENSIONS, _K, _CLASSES = 12, 512, 3, 40
+_CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -62,10 +66,16 @@ def run(arguments: Sequence[str]) -> int:
     _measure_hypotheses(synthetic_scene())
     measure_maps(options.landmarks)
     if options.queries is not None:
-        for matching in ('hybrid', 'class'):
-            scenes = query_scenes(options.queries, options.map, matching)
-            _measure_whole(f'{matching}, every sample', scenes, search_exhaustively)
-            _measure_whole(f'{matching}, every compatible sample', scenes, _compatible)
+        place = Recording(options.queries, options.map, every_frame=False).load()
+        for matching, algorithm in (('hybrid', 'b-prosac'), ('class', 'bf')):
+            # candidates as the paper has them
+            paper = RelocalizerOptions(matching=matching, algorithm=algorithm)
+            scenes = [match_frame(place.landmark_map, one.observation, paper)[0]
+                      for one in place.ask(ONE)]
+            _measure_whole(f'{matching}, every sample', scenes, strategies.search_exhaustively)
+            _measure_whole(f'{matching}, every compatible sample', scenes,
+                           lambda scene, leaders: strategies.search_progressively(
+                               scene, compatible_pairs(scene), leaders))
     return 0
 
 
@@ -83,48 +93,17 @@ def synthetic_scene() -> Scene:
     return make_scene(boxes, centers, shapes, potential, np.argwhere(potential), _IOU_THRESHOLD)
 
 
-def query_scenes(queries: Path, map_file: Path, matching: str) -> list[Scene]:
-    """Return the scenes of a file's queries, with candidates as the paper has them.
-
-    Parameters
-    ----------
-    matching : str
-        'hybrid' or 'class'.
-    """
-    from cliploc_ros.offline.datasets.observations import (
-        load_queries,  # core needs no data sets otherwise
-    )
-
-    landmark_map = LandmarkMap.from_file(map_file)
-    recorded = load_queries(queries, landmark_map.landmark_ids)
-    camera = Camera(640, 480, *recorded.intrinsics_fx_fy_cx_cy)
-    scenes = []
-    for frame in recorded.main_frames():
-        index = landmark_map.classes
-        candidates = potential = class_candidates(index, index.classes_of(frame.class_ids))
-        if matching == 'hybrid':
-            candidates = balanced_order(
-                nearest_candidates(frame.similarities.astype(np.float32), _K))
-            potential = joined(candidates, potential, len(landmark_map))
-        scenes.append(make_scene(camera.normalize_bboxes(frame.bboxes_xyxy),
-                                 landmark_map.centers, landmark_map.shapes, potential.pairs,
-                                 candidates.pairs, _IOU_THRESHOLD))
-    return scenes
-
-
 def _measure_hypotheses(scene: Scene) -> None:
     samples = draw_ransac(scene.pairs, 4_000, np.random.default_rng(0))
     samples = samples[samples[:, 0] >= 0]
     bench = set_up(scene)
     solved = _verify_all(bench, samples)
     whole_us = 1e6 * least_s(lambda: _verify_all(bench, samples))
-    searched_us = 1e6 * least_s(lambda: drain(search_samples(scene, samples,
-                                                               Leaders.none_yet())))
-    five_hundred_ms = 1e3 * least_s(lambda: drain(search_samples(scene, samples[:500],
-                                                                   Leaders.none_yet())))
+    searched_us = 1e6 * least_s(partial(_search, scene, samples))
+    five_hundred_ms = 1e3 * least_s(partial(_search, scene, samples[:500]))
     plain_us, plain_score = _plain(scene, samples[:_PLAIN_HYPOTHESES])
     leaders = Leaders.none_yet()
-    drain(search_samples(scene, samples[:_PLAIN_HYPOTHESES], leaders))
+    drain(strategies.search_samples(scene, samples[:_PLAIN_HYPOTHESES], leaders))
     print(f'{len(scene.bearings)} boxes, {len(scene.potential.detections)} pairs, one core:\n'
           f'  {whole_us / solved:7.2f} us a hypothesis, P3P to whole verification\n'
           f'  {searched_us / len(samples):7.2f} us a sample, in a search\n'
@@ -152,20 +131,14 @@ def _measure_whole(name: str, scenes: list[Scene],
                    search: Callable[[Scene, Leaders], Iterator[Progress]]) -> None:
     times_ms, tried = [], []
     for scene in scenes:
-        run = partial(_search_once, search, scene)
+        def run(scene: Scene = scene) -> int:
+            return drain(search(scene, Leaders.none_yet()))
+
         tried.append(run())
         times_ms.append(1e3 * least_s(run, 3))
     print(f'{name}, {len(scenes)} queries: {np.median(times_ms):.1f} ms (median), '
           f'{max(times_ms):.1f} ms (longest); {np.median(tried):.0f} and {max(tried)} '
           f'hypotheses; {1e3 * sum(times_ms) / max(sum(tried), 1):.2f} us each')
-
-
-def _compatible(scene: Scene, leaders: Leaders) -> Iterator[Progress]:
-    yield from search_progressively(scene, compatible_pairs(scene), leaders)
-
-
-def _search_once(search: Callable[[Scene, Leaders], Iterator[Progress]], scene: Scene) -> int:
-    return drain(search(scene, Leaders.none_yet()))
 
 
 def _plain(scene: Scene, samples: NDArray[np.int64]) -> tuple[float, float]:
@@ -185,8 +158,6 @@ def _plain(scene: Scene, samples: NDArray[np.int64]) -> tuple[float, float]:
 def _plain_pose(scene: Scene, duals: list[NDArray[np.float64]], pairs: NDArray[np.int64]
                 ) -> NDArray[np.float64] | None:
     """Return camera_from_map (3, 4): of P3P's poses, the one whose sampled IoUs sum highest."""
-    import cv2
-
     seen = scene.box_ellipses[pairs[:, 0], :2].reshape(3, 1, 2)
     points = scene.centers[pairs[:, 1]].reshape(3, 1, 3)
     _, vectors, translations = cv2.solveP3P(points, seen, np.eye(3), None, cv2.SOLVEPNP_AP3P)
@@ -254,3 +225,112 @@ def _plain_iou(box: NDArray[np.float64], conic: NDArray[np.float64] | None) -> f
         (high - low) / 2 * np.pi / _CHORDS)
     area = np.pi * (box[2] * box[3] + np.sqrt(exx * eyy - exy * exy))
     return float(shared / (area - shared))
+
+
+def storey(count: int) -> tuple[LandmarkMap, Observation]:
+    """Return a map of one landmark in four square metres, and a frame of up to twelve boxes."""
+    rng, side = np.random.default_rng(0), np.sqrt(4.0 * count)
+    names = tuple(f'class {number}' for number in rng.integers(0, _CLASSES, count))
+    quats = rng.normal(size=(count, 4))
+    ids = tuple(map(str, range(count)))
+    landmark_map = LandmarkMap(
+        'map', ids, ids, names, np.c_[rng.uniform(0, side, (count, 2)), rng.uniform(0, 2, count)],
+        rng.uniform(0.05, 0.4, (count, 3)), quats / np.linalg.norm(quats, axis=1, keepdims=True))
+    map_from_camera = make_transform(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
+                                     np.array([0.4 * side, 0.5 * side, 1.2]))
+    boxes = ellipse_bboxes(project_ellipsoids(invert_transform(map_from_camera),
+                                              landmark_map.centers, landmark_map.shapes))
+    near = np.linalg.norm(landmark_map.centers - map_from_camera[:3, 3], axis=1) < 12
+    seen = np.nonzero((np.abs(boxes) < 0.48).all(axis=1) & near)[0][:_CROPS]
+    pixels = 500 * (boxes[seen] + rng.normal(0, 0.004, (len(seen), 4))) + [320, 240, 320, 240]
+    labels = _units(rng, count)
+    crops = labels[seen] + 0.5 * _units(rng, len(seen))
+    crops /= np.linalg.norm(crops, axis=1, keepdims=True)
+    detections = Detections(pixels, tuple(names[row] for row in seen), np.ones(len(seen)))
+    return landmark_map, Observation(_CAMERA, detections,
+                                     CropSimilarities(crops, LabelEmbeddings.of(labels)))
+
+
+def measure_maps(counts: Sequence[int]) -> None:
+    """Print time and memory for maps of some sizes."""
+    rows, first_us = [], None
+    for count in counts:
+        landmark_map, observation = storey(count)
+        similarities = observation.similarities
+        assert isinstance(similarities, CropSimilarities)
+        start = time.perf_counter()
+        landmark_map.prepare()
+        sort_s = time.perf_counter() - start
+        sorted_mb = sum(array.nbytes for array in landmark_map.sorted_landmarks) / 1e6
+        knn_ms = 1e3 * least_s(partial(nearest_landmarks, similarities, _K), 5)
+        scene, _ = match_frame(landmark_map, observation, RelocalizerOptions())
+        # those of CLIP's candidates, whose mixture does not depend on the map's size
+        samples = draw_ransac(scene.pairs[:min(len(scene.pairs), _K * _CROPS)], 4_000,
+                              np.random.default_rng(0))
+        samples = samples[samples[:, 0] >= 0]
+        frame_ms = 1e3 * least_s(partial(_frame, landmark_map, observation, scene), 5)
+        sample_us = 1e6 / len(samples) * least_s(partial(_search, scene, samples), 5)
+        relocalizer = Relocalizer(landmark_map, RelocalizerOptions())
+        relocalizer.warm_up()
+        request_ms = 1e3 * least_s(partial(relocalizer.relocalize, [observation]), 5)
+        first_us = first_us or sample_us
+        peak = re.search(r'VmHWM:\s+(\d+) kB', Path('/proc/self/status').read_text())
+        rows.append([f'{count:,d}', f'{knn_ms:.1f}',
+                     f'{similarities.labels.unique.nbytes / 1e6:.0f}', f'{sort_s:.2f}',
+                     f'{sorted_mb:.1f}', f'{frame_ms:.2f}', f'{sample_us:.2f}',
+                     f'{sample_us / first_us:.2f}', f'{request_ms:.1f}',
+                     f'{int(peak[1]) * 1.024e-3:.0f}' if peak else ''])
+    print(f'maps, {_CROPS} crops of {_DIMENSIONS} numbers, all labels different:\n' + table(
+        ['landmarks', 'k-NN [ms]', 'labels [MB]', 'sorting [s]', 'sorted map [MB]', 'frame [ms]',
+         'a sample [us]', 'ratio', 'request [ms]', 'process [MB]'], rows), flush=True)
+
+
+def measure_first_request() -> None:
+    """Print the time of the first request after a start, compared with the tenth."""
+    landmark_map, observation = storey(100)
+    start = time.perf_counter()
+    relocalizer = Relocalizer(landmark_map, RelocalizerOptions())
+    relocalizer.warm_up()
+    ready_s, times_ms = time.perf_counter() - start, []
+    for _ in range(10):
+        start = time.perf_counter()
+        relocalizer.relocalize([observation])
+        times_ms.append(1e3 * (time.perf_counter() - start))
+    print(f'first request: {times_ms[0]:.1f} ms, {times_ms[0] / times_ms[9]:.2f} times the tenth, '
+          f'after a start of {ready_s:.1f} s')
+
+
+def _frame(landmark_map: LandmarkMap, observation: Observation, scene: Scene) -> None:
+    """Prepare the search of a frame: the tree of its classes' landmarks, and the bench."""
+    make_groups(landmark_map.sorted_landmarks,
+                landmark_map.classes.classes_of(observation.detections.class_ids),
+                scene.box_ellipses, scene.iou_threshold)
+    set_up(scene)
+
+
+def _search(scene: Scene, samples: NDArray[np.int64]) -> None:
+    drain(strategies.search_samples(scene, samples, Leaders.none_yet()))
+
+
+def drain(search: Iterator[Progress]) -> int:
+    """Search to the end; return how many hypotheses were tried."""
+    tried = 0
+    for progress in search:
+        tried = progress.tried
+    return tried
+
+
+def _units(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+    rows = rng.standard_normal((count, _DIMENSIONS), dtype=np.float32)
+    rows /= np.sqrt(np.einsum('ij,ij->i', rows, rows))[:, None]
+    return rows
+
+
+def least_s(run: Callable[[], object], repetitions: int = 20) -> float:
+    """Return the least time [s] of some runs, the one least disturbed by other programs."""
+    least = inf
+    for _ in range(repetitions):
+        start = time.perf_counter()
+        run()
+        least = min(least, time.perf_counter() - start)
+    return least

@@ -26,11 +26,8 @@ from cliploc_ros.offline.datasets.observations import load_observations, load_re
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
 from cliploc_ros.offline.mapping.building import build_map
 from studies.acceptance.fit import FITTED_KINDS
-from studies.watch import fit
-from studies.watch.judge import Alarm, Right, alarm_table, judge, right_table
-from studies.watch.localizers import Drive, recorded_drive, simulated_drive
+from studies.watch import fit, judge
 from studies.watch.recordings import watch_recording, write_watch
-from studies.watch.sensors import mount_table
 from studies.worlds.places import KINDS
 
 # Frames of a recording at 30 Hz between two looks.
@@ -50,7 +47,7 @@ def _fit(options: argparse.Namespace) -> None:
 
 def _judge(options: argparse.Namespace) -> None:
     for changed in options.changed:
-        drives = (simulated_drive(kind, seed, options.images, changed, options.labels)
+        drives = (judge.simulated_drive(kind, seed, options.images, changed, options.labels)
                   for kind in options.kinds
                   for seed in range(options.first_seed, options.first_seed + options.worlds))
         _print(drives, options.worlds * len(options.kinds), changed == 0.0,
@@ -61,14 +58,14 @@ def _recorded(options: argparse.Namespace) -> None:
     recorded = load_observations(options.observations)
     its_map = LandmarkMap.from_file(options.map)
     # the map was made of the even frames
-    _print((recorded_drive('fr3', recorded, its_map, range(first, len(recorded), _STEP))
+    _print((judge.recorded_drive('fr3', recorded, its_map, range(first, len(recorded), _STEP))
             for first in range(1, _STEP, options.every)), len(range(1, _STEP, options.every)),
            True, str(options.map))
     if options.splits is not None:
         drives = []
         for name, rows in json.loads(options.splits.read_text()).items():
             built = build_map(recorded.select_frames(rows['map'])).landmark_map
-            drives.append(recorded_drive(name, recorded, built, sorted(
+            drives.append(judge.recorded_drive(name, recorded, built, sorted(
                 frame for _, is_main, frame in rows['queries'] if is_main)))
         _print(drives, len(drives), True, 'maps of the splits')
 
@@ -82,15 +79,15 @@ def _localizer(options: argparse.Namespace) -> None:
     print(write_watch(options.out, looks))
 
 
-def _print(drives: Iterable[Drive], count: int, wrong_poses: bool, title: str) -> None:
-    right, alarms = list[Right](), list[Alarm]()
+def _print(drives: Iterable[judge.Drive], count: int, wrong_poses: bool, title: str) -> None:
+    right, alarms = list[judge.Right](), list[judge.Alarm]()
     for number, drive in enumerate(tqdm(drives, title, count, disable=None)):
-        one, its = judge(drive, number, wrong_poses)
+        one, its = judge.judge(drive, number, wrong_poses)
         right.append(one)
         alarms += its
-    print(f'{title}\n\n{right_table(right)}\n')
+    print(f'{title}\n\n{judge.right_table(right)}\n')
     if alarms:
-        print(f'{alarm_table(alarms)}\n')
+        print(f'{judge.alarm_table(alarms)}\n')
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
@@ -133,7 +130,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     own.add_argument('--tilt-deviation', type=float, default=40.0, metavar='DEG',
                      help='of the camera off upright (%(default)s)')
     own.add_argument('--out', type=Path, default=Path('watched'), metavar='DIR')
-    mount = add('mount', lambda options: print(mount_table(
+    mount = add('mount', lambda options: print(judge.mount_table(
         options.kinds, range(options.first_seed, options.first_seed + options.worlds))),
         'the angle of a camera that is turned on its robot')
     add_worlds(mount, 10, 1000)

@@ -7,14 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.geometry.transforms import Tolerance
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.watch.look import LookEvidence, align, log_odds, look_at, measure
-from studies.reports import table
-from studies.watch.localizers import (
+from studies.reports import fit_logistic, table
+from studies.watch.judge import (
     displaced,
     drifting,
     kidnapped,
@@ -74,19 +73,10 @@ def fit(looks: Sequence[Look]) -> Calibration:
     """Return the coefficients of maximum likelihood."""
     seen = [one for one in looks if one.evidence.known]
     terms = np.array([[*one.evidence.terms.values()] for one in seen])
-    signs = np.where([one.is_right for one in seen], 1.0, -1.0)
-    scale = np.append(1.0, terms[:, 1:].std(axis=0) + 1e-9)
-
-    def loss(coefficients: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        margins = signs * (terms / scale @ coefficients)
-        pull = -signs / (1.0 + np.exp(margins)) / len(signs)
-        return (float(np.logaddexp(0.0, -margins).mean() + _RIDGE * coefficients @ coefficients),
-                (terms / scale).T @ pull + 2.0 * _RIDGE * coefficients)
-
-    names = [*seen[0].evidence.terms]
-    solved = minimize(loss, np.zeros(len(names)), jac=True, method='L-BFGS-B')
+    found = fit_logistic(terms, np.array([one.is_right for one in seen]),
+                         np.full(terms.shape[1], 2.0 * _RIDGE * len(seen)))
     return CALIBRATION._replace(watch=CALIBRATION.watch._replace(
-        **dict(zip(names, map(float, solved.x / scale), strict=True))))
+        **dict(zip(seen[0].evidence.terms, map(float, found), strict=True))))
 
 
 def report(looks: Sequence[Look], calibration: Calibration) -> str:

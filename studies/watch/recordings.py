@@ -13,21 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, pose_error
+from cliploc_ros.core.geometry.transforms import SAME_ANSWER, pose_error
 from cliploc_ros.core.watch.watch import Watch, WatchState
 from cliploc_ros.files.storage import make_folder, write_text
 from cliploc_ros.offline.datasets.observations import Recorded
 from cliploc_ros.offline.datasets.poses import Poses
-from cliploc_ros.offline.evaluation.figures import add_legend, save_figure
 from cliploc_ros.units import NS_PER_S
 from studies.acceptance.places import observation_of
-
-# Okabe and Ito, see cliploc_ros.offline.evaluation.figures.
-_COLORS = {'localized': '#009E73', 'uncertain': '#E69F00', 'lost': '#D55E00'}
-_ERROR, _PROBABILITY = '#555555', '#0072B2'
 
 
 @dataclass(frozen=True)
@@ -128,13 +121,11 @@ def summarize_watch(looks: Sequence[WatchedLook]) -> dict[str, Any]:
 
 
 def write_watch(folder: Path, looks: Sequence[WatchedLook]) -> str:
-    """Write watch.json and the figures; return a summary in a few lines."""
+    """Write watch.json; return a summary in a few lines."""
     summary = summarize_watch(looks)
     make_folder(folder)
     write_text(folder / 'watch.json', json.dumps(
         {**summary, 'every_look': [asdict(one) for one in looks]}, indent=1))
-    if looks:
-        _draw_timeline(folder / 'watch_timeline.png', looks)
     states = ', '.join(f'{name} {count}' for name, count in summary['states'].items())
     lines = [f'{len(looks)} looks in {60.0 * summary["hours"]:.1f} min and '
              f'{summary["way_m"]:.0f} m: {states}; {summary["alarms"]} alarms']
@@ -147,36 +138,3 @@ def write_watch(folder: Path, looks: Sequence[WatchedLook]) -> str:
                      f'wrong poses: called lost after {one["looks"]} looks, '
                      f'{one["seconds"]:.1f} s, {one["metres"]:.1f} m')
     return '\n'.join(lines)
-
-
-def _draw_timeline(path: Path, looks: Sequence[WatchedLook]) -> Path:
-    """Draw pose error, probability, state and alarms over time; return the path."""
-    figure = Figure(figsize=(8.0, 4.4), layout='constrained')
-    above, below = figure.subplots(2, 1, sharex=True)
-    times = np.array([one.stamp_s for one in looks]) - looks[0].stamp_s
-    ends = np.append(times[1:], times[-1] + (times[-1] - times[-2] if len(times) > 1 else 1.0))
-    named = set[str]()
-    for one, begin, end in zip(looks, times, ends, strict=True):
-        below.axvspan(begin, end, color=_COLORS[one.state], alpha=0.3, linewidth=0.0,
-                      label=None if one.state in named else one.state)
-        named.add(one.state)
-    errors = np.array([np.nan if one.error_m is None else one.error_m for one in looks])
-    above.plot(times, errors, color=_ERROR, marker='.', markersize=3, linewidth=1.0)
-    above.axhline(RIGHT_M, color=_ERROR, linestyle=':', linewidth=1.0)
-    above.set_ylabel('error of the pose [m]')
-    if np.isnan(errors).all():
-        above.text(0.5, 0.5, 'the truth is unknown', transform=above.transAxes, ha='center')
-    below.plot(times, [one.probability for one in looks], color=_PROBABILITY, marker='.',
-               markersize=3, linewidth=1.0, label='probability')
-    for limit in (CALIBRATION.watch.lost, CALIBRATION.watch.localized):
-        below.axhline(limit, color=_PROBABILITY, linestyle=':', linewidth=1.0)
-    for number, one in enumerate(alarms_of(looks)):
-        for axes in (above, below):
-            axes.axvline(one.stamp_s - looks[0].stamp_s, color='black', linewidth=1.2,
-                         label='alarm' if number == 0 and axes is below else None)
-    below.set(xlabel='time [s]', ylabel='probability that\nthe pose is right',
-              ylim=(-0.03, 1.03))
-    for axes in (above, below):
-        axes.grid(alpha=0.3)
-    add_legend(figure)
-    return save_figure(figure, path)

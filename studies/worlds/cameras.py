@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
-from studies.worlds.places import Place
-from studies.worlds.things import Objects
+from studies.worlds.places import Objects, Place
 
 #: Images of one group.
 GROUP_SIZE = 5

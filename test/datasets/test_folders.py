@@ -15,7 +15,8 @@ from cliploc_ros.core.depth_image import (
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.folders import FolderOptions, rgbd_frames
+from cliploc_ros.offline.datasets.captures.capture import FolderOptions
+from cliploc_ros.offline.datasets.folders import rgbd_frames
 from cliploc_ros.offline.datasets.frames import DepthFormat
 from cliploc_ros.offline.recording.recorder import check_depth_unit
 

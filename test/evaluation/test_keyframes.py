@@ -23,7 +23,8 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import constraint_of
 from cliploc_ros.core.watch.watch import Watch
-from cliploc_ros.offline.datasets.folders import FolderOptions, rgbd_frames, tum_frames
+from cliploc_ros.offline.datasets.captures.capture import FolderOptions
+from cliploc_ros.offline.datasets.folders import rgbd_frames, tum_frames
 from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer

@@ -18,8 +18,9 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError, OptionsError
-from cliploc_ros.offline.evaluation.map_check.page import DATA, PAGE, ViewPainter, write_report
+from cliploc_ros.offline.evaluation.map_check.page import DATA, PAGE, write_report
 from cliploc_ros.offline.evaluation.map_check.pictures import draw_pictures
+from cliploc_ros.offline.evaluation.map_check.views import ViewPainter
 from cliploc_ros.offline.mapping.check.advice import give_advice
 from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.landmark_faults import (

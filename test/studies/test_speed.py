@@ -21,7 +21,7 @@ def test_the_kernel_is_two_orders_faster_than_a_plain_loop_and_as_good():
     print(f'\n{done.stdout}')
     ratio = float(re.search(r'(\d+) times as long', done.stdout).group(1))
     ours, plain = re.search(r'score ([\d.]+), plain ([\d.]+)', done.stdout).groups()
-    assert re.search(r'^ +1,000 ', done.stdout, re.MULTILINE)
+    assert re.search(r'^\| 1,000 ', done.stdout, re.MULTILINE)
     assert 'times the tenth' in done.stdout
     assert ratio > 120
     assert float(ours) == pytest.approx(float(plain), abs=5e-3)

@@ -6,10 +6,7 @@
 import numpy as np
 import pytest
 
-from studies.watch.judge import KIDNAPPED, alarm_table, judge, right_table
-from studies.watch.localizers import (
-    simulated_drive,
-)
+from studies.watch.judge import KIDNAPPED, alarm_table, judge, right_table, simulated_drive
 
 pytestmark = pytest.mark.full
 

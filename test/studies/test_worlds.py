@@ -8,6 +8,7 @@ import pytest
 from cliploc_ros.core.geometry.transforms import is_rigid
 from studies.acceptance import fit
 from studies.acceptance.places import MODES, Simulated
+from studies.reports import judged_of
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_world
@@ -40,7 +41,9 @@ def test_a_fit_judges_each_kind_by_the_others(record_property):
     calibrations = fit.cross_fitted(searched)
     assert calibrations['room'] != calibrations['shop']
     rooms = [one.case for one in here if one.kind == 'room']
-    likely, right = fit.judged([one for one in here if one.kind == 'room'], calibrations)
+    likely, right = judged_of(fit.answers([one for one in here if one.kind == 'room'],
+                                          calibrations))
     assert np.array_equal(likely, fit.outcomes(rooms, calibrations['room'])[0])
-    elsewhere = fit.judged([one for one in searched if one.case.is_elsewhere], calibrations)[0]
+    elsewhere = judged_of(fit.answers([one for one in searched if one.case.is_elsewhere],
+                                      calibrations))[0]
     assert likely[right].mean() > elsewhere.mean()

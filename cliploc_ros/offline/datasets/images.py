@@ -14,7 +14,8 @@ from cliploc_ros.core.depth_image import DepthImage
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_images
-from cliploc_ros.offline.datasets.folders import FolderOptions, find_layout, read_folder
+from cliploc_ros.offline.datasets.captures.capture import FolderOptions
+from cliploc_ros.offline.datasets.folders import find_layout, read_folder
 from cliploc_ros.offline.datasets.frames import read_color, read_depth, undistorted
 from cliploc_ros.offline.datasets.map_recording import MapRecording
 from cliploc_ros.offline.mapping.posed_detections import (

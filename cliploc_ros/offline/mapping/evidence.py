@@ -11,8 +11,14 @@ from numpy.typing import NDArray
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.offline.mapping.association import find_overlaps, ious_with
-from cliploc_ros.offline.mapping.fitting import LANDMARK_SIZE, accumulate
-from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes, is_in_image, project_box
+from cliploc_ros.offline.mapping.fitting import accumulate
+from cliploc_ros.offline.mapping.landmarks import (
+    LANDMARK_SIZE,
+    Landmarks,
+    group_boxes,
+    is_in_image,
+    project_box,
+)
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.views import Views, camera_centers
 

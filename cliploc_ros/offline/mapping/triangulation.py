@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.errors import MappingError
-from cliploc_ros.offline.mapping.fitting import LANDMARK_SIZE, descend, fit_ellipsoid
+from cliploc_ros.offline.mapping.fitting import descend, fit_ellipsoid
 from cliploc_ros.offline.mapping.landmarks import (
+    LANDMARK_SIZE,
     Landmarks,
     box_iou,
     group_boxes,

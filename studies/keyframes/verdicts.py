@@ -1,0 +1,179 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Judge stored records by the package's verdict, and fit what it says of keyframes.
+
+What points of keyframes say, and the signs of pictures, are logistic models, fitted by maximum
+likelihood. First the odds of a place by its points, against a place by chance: images as they are,
+or darker, blurred and covered, and other rooms. Then the signs that a place is there, in all
+records, given what the verdict says without them.
+
+Robots see places far more often than pictures of them, so untroubled images weigh more than there
+are. Their weight is a choice: so large that of the pictures on up to 30 % of the image one of a
+hundred is accepted, in rooms that did not fit.
+"""
+
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from math import inf
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.acceptance.contenders import contenders_of, join_frames, unrefined
+from cliploc_ros.core.acceptance.genuine import Signs
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
+from studies.keyframes.records import Record, StoredCase, StoredRecognizer, localize
+from studies.reports import Answer, chance, fit_logistic, judged
+from studies.rooms.rooms import without_boxes
+
+Floats = NDArray[np.float64]
+
+#: The families in which a wrong place is wrong by chance.
+BY_CHANCE = ('plain', 'image', 'other room', 'classes', 'features')
+#: The terms that are fitted, as calibration.yaml calls them.
+POINTS = ('none', 'inliers', 'confirmed', 'explained', 'unexplained')
+GENUINE = ('none', *Signs._fields)
+_UNTROUBLED = ('plain', 'image', 'classes', 'features')
+_WEIGHT = 4.0
+# Deviations of the Gaussian prior of all coefficients but the first, for signs of deviation 1.
+_PRIOR = 3.0
+#: What answers.
+WAYS = ('objects', 'keyframes', 'both')
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome(Answer):
+    """One way's answer to a query, by one of its true poses."""
+
+    site: str
+    place: str
+    family: str
+    case: str
+    number: int
+    way: str
+    truth: int = 0  #: Which of the true poses: 1 is that by a moved half
+    refusal: str
+
+
+def decide(case: StoredCase, record: Record, way: str) -> Relocalization:
+    """Return the package's answer to a record by objects, by keyframes, or by both."""
+    searched, keyframes = [one.searched for one in record.looks], _keyframes(case)
+    if way == 'keyframes':
+        relocalizer = Relocalizer(case.landmark_map, record.options)
+        searched = [relocalizer.search(without_boxes(one.observation)) for one in searched]
+    return localize(case.landmark_map, record.options, searched, [
+        None if way == 'objects' else StoredRecognizer(
+            one.seen, keyframes, one.searched.observation.camera) for one in record.looks])
+
+
+@lru_cache(maxsize=1)
+def _keyframes(case: StoredCase) -> KeyframeLocalizer:
+    return KeyframeLocalizer(case.layer)
+
+
+def make_judge(ways: Sequence[str] = WAYS) -> Callable[[Path], list[Outcome]]:
+    """Return what judges the records of a file in some ways."""
+    def judge(path: Path) -> list[Outcome]:
+        case: StoredCase = pickle.loads(path.read_bytes())
+        return [one for record in case.records for way in ways
+                for one in _outcomes(case, record, way)]
+    return judge
+
+
+def _outcomes(case: StoredCase, record: Record, way: str) -> list[Outcome]:
+    found = decide(case, record, way)
+    first, *others = [Outcome(
+        site=case.place.partition('/')[0], place=case.place, family=case.name.partition(':')[0],
+        case=case.name, number=record.number, way=way, truth=number,
+        refusal='' if found.accepted else str(found.refusal_kind or way), **judged(found, truth))
+        for number, truth in enumerate(record.truths or (None,))]
+    return [first, *(replace(one, nees=inf) for one in others)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row(Answer):
+    """A place: predictors with a leading 1, and the most that its chance can be."""
+
+    site: str
+    family: str
+    case: str
+    predictors: Floats
+    ceiling: float
+
+
+def place_rows(case: StoredCase) -> list[Row]:
+    """Return a row for each place that keyframes recognize."""
+    rows, most = [], CALIBRATION.keyframes.most_objects
+    for record in case.records:
+        look = record.looks[-1]
+        joined = join_frames(case.landmark_map, record.options, [look.searched])
+        places = look.seen.places
+        for place, one in zip(places, contenders_of(joined, [
+                unrefined(place.map_from_camera) for place in places], [True] * len(places)),
+                strict=True):
+            rows.append(_row(case, record, place.map_from_camera, [
+                np.log(max(1, place.inliers)), place.confirmed,
+                min(most, one.support.inliers), min(most, one.support.unexplained)]))
+    return rows
+
+
+def sign_rows(case: StoredCase) -> list[Row]:
+    """Return a row for each answer that keyframes propose."""
+    rows = []
+    for record in case.records:
+        found = decide(case, record, 'both')
+        if found.map_from_camera is None or found.evidence is None or found.evidence.signs is None:
+            continue
+        rows.append(_row(case, record, found.map_from_camera, found.evidence.signs,
+                         found.evidence.confidence / max(found.evidence.genuine, 1e-12)))
+    return rows
+
+
+def _row(case: StoredCase, record: Record, pose: Floats, predictors: Sequence[float],
+         ceiling: float = 1.0) -> Row:
+    error_m, error_deg = pose_error(pose, record.truths[0]) if record.truths else (inf, inf)
+    return Row(site=case.place.partition('/')[0], family=case.name.partition(':')[0],
+               case=case.name, predictors=np.array([1.0, *predictors]), ceiling=ceiling,
+               accepted=False, confidence=0.0, error_m=error_m, error_deg=error_deg)
+
+
+def make_rows() -> Callable[[Path], list[tuple[list[Row], list[Row]]]]:
+    """Return what reads the rows of a file: of places by chance, and of signs."""
+    def rows(path: Path) -> list[tuple[list[Row], list[Row]]]:
+        case: StoredCase = pickle.loads(path.read_bytes())
+        by_chance = case.name.partition(':')[0] in BY_CHANCE
+        return [(place_rows(case) if by_chance else [], sign_rows(case))]
+    return rows
+
+
+def fit(rows: Sequence[Row]) -> Floats:
+    """Return the coefficients of a logistic model whose chance counts below each row's ceiling."""
+    predictors = np.array([one.predictors for one in rows])
+    return fit_logistic(
+        predictors, np.array([one.right for one in rows]),
+        np.append(0.0, np.full(predictors.shape[1] - 1, _PRIOR ** -2)),
+        weights=np.array([_WEIGHT if one.family in _UNTROUBLED else 1.0 for one in rows]),
+        ceilings=np.array([one.ceiling for one in rows]))
+
+
+def left_out(rows: Sequence[Row]) -> list[Row]:
+    """Return rows, accepted by the coefficients that the other sites fit."""
+    others = {site: fit([one for one in rows if one.site != site])
+              for site in {one.site for one in rows}}
+    chances = [float(one.ceiling * chance(one.predictors, others[one.site])) for one in rows]
+    return [replace(one, confidence=its, accepted=its >= RelocalizerOptions().min_confidence)
+            for one, its in zip(rows, chances, strict=True)]
+
+
+def paste(section: str, names: Sequence[str], coefficients: Floats) -> Iterator[str]:
+    """Yield what calibration.yaml is to say."""
+    yield f'{section}:'
+    for name, value in zip(names, coefficients, strict=True):
+        yield f'    {name}: {value:.3g}'
