@@ -16,8 +16,7 @@ from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.query import Query
-from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.tum import TumSequence, parse_stamp_ns

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
-from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalization
 from cliploc_ros.files.storage import make_folder
 from cliploc_ros.offline.evaluation.figures import (
     add_legend,

@@ -4,8 +4,8 @@
 
 Imports point downwards only, in this order (test/test_layout.py checks it):
 
-localizer, relocalizer, relocalization, warm_up
-    Frame after frame of a moving camera; frames to a result; the result.
+localizer, relocalizer, warm_up
+    Frame after frame of a moving camera; frames to a result.
 acceptance
     Confidence, and the decision to accept or refuse.
 fit

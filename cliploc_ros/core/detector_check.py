@@ -14,7 +14,7 @@ from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.geometry.camera_faults import Fault
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalization
 from cliploc_ros.errors import did_you_mean
 
 # Frames that are remembered, and detections without which nothing is said of a detector (guesses).

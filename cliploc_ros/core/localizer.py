@@ -53,8 +53,7 @@ from cliploc_ros.core.map.similarities import CropSimilarities, Similarities
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Case, Query
-from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.core.relocalizer import Relocalizer, TimeBudget
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, TimeBudget
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.units import NS_PER_S
 

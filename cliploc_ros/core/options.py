@@ -13,6 +13,11 @@ COMPARED = ('text', 'image', 'both')
 ALGORITHMS = ('auto', 'bf', 'ransac', 'prosac', 'b-prosac')
 #: Which crops of a frame are compared with labels.
 CROPS = ('all', 'on_demand')
+_CHOICES = {'matching': MATCHINGS, 'algorithm': ALGORITHMS, 'crops': CROPS}
+_RANGES = {'k': (1, math.inf), 'iterations': (1, 1_000_000), 'iou_threshold': (0.0, 1.0),
+           'time_budget_s': (0.0, math.inf), 'max_tilt_deg': (0.0, 180.0),
+           'tilt_deviation_deg': (0.0, 60.0), 'vertical_deviation_deg': (0.01, 45.0),
+           'min_inliers': (3, math.inf), 'min_confidence': (0.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -72,40 +77,24 @@ class RelocalizerOptions:
 
     def __post_init__(self) -> None:
         """Refuse values that an option does not allow."""
-        _check_choice('matching', self.matching, MATCHINGS)
-        _check_choice('algorithm', self.algorithm, ALGORITHMS)
-        _check_choice('crops', self.crops, CROPS)
+        for name, choices in _CHOICES.items():
+            if (chosen := getattr(self, name)) not in choices:
+                raise OptionsError(f"{name}: '{chosen}' is none of {', '.join(choices)}")
         if self.matching == 'class' and 'prosac' in self.algorithm:
             raise OptionsError(f"algorithm '{self.algorithm}' needs similarities, but matching "
                                "'class' has none: set algorithm to auto, bf or ransac")
-        _check_range('k', self.k, 1, math.inf)
-        _check_range('iterations', self.iterations, 1, 1_000_000)
-        _check_range('iou_threshold', self.iou_threshold, 0.0, 1.0)
-        _check_range('time_budget_s', self.time_budget_s, 0.0, math.inf)
+        for name, (low, high) in _RANGES.items():
+            if not low <= (value := getattr(self, name)) <= high:
+                raise OptionsError(f'{name}: {value} must lie within {low:g} and {high:g}')
         heights = self.height_range_m
         if len(heights) != 2 or not heights[0] < heights[1]:
             raise OptionsError(f'height_range_m: {list(heights)} must be a lower and a greater '
                                'height')
-        _check_range('max_tilt_deg', self.max_tilt_deg, 0.0, 180.0)
-        _check_range('tilt_deviation_deg', self.tilt_deviation_deg, 0.0, 60.0)
-        _check_range('vertical_deviation_deg', self.vertical_deviation_deg, 0.01, 45.0)
         mounts = self.mount_deviation
         if len(mounts) != 2 or not all(0.0 <= one < math.inf for one in mounts):
             raise OptionsError(f'mount_deviation: {list(mounts)} must be two numbers, 0 or more')
-        _check_range('min_inliers', self.min_inliers, 3, math.inf)
-        _check_range('min_confidence', self.min_confidence, 0.0, 1.0)
 
     @property
     def needs_similarities(self) -> bool:
         """Return whether crops must be compared with labels."""
         return self.matching != 'class'
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise OptionsError(f"{name}: '{value}' is none of {', '.join(choices)}")
-
-
-def _check_range(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise OptionsError(f'{name}: {value} must lie within {low:g} and {high:g}')

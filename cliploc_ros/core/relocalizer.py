@@ -12,25 +12,26 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.camera_check import CameraCheck, CameraLook, looks_of
 from cliploc_ros.core.acceptance.comparison import Comparison, search_contenders
+from cliploc_ros.core.acceptance.confidence import Support
 from cliploc_ros.core.acceptance.contenders import (
     Contender,
     JoinedFrames,
     join_frames,
     without_depth,
 )
-from cliploc_ros.core.acceptance.depth_check import check_depth
+from cliploc_ros.core.acceptance.depth_check import DepthCheck, check_depth
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, refusal
-from cliploc_ros.core.fit.finalists import find_with_rivals
+from cliploc_ros.core.fit.finalists import Match, find_with_rivals
 from cliploc_ros.core.geometry.transforms import SAME_PLACE
 from cliploc_ros.core.kernels.compiled import warm_up
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
+from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
+from cliploc_ros.core.map.joined_map import MapPart, parts_of, place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import Hypothesis, Relocalization
-from cliploc_ros.core.search.candidates import check_k
-from cliploc_ros.core.search.frame_search import SearchedFrame, coverage_of, search_frame
+from cliploc_ros.core.search.frame_search import SearchedFrame, check_k, coverage_of, search_frame
 from cliploc_ros.core.warm_up import call_every_kernel
 
 # Shares of the budget at which the search and the refinement end; acceptance takes the rest.
@@ -40,6 +41,107 @@ _SEARCH_SHARE, _REFINEMENT_SHARE = 0.8, 0.9
 _EARLIER_SEARCH_S, _EARLIER_REFINEMENT_S, _SHORT_BUDGET_S = 0.0065, 0.003, 0.05
 _MOST_FRAMES = 5
 _NO_LOOKS = Looks()
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A possible pose of the camera."""
+
+    map_from_camera: NDArray[np.float64]  #: (4, 4)
+    score: float  #: Sum of the IoUs of its inliers
+    #: Probability that it is within 1 m of the truth, 0 to 1. Each position is taken for as
+    #: uncertain as that of the best hypothesis.
+    confidence: float
+    support: Support  #: Basis of the confidence
+    #: Log odds that its attitude takes from it, see cliploc_ros.core.acceptance.confidence
+    handicap: float = 0.0
+
+
+@dataclass(frozen=True)
+class Relocalization:
+    """The hypotheses of a relocalization, and whether the best one is accepted."""
+
+    accepted: bool  #: Whether to act on the pose
+    reason: str  #: Reason of a refusal, in one line; empty when accepted
+    #: The best distinct hypotheses, best first; empty when nothing was found
+    hypotheses: tuple[Hypothesis, ...] = ()
+    #: Inliers of the best hypothesis in each frame, the newest last; empty when nothing was found
+    frame_matches: tuple[tuple[Match, ...], ...] = ()
+    #: Evidence for the best hypothesis, which decided; None when nothing was found
+    evidence: Evidence | None = None
+    #: (6, 6): of the best hypothesis, see cliploc_ros.core.fit.covariance; None when nothing was
+    #: found
+    covariance: NDArray[np.float64] | None = None
+    tried: int = 0  #: Number of hypotheses tried
+    #: Iteration that found the best hypothesis, from 1; 0 when nothing was found
+    best_iteration: int = 0
+    coverage: float = 1.0  #: Share of its samples that the search tried, 0 to 1
+    search_ms: float = 0.0  #: Time of association, search and verification [ms]
+    stamp_ns: int = 0  #: Stamp of the newest observation [ns]
+    source: str = 'objects'  #: What proposes the best pose: 'objects', 'keyframes' or 'both'
+    #: Kind of the refusal, which programs compare; None when accepted
+    refusal_kind: RefusalKind | None = None
+    #: What keyframes say, whatever the best pose comes from; None without keyframes
+    recognition: Recognition | None = None
+    #: Whether the depths of the objects can be right; None without depth
+    depth: DepthCheck | None = None
+    #: What a pose that depends on boxes, and is accepted with right cameras, says of the cameras
+    cameras: tuple[CameraLook, ...] = ()
+
+    @property
+    def matches(self) -> tuple[Match, ...]:
+        """Return the inliers of the best hypothesis in the newest frame."""
+        return self.frame_matches[-1] if self.frame_matches else ()
+
+    @property
+    def recognized(self) -> RecognizedPlace | None:
+        """Return the first place that keyframes recognize; None without one."""
+        return self.recognition.places[0] if self.recognition and self.recognition.places else None
+
+    @property
+    def solved(self) -> bool:
+        """Return whether any pose was found, accepted or not."""
+        return bool(self.hypotheses)
+
+    @property
+    def map_from_camera(self) -> NDArray[np.float64] | None:
+        """Return the best pose (4, 4), accepted or not; None when there is none."""
+        return self.hypotheses[0].map_from_camera if self.hypotheses else None
+
+    @property
+    def confidence(self) -> float:
+        """Return the probability that the best pose is within 1 m; 0 when nothing was found."""
+        return self.hypotheses[0].confidence if self.hypotheses else 0.0
+
+    @property
+    def score(self) -> float:
+        """Return the best score; 0 when nothing was found."""
+        return self.hypotheses[0].score if self.hypotheses else 0.0
+
+
+def in_its_map(found: Relocalization, landmark_map: LandmarkMap
+               ) -> tuple[Relocalization, MapPart]:
+    """Return a result in the coordinate frame of the map of its best pose, and this map.
+
+    It was found in landmark_map, which may be a JoinedMap. Poses on other maps are left out: they
+    have no place in this coordinate frame. The reason of a refusal names the map. A result from a
+    single map stays as it is.
+    """
+    parts = parts_of(landmark_map)
+    if found.map_from_camera is None or len(parts) == 1:
+        return found, parts[0]
+    places = [place_of(landmark_map, one.map_from_camera) for one in found.hypotheses]
+    part, name = places[0].part, places[0].name
+    rows = range(part.first, part.first + len(part.landmark_map))
+    reason = found.reason and f'in {name}: {found.reason}'
+    return replace(
+        found, reason=reason,
+        hypotheses=tuple(replace(one, map_from_camera=place.map_from_camera)
+                         for one, place in zip(found.hypotheses, places, strict=True)
+                         if place.name == name),
+        frame_matches=tuple(tuple(replace(one, landmark=one.landmark - part.first)
+                                  for one in of_frame if one.landmark in rows)
+                            for of_frame in found.frame_matches)), part
 
 
 @dataclass(frozen=True)
@@ -158,10 +260,17 @@ class Relocalizer:
             evidence = replace(evidence, camera=camera, camera_fault=fault)
         refused = refusal(evidence, self.options)
         shown = compared.by_objects or compared.contenders[0]
+        # the pose that leads, and the best one of each other place
+        poses = np.array([pose, *compared.poses[1:]])
+        confidences = (compared.likely * evidence.found * evidence.certainty).tolist()
+        confidences[0] = evidence.confidence
+        hypotheses = tuple(Hypothesis(
+            poses[row], one.finalist.score, confidences[row], one.support, one.handicap)
+            for row in SAME_PLACE.distinct(poses) for one in [compared.contenders[row]])
         return replace(
             result, accepted=refused is None, reason=refused.reason if refused else '',
             refusal_kind=refused.kind if refused else None,
-            hypotheses=_hypotheses(pose, compared, evidence), frame_matches=tuple(shown.matches),
+            hypotheses=hypotheses, frame_matches=tuple(shown.matches),
             evidence=evidence, covariance=covariance, best_iteration=shown.finalist.iteration,
             search_ms=budget.elapsed_ms, source=compared.source,
             recognition=compared.recognition, depth=depth, cameras=tuple(seen))
@@ -170,18 +279,6 @@ class Relocalizer:
         """Return the best poses that the search met, see search_contenders."""
         return search_contenders(joined, *find_with_rivals(
             joined.frames, joined.rig, self.options.refine, budget.refinement_end))
-
-
-def _hypotheses(pose: NDArray[np.float64], compared: Comparison, evidence: Evidence
-                ) -> tuple[Hypothesis, ...]:
-    """Return the pose that leads, and the best one of each other place."""
-    poses = np.array([pose, *compared.poses[1:]])
-    confidences = compared.likely * evidence.found * evidence.certainty
-    rows = SAME_PLACE.distinct(poses)
-    found = [compared.contenders[row] for row in rows]
-    return tuple(Hypothesis(
-        poses[row], one.finalist.score, float(confidences[row]) if row else evidence.confidence,
-        one.support, one.handicap) for row, one in zip(rows, found, strict=True))
 
 
 def _nothing_found(frames: Sequence[SearchedFrame]) -> tuple[RefusalKind, str]:

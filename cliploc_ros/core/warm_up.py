@@ -28,10 +28,11 @@ from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.kernels.compiled import warm_up
 from cliploc_ros.core.map.pairs import find_repeats, make_pairs
 from cliploc_ros.core.map.similarities import keep_greatest
-from cliploc_ros.core.search.sampling import compatible_pairs, draw_ransac
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Scene, make_scene
 from cliploc_ros.core.search.strategies import (
     Leaders,
+    compatible_pairs,
+    draw_ransac,
     search_exhaustively,
     search_progressively,
     search_samples,

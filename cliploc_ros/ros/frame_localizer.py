@@ -30,8 +30,7 @@ from cliploc_ros.core.map.similarities import split_similarities
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
-from cliploc_ros.core.relocalization import Relocalization, in_its_map
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, in_its_map
 from cliploc_ros.core.watch.watch import Watch, WatchReport
 from cliploc_ros.errors import MapError
 from cliploc_ros.files.storage import resolve_cache_dir

@@ -29,8 +29,7 @@ from cliploc_ros.core.acceptance.confidence import (
 )
 from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, pose_error
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.errors import OptionsError
 from studies.acceptance.places import ALL, MODES, ONE, Simulated
 from studies.acceptance.troubles import FAMILIES, exchange_landmarks

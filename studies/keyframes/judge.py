@@ -15,8 +15,7 @@ import numpy as np
 from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.offline.evaluation.figures import within_ellipsoid
 from studies.keyframes.records import Record, StoredCase, StoredRecognizer, localize
 from studies.reports import SUCCESS_M, Judged, errors_of, grouped, interval

@@ -28,8 +28,7 @@ from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.core.search.scene import Constraint
 from cliploc_ros.files.storage import make_folder, write_file

@@ -27,8 +27,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import Relocalization, in_its_map
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, in_its_map
 from studies.speed.floors import CAMERA, SeenFloor, make_floor, see_floor
 from studies.worlds.things import CLASS_NAMES
 

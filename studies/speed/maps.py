@@ -25,11 +25,10 @@ from cliploc_ros.core.map.similarities import (
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.search.candidates import match_frame
-from cliploc_ros.core.search.sampling import draw_ransac
+from cliploc_ros.core.search.frame_search import match_frame
 from cliploc_ros.core.search.scene import Scene
 from cliploc_ros.core.search.screening import set_up
-from cliploc_ros.core.search.strategies import Leaders, Progress, search_samples
+from cliploc_ros.core.search.strategies import Leaders, Progress, draw_ransac, search_samples
 
 _CROPS, _DIMENSIONS, _K, _CLASSES = 12, 512, 3, 40
 _CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)

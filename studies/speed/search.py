@@ -24,18 +24,19 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.search.candidates import (
+from cliploc_ros.core.search.frame_search import (
     balanced_order,
     class_candidates,
     joined,
     nearest_candidates,
 )
-from cliploc_ros.core.search.sampling import compatible_pairs, draw_ransac
 from cliploc_ros.core.search.scene import Scene, make_scene
 from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
 from cliploc_ros.core.search.strategies import (
     Leaders,
     Progress,
+    compatible_pairs,
+    draw_ransac,
     search_exhaustively,
     search_progressively,
     search_samples,

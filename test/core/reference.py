@@ -14,7 +14,7 @@ from cliploc_ros.core.geometry.ellipse import ellipse_iou
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.geometry.minimal_solvers import solve_p3p
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.core.search.candidates import Candidates
+from cliploc_ros.core.search.frame_search import Candidates
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Scene
 
 # A pose: rotation (3, 3) and translation (3,) of camera_from_map.

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from reference import same_class
 
 from cliploc_ros.core.map.landmark_map import ClassIndex
-from cliploc_ros.core.search.candidates import (
+from cliploc_ros.core.search.frame_search import (
     balanced_order,
     class_candidates,
     joined,

@@ -15,7 +15,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.search.candidates import match_frame
+from cliploc_ros.core.search.frame_search import match_frame
 
 ROOM = make_room()
 BY_CLASS = RelocalizerOptions(matching='class')

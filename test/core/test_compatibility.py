@@ -9,16 +9,18 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, see_room
 
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
-from cliploc_ros.core.search.sampling import (
+from cliploc_ros.core.search.scene import make_scene
+from cliploc_ros.core.search.strategies import (
     FARTHEST,
     NEAREST,
+    Leaders,
     _depths,
     _distance_range,
     compatible_pairs,
     enumerate_compatible_triples,
+    search_exhaustively,
+    search_progressively,
 )
-from cliploc_ros.core.search.scene import make_scene
-from cliploc_ros.core.search.strategies import Leaders, search_exhaustively, search_progressively
 
 
 def scene_of(room, rows=slice(None)):

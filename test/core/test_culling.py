@@ -21,9 +21,8 @@ from cliploc_ros.core.map.culling import (
     sort_landmarks,
     visible_members,
 )
-from cliploc_ros.core.search.sampling import draw_ransac
 from cliploc_ros.core.search.scene import Scene, make_scene
-from cliploc_ros.core.search.strategies import Leaders, search_samples
+from cliploc_ros.core.search.strategies import Leaders, draw_ransac, search_samples
 
 HERE = Poses(np.eye(3)[None], np.zeros((1, 3)))
 

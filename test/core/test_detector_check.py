@@ -9,7 +9,7 @@ from scene import CAMERA, make_room, see_room
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.detector_check import DetectorCheck
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalization
 
 NOTHING_FOUND = Relocalization(False, '5 detections are too few; turn the camera to more objects',
                                refusal_kind=RefusalKind.TOO_FEW_OBJECTS)

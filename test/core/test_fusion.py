@@ -21,7 +21,7 @@ from cliploc_ros.core.geometry.transforms import SAME_PLACE, invert_transform, m
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.search.candidates import match_frame
+from cliploc_ros.core.search.frame_search import match_frame
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
 
 FRAMES = 4

@@ -7,7 +7,7 @@ import pytest
 from reference import candidate_mask, same_class, sample_pose, verify
 
 from cliploc_ros.core.geometry.minimal_solvers import solve_p3p
-from cliploc_ros.core.search.candidates import (
+from cliploc_ros.core.search.frame_search import (
     balanced_order,
     nearest_candidates,
     prosac_order,

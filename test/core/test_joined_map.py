@@ -13,8 +13,7 @@ from cliploc_ros.core.map.joined_map import MAX_MAPS, join_maps, parts_of, place
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import in_its_map
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalizer, in_its_map
 from cliploc_ros.errors import MapError
 
 OPTIONS = RelocalizerOptions(matching='class')

@@ -18,8 +18,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.search import candidates
-from cliploc_ros.core.search.candidates import match_frame, nearest_candidates
+from cliploc_ros.core.search import frame_search
+from cliploc_ros.core.search.frame_search import match_frame, nearest_candidates
 from cliploc_ros.core.search.scene import make_scene
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
@@ -95,7 +95,7 @@ def test_a_box_that_no_lens_sees_changes_nothing(count, far):
 def test_too_many_candidates_are_cut_and_said(monkeypatch):
     landmark_map, observation = make_world(400)
     whole, _ = match_frame(landmark_map, observation, RelocalizerOptions())
-    monkeypatch.setattr(candidates, 'MAX_CANDIDATES', 60)
+    monkeypatch.setattr(frame_search, 'MAX_CANDIDATES', 60)
     cut, left_out = match_frame(landmark_map, observation, RelocalizerOptions())
     assert len(cut.pairs) < len(whole.pairs) <= len(cut.pairs) + left_out
     assert (cut.pairs == whole.pairs[:len(cut.pairs)]).all()

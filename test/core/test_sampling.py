@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cliploc_ros.core.search.sampling import draw_prosac, draw_ransac, prosac_growth
+from cliploc_ros.core.search.strategies import draw_prosac, draw_ransac, prosac_growth
 
 
 def test_growth_of_chum_and_matas():

@@ -13,11 +13,12 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
 from cliploc_ros.core.geometry.ellipse import ellipse_iou, iou_bound
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
-from cliploc_ros.core.search.sampling import compatible_pairs, draw_ransac
 from cliploc_ros.core.search.scene import Constraint, make_scene
 from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
 from cliploc_ros.core.search.strategies import (
     Leaders,
+    compatible_pairs,
+    draw_ransac,
     search_exhaustively,
     search_progressively,
     search_samples,

@@ -52,8 +52,7 @@ from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, SAME_PLAC
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.map.joined_map import Place, place_of
-from cliploc_ros.core.search.candidates import match_frame
-from cliploc_ros.core.search.frame_search import constraint_of, coverage_of
+from cliploc_ros.core.search.frame_search import constraint_of, coverage_of, match_frame
 from cliploc_ros.core.search.strategies import MAX_DISTINCT
 
 # The most poses of objects that propose keyframes.

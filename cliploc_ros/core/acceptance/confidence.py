@@ -157,7 +157,12 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
                     landmark_map, frame, map_from_camera, distinct), strict=True):
                 rows.setdefault(int(landmark_map.objects[match.landmark]), {})[
                     number, match.detection] = row
-        unexplained += _unexplained(frame, [match.detection for match in found])
+        # A class that a landmark is only taken for does not count: a real person is not expected
+        # in a map because a teddy bear sometimes looks like one.
+        matched, others = [match.detection for match in found], frame.are_own.copy()
+        others[matched] = False
+        alone = 1.0 - frame.same[others][:, matched].max(axis=1, initial=0.0)
+        unexplained += float((alone / frame.same[others][:, others].sum(axis=1)).sum())
     if not rows:
         return Support()
     shown = {one: row / len(of_object) for of_object in rows.values()
@@ -166,16 +171,6 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
     views_of_each = len(shown) / len(rows)
     return Support(*map(float, [*total[:-1], unexplained / views_of_each, total[-1]]),
                    shown=shown)
-
-
-def _unexplained(frame: ComparedFrame, matched: list[int]) -> float:
-    """Return the number of things of the map's classes that no match shows."""
-    # A class that a landmark is only taken for does not count: a real person is not expected in a
-    # map because a teddy bear sometimes looks like one.
-    others = frame.are_own.copy()
-    others[matched] = False
-    alone = 1.0 - frame.same[others][:, matched].max(axis=1, initial=0.0)
-    return float((alone / frame.same[others][:, others].sum(axis=1)).sum())
 
 
 def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
@@ -192,12 +187,27 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
         likenesses = (likenesses - frame.means[detections]) / frame.deviations[detections]
     # 0 if the class of a detection is none of its landmark
     shares = landmark_map.classes.shares(landmarks, frame.classes[detections])
-    sigmas = landmark_map.position_sigmas[landmarks]
+    scene, sigmas = frame.scene, landmark_map.position_sigmas[landmarks]
+    centers, shapes = scene.centers[landmarks], scene.shapes[landmarks]
+    camera_from_map, odds = invert_transform(map_from_camera), np.zeros(len(matches))
+    outlines = project_ellipsoids(camera_from_map, centers, shapes)
+    boxes, halves = scene.box_ellipses[detections], np.sqrt(outlines[:, [2, 4]])
+    depths = centers @ camera_from_map[2, :3] + camera_from_map[2, 3]
+    # the calibration's maps are no worse than the default
+    more = np.sqrt(np.maximum(0.0, sigmas ** 2 - DEFAULT_SIGMA_M ** 2)) / depths
+    deviations = np.hypot(_EDGE_DEVIATION[0] * boxes[:, 2:].mean(axis=1) + _EDGE_DEVIATION[1],
+                          more)[:, None]
+    edges = np.concatenate([outlines[:, :2] - halves - boxes[:, :2] + boxes[:, 2:],
+                            outlines[:, :2] + halves - boxes[:, :2] - boxes[:, 2:]], axis=1)
+    misfits = np.log1p((edges / deviations) ** 2).sum(axis=1)
+    if scene.depths.any():
+        odds = depth_odds(depth_errors(
+            scene.depths[detections], centers, shapes, sigmas,
+            np.ascontiguousarray(camera_from_map[:3, :3]),
+            np.ascontiguousarray(camera_from_map[:3, 3])))
     return np.column_stack([
-        np.ones(len(matches)), [match.iou for match in matches],
-        _misfits(frame.scene, map_from_camera, detections, landmarks, sigmas), likenesses,
-        shares * frame.rarities[detections], ~compared,
-        _depth_odds(frame.scene, map_from_camera, detections, landmarks, sigmas)])
+        np.ones(len(matches)), [match.iou for match in matches], misfits, likenesses,
+        shares * frame.rarities[detections], ~compared, odds])
 
 
 def one_thing(bboxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -212,34 +222,6 @@ def one_thing(bboxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
     found = np.clip((ious - least) / (most - least), 0.0, 1.0)
     np.fill_diagonal(found, 1.0)
     return np.asarray(found)
-
-
-def _misfits(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDArray[np.int64],
-             landmarks: NDArray[np.int64], sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
-    camera_from_map = invert_transform(map_from_camera)
-    outlines = project_ellipsoids(camera_from_map, scene.centers[landmarks],
-                                  scene.shapes[landmarks])
-    boxes, halves = scene.box_ellipses[detections], np.sqrt(outlines[:, [2, 4]])
-    depths = scene.centers[landmarks] @ camera_from_map[2, :3] + camera_from_map[2, 3]
-    # the calibration's maps are no worse than the default
-    more = np.sqrt(np.maximum(0.0, sigmas ** 2 - DEFAULT_SIGMA_M ** 2)) / depths
-    deviations = np.hypot(_EDGE_DEVIATION[0] * boxes[:, 2:].mean(axis=1) + _EDGE_DEVIATION[1],
-                          more)[:, None]
-    edges = np.concatenate([outlines[:, :2] - halves - boxes[:, :2] + boxes[:, 2:],
-                            outlines[:, :2] + halves - boxes[:, :2] - boxes[:, 2:]], axis=1)
-    return np.asarray(np.log1p((edges / deviations) ** 2).sum(axis=1))
-
-
-def _depth_odds(scene: Scene, map_from_camera: NDArray[np.float64], detections: NDArray[np.int64],
-                landmarks: NDArray[np.int64], sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the log odds of each match (m,) by its depth; 0 where none was measured."""
-    if not scene.depths.any():
-        return np.zeros(len(detections))
-    camera_from_map = invert_transform(map_from_camera)
-    return depth_odds(depth_errors(
-        scene.depths[detections], scene.centers[landmarks], scene.shapes[landmarks], sigmas,
-        np.ascontiguousarray(camera_from_map[:3, :3]),
-        np.ascontiguousarray(camera_from_map[:3, 3])))
 
 
 class Setting(NamedTuple):

@@ -25,7 +25,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import move_covariance, pose_difference
 from cliploc_ros.core.keyframes.localization import PER_RADIAN
 from cliploc_ros.core.keyframes.places import RecognizedPlace
-from cliploc_ros.core.keyframes.point_pose import PointPose, find_pose
+from cliploc_ros.core.keyframes.point_pose import find_pose
 
 #: Motions of right poses are no further off, in squared deviations (95 %, dof 6).
 SURE_MOTION = float(chi2.ppf(0.95, 6))
@@ -61,43 +61,32 @@ def compare_motion(deviation_per_metre: float, first: RecognizedPlace, second: R
     first_from_second : ndarray (4, 4)
         Motion of the camera by odometry.
     """
-    expected = first.map_from_camera @ first_from_second
-    information = np.linalg.inv(_covariance(deviation_per_metre, first, second, first_from_second))
-
-    def square(pose: NDArray[np.float64]) -> float:
-        step = pose_difference(expected, pose)
-        return float(step @ information @ step)
-    pictures = [_on_picture(first, first_from_second, away_m) for away_m in _PICTURES_M]
-    return Motion(square(second.map_from_camera), min(
-        np.inf if one is None else square(one.map_from_camera) for one in pictures))
-
-
-def _covariance(deviation_per_metre: float, first: RecognizedPlace, second: RecognizedPlace,
-                first_from_second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the covariance (6, 6) of the second pose about the pose expected by odometry.
-
-    A wrong pose of a keyframe moves both looks at it alike, so it does not count where the same
-    keyframes are seen. What their points add with the distance counts for the way between.
-    """
+    # A wrong pose of a keyframe moves both looks at it alike, so it does not count where the same
+    # keyframes are seen. What their points add with the distance counts for the way between.
     shares = dict(zip(second.keyframes, second.shares, strict=True))
     same = sum(min(share, shares.get(keyframe, 0.0))
                for keyframe, share in zip(first.keyframes, first.shares, strict=True))
     way, turn = first_from_second[:3, 3], Rotation.from_matrix(first_from_second[:3, :3])
     grown = (deviation_per_metre * np.linalg.norm(way), PER_RADIAN * turn.magnitude())
     before, after = (one.covariance - same * one.shared for one in (first, second))
-    return move_covariance(before, first.map_from_camera[:3, :3] @ way) + after + np.diag(
-        odometry_deviations(first_from_second) ** 2 + same * np.repeat(grown, 3) ** 2)
+    information = np.linalg.inv(
+        move_covariance(before, first.map_from_camera[:3, :3] @ way) + after + np.diag(
+            odometry_deviations(first_from_second) ** 2 + same * np.repeat(grown, 3) ** 2))
+    expected = first.map_from_camera @ first_from_second
 
-
-def _on_picture(first: RecognizedPlace, first_from_second: NDArray[np.float64], away_m: float
-                ) -> PointPose | None:
-    """Return where the second image is recognized if both show a picture that faced the first."""
+    def square(pose: NDArray[np.float64]) -> float:
+        step = pose_difference(expected, pose)
+        return float(step @ information @ step)
+    # where the second image is recognized if both show a picture that faced the first
     points = first.points[::1 + len(first.points) // _MOST_POINTS]
     inside = (points - first.map_from_camera[:3, 3]) @ first.map_from_camera[:3, :3]
-    shown = away_m * inside / inside[:, 2:]
-    moved = (shown - first_from_second[:3, 3]) @ first_from_second[:3, :3]
-    ahead = moved[:, 2] > _AHEAD_M
-    return find_pose(points[ahead], moved[ahead, :2] / moved[ahead, 2:])
+    picture = np.inf
+    for away_m in _PICTURES_M:
+        moved = (away_m * inside / inside[:, 2:] - way) @ first_from_second[:3, :3]
+        ahead = moved[:, 2] > _AHEAD_M
+        seen = find_pose(points[ahead], moved[ahead, :2] / moved[ahead, 2:])
+        picture = min(picture, np.inf if seen is None else square(seen.map_from_camera))
+    return Motion(square(second.map_from_camera), picture)
 
 
 class Signs(NamedTuple):

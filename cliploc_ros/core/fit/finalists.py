@@ -103,7 +103,16 @@ def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, coun
         order = np.argsort(-scores, kind='stable')
         found = [found[row]._replace(score=float(scores[row])) for row in order[
             SAME_PLACE.distinct(poses_of(found)[order], count)]]
-    return _refined(found, rig, deadline)[:_COMPARED] if refine else found[:MAX_DISTINCT]
+    if not refine:
+        return found[:MAX_DISTINCT]
+    improved: list[Finalist] = []
+    for some in batched(found, _REFINED_AT_ONCE):
+        in_time = not improved or time.perf_counter() <= deadline
+        improved += [one._replace(**refine_rig(rig, one.rotation, one.translation)._asdict())
+                     for one in some] if in_time else some
+    improved.sort(key=lambda one: -one.score)
+    # one of each minimum
+    return [improved[row] for row in SAME_MINIMUM.distinct(poses_of(improved), _COMPARED)]
 
 
 def _leaders_of(frames: Sequence[SearchedFrame], rig: Rig, frame: int) -> list[Finalist]:
@@ -115,19 +124,6 @@ def _leaders_of(frames: Sequence[SearchedFrame], rig: Rig, frame: int) -> list[F
                      float(leaders.scores[row]), int(leaders.iterations[row]), frame,
                      leaders.samples[row][leaders.samples[row] >= 0])
             for row in leaders.ranked()]
-
-
-def _refined(found: list[Finalist], rig: Rig, deadline: float) -> list[Finalist]:
-    """Return the poses after refinement, best first, one of each minimum."""
-    improved: list[Finalist] = []
-    for some in batched(found, _REFINED_AT_ONCE):
-        if improved and time.perf_counter() > deadline:
-            improved += some
-            continue
-        improved += [one._replace(**refine_rig(rig, one.rotation, one.translation)._asdict())
-                     for one in some]
-    improved.sort(key=lambda one: -one.score)
-    return [improved[row] for row in SAME_MINIMUM.distinct(poses_of(improved))]
 
 
 def matches_of(rig: Rig, pose: Finalist) -> list[tuple[Match, ...]]:

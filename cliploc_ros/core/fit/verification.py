@@ -95,18 +95,15 @@ def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64]
                                                      strict=True))),
         pairs=first.pairs[:0],
         groups=Groups(*map(np.concatenate, zip(*(one.groups for one in scenes), strict=True))))
-    sizes = [[0] * len(FrameStarts._fields), *map(_sizes, scenes)]
+    # how many rows each frame has in each array, in the order of FrameStarts
+    sizes = [[0] * len(FrameStarts._fields), *(
+        [len(one.box_ellipses), len(one.potential.landmarks), len(one.potential.detections),
+         len(one.groups.starts) - 1, *(len(rows) for rows in (
+             one.groups.detections, one.groups.members, one.groups.levels, one.groups.spheres))]
+        for one in scenes)]
     starts = np.ascontiguousarray(np.cumsum(sizes, axis=0, dtype=np.int64).T)
     return Rig(joined, FrameStarts(*starts), np.ascontiguousarray(camera_from_reference[:, :3]),
                np.ascontiguousarray(verticals), sigmas)
-
-
-def _sizes(scene: Scene) -> list[int]:
-    """Return how many rows a frame has in each array, in the order of FrameStarts."""
-    potential, groups = scene.potential, scene.groups
-    return [len(scene.box_ellipses), len(potential.landmarks), len(potential.detections),
-            len(groups.starts) - 1, len(groups.detections), len(groups.members),
-            len(groups.levels), len(groups.spheres)]
 
 
 @compiled

@@ -84,33 +84,23 @@ def expect(landmark_map: LandmarkMap, camera: Camera, map_from_camera: NDArray[n
     sides, full = clipped[:, 2:] - clipped[:, :2], boxes[:, 2:] - boxes[:, :2]
     visible = (sides.min(axis=1, initial=np.inf) >= _LEAST_SIDE_PX) & (
         sides.prod(axis=1) >= _SHOWN_SHARE * full.prod(axis=1))
-    visible &= ~_hidden(clipped, offsets[:, 2], landmark_map.semi_axes[near].max(axis=1))
+    # one nearer landmark hides a part
+    shared = (np.minimum(clipped[:, None, 2:], clipped[:, 2:])
+              - np.maximum(clipped[:, None, :2], clipped[:, :2])).clip(0.0).prod(axis=2)
+    areas, depths = np.maximum(sides.prod(axis=1), 1e-9), offsets[:, 2]
+    nearer = depths + landmark_map.semi_axes[near].max(axis=1) < depths[:, None]
+    visible &= ~(nearer & (shared > _HIDDEN_SHARE * areas[:, None])).any(axis=1)
     was_seen = np.isin(landmark_map.objects[near], landmark_map.objects[shown])
-    in_sight = _beside(offsets, was_seen)
+    # beside a seen one or before it
+    distances = np.linalg.norm(offsets, axis=1)
+    directions = offsets / np.maximum(distances, 1e-9)[:, None]
+    in_sight = ((directions @ directions[was_seen].T > _BESIDE_COSINE) & (
+        distances[was_seen] > _BESIDE_SHARE * distances[:, None])).any(axis=1)
     rows = np.nonzero(visible)[0]
     rows = rows[np.unique(landmark_map.objects[near[rows]], return_index=True)[1]]
     x, y, _ = (landmark_map.centers[near[rows]] - map_from_camera[:3, 3]).T
     sides = np.floor(SIDES * (np.arctan2(y, x) / (2.0 * np.pi) + 0.5)).astype(np.int64) % SIDES
     return Expected(near[rows], was_seen[rows], in_sight[rows], sides)
-
-
-def _hidden(boxes: NDArray[np.float64], depths: NDArray[np.float64], radii: NDArray[np.float64]
-            ) -> NDArray[np.bool_]:
-    """Return which of k boxes (k, 4) one nearer landmark hides in part."""
-    shared = (np.minimum(boxes[:, None, 2:], boxes[:, 2:])
-              - np.maximum(boxes[:, None, :2], boxes[:, :2])).clip(0.0).prod(axis=2)
-    areas = np.maximum((boxes[:, 2:] - boxes[:, :2]).prod(axis=1), 1e-9)
-    nearer = depths + radii < depths[:, None]
-    return np.asarray((nearer & (shared > _HIDDEN_SHARE * areas[:, None])).any(axis=1))
-
-
-def _beside(offsets: NDArray[np.float64], was_seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which of k landmarks (k, 3) in the camera are beside a seen one or before it."""
-    distances = np.linalg.norm(offsets, axis=1)
-    directions = offsets / np.maximum(distances, 1e-9)[:, None]
-    beside = (directions @ directions[was_seen].T > _BESIDE_COSINE) & (
-        distances[was_seen] > _BESIDE_SHARE * distances[:, None])
-    return np.asarray(beside.any(axis=1))
 
 
 class _Record(NamedTuple):

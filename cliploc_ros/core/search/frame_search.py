@@ -1,6 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The search of one frame by the algorithm that the options name."""
+"""One frame: its association with the map, and the search by the algorithm that the options name.
+
+Candidates are pairs of a detection and a landmark that it may show. Matching types (Matsuzaki et
+al. 2024, Sec. IV-A3): *class* pairs equal detector classes, *clip* each detection with the k
+landmarks whose labels are most similar to its crop, *hybrid* samples from clip and verifies with
+both.
+"""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -11,28 +17,36 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry.depth import depth_deviations
+from cliploc_ros.core.map.culling import FEW, SortedLandmarks
 from cliploc_ros.core.map.joined_map import parts_of
-from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import ClassIndex, LandmarkMap
+from cliploc_ros.core.map.similarities import Similarities, nearest_landmarks, split_similarities
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.search.candidates import match_frame
-from cliploc_ros.core.search.sampling import (
+from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Constraint, Scene, make_scene
+from cliploc_ros.core.search.strategies import (
+    MAX_DISTINCT,
     SAMPLE_SIZE,
+    Leaders,
+    Progress,
     compatible_pairs,
     draw_prosac,
     draw_ransac,
-)
-from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Constraint, Scene
-from cliploc_ros.core.search.strategies import (
-    MAX_DISTINCT,
-    Leaders,
-    Progress,
     search_exhaustively,
     search_progressively,
     search_samples,
 )
 from cliploc_ros.errors import OptionsError
 
+#: The most candidates of auto. Which of them are compatible takes this squared in bytes, and a
+#: few milliseconds. In sparse maps of 100,000 landmarks this limit ends the search before its
+#: iterations do: candidates of equal class are hardly ever neighbours.
+MAX_CANDIDATES = 1_500
+# Coordinates on the plane z = 1 beyond this are no image of any lens; their squares are finite.
+_FARTHEST = 1e6
+# Depths beyond this have another unit.
+_FARTHEST_M = 40.0
 #: The number of best hypotheses that are refined. On the recorded frames, worse ones never led
 #: afterwards.
 REFINED = 32
@@ -40,6 +54,220 @@ REFINED = 32
 _UP_IN_MAP = (0.0, 0.0, 1.0)
 _UPRIGHT = (0.0, -1.0, 0.0)
 _UNIT_TOLERANCE = 1e-3
+
+
+class Candidates(NamedTuple):
+    """Correspondence candidates, in the order in which a sampler prefers them."""
+
+    #: (c,): indices of the pair
+    detections: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+    #: (c,): 0 for a detection's most similar landmark, 1 for the next, and so on
+    ranks: NDArray[np.int64]
+    #: (c,): cosine similarity of crop and label; 0 where only the class is known
+    similarities: NDArray[np.float64]
+
+    @property
+    def pairs(self) -> NDArray[np.int64]:
+        """Return (detection, landmark) of each candidate (c, 2)."""
+        return np.stack([self.detections, self.landmarks], axis=1)
+
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> 'Candidates':
+        """Return some of the candidates."""
+        return Candidates._make(column[rows] for column in self)
+
+    def moved(self, first: int) -> 'Candidates':
+        """Return the candidates of a map whose landmarks begin at a row of several maps'."""
+        return self._replace(landmarks=self.landmarks + first)
+
+    def ordered(self, *keys: NDArray[np.float64] | NDArray[np.int64]) -> 'Candidates':
+        """Return the candidates sorted by keys, the first key first; ties keep their order."""
+        return self.select(np.lexsort(keys[::-1]))
+
+
+def class_candidates(index: ClassIndex, classes: NDArray[np.int64], limit: int | None = None
+                     ) -> Candidates:
+    """Return the pairs of equal class, detection by detection.
+
+    With a limit there are no more than that, beginning with the rarest classes: a pair is the more
+    probable, the fewer landmarks its class has.
+
+    Parameters
+    ----------
+    classes : ndarray (n,) of int
+        Class of each detection, as the index numbers them; below 0 for none.
+    """
+    order = np.arange(len(classes)) if limit is None else np.argsort(index.sizes_of(classes),
+                                                                     kind='stable')
+    pairs = index.pairs(classes, order, limit)
+    zeros = np.zeros(len(pairs))
+    return Candidates(pairs[:, 0], pairs[:, 1], zeros.astype(np.int64), zeros)
+
+
+def check_k(k: int, landmark_count: int) -> None:
+    """Refuse a k that exceeds the map with an OptionsError."""
+    if not 1 <= k <= landmark_count:
+        raise OptionsError(f'k = {k}, but the map has {landmark_count} landmarks: '
+                           f'set k to {landmark_count} or less')
+
+
+def nearest_candidates(similarities: Similarities, k: int) -> Candidates:
+    """Return the k most similar landmarks of each detection as candidates, best first.
+
+    OptionsError: the map has fewer than k landmarks.
+    """
+    detection_count, landmark_count = similarities.shape
+    check_k(k, landmark_count)
+    landmarks, values = nearest_landmarks(similarities, k)
+    return Candidates(np.repeat(np.arange(detection_count), k), landmarks.ravel(),
+                      np.tile(np.arange(k), detection_count), values.ravel().astype(np.float64))
+
+
+def prosac_order(candidates: Candidates) -> Candidates:
+    """Return the candidates by decreasing similarity (Chum and Matas 2005)."""
+    return candidates.ordered(-candidates.similarities)
+
+
+def balanced_order(candidates: Candidates) -> Candidates:
+    """Return all nearest landmarks by decreasing similarity, then all second-nearest, and so on.
+
+    The order of B-PROSAC (Matsuzaki et al. 2024, Fig. 3): it keeps large, confident detections
+    from filling the head of the list.
+    """
+    return candidates.ordered(candidates.ranks, -candidates.similarities)
+
+
+def concatenated(some: Sequence[Candidates]) -> Candidates:
+    """Return the candidates of several lists, at least one, one list after the other."""
+    return Candidates(*map(np.concatenate, zip(*some, strict=True)))
+
+
+def joined(first: Candidates, second: Candidates, landmark_count: int) -> Candidates:
+    """Return the first candidates, followed by those of the second that are new."""
+    known = first.detections * landmark_count + first.landmarks
+    new = np.nonzero(~np.isin(second.detections * landmark_count + second.landmarks, known))[0]
+    return concatenated([first, second.select(new)])
+
+
+def match_frame(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions
+                ) -> tuple[Scene, int]:
+    """Associate one frame with the map.
+
+    Returns
+    -------
+    scene : Scene
+        Its pairs are the candidates, in the order of the sampler.
+    left_out : int
+        How many candidates exceed the limit of auto.
+
+    Raises
+    ------
+    OptionsError
+        The matching type needs similarities that are missing, of the wrong shape, or not finite;
+        depths are of the wrong shape.
+    """
+    bboxes = observation.camera.normalize_bboxes(observation.detections.bboxes_xyxy)
+    # NaN where the lens model has no inverse; a box turned inside out has no ellipse
+    sound = (bboxes[:, 2:] > bboxes[:, :2]).all(axis=1) & (np.abs(bboxes) < _FARTHEST).all(axis=1)
+    classes = landmark_map.classes.classes_of(observation.detections.class_ids)
+    classes[~sound] = -1
+    nearest = _nearest(landmark_map, observation, options, sound)
+    candidates, left_out = _candidates(landmark_map, observation.detections.class_ids, classes,
+                                       nearest, options)
+    by_class = classes if options.matching != 'clip' else np.full_like(classes, -1)
+    single, sorted_landmarks = _potential(landmark_map, by_class, nearest)
+    # no pair uses the placeholder of a box that is not sound
+    return make_scene(np.where(sound[:, None], bboxes, 1.0), landmark_map.centers,
+                      landmark_map.shapes, single, candidates.pairs, options.iou_threshold,
+                      sorted_landmarks, by_class, _depths(observation, options)), left_out
+
+
+def _depths(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64] | None:
+    """Return the depths of a scene (n, 2); the paper's algorithms do not use them."""
+    depths, deviations = observation.depths, observation.depth_deviations
+    if depths is None or options.algorithm != 'auto':
+        return None
+    if deviations is None:
+        deviations = depth_deviations(depths)
+    for name, values in (('depths', depths), ('depth_deviations', deviations)):
+        if values.shape != (len(observation.detections),):
+            raise OptionsError(f'{name} of shape {values.shape}, but there are '
+                               f'{len(observation.detections)} detections')
+    with np.errstate(invalid='ignore'):
+        known = ((depths > 0.0) & (depths < _FARTHEST_M)
+                 & (deviations > 0.0) & (deviations < np.inf))
+    return np.where(known[:, None], np.column_stack([depths, deviations]), 0.0)
+
+
+def _potential(landmark_map: LandmarkMap, classes: NDArray[np.int64], nearest: Candidates | None
+               ) -> tuple[NDArray[np.int64], SortedLandmarks | None]:
+    """Return the pairs (p, 2) to verify, and the landmarks to verify by class besides.
+
+    In a small map the pairs are complete: culling costs more there than it saves.
+    """
+    if len(landmark_map) <= FEW:
+        of_class = class_candidates(landmark_map.classes, classes)
+        return (of_class if nearest is None else
+                joined(nearest, of_class, len(landmark_map))).pairs, None
+    if nearest is None:
+        return np.empty((0, 2), dtype=np.int64), landmark_map.sorted_landmarks
+    by_class = landmark_map.classes.have(nearest.landmarks, classes[nearest.detections])
+    return nearest.select(~by_class).pairs, landmark_map.sorted_landmarks
+
+
+def _nearest(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions,
+             sound: NDArray[np.bool_]) -> Candidates | None:
+    """Return the k most similar landmarks of each sound, compared detection; None without CLIP."""
+    if not options.needs_similarities:
+        return None
+    compared = observation.compared
+    if compared is None:
+        compared = np.arange(len(observation.detections))
+    shape = (len(compared), len(landmark_map))
+    similarities = observation.similarities
+    if similarities is None or similarities.shape != shape:
+        found = 'none' if similarities is None else f'{similarities.shape}'
+        raise OptionsError(f"matching '{options.matching}' needs similarities of shape "
+                           f'{shape}, found {found}')
+    parts = parts_of(landmark_map)
+    sizes = [len(part.landmark_map) for part in parts]
+    # k of each map, so that the labels of one map do not hide the rivals on the others
+    nearest = concatenated([
+        nearest_candidates(some, min(options.k, size)).moved(part.first)
+        for part, size, some in zip(parts, sizes, split_similarities(similarities, sizes),
+                                    strict=True)])
+    nearest = nearest._replace(detections=compared[nearest.detections])
+    return nearest.select(sound[nearest.detections])
+
+
+def _candidates(landmark_map: LandmarkMap, class_ids: Sequence[str],
+                classes: NDArray[np.int64], nearest: Candidates | None,
+                options: RelocalizerOptions) -> tuple[Candidates, int]:
+    """Return the candidates in the order of the sampler, and how many are left out.
+
+    Of pairs of equal class auto has at most MAX_CANDIDATES. Each of several maps gets an equal
+    share, and they take turns: a search that is cut short has looked for rivals on all of them.
+    """
+    index = landmark_map.classes
+    if nearest is not None:
+        if options.algorithm == 'prosac':
+            nearest = prosac_order(nearest)
+        elif options.algorithm in ('b-prosac', 'auto'):
+            nearest = balanced_order(nearest)
+        if options.matching == 'clip' or options.algorithm != 'auto':
+            return nearest, 0
+    if options.algorithm != 'auto':
+        return class_candidates(index, classes), 0
+    parts, found = parts_of(landmark_map), []
+    for part in parts:
+        of_part = part.landmark_map.classes
+        own = np.where(classes >= 0, of_part.classes_of(class_ids), -1)
+        found.append(class_candidates(of_part, own, MAX_CANDIDATES // len(parts))
+                     .moved(part.first))
+    turns = np.concatenate([np.arange(len(some.landmarks)) for some in found])
+    of_class = concatenated(found).ordered(turns)
+    left_out = int(index.sizes_of(classes).sum()) - len(of_class.landmarks)
+    return of_class if nearest is None else joined(nearest, of_class, len(landmark_map)), left_out
 
 
 class SearchedFrame(NamedTuple):
@@ -58,12 +286,13 @@ class SearchedFrame(NamedTuple):
     @property
     def sample_size(self) -> int:
         """Return how many candidates a minimal sample has."""
-        return _sample_size(self.vertical)
+        return SAMPLE_SIZE - 1 if self.vertical[6] > 0.0 else SAMPLE_SIZE
 
     @property
     def has_samples(self) -> bool:
         """Return whether there are enough different detections and landmarks for a sample."""
-        return _has_samples(self.scene, self.vertical)
+        pairs = self.scene.pairs
+        return min(len(np.unique(pairs[:, 0])), len(np.unique(pairs[:, 1]))) >= self.sample_size
 
     @property
     def known_tried(self) -> int:
@@ -84,41 +313,42 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
     the vertical is no unit vector.
     """
     scene, left_out = match_frame(landmark_map, observation, options)
-    vertical = vertical_of(observation, options)
-    leaders = Leaders.none_yet(REFINED if options.refine else MAX_DISTINCT)
-    tilted, samples, progress = Leaders.none_yet(), None, Progress(0, 1.0)
-    if _has_samples(scene, vertical):
-        constraint = constraint_of(observation, options)
-        if options.algorithm == 'auto':
-            try_all = partial(search_progressively, scene, compatible_pairs(scene),
-                              constraint=constraint, limit=options.iterations)
-            progress = _run(try_all(leaders, size=_sample_size(vertical)), deadline)
-            if _is_known(vertical):
-                # The vertical may be wrong, as with a wrong camera mount. Then the pose that the
-                # boxes alone suggest must be among the rivals.
-                free = _run(try_all(tilted), deadline)
-                progress = progress._replace(tried=progress.tried + free.tried)
-        elif options.algorithm == 'bf':
-            progress = _run(search_exhaustively(scene, leaders, constraint), deadline)
-        else:
-            draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
-            seed = options.random_seed if options.random_seed >= 0 else None
-            samples = draw(scene.pairs, options.iterations, np.random.default_rng(seed))
-            progress = _run(search_samples(scene, samples, leaders, constraint), deadline)
-        if left_out:  # the share of all samples that consist of the candidates kept
-            kept = comb(len(scene.pairs), SAMPLE_SIZE) / max(
-                comb(len(scene.pairs) + left_out, SAMPLE_SIZE), 1)
-            progress = progress._replace(coverage=progress.coverage * kept)
-    return SearchedFrame(observation, scene, vertical, leaders, tilted, progress, samples,
-                         tuple(part.first for part in parts_of(landmark_map)))
+    frame = SearchedFrame(
+        observation, scene, vertical_of(observation, options),
+        Leaders.none_yet(REFINED if options.refine else MAX_DISTINCT), Leaders.none_yet(),
+        Progress(0, 1.0), None, tuple(part.first for part in parts_of(landmark_map)))
+    if not frame.has_samples:
+        return frame
+    samples, constraint = None, constraint_of(observation, options)
+    if options.algorithm == 'auto':
+        try_all = partial(search_progressively, scene, compatible_pairs(scene),
+                          constraint=constraint, limit=options.iterations)
+        progress = _run(try_all(frame.leaders, size=frame.sample_size), deadline)
+        if frame.vertical[6] > 0.0:
+            # The vertical may be wrong, as with a wrong camera mount. Then the pose that the boxes
+            # alone suggest must be among the rivals.
+            free = _run(try_all(frame.tilted), deadline)
+            progress = progress._replace(tried=progress.tried + free.tried)
+    elif options.algorithm == 'bf':
+        progress = _run(search_exhaustively(scene, frame.leaders, constraint), deadline)
+    else:
+        draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
+        seed = options.random_seed if options.random_seed >= 0 else None
+        samples = draw(scene.pairs, options.iterations, np.random.default_rng(seed))
+        progress = _run(search_samples(scene, samples, frame.leaders, constraint), deadline)
+    if left_out:  # the share of all samples that consist of the candidates kept
+        kept = comb(len(scene.pairs), SAMPLE_SIZE) / max(
+            comb(len(scene.pairs) + left_out, SAMPLE_SIZE), 1)
+        progress = progress._replace(coverage=progress.coverage * kept)
+    return frame._replace(progress=progress, samples=samples)
 
 
 def constraint_of(observation: Observation, options: RelocalizerOptions) -> Constraint:
     """Return what is known of the camera of a frame before anything is searched."""
     vertical, (low, high) = vertical_of(observation, options), options.height_range_m
-    known = _is_known(vertical)
+    known = vertical[6] > 0.0
     return Constraint(tuple(vertical[:3]) if known else _UPRIGHT, _UP_IN_MAP, low, high,
-                 np.radians(options.max_tilt_deg), vertical[6] if known else inf)
+                      np.radians(options.max_tilt_deg), vertical[6] if known else inf)
 
 
 def coverage_of(frames: Sequence[SearchedFrame]) -> float:
@@ -137,19 +367,6 @@ def vertical_of(observation: Observation, options: RelocalizerOptions) -> NDArra
     if up.shape != (3,) or not abs(np.linalg.norm(up) - 1.0) < _UNIT_TOLERANCE:
         raise OptionsError(f'up_in_camera: {up} is no unit vector')
     return np.array([*up, *_UP_IN_MAP, np.radians(options.vertical_deviation_deg)])
-
-
-def _is_known(vertical: NDArray[np.float64]) -> bool:
-    return bool(vertical[6] > 0.0)
-
-
-def _sample_size(vertical: NDArray[np.float64]) -> int:
-    return SAMPLE_SIZE - 1 if _is_known(vertical) else SAMPLE_SIZE
-
-
-def _has_samples(scene: Scene, vertical: NDArray[np.float64]) -> bool:
-    distinct = min(len(np.unique(scene.pairs[:, 0])), len(np.unique(scene.pairs[:, 1])))
-    return distinct >= _sample_size(vertical)
 
 
 def _run(search: Iterator[Progress], deadline: float) -> Progress:

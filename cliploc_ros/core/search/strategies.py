@@ -1,6 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which minimal samples a search tries: given ones, all of them, or the likeliest first.
+"""Minimal samples, and which of them a search tries: drawn ones, all, or the likeliest first.
+
+A sample is three candidates with three different detections and three different landmarks.
+
+The size of a box gives the distance of its landmark, roughly. So two boxes and the angle between
+them bound the distance between their landmarks, which the map knows: two candidates that cannot be
+right at once never form a sample.
 
 Leaders take the best hypotheses; poses that contradict the constraint are not verified. Each
 search yields its progress after each block of samples, and the caller may stop there.
@@ -11,7 +17,7 @@ Leaders are the best hypotheses of a search, each at a place of its own.
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from math import comb, inf
+from math import comb, inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -19,15 +25,19 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.transforms import SAME_PLACE
 from cliploc_ros.core.kernels.compiled import compiled
-from cliploc_ros.core.search.sampling import (
-    SAMPLE_SIZE,
-    enumerate_compatible_pairs,
-    enumerate_compatible_triples,
-    enumerate_triples,
-)
 from cliploc_ros.core.search.scene import Constraint, Scene
 from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
 
+SAMPLE_SIZE = 3
+# An enumeration returns after this number of steps of some nanoseconds, even without a sample.
+_MAX_STEPS = 500_000
+# A draw without a valid sample in this many attempts is skipped (its row is -1): the first
+# candidates of PROSAC may not have any.
+_MAX_ATTEMPTS = 100
+# Limits of a landmark's distance, divided by the distance that the size of its box gives. Of 1375
+# boxes of the recorded TUM frames, to which the map was fitted, 99.8 % lie between .67 and 2.5:
+# boxes are larger than the ellipsoid, or cut by the border.
+NEAREST, FARTHEST = 0.55, 2.5
 MAX_DISTINCT = 8
 # Plain numbers, for the kernels.
 _PLACE_M, _PLACE_TRACE = SAME_PLACE.distance_m, SAME_PLACE.least_trace
@@ -38,13 +48,268 @@ _TIE = 1e-9
 _MIN_SAMPLED_IOU = 0.9
 # The same of two pairs, whose poses inherit the noise of the vertical.
 _MIN_SAMPLED_PAIR_IOU = 0.2
-# How search_progressively enumerates samples of each size.
-_ORDERED = {3: (enumerate_compatible_triples, _MIN_SAMPLED_IOU),
-            2: (enumerate_compatible_pairs, _MIN_SAMPLED_PAIR_IOU)}
 # A block of a search takes about this long, so that it keeps time limits.
 _BLOCK_S = 1e-3
 # Samples in a block.
 _FIRST_BLOCK, _LARGEST_BLOCK = 64, 1024
+
+
+def prosac_growth(candidate_count: int, iterations: int) -> NDArray[np.int64]:
+    """Return T'_3 .. T'_N (N - 2,): PROSAC's last iteration with each size of its candidate set.
+
+    Chum and Matas, "Matching with PROSAC", CVPR 2005, Eqs. 3 to 5, for N >= 3 candidates. T_N,
+    after which PROSAC becomes RANSAC, is the number of iterations: with the textbook's 200,000 a
+    search of 500 never leaves its first five candidates.
+    """
+    sizes = np.arange(SAMPLE_SIZE, candidate_count)
+    drawn = iterations * np.prod([(SAMPLE_SIZE - i) / (candidate_count - i)
+                                  for i in range(SAMPLE_SIZE)])
+    expected = drawn * np.cumprod(np.concatenate(
+        [[1.0], (sizes + 1) / (sizes + 1 - SAMPLE_SIZE)]))
+    # The tolerance keeps whole numbers from being rounded up because of their last digit.
+    steps = np.ceil(np.diff(expected) - 1e-9).astype(np.int64)
+    return 1 + np.concatenate([[0], np.cumsum(steps)])
+
+
+def draw_ransac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Generator
+                ) -> NDArray[np.int64]:
+    """Return samples (iterations, 3) of uniformly drawn candidates; rows of -1 are skipped.
+
+    Parameters
+    ----------
+    pairs : ndarray (c, 2)
+        Detection and landmark of each candidate.
+    """
+    samples = np.full((iterations, SAMPLE_SIZE), -1, dtype=np.int64)
+    if len(pairs) >= SAMPLE_SIZE:
+        # the whole set from the first iteration on
+        growth = np.zeros(len(pairs) - SAMPLE_SIZE + 1, dtype=np.int64)
+        _draw(np.ascontiguousarray(pairs), growth, rng, samples)
+    return samples
+
+
+def draw_prosac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Generator
+                ) -> NDArray[np.int64]:
+    """Return samples (iterations, 3) as PROSAC draws them; rows of -1 are skipped.
+
+    Parameters
+    ----------
+    pairs : ndarray (c, 2)
+        Detection and landmark of each candidate, in order of preference.
+    """
+    samples = np.full((iterations, SAMPLE_SIZE), -1, dtype=np.int64)
+    if len(pairs) >= SAMPLE_SIZE:
+        growth = prosac_growth(len(pairs), iterations)
+        _draw(np.ascontiguousarray(pairs), growth, rng, samples)
+    return samples
+
+
+@compiled
+def _draw(pairs, growth, rng, samples):
+    """Fill samples: u_n and two of the n - 1 before it while t <= T'_n, then three of all."""
+    size = SAMPLE_SIZE
+    for t in range(1, samples.shape[0] + 1):
+        while size < pairs.shape[0] and t > growth[size - SAMPLE_SIZE]:
+            size += 1
+        newest = t <= growth[size - SAMPLE_SIZE]
+        for _ in range(_MAX_ATTEMPTS):
+            i = size - 1 if newest else int(rng.random() * size)
+            j = int(rng.random() * (size - 1 if newest else size))
+            k = int(rng.random() * (size - 1 if newest else size))
+            if (pairs[i, 0] != pairs[j, 0] and pairs[i, 0] != pairs[k, 0]
+                    and pairs[j, 0] != pairs[k, 0] and pairs[i, 1] != pairs[j, 1]
+                    and pairs[i, 1] != pairs[k, 1] and pairs[j, 1] != pairs[k, 1]):
+                samples[t - 1, 0], samples[t - 1, 1], samples[t - 1, 2] = i, j, k
+                break
+
+
+@compiled
+def enumerate_triples(pairs, cursor, samples):
+    """Write the next valid samples in lexicographic order; return their number.
+
+    Parameters
+    ----------
+    pairs : ndarray (c, 2)
+        Detection and landmark of each candidate.
+    cursor : ndarray (3,)
+        The next sample, at first 0, 1, 2; updated. Its first value is c - 2 at the end.
+    samples : ndarray (t, 3)
+        Filled from the first row on.
+    """
+    count = pairs.shape[0]
+    first, second, third = cursor[0], cursor[1], cursor[2]
+    found, steps = 0, 0
+    while first < count - 2 and found < samples.shape[0] and steps < _MAX_STEPS:
+        steps += 1
+        if second >= count - 1:
+            first += 1
+            second, third = first + 1, first + 2
+            continue
+        if third >= count or _clash(pairs, first, second):
+            second += 1
+            third = second + 1
+            continue
+        if not (_clash(pairs, first, third) or _clash(pairs, second, third)):
+            samples[found, 0], samples[found, 1], samples[found, 2] = first, second, third
+            found += 1
+        third += 1
+    cursor[0], cursor[1], cursor[2] = first, second, third
+    return found
+
+
+@compiled
+def _clash(pairs, a, b):
+    """Return whether two candidates share a detection or a landmark."""
+    return pairs[a, 0] == pairs[b, 0] or pairs[a, 1] == pairs[b, 1]
+
+
+@compiled
+def enumerate_compatible_triples(compatible, cursor, samples):
+    """Write the next samples of compatible candidates, by their newest; return their number.
+
+    Parameters
+    ----------
+    compatible : ndarray (c, c) of bool
+        See cliploc_ros.core.search.compatibility.
+    cursor : ndarray (3,)
+        Newest, first and second candidate, at first 2, 0, 1; updated. The newest is c at the end.
+    samples : ndarray (t, 3)
+        Filled from the first row on: first, second, newest.
+    """
+    count = compatible.shape[0]
+    newest, first, second = cursor[0], cursor[1], cursor[2]
+    earlier = np.empty(count, dtype=np.int64)
+    found, steps = 0, 0
+    while newest < count and found < samples.shape[0] and steps < _MAX_STEPS:
+        known = _compatible_before(compatible, newest, earlier)
+        steps += newest + 1
+        for a in range(known):
+            if earlier[a] < first:
+                continue
+            for b in range(a + 1, known):
+                if earlier[a] == first and earlier[b] < second:
+                    continue
+                steps += 1
+                if not compatible[earlier[a], earlier[b]]:
+                    continue
+                if found == samples.shape[0]:
+                    cursor[0], cursor[1], cursor[2] = newest, earlier[a], earlier[b]
+                    return found
+                samples[found, 0], samples[found, 1] = earlier[a], earlier[b]
+                samples[found, 2] = newest
+                found += 1
+        newest, first, second = newest + 1, 0, 1
+    cursor[0], cursor[1], cursor[2] = newest, first, second
+    return found
+
+
+@compiled
+def _compatible_before(compatible, newest, earlier):
+    """Write the candidates before the newest one that are compatible; return their number."""
+    known = 0
+    for candidate in range(newest):
+        if compatible[newest, candidate]:
+            earlier[known] = candidate
+            known += 1
+    return known
+
+
+@compiled
+def enumerate_compatible_pairs(compatible, cursor, samples):
+    """Write the next pairs of compatible candidates, by their newer; return their number.
+
+    As enumerate_compatible_triples does, into two columns: older, newer. The cursor (2,) is at
+    first 1, 0, and its first value is c at the end.
+    """
+    count = compatible.shape[0]
+    newest, first = cursor[0], cursor[1]
+    found, steps = 0, 0
+    while newest < count and found < samples.shape[0] and steps < _MAX_STEPS:
+        steps += 1
+        if first >= newest:
+            newest, first = newest + 1, 0
+            continue
+        if compatible[newest, first]:
+            samples[found, 0], samples[found, 1] = first, newest
+            found += 1
+        first += 1
+    cursor[0], cursor[1] = newest, first
+    return found
+
+
+def compatible_pairs(scene: Scene) -> NDArray[np.bool_]:
+    """Return which pairs of candidates (c, c) may form a sample; symmetric.
+
+    Detections and landmarks must differ, and the landmarks' distance in the map must be within
+    the range that their boxes allow.
+    """
+    depths = _depths(scene)
+    compatible = np.zeros((len(scene.pairs), len(scene.pairs)), dtype=np.bool_)
+    _compare_near(scene, depths, np.argsort(scene.centers[scene.pairs[:, 1], 0]), compatible)
+    return compatible
+
+
+def _depths(scene: Scene) -> NDArray[np.float64]:
+    """Return the distance (c,) [m] at which each candidate's landmark is as large as its box."""
+    xx, xy, xz, yy, yz, zz = scene.shapes[scene.pairs[:, 1]].T
+    # the determinant of a shape matrix is the product of the squared semi-axes
+    determinant = (xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz))
+    radius = np.cbrt(np.sqrt(np.maximum(determinant, 0.0)))
+    half = scene.box_ellipses[scene.pairs[:, 0], 2:]
+    # boxes are on the plane z = 1, whose points are farther away off the axis
+    middle = scene.box_ellipses[scene.pairs[:, 0], :2]
+    return np.asarray(radius / np.sqrt(half.prod(axis=1))
+                      * np.sqrt(1.0 + (middle * middle).sum(axis=1)))
+
+
+@compiled
+def _compare_near(scene, depths, along_x, compatible):
+    """Compare each candidate with those before it along the x axis, as far as it may reach.
+
+    In a large map, and in several maps side by side, most are beyond.
+    """
+    pairs, deepest = scene.pairs, 0.0
+    for depth in depths:
+        deepest = max(deepest, depth)
+    for number in range(pairs.shape[0]):
+        i = along_x[number]
+        reach = FARTHEST * (depths[i] + deepest)
+        for before in range(number - 1, -1, -1):
+            j = along_x[before]
+            if scene.centers[pairs[i, 1], 0] - scene.centers[pairs[j, 1], 0] > reach:
+                break
+            if pairs[i, 0] == pairs[j, 0] or pairs[i, 1] == pairs[j, 1]:
+                continue
+            p, q = scene.centers[pairs[i, 1]], scene.centers[pairs[j, 1]]
+            apart = sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
+            # most pairs of a large map are farther apart than any camera between them allows
+            if apart > FARTHEST * (depths[i] + depths[j]):
+                continue
+            a, b = scene.bearings[pairs[i, 0]], scene.bearings[pairs[j, 0]]
+            cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+            low, high = _distance_range(depths[i], depths[j], cosine)
+            if low <= apart <= high:
+                compatible[i, j] = compatible[j, i] = True
+
+
+@compiled
+def _distance_range(depth_a, depth_b, cosine):
+    """Return the least and greatest distance of two points whose depths are about these."""
+    near_a, far_a = NEAREST * depth_a, FARTHEST * depth_a
+    near_b, far_b = NEAREST * depth_b, FARTHEST * depth_b
+    # The squared distance is convex in both depths: greatest at a corner, least on an edge.
+    high = max(_square(near_a, near_b, cosine), _square(near_a, far_b, cosine),
+               _square(far_a, near_b, cosine), _square(far_a, far_b, cosine))
+    low = min(_square(near_a, min(max(near_a * cosine, near_b), far_b), cosine),
+              _square(far_a, min(max(far_a * cosine, near_b), far_b), cosine),
+              _square(min(max(near_b * cosine, near_a), far_a), near_b, cosine),
+              _square(min(max(far_b * cosine, near_a), far_a), far_b, cosine))
+    return sqrt(max(0.0, low)), sqrt(high)
+
+
+@compiled
+def _square(depth_a, depth_b, cosine):
+    return depth_a * depth_a + depth_b * depth_b - 2.0 * depth_a * depth_b * cosine
 
 
 class Leaders(NamedTuple):
@@ -180,13 +445,16 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
     Parameters
     ----------
     compatible : ndarray (c, c) of bool
-        See cliploc_ros.core.search.sampling.
+        See cliploc_ros.core.search.strategies.
     size : int, optional
         Candidates in a sample: three, or two where the constraint's vertical is known (see
         cliploc_ros.core.geometry.minimal_solvers). With two, the third column of the leaders'
         samples is -1.
     """
-    count, (enumerate_samples, least_iou) = len(scene.pairs), _ORDERED[size]
+    count = len(scene.pairs)
+    enumerate_samples, least_iou = (
+        (enumerate_compatible_triples, _MIN_SAMPLED_IOU) if size == SAMPLE_SIZE
+        else (enumerate_compatible_pairs, _MIN_SAMPLED_PAIR_IOU))
     cursor = np.array([size - 1, *range(size - 1)], dtype=np.int64)  # newest, first, ...
     if cursor[0] >= count:
         return

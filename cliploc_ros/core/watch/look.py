@@ -44,8 +44,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.visibility import Expected, expect
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.search.candidates import match_frame
-from cliploc_ros.core.search.frame_search import SearchedFrame, constraint_of
+from cliploc_ros.core.search.frame_search import SearchedFrame, constraint_of, match_frame
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN
 from cliploc_ros.core.search.strategies import Leaders, Progress
 

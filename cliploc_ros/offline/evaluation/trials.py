@@ -23,8 +23,7 @@ from cliploc_ros.core.localizer import (
 from cliploc_ros.core.map.joined_map import place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.queries import Queries

@@ -19,8 +19,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.check.landmark_faults import (
     LandmarkCheck,

@@ -17,7 +17,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.query import Query
-from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalization
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.messages import (
     camera_from_msg,

@@ -15,7 +15,7 @@ from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalization
 
 _BLANK, _OTHER, _TEXT = (40, 40, 40), (120, 120, 120), (255, 255, 255)
 _RADIUS_PX = 3

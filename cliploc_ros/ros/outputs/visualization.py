@@ -21,7 +21,7 @@ from cliploc_ros.core.geometry.camera import frusta
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.relocalization import Relocalization
+from cliploc_ros.core.relocalizer import Relocalization
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_array_msg
 from cliploc_ros.ros.outputs.debug_image import SeenImage, draw_debug_image
