@@ -44,6 +44,7 @@ class Calibration(NamedTuple):
     watch: Terms  #: Log odds of a look of the watch, and how its looks add up
     images: Terms  #: Faults of a camera by its images
     turn: Terms  #: How a camera is turned against its mount
+    depth: Terms  #: Whether depths can be right
 
 
 #: The installed numbers; a missing or unknown section is a defect of the installation.

@@ -89,12 +89,8 @@ _INSIDE = 0.1
 _LEAST_DENSITY, _NEAR_SHARE = 4.0, 0.1
 # Share of boxes whose middle is beyond the image, by mistake.
 _BEYOND = 0.01
-# A mount is wrong where accepted poses explain less than this share of what its camera saw, and
-# more than twice as much of what the others did. With four cameras among simulated objects, a
-# right mount has 1.0, one that is turned by 2 degrees .8, by 5 degrees .1, by more 0 to .1.
-_LEAST_SHARE = 0.3
-# Of instants, and of objects in all of them; before, nothing is said.
-_LEAST_INSTANTS, _MOST_INSTANTS, _LEAST_OBJECTS = 5, 20, 15
+# Instants that are remembered, for the mounts.
+_MOST_INSTANTS = 20
 # No box that was recorded reaches further.
 _FAR = 1e9
 
@@ -457,8 +453,8 @@ class CameraCheck:
         for name, of_one in counts.items():
             known, matched = of_one.sum(axis=0)
             others_known, others_matched = every - (known, matched)
-            if (len(of_one) >= _LEAST_INSTANTS and min(known, others_known) >= _LEAST_OBJECTS
-                    and matched < _LEAST_SHARE * known
+            if (len(of_one) >= _TERMS.mount_instants and min(known, others_known)
+                    >= _TERMS.mount_objects and matched < _TERMS.mount_share * known
                     and matched / known < 0.5 * others_matched / others_known):
                 found.append(name)
         return found

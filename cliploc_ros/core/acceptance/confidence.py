@@ -50,19 +50,8 @@ from cliploc_ros.core.map.similarities import (
 from cliploc_ros.core.observation import Detections, Region
 from cliploc_ros.core.search.scene import Scene
 
-# Boxes whose IoU is below the first number show two things, above the second number one thing.
-_ONE_THING_IOU = (0.4, 0.8)
 # No image reaches further [px].
 _FAR_PX = 1e6
-# Deviation of a box's edge on the plane z = 1: a share of the box's mean semi-axis, plus a floor.
-# .2 of the semi-axis is .1 of the mean side. The calibration is fitted with these values.
-_EDGE_DEVIATION = (0.2, 0.003)
-# Deviations [deg] of the best vertical that the fit has seen, and of one that is no help.
-_BEST_VERTICAL_DEG, _VAGUE_VERTICAL_DEG = 0.5, 45.0
-# A robot drives about beyond the outermost landmarks, too [m].
-_MARGIN_M = 1.0
-# A body that points up or down has no yaw: of its x axis, this much must be level.
-_LEAST_AHEAD = 0.5
 
 
 @dataclass(frozen=True)
@@ -187,7 +176,8 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
         likenesses = (likenesses - frame.means[detections]) / frame.deviations[detections]
     # 0 if the class of a detection is none of its landmark
     shares = landmark_map.classes.shares(landmarks, frame.classes[detections])
-    scene, sigmas = frame.scene, landmark_map.position_sigmas[landmarks]
+    terms, scene = CALIBRATION.objects, frame.scene
+    sigmas = landmark_map.position_sigmas[landmarks]
     centers, shapes = scene.centers[landmarks], scene.shapes[landmarks]
     camera_from_map, odds = invert_transform(map_from_camera), np.zeros(len(matches))
     outlines = project_ellipsoids(camera_from_map, centers, shapes)
@@ -195,7 +185,7 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
     depths = centers @ camera_from_map[2, :3] + camera_from_map[2, 3]
     # the calibration's maps are no worse than the default
     more = np.sqrt(np.maximum(0.0, sigmas ** 2 - DEFAULT_SIGMA_M ** 2)) / depths
-    deviations = np.hypot(_EDGE_DEVIATION[0] * boxes[:, 2:].mean(axis=1) + _EDGE_DEVIATION[1],
+    deviations = np.hypot(terms.edge_share * boxes[:, 2:].mean(axis=1) + terms.edge_floor,
                           more)[:, None]
     edges = np.concatenate([outlines[:, :2] - halves - boxes[:, :2] + boxes[:, 2:],
                             outlines[:, :2] + halves - boxes[:, :2] - boxes[:, 2:]], axis=1)
@@ -218,7 +208,7 @@ def one_thing(bboxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
     shared = np.maximum(high - low, 0.0).prod(axis=2)
     areas = np.diag(shared)
     ious = shared / np.maximum(areas[:, None] + areas - shared, 1e-12)
-    least, most = _ONE_THING_IOU
+    least, most = CALIBRATION.objects.two_things, CALIBRATION.objects.one_thing
     found = np.clip((ious - least) / (most - least), 0.0, 1.0)
     np.fill_diagonal(found, 1.0)
     return np.asarray(found)
@@ -242,8 +232,9 @@ class Setting(NamedTuple):
     @property
     def vertical(self) -> float:
         """Return the log of the attitudes that it rules out: 3.8 to 1 degree, 0 for none."""
-        return math.log(_VAGUE_VERTICAL_DEG / min(max(self.vertical_deg, _BEST_VERTICAL_DEG),
-                                                  _VAGUE_VERTICAL_DEG))
+        terms = CALIBRATION.objects
+        return math.log(terms.vague_vertical_deg / min(
+            max(self.vertical_deg, terms.best_vertical_deg), terms.vague_vertical_deg))
 
 
 def confidences(odds: NDArray[np.float64], poses: NDArray[np.float64], none: float,
@@ -344,14 +335,14 @@ def region_odds(landmark_map: LandmarkMap, region: Region, poses: NDArray[np.flo
     steps = np.c_[bodies[:, :2, 3] - shift[:2], np.arctan2(bodies[:, 1, 0], bodies[:, 0, 0])]
     steps -= region.mean
     steps[:, 2] = (steps[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
-    steps[np.hypot(*bodies[:, :2, 0].T) < _LEAST_AHEAD, 2] = 0.0
+    steps[np.hypot(*bodies[:, :2, 0].T) < terms.least_ahead, 2] = 0.0
     covariance = region.covariance + np.diag(
         [terms.least_m, terms.least_m, math.radians(terms.least_deg)]) ** 2
     spot, yaw = covariance[:2, :2], covariance[2, 2]
     squares = (np.einsum('ni,ij,nj->n', steps[:, :2], np.linalg.inv(spot), steps[:, :2])
                + steps[:, 2] ** 2 / yaw)
-    area = sum(float(np.prod(np.ptp(one.landmark_map.centers[:, :2], axis=0) + 2.0 * _MARGIN_M))
-               for one in parts)
+    area = sum(float(np.prod(np.ptp(one.landmark_map.centers[:, :2], axis=0)
+                             + 2.0 * terms.margin_m)) for one in parts)
     # a region wider than the map is as good as the map
     peak = (max(0.0, math.log(area / (2.0 * math.pi)) - 0.5 * np.linalg.slogdet(spot)[1])
             + max(0.0, 0.5 * math.log(2.0 * math.pi / yaw)))

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.fit.finalists import Finalist
 from cliploc_ros.core.fit.refinement import (
     Inliers,
@@ -26,14 +27,9 @@ from cliploc_ros.core.fit.refinement import (
 from cliploc_ros.core.fit.verification import Rig, camera_pose, verify_rig
 from cliploc_ros.core.geometry.depth import depth_odds
 
-# The most log odds that the depth of an object may lack, on average, and what a unit of the boxes'
-# cost counts, by which depth spoils their fit. In a kitchen 97 % of the right poses lack less than
-# .95 in all; half of those with depth that is 15 % too large or small lack more than 2.
-_MOST_LACKING, _SPOILT = 1.0, 3.0
-# Depth whose scale is off by more is not used. The median of five accepted poses tells: in 98 % of
-# all choices of five from a kitchen's poses it is within .98 and 1.04, with depth that is 15 % too
-# large above 1.04.
-_MOST_RATIO, _LEAST_POSES, _MOST_POSES = 1.08, 5, 20
+_TERMS = CALIBRATION.depth
+# Accepted poses that are remembered.
+_MOST_POSES = 20
 
 
 class DepthCheck(NamedTuple):
@@ -47,7 +43,7 @@ class DepthCheck(NamedTuple):
     @property
     def is_passed(self) -> bool:
         """Return whether the depths can be right."""
-        return self.lacking + _SPOILT * self.spoilt <= _MOST_LACKING * self.objects
+        return self.lacking + _TERMS.spoilt * self.spoilt <= _TERMS.lacking * self.objects
 
 
 class DepthScale:
@@ -63,12 +59,12 @@ class DepthScale:
     @property
     def ratio(self) -> float:
         """Return measured over true depth; 1 before enough poses tell."""
-        return median(self._ratios) if len(self._ratios) >= _LEAST_POSES else 1.0
+        return median(self._ratios) if len(self._ratios) >= _TERMS.least_poses else 1.0
 
     @property
     def is_wrong(self) -> bool:
         """Return whether depth is of no use."""
-        return abs(math.log(self.ratio)) > math.log(_MOST_RATIO)
+        return abs(math.log(self.ratio)) > math.log(_TERMS.most_ratio)
 
 
 def check_depth(rig: Rig, pose: Finalist) -> DepthCheck | None:
