@@ -24,7 +24,7 @@ from cliploc_ros.offline.studio.viewpoint import Bounds, extent_of
 
 _MAX_LINES = 60
 # How long stopping waits for an action that takes long.
-_GRACE_S = 5.0
+_GRACE_S = 2.0
 # After these, the camera of the person flies to the selection.
 _BRING_ANOTHER = ('step', 'accept', 'discard', 'create', 'select')
 
@@ -80,7 +80,9 @@ class Desk:
 
     def show_mode(self, person: str, mode: str) -> None:
         """Take the mode of a person's page, '' once it is closed."""
-        self.modes = {**self.modes, person: mode}
+        with self._lock:
+            others = {key: one for key, one in self.modes.items() if key != person}
+            self.modes = {**others, person: mode} if mode else others
         self.studio.changed.set()
 
     def _start(self, name: str, values: dict[str, Any]) -> str | None:
@@ -101,7 +103,8 @@ class Desk:
             if name in self.running:
                 raise EditError(f'{name.replace("_", " ")}: this goes on; wait for it, or stop it')
             thread = threading.Thread(target=self._run, args=(name, action), daemon=True)
-            self.running = {**self.running, name: thread}
+            with self._lock:
+                self.running = {**self.running, name: thread}
             thread.start()
             return None
         raise EditError(f"the studio cannot '{name:.60}'"
@@ -109,7 +112,8 @@ class Desk:
 
     def _run(self, name: str, action: Callable[[], str | None]) -> None:
         self.ask(action)
-        self.running = {key: one for key, one in self.running.items() if key != name}
+        with self._lock:
+            self.running = {key: one for key, one in self.running.items() if key != name}
         self.studio.changed.set()
 
     def act(self, action: Callable[[], str | None]) -> None:
