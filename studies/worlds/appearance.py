@@ -3,7 +3,7 @@
 """Similarities of crops and labels in a simulated world, from a weak or a strong encoder.
 
 Objects are vectors: a part of their class, and a part of their model, which is how they look. A
-crop is the vector of its object and noise, see cliploc_ros.offline.simulation.labels.
+crop is the vector of its object and noise, see cliploc_ros.offline.simulation.
 """
 
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.offline.simulation.labels import CLASS_SHARE, shared_noise, similarities_of
+from cliploc_ros.offline.simulation import CLASS_SHARE, shared_noise, similarities_of
 from studies.worlds.things import CLASS_NAMES, rows_of
 
 _SIZE = 128

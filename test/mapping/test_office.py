@@ -55,7 +55,7 @@ def required() -> dict:
 
 def held_out(observations, split, landmark_map):
     frames = sorted({frame for _, _, frame in split['queries']})
-    views = make_views(observations.select_frames(frames), MappingOptions())
+    views = make_views(observations.select_frames(frames))
     return explained_boxes(views, landmarks_of_map(landmark_map, observations.class_names))
 
 

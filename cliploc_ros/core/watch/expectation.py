@@ -3,7 +3,7 @@
 """The landmarks that an image should show at a pose: near, large, wholly in view and not hidden.
 
 Walls are in no map, so an expected landmark may be hidden. That a landmark is beside one that the
-image shows tells that it is not, see mapping.update.sight, which judges whole recordings.
+image shows tells that it is not, see mapping.evidence, which judges whole recordings.
 """
 
 from typing import NamedTuple

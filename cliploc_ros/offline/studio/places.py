@@ -27,7 +27,7 @@ from cliploc_ros.offline.mapping.check.relocalization import (
 )
 from cliploc_ros.offline.mapping.check.report import GridCheck
 from cliploc_ros.offline.mapping.options import CheckOptions
-from cliploc_ros.offline.simulation.detector import DetectorModel, guess_detector
+from cliploc_ros.offline.simulation import DetectorModel, guess_detector
 from cliploc_ros.offline.studio.document import fields_of
 from cliploc_ros.offline.studio.edits import EditError, Landmarks
 from cliploc_ros.offline.studio.landmark import map_of
@@ -99,20 +99,18 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Cover
 
 def _detector(landmark_map: LandmarkMap, recording: Recording | None
               ) -> tuple[DetectorModel, str]:
-    guess = guess_detector(landmark_map, (_OPTIONS.mapping.edge_sigma_px,
-                                          _OPTIONS.mapping.edge_sigma_share))
+    guess = guess_detector(landmark_map)
     if recording is None:
         return guess, 'without a recording, the camera and the detector are guesses'
     detections = recording.detections
     guess = replace(guess, camera=detections.cameras[0])
     if len(detections.classes) == 0:
         return guess, 'without boxes, the detector is a guess'
-    witness = hear_witness(recording.views, landmark_map, detections.class_names,
-                           recording.options)
+    witness = hear_witness(recording.views, landmark_map, detections.class_names)
     if not (witness.shown >= 0).any():
         return guess, 'no box of the recording shows a landmark: the detector is a guess'
-    return (measure_detector(landmark_map, detections, recording.views, witness,
-                             recording.options), 'the detector is as in the recording')
+    return (measure_detector(landmark_map, detections, recording.views, witness),
+            'the detector is as in the recording')
 
 
 def _grid(landmark_map: LandmarkMap, recording: Recording | None, before: Coverage | None) -> Grid:

@@ -35,11 +35,10 @@ from cliploc_ros.offline.mapping.fitting import Fit, fit_ellipsoid
 from cliploc_ros.offline.mapping.labelling import embed_landmarks
 from cliploc_ros.offline.mapping.landmarks import Landmarks as Ellipsoids
 from cliploc_ros.offline.mapping.landmarks import group_boxes
-from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.refit import refit_map
-from cliploc_ros.offline.mapping.views import Views, camera_centers, make_views
-from cliploc_ros.offline.simulation.labels import LabelModel
+from cliploc_ros.offline.mapping.views import Views, make_views
+from cliploc_ros.offline.simulation import LabelModel
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.edits import Change, EditError, Landmarks
 from cliploc_ros.offline.studio.landmark import Encoded, looks_of, map_of
@@ -85,12 +84,11 @@ class Recording:
 
     def __init__(self, detections: PosedDetections):
         self.detections = detections
-        self.options = MappingOptions()
 
     @cached_property
     def views(self) -> Views:
         """The arrays that the kernels of mapping read."""
-        return make_views(self.detections, self.options)
+        return make_views(self.detections)
 
     def boxes_of(self, landmarks: Landmarks) -> dict[str, NDArray[np.int64]]:
         """Return the boxes that show each landmark; a box shows one at most."""
@@ -101,7 +99,7 @@ class Recording:
             np.array([one.center for one in landmarks.values()]),
             np.array([one.basis for one in landmarks.values()]),
             np.array([numbers.get(one.class_id, -1) for one in landmarks.values()]))
-        shown = associate(self.views, ellipsoids, self.options.association_iou)
+        shown = associate(self.views, ellipsoids)
         return dict(zip(landmarks, group_boxes(shown, len(landmarks)), strict=True))
 
     def boxes_in_view(self, view: int) -> NDArray[np.float64]:
@@ -137,8 +135,7 @@ class Recording:
             raise EditError(f"landmark '{locked[0]}' is locked: unlock it first")
         chosen = np.array([key in set(landmark_ids) for key in landmarks])
         # the others keep their boxes, so that none takes those of its neighbour
-        refit = refit_map(self.detections, map_of(landmarks, 'map', 'studio'), chosen,
-                          self.options)
+        refit = refit_map(self.detections, map_of(landmarks, 'map', 'studio'), chosen)
         reasons = {key: reason for key, reason in zip(landmarks, refit.reasons, strict=True)
                    if reason is not None and key in landmark_ids}
         fitted = [key for key in landmark_ids if key not in reasons]
@@ -157,10 +154,9 @@ class Recording:
     def check(self, landmarks: Landmarks) -> tuple[list[LandmarkCheck], list[Overlap]]:
         """Return the check of each landmark, the worst first, and the overlaps."""
         landmark_map = map_of(landmarks, 'map', 'studio')
-        witness = hear_witness(self.views, landmark_map, self.detections.class_names,
-                               self.options)
+        witness = hear_witness(self.views, landmark_map, self.detections.class_names)
         overlaps = find_map_overlaps(landmark_map, witness, self.views)
-        return check_landmarks(landmark_map, witness, overlaps, self.options), overlaps
+        return check_landmarks(landmark_map, witness, overlaps), overlaps
 
     def relocalize(self, landmarks: Landmarks, views: Sequence[int],
                    keyframes: RecordedKeyframes | None = None) -> list[ViewAnswer]:
@@ -216,10 +212,10 @@ def fit_boxes(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64],
         cameras=tuple(cameras), map_from_camera=map_from_camera,
         stamps_s=np.arange(count, dtype=np.float64), frame_offsets=np.arange(count + 1),
         bboxes_xyxy=bboxes_xyxy, class_names=('drawn',), classes=np.zeros(count, dtype=np.int64),
-        scores=np.ones(count), camera_rows=np.arange(count)), MappingOptions())
+        scores=np.ones(count), camera_rows=np.arange(count)))
     # each box was drawn for itself: none shares the error of a detector that stood still
     views = views._replace(weights=np.ones(count))
-    origins = camera_centers(views)
+    origins = views.centers
     start, radius = _meeting_point(views, origins)
     # a sphere, one stretched along each axis of the map, and one along a diagonal
     sphere = radius * np.eye(3)

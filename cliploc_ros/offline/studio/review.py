@@ -15,7 +15,6 @@ from cliploc_ros.offline.mapping.check.landmark_faults import (
     find_map_overlaps,
 )
 from cliploc_ros.offline.mapping.check.report import SERIOUS
-from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.edits import EditError
@@ -168,7 +167,7 @@ class ReviewQueue:
         else:
             landmark_map = map_of(landmarks, 'map', 'studio')
             overlaps = find_map_overlaps(landmark_map, None, None)
-            found = check_landmarks(landmark_map, None, overlaps, MappingOptions())
+            found = check_landmarks(landmark_map, None, overlaps)
         ids = list(landmarks)
         self._checks = {one.landmark_id: one for one in found}
         self._duplicates = [(ids[one.first], ids[one.second]) for one in overlaps
