@@ -126,15 +126,18 @@ def _may_show(views, row, center, radius):
     return True
 
 
-def associate(views: Views, landmarks: Landmarks, min_iou: float = ASSOCIATION_IOU
-              ) -> NDArray[np.int64]:
-    """Return the landmark (n,) that each box shows, -1 for none.
+def associate(views: Views, landmarks: Landmarks, min_iou: float = ASSOCIATION_IOU,
+              among: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
+    """Return the landmark (n,), among some or all (L,), that each box shows, -1 for none.
 
     In every frame a landmark has at most one box and a box at most one landmark; the sum of
     their IoUs is the greatest possible (Hungarian method). Pairs that overlap less than min_iou
     are no candidates.
     """
     boxes, candidates, ious = find_overlaps(views, landmarks, min_iou)
+    if among is not None:
+        kept = among[candidates]
+        boxes, candidates, ious = boxes[kept], candidates[kept], ious[kept]
     shown = np.full(len(views.frames), -1, dtype=np.int64)
     frames = views.frames[boxes]
     sole = _is_sole(boxes) & _is_sole(frames * len(landmarks.centers) + candidates)

@@ -51,11 +51,11 @@ class Fit(NamedTuple):
 
 
 def fit_landmarks(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
-                  iterations: int = 30) -> Landmarks:
-    """Return landmarks, each fitted to the boxes that show it; one without stays as it is."""
+                  iterations: int = 30, among: NDArray[np.bool_] | None = None) -> Landmarks:
+    """Return all landmarks, those among some or all (L,) fitted to the boxes that show them."""
     centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
     for number, rows in enumerate(group_boxes(shown, len(centers))):
-        if len(rows):
+        if len(rows) and (among is None or among[number]):
             fit = fit_ellipsoid(views, rows, centers[number], bases[number], iterations)
             centers[number], bases[number] = fit.center, fit.basis
     return landmarks._replace(centers=centers, bases=bases)

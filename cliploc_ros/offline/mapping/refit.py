@@ -89,9 +89,13 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
             "the recording has no boxes of the map's classes; map: "
             f'{", ".join(sorted(set(landmark_map.class_ids)))}; recording: '
             f'{", ".join(sorted(detections.class_names))}; rename the classes of the map')
-    settled, part_of = _settle(views, given, chosen)
+    settled = given
+    for min_iou in (*_FIRST_IOUS, *[ASSOCIATION_IOU] * SETTLING_ROUNDS):
+        shown = associate(views, settled, min_iou)
+        settled = fit_landmarks(views, settled, shown, among=chosen)
+    settled, part_of = resolve_doubles(views, settled, associate(views, settled), chosen)
     is_own = part_of == np.arange(len(chosen))
-    shown = _associate_some(views, settled, is_own)
+    shown = associate(views, settled, among=is_own)
     evidence = gather_evidence(views, settled, shown)
     reasons = [reason if is_chosen else None for reason, is_chosen in zip(
         _reasons(views, given, settled, part_of, evidence, landmark_map), chosen, strict=True)]
@@ -113,8 +117,8 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
     landmarks = settled._replace(
         centers=np.where(is_fitted[:, None], settled.centers, given.centers),
         bases=np.where(is_fitted[:, None, None], settled.bases, given.bases))
-    shown = _associate_some(views, landmarks, is_fitted | ~chosen)
-    landmarks = _fit(views, landmarks, shown, is_fitted)
+    shown = associate(views, landmarks, among=is_fitted | ~chosen)
+    landmarks = fit_landmarks(views, landmarks, shown, among=is_fitted)
     evidence = gather_evidence(views, landmarks, shown)
     after = explained_boxes(views, landmarks.select(is_fitted | ~chosen))
     details = list(landmark_map.joined(part_of).details)
@@ -130,32 +134,6 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
                 details=tuple(details)),
         tuple(reasons), part_of, tuple(notes), share_before, after.explained / share_known,
         before.median_iou, after.median_iou)
-
-
-def _settle(views: Views, given: Landmarks, chosen: NDArray[np.bool_]
-            ) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Associate and fit until the chosen landmarks and their boxes agree, and resolve doubles.
-
-    Returns the landmarks, and the one (L,) that each of them is part of.
-    """
-    landmarks = given
-    for min_iou in (*_FIRST_IOUS, *[ASSOCIATION_IOU] * SETTLING_ROUNDS):
-        landmarks = _fit(views, landmarks, associate(views, landmarks, min_iou), chosen)
-    shown = associate(views, landmarks)
-    return resolve_doubles(views, landmarks, shown, chosen)
-
-
-def _associate_some(views: Views, landmarks: Landmarks, rows: NDArray[np.bool_]
-                    ) -> NDArray[np.int64]:
-    """Return which of some landmarks each box shows, by its row among all, -1 for none."""
-    shown = associate(views, landmarks.select(rows))
-    return np.append(np.nonzero(rows)[0], -1)[shown]
-
-
-def _fit(views: Views, landmarks: Landmarks, shown: NDArray[np.int64], chosen: NDArray[np.bool_]
-         ) -> Landmarks:
-    """Return the landmarks, the chosen ones fitted to the boxes that show them."""
-    return fit_landmarks(views, landmarks, np.where(np.append(chosen, False)[shown], shown, -1))
 
 
 def _reasons(views: Views, given: Landmarks, landmarks: Landmarks, part_of: NDArray[np.int64],

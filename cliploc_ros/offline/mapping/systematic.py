@@ -261,8 +261,9 @@ def _solve(views: Views, derivatives: NDArray[np.float64], linear: Linear,
     gradients = np.zeros((viewpoints.max() + 1, len(step)))
     np.add.at(gradients, viewpoints, np.einsum(
         'meg,me->mg', free, linear.weights * (residuals + free @ step)))
-    scatter = gradients.T @ gradients + np.diag(prior)
-    return step, np.sqrt(np.maximum(np.diag(inverse @ scatter @ inverse), 1e-24))
+    covariance = (inverse @ gradients.T @ gradients @ inverse
+                  + inverse @ np.diag(prior) @ inverse)
+    return step, np.sqrt(np.maximum(np.diag(covariance), 1e-24))
 
 
 def _without_landmarks(derivatives: NDArray[np.float64], linear: Linear

@@ -91,7 +91,6 @@ def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterato
     of_frames = (elapsed / block_s).astype(np.int64) % options.folds
     gap_s = min(options.gap_s, 0.25 * float(elapsed[-1]) / options.folds)
     fits = witness.evidence.median_iou >= MIN_MEDIAN_IOU
-    of_boxes = np.append(fits, False)[witness.shown]  # the last one is that of no landmark
     for number in range(options.folds):
         judged = np.nonzero(of_frames == number)[0]
         if len(judged) == 0:
@@ -102,13 +101,13 @@ def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterato
         nearest = np.minimum(np.abs(times[after] - stamps_s),
                              np.abs(times[(after - 1).clip(0)] - stamps_s))
         training = nearest > gap_s
-        shown = np.where(of_boxes & training[views.frames], witness.shown, -1)
-        kept = np.array([len(np.unique(views.viewpoints[views.frames[rows]]))
-                         for rows in group_boxes(shown, len(fits))]
-                        ) >= MappingOptions.min_viewpoints
-        yield Fold(judged, np.nonzero(kept | ~fits)[0], fit_landmarks(
-            views, witness.landmarks, np.where(np.append(kept, False)[shown], shown, -1)
-            ).select(kept | ~fits), training)
+        shown = np.where(training[views.frames], witness.shown, -1)
+        is_enough = np.array([len(np.unique(views.viewpoints[views.frames[rows]]))
+                              for rows in group_boxes(shown, len(fits))]
+                             ) >= MappingOptions.min_viewpoints
+        fitted = fit_landmarks(views, witness.landmarks, shown, among=fits & is_enough)
+        kept = is_enough | ~fits
+        yield Fold(judged, np.nonzero(kept)[0], fitted.select(kept), training)
 
 
 def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,

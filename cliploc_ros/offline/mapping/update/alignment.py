@@ -62,20 +62,6 @@ class OldMap(NamedTuple):
         """Return all pairs of a landmark and one of its classes."""
         return {(row, name) for row, name in self.landmarks.names.tolist()}
 
-    def shown(self, views: Views, min_iou: float = ASSOCIATION_IOU,
-              is_gone: NDArray[np.bool_] | None = None,
-              others: Landmarks | None = None) -> NDArray[np.int64]:
-        """Return the old landmark (n,) that each box shows, or L + the other one; -1 for none.
-
-        Those that are gone (L,) have none.
-        """
-        kept = np.ones(len(self.sigmas), dtype=np.bool_) if is_gone is None else ~is_gone
-        others = others or Landmarks.none()
-        rows = np.concatenate([np.nonzero(kept)[0],
-                               len(kept) + np.arange(len(others.centers)), [-1]])
-        every = Landmarks.joined(self.landmarks.select(kept), others)
-        return rows[associate(views, every, min_iou)]
-
 
 def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...]) -> OldMap:
     """Return the landmarks of a map for a recording with some classes."""
@@ -143,8 +129,8 @@ def align(given: Views, known: OldMap, options: MappingOptions) -> Aligned:
     """Return the views with poses in the coordinate frame of the old map."""
     views, total = given, np.eye(4)
     for number in range(_ROUNDS):
-        min_iou = ASSOCIATION_IOU if number else _LOOSE_IOU
-        found = refit(views, known.landmarks, known.shown(views, min_iou), options.min_viewpoints)
+        shown = associate(views, known.landmarks, ASSOCIATION_IOU if number else _LOOSE_IOU)
+        found = refit(views, known.landmarks, shown, options.min_viewpoints)
         if np.count_nonzero(found.is_known) < MIN_CONFIRMED:
             break
         step = _offset(known, found)
@@ -158,7 +144,7 @@ def align(given: Views, known: OldMap, options: MappingOptions) -> Aligned:
     offset_deg = float(np.degrees(Rotation.from_matrix(total[:3, :3]).magnitude()))
     errors, estimated = options.pose_errors, None
     if errors is None and options.estimate_pose_errors:
-        shown = known.shown(views)
+        shown = associate(views, known.landmarks)
         found = refit(views, known.landmarks, shown, options.min_viewpoints)
         errors = estimated = significant_pose_errors(views, found.landmarks, shown)
     refined = views if errors is None else _refine(views, known, errors, options)
@@ -197,7 +183,7 @@ def _refine(aligned: Views, known: OldMap, errors: PoseErrors, options: MappingO
     views = aligned
     anchors = Anchors(known.landmarks.centers, known.sigmas)
     for _ in range(REFINEMENTS):
-        shown = known.shown(views)
+        shown = associate(views, known.landmarks)
         found = refit(views, known.landmarks, shown, options.min_viewpoints)
         away = has_moved(known.landmarks, known.sigmas, found)
         shown[np.isin(shown, np.nonzero(away)[0])] = -1

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import betaln, expit
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.offline.mapping.association import find_overlaps
+from cliploc_ros.offline.mapping.association import associate, find_overlaps
 from cliploc_ros.offline.mapping.building import LeftOut, NothingFoundError, build_map, rounded
 from cliploc_ros.offline.mapping.doubles import Relation, close_pairs, relation
 from cliploc_ros.offline.mapping.evidence import MIN_MEDIAN_IOU, Sight, gather_evidence, look_for
@@ -200,10 +200,10 @@ def _log_evidence(sight: Sight, ratios: NDArray[np.float64], views: float) -> ND
 def _look(views: Views, known: OldMap, finds: Finds, is_gone: NDArray[np.bool_]
           ) -> tuple[NDArray[np.int64], Sight]:
     """Return the landmark or find that each box shows, and the sight of all their places."""
-    shown = known.shown(views, is_gone=is_gone, others=finds.landmarks)
+    places = Landmarks.joined(known.landmarks, finds.landmarks)
     is_solid = np.concatenate([~is_gone, np.ones(len(finds.details), dtype=np.bool_)])
-    return shown, look_for(views, Landmarks.joined(known.landmarks, finds.landmarks), shown,
-                           is_solid)
+    shown = associate(views, places, among=is_solid)
+    return shown, look_for(views, places, shown, is_solid)
 
 
 def _free(views: Views, known: OldMap) -> NDArray[np.bool_]:
@@ -212,7 +212,7 @@ def _free(views: Views, known: OldMap) -> NDArray[np.bool_]:
     Nor is a box free on a landmark that has at least as many of its own: it may be another name
     for it.
     """
-    own = known.shown(views, MIN_MEDIAN_IOU)
+    own = associate(views, known.landmarks, MIN_MEDIAN_IOU)
     nameless = find_overlaps(
         views._replace(classes=np.zeros_like(views.classes)),
         Landmarks(known.landmarks.centers, known.landmarks.bases,

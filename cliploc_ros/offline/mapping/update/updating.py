@@ -20,7 +20,7 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU
+from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU, associate
 from cliploc_ros.offline.mapping.building import LeftOut, left_out_lines, rounded
 from cliploc_ros.offline.mapping.doubles import find_doubles
 from cliploc_ros.offline.mapping.evidence import MIN_MEDIAN_IOU, Evidence, Sight, gather_evidence
@@ -168,7 +168,7 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     known = known_landmarks(old, detections.class_names)
     aligned = align(given, known, options)
     judged = judge(detections, aligned.views, known, options)
-    loose, well = (int((known.shown(aligned.views, min_iou) >= 0).sum())
+    loose, well = (int((associate(aligned.views, known.landmarks, min_iou) >= 0).sum())
                    for min_iou in (ASSOCIATION_IOU, MIN_MEDIAN_IOU))
     _check_belongs(judged, well / max(1, loose))
     objects = gather_objects(aligned, known, judged, options)
