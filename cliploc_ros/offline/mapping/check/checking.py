@@ -137,9 +137,12 @@ def judge_grid(grid: Grid, model: DetectorModel, trials: Sequence[Trial], headin
     """
     count = len(trials) // headings
     trials = trials[:count * headings]
+    verdicts = np.array([one.verdict for one in trials]).reshape(count, headings)
     visible = np.array([model.expected_detections(pose) for pose in grid.poses[:len(trials)]])
-    return GridCheck(grid.positions[:count], grid.is_near[:count], grid.poses[:len(trials)],
-                     grid.spacing_m, visible.reshape(count, headings), tuple(trials))
+    return GridCheck(
+        grid.positions[:count], grid.is_near[:count], grid.poses[:len(trials)], grid.spacing_m,
+        (verdicts == 'accepted').sum(axis=1), (verdicts == 'misled').sum(axis=1),
+        visible.reshape(count, headings), tuple(trials))
 
 
 def _told(trials: Iterator[Trial], count: int, tell: Tell) -> list[Trial]:

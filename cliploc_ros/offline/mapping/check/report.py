@@ -4,7 +4,6 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -17,7 +16,6 @@ from cliploc_ros.offline.mapping.check.places import Grid, LookAlike
 from cliploc_ros.offline.mapping.check.relocalization import (
     LANDMARKS_FOR_A_POSE,
     Trial,
-    Verdict,
     count_verdicts,
 )
 from cliploc_ros.offline.mapping.evidence import BoxQuality
@@ -119,6 +117,9 @@ class RecordingCheck:
 class GridCheck(Grid):
     """Relocalization over a grid of camera positions."""
 
+    #: (P,): headings of each position in which a right, and a wrong pose is accepted
+    accepted: NDArray[np.int64]
+    misled: NDArray[np.int64]
     #: (P, H): how many landmarks the detector finds on average, by heading
     visible: NDArray[np.float64]
     trials: tuple[Trial, ...]  #: Heading by heading of each position
@@ -127,20 +128,6 @@ class GridCheck(Grid):
     def headings(self) -> int:
         """Return the number of headings at each position."""
         return self.visible.shape[1]
-
-    @cached_property
-    def accepted(self) -> NDArray[np.int64]:
-        """Return the headings (P,) of each position in which a right pose is accepted."""
-        return self._count('accepted')
-
-    @cached_property
-    def misled(self) -> NDArray[np.int64]:
-        """Return the headings (P,) of each position in which a wrong pose is accepted."""
-        return self._count('misled')
-
-    def _count(self, verdict: Verdict) -> NDArray[np.int64]:
-        found = np.array([one.verdict == verdict for one in self.trials], dtype=np.bool_)
-        return np.asarray(found.reshape(self.visible.shape).sum(axis=1))
 
     @property
     def useful(self) -> NDArray[np.int64]:
