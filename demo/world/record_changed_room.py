@@ -26,7 +26,6 @@ from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.labelling import embed_landmarks
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
-from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.views import make_views
 from cliploc_ros.offline.recording.recorder import KeyframeOptions, RecordingOptions, record_once
@@ -40,7 +39,7 @@ def record_changed_room(room: Path, out: Path) -> None:
     """Write the files of a changed room to a folder."""
     before, after = (_look(room / name) for name in ('before', 'after'))
     landmark_map = LandmarkMap.from_file(room / 'map.yaml')
-    shown = associate(make_views(before, MappingOptions()),
+    shown = associate(make_views(before),
                       landmarks_of_map(landmark_map, before.class_names), _SHOWN_IOU)
     out.mkdir(parents=True, exist_ok=True)
     for name in ('map.yaml', 'changes.json'):

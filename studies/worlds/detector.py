@@ -19,7 +19,7 @@ from cliploc_ros.core.geometry.ellipsoid import (
     project_ellipsoids,
 )
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.offline.simulation.labels import CLASS_SHARE, shared_noise, similarities_of
+from cliploc_ros.offline.simulation import CLASS_SHARE, shared_noise, similarities_of
 from studies.worlds.places import CLASS_NAMES, Objects, rows_of
 
 _LEAST_SIDE_PX, _RANGE_M = 12.0, 8.0

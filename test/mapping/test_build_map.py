@@ -194,7 +194,7 @@ def test_a_camera_that_stands_still_gives_few_frames():
     poses = np.repeat(walk_around(5, turn_deg=90.0), [40, 1, 3, 2, 1], axis=0)
     seen = see(make_table(), poses)
     assert number_viewpoints(seen).tolist() == np.repeat(range(5), [40, 1, 3, 2, 1]).tolist()
-    views = make_views(seen, MappingOptions())
+    views = make_views(seen)
     kept = thin_out(views, 3)
     assert np.bincount(views.viewpoints[kept]).tolist() == [3, 1, 3, 2, 1]
     assert views.weights[0] == pytest.approx(1 / 40)

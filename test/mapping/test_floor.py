@@ -10,7 +10,6 @@ from walk import CLASSES, join_maps, make_table, see, walk_around
 
 from cliploc_ros.offline.mapping.association import find_overlaps, ious_with
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
-from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.pose_noise import _sample
 from cliploc_ros.offline.mapping.views import make_views
 
@@ -33,7 +32,7 @@ def seen(floor):
 
 
 def test_far_landmarks_are_passed_over_without_a_loss(floor, seen):
-    views = make_views(seen, MappingOptions())
+    views = make_views(seen)
     landmarks = landmarks_of_map(floor, CLASSES)
     landmarks.classes[7] = -1  # of a class that the recording does not know
     found = find_overlaps(views, landmarks, 0.2)
@@ -53,14 +52,14 @@ def test_pose_errors_of_a_long_recording_are_estimated_from_a_part_of_it(seen):
     long = replace(seen, map_from_camera=far, stamps_s=np.arange(8000.0),
                    frame_offsets=np.zeros(8001, dtype=np.int64), classes=np.empty(0, np.int64),
                    bboxes_xyxy=np.empty((0, 4)), scores=np.empty(0))
-    frames, rows = _sample(make_views(long, MappingOptions()))
+    frames, rows = _sample(make_views(long))
     assert (len(frames), len(rows)) == (200, 0)
     assert 2900 < np.ptp(frames) < 3000
     assert abs(frames.mean() - 4000) < 10
 
 
 def test_no_landmarks_and_no_boxes(floor, seen):
-    views = make_views(seen, MappingOptions())
+    views = make_views(seen)
     none = landmarks_of_map(floor.select([0]), ())
     assert none.classes.tolist() == [-1]
     assert len(find_overlaps(views, none, 0.2).boxes) == 0

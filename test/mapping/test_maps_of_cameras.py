@@ -153,7 +153,7 @@ def test_a_turn_of_the_robot_is_one_error_of_all_cameras():
         moved[:, :3, 3] = front[:, :3, 3] + np.einsum(
             'ij,fj->fi', turn, poses[:, :3, 3] - front[:, :3, 3])
         return moved
-    given, present = (make_views(drive(*RIG, move=one)[0], MappingOptions())
+    given, present = (make_views(drive(*RIG, move=one)[0])
                       for one in (move, lambda stamps_s, poses: poses))
     np.testing.assert_allclose(np.linalg.norm(given.levers[given.cameras == 2], axis=1),
                                2.0 * _LEVER_M, atol=2e-3)
@@ -164,7 +164,7 @@ def test_a_turn_of_the_robot_is_one_error_of_all_cameras():
 def test_viewpoints_and_samples_are_those_of_each_camera():
     standing = drive(*RIG, seconds=10.0, move=lambda stamps_s, poses: poses[:1].repeat(
         len(poses), axis=0))[0]
-    views = make_views(standing, MappingOptions())
+    views = make_views(standing)
     assert sorted(np.bincount(views.viewpoints).tolist()) == [20] * 4
     assert np.bincount(views.cameras[thin_out(views, 3)]).tolist() == [3] * 4
     with pytest.raises(MappingError, match='move it around'):

@@ -34,7 +34,7 @@ def seen():
 
 def draft_of(detections):
     built = build_map(detections)
-    return (make_views(detections, MappingOptions()),
+    return (make_views(detections),
             landmarks_of_map(built.landmark_map, detections.class_names), built.shown)
 
 
@@ -73,7 +73,7 @@ def test_estimated_errors_are_refined_and_reported(seen):
 
 def test_too_few_boxes_give_no_estimate():
     few = see(make_table(), walk_around(frames=12))
-    assert estimate_pose_errors(*draft_of(few), make_views(few, MappingOptions())) is None
+    assert estimate_pose_errors(*draft_of(few), make_views(few)) is None
 
 
 def test_the_determinant_of_the_prior_is_that_of_its_matrix():

@@ -18,7 +18,6 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.offline.datasets.frames import RawFrame
 from cliploc_ros.offline.datasets.observations import load_recorded
-from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.views import make_views
 from cliploc_ros.offline.recording.networks import RunNetworks
 from demo.truth import read_objects
@@ -81,11 +80,11 @@ def test_a_folder_gives_the_map_of_the_room(recorded, folder):
 
 def test_an_edge_at_the_border_of_the_image_is_open(recorded):
     """The lens moves the border inwards: such an edge measures no object."""
-    views = make_views(recorded, MappingOptions())
+    views = make_views(recorded)
     assert views.is_open.any(axis=0).all() and 0.02 < views.is_open.mean() < 0.1
     left, top, right, bottom = views.bounds[0] * LENS.fx + (319.5, 239.5, 319.5, 239.5)
     assert 5 < left < 30 and 3 < top < 30 and 610 < right < 635 and 450 < bottom < 477
-    again = make_views(recorded.select_frames(range(5)), MappingOptions())
+    again = make_views(recorded.select_frames(range(5)))
     assert (again.is_open == views.is_open[:len(again.is_open)]).all()
 
 

@@ -10,8 +10,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.association import associate, ious_with
 from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map, project_box
-from cliploc_ros.offline.mapping.options import MappingOptions
-from cliploc_ros.offline.mapping.views import camera_centers, make_views
+from cliploc_ros.offline.mapping.views import make_views
 from cliploc_ros.offline.studio.edits import EditError
 from cliploc_ros.offline.studio.new_landmark import fit_boxes
 
@@ -22,7 +21,7 @@ TRIALS_PER_LANDMARK = 6
 def office(shared_data):
     folder = shared_data / 'tum_fr3_office'
     detections = load_observations(folder / 'observations.npz')
-    views = make_views(detections, MappingOptions())
+    views = make_views(detections)
     landmark_map = LandmarkMap.from_file(folder / 'map.yaml')
     landmarks = landmarks_of_map(landmark_map, detections.class_names)
     return detections, views, landmarks, associate(views, landmarks, 0.2)
@@ -51,7 +50,7 @@ def draw_boxes(office, script, rng):
         rows = rows[~views.is_open[rows].any(axis=1)]
         if len(rows) < 30:
             continue
-        offsets = landmarks.centers[number] - camera_centers(views, views.frames[rows])
+        offsets = landmarks.centers[number] - views.centers[views.frames[rows]]
         directions = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
         center, basis = landmarks.centers[number], landmarks.bases[number]
         drawable = np.nonzero(ious_with(views, rows, center, basis) >= script['min_iou'])[0]

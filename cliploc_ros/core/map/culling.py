@@ -72,7 +72,7 @@ def sort_landmarks(centers: NDArray[np.float64], shapes: NDArray[np.float64],
     members : ndarray (m, 2) of int
         Landmark and class number, see ClassIndex.members.
     """
-    members = members[np.argsort(_morton_codes(centers[members[:, 0]]), kind='stable')]
+    members = members[np.argsort(morton_codes(centers[members[:, 0]]), kind='stable')]
     numbers, classes = members.T
     centers, shapes = centers[numbers], shapes[numbers]
     # the greatest eigenvalue of a shape matrix is the square of the greatest semi-axis
@@ -142,10 +142,11 @@ def _make_tree(centers: NDArray[np.float64], radii: NDArray[np.float64],
     return np.cumsum([0, *map(len, spheres)]).astype(np.int64), np.concatenate(spheres)
 
 
-def _morton_codes(centers: NDArray[np.float64]) -> NDArray[np.uint64]:
+def morton_codes(centers: NDArray[np.float64]) -> NDArray[np.uint64]:
     """Return the place (u,) of points (u, 3) on a Morton curve through their bounding cube."""
-    low, extent = centers.min(axis=0), np.ptp(centers, axis=0).max()
-    cells = ((centers - low) / max(extent, 1e-9) * (2**_MORTON_BITS - 1)).astype(np.uint64)
+    offsets = centers - centers.min(axis=0, initial=np.inf)
+    extent = max(offsets.max(initial=0.0), 1e-9)
+    cells = (offsets / extent * (2**_MORTON_BITS - 1)).astype(np.uint64)
     code = np.zeros(len(centers), dtype=np.uint64)
     for axis in range(3):
         bits = cells[:, axis]

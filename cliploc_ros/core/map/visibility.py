@@ -4,7 +4,7 @@
 
 An image should show the landmarks that are near, large, wholly in view and not hidden. Walls are
 in no map, so an expected landmark may be hidden. That a landmark is beside one that the image
-shows tells that it is not, see mapping.update.sight, which judges whole recordings.
+shows tells that it is not, see mapping.evidence, which judges whole recordings.
 
 A detector finds some landmarks in each image and others hardly ever. The share of looks that find
 a landmark has a beta distribution, which each look narrows down. Then the probability of k misses

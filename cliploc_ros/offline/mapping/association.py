@@ -10,9 +10,12 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.core.map.culling import morton_codes
 from cliploc_ros.offline.mapping.landmarks import Landmarks, box_iou, project_box
 from cliploc_ros.offline.mapping.views import Views
 
+#: A box and a landmark that overlap less do not belong together.
+ASSOCIATION_IOU = 0.2
 _GROUP_SIZE = 8
 # Rounding must not hide a landmark [m].
 _SLACK = 1e-6
@@ -54,7 +57,7 @@ class _Groups(NamedTuple):
 def _make_groups(landmarks: Landmarks, classes: int) -> _Groups:
     """Return groups of landmarks; one without a class is in none."""
     rows, of_names = landmarks.names.T
-    order = np.lexsort((_along_curve(landmarks.centers)[rows], of_names))
+    order = np.lexsort((morton_codes(landmarks.centers)[rows], of_names))
     members, own = rows[order], of_names[order]
     first = np.searchsorted(own, np.arange(classes + 1))
     starts = np.concatenate([[0], np.cumsum(-(-np.diff(first) // _GROUP_SIZE))])
@@ -68,17 +71,6 @@ def _make_groups(landmarks: Landmarks, classes: int) -> _Groups:
     reaches = np.linalg.norm(points - centers[group_of], axis=1) + sizes[members]
     return _Groups(starts, offsets, members, centers,
                    np.maximum.reduceat(reaches, offsets[:-1]), sizes)
-
-
-def _along_curve(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the place of each point (n, 3) on Morton's curve, on which near points are near."""
-    offsets = points - points.min(axis=0, initial=np.inf)
-    cells = (offsets * (1023.0 / max(1e-9, offsets.max(initial=0.0)))).astype(np.int64)
-    places = np.zeros(len(points), dtype=np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            places |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return places
 
 
 @compiled
@@ -134,14 +126,18 @@ def _may_show(views, row, center, radius):
     return True
 
 
-def associate(views: Views, landmarks: Landmarks, min_iou: float) -> NDArray[np.int64]:
-    """Return the landmark (n,) that each box shows, -1 for none.
+def associate(views: Views, landmarks: Landmarks, min_iou: float = ASSOCIATION_IOU,
+              among: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
+    """Return the landmark (n,), among some or all (L,), that each box shows, -1 for none.
 
     In every frame a landmark has at most one box and a box at most one landmark; the sum of
     their IoUs is the greatest possible (Hungarian method). Pairs that overlap less than min_iou
     are no candidates.
     """
     boxes, candidates, ious = find_overlaps(views, landmarks, min_iou)
+    if among is not None:
+        kept = among[candidates]
+        boxes, candidates, ious = boxes[kept], candidates[kept], ious[kept]
     shown = np.full(len(views.frames), -1, dtype=np.int64)
     frames = views.frames[boxes]
     sole = _is_sole(boxes) & _is_sole(frames * len(landmarks.centers) + candidates)

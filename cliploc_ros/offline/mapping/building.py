@@ -4,7 +4,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,22 +15,10 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.doubles import close_pairs, merge_doubles, resolve_doubles
-from cliploc_ros.offline.mapping.evidence import (
-    Evidence,
-    explained_boxes,
-    gather_evidence,
-    reasons_against,
-)
+from cliploc_ros.offline.mapping.evidence import explained_boxes, gather_evidence, reasons_against
 from cliploc_ros.offline.mapping.fitting import fit_landmarks
 from cliploc_ros.offline.mapping.joint import pose_changes, pose_errors, refine_jointly
-from cliploc_ros.offline.mapping.landmarks import (
-    Landmarks,
-    ellipsoid_numbers,
-    group_boxes,
-    join_landmarks,
-    no_landmarks,
-    unused_ids,
-)
+from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes, unused_ids
 from cliploc_ros.offline.mapping.odometry import link_frames
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.pose_noise import (
@@ -44,22 +32,24 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.systematic import MountCorrection, refine_mount
 from cliploc_ros.offline.mapping.triangulation import (
     SUPPORT_IOU,
-    add_depths,
-    correct_scale,
-    depth_scale,
     options_with_depth,
+    scaled_depths,
     triangulate,
 )
-from cliploc_ros.offline.mapping.views import (
-    Views,
-    check_input,
-    make_views,
-    map_from_cameras,
-    thin_out,
-)
+from cliploc_ros.offline.mapping.views import Views, check_input, make_views, thin_out
 
 # Landmarks are found in windows of time that overlap: no pair of boxes is farther apart.
 _WINDOW_S, _OVERLAP_S = 90.0, 30.0
+# At most this number of frames of a viewpoint are searched for new landmarks.
+_FRAMES_PER_VIEWPOINT = 8
+# How often boxes without a landmark are searched for new ones; how often after that landmarks are
+# associated, merged and fitted.
+_DISCOVERY_ROUNDS = 2
+SETTLING_ROUNDS = 3
+# How often the map is built again with refined poses; how often poses and landmarks are refined
+# together before each of these, and after all.
+_REBUILDS = 1
+REFINEMENTS = 3
 _REASONS_SHOWN = 10
 
 #: Told the name of a stage and the share of it that is done, 0 to 1.
@@ -159,49 +149,51 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     if options.refine_mount and len(detections.cameras) > 1:
         raise MappingError(f'the mounts of {len(detections.cameras)} cameras cannot be corrected '
                            'together; correct each with a map of that camera alone')
-    tell = progress or (lambda stage, share: None)
-    given = make_views(detections, options)
-    notes = check_input(detections, given, options)
-    rng = np.random.default_rng(options.random_seed)
-    draft = _draft(given, options, rng, tell)
+    builder = _Builder(detections, options, np.random.default_rng(options.random_seed),
+                       progress or (lambda stage, share: None))
+    given = make_views(detections)
+    notes = check_input(detections, given, options.min_viewpoints)
+    draft = builder.draft(given)
     if detections.depths is not None:
         # the draft of boxes alone tells the scale of depth
-        evidence = gather_evidence(given, draft.landmarks, draft.shown)
-        given = add_depths(given, detections)
-        scales = [depth_scale(given, draft.landmarks, np.where(
-            given.cameras[given.frames] == number, draft.shown, -1), evidence.baseline_deg)
-            for number in range(len(detections.cameras))]
-        given, depth_notes = correct_scale(given, detections, scales)
+        given, depth_notes = scaled_depths(given, detections, draft.landmarks, draft.shown)
         notes += depth_notes
-        options = options_with_depth(options)
-        draft = _draft(given, options, rng, tell)
+        builder = builder._replace(options=options_with_depth(options))
+        draft = builder.draft(given)
     mount, odometry = None, detections.odom_from_camera
     if options.refine_mount:
         views = given
-        for number in range(options.rebuilds + 1):
+        for number in range(_REBUILDS + 1):
             if len(draft.landmarks.centers) == 0:
                 break
-            tell('refining the mount', number / (options.rebuilds + 1))
-            mount = refine_mount(given, draft.landmarks, draft.shown, views)
+            builder.tell('refining the mount', number / (_REBUILDS + 1))
+            mount = refine_mount(detections, given, draft.landmarks, draft.shown, views)
             views = mount.views
-            draft = _draft(views, options, rng, tell)
+            draft = builder.draft(views)
     if mount is not None:
         given, notes = mount.views, notes + mount.lines()
         odometry = None if odometry is None else odometry @ mount.given_from_corrected
-    views, draft, errors, pose_notes = _with_poses(given, odometry, draft, options, rng, tell)
-    tell('done', 1.0)
+    views, draft, errors, pose_notes = builder.with_poses(given, odometry, draft)
+    builder.tell('done', 1.0)
+    left_out = tuple(sorted(draft.left_out, key=lambda one: -one.support))
     if len(draft.landmarks.centers) == 0:
         why = ('no boxes of one class meet in space; check that poses and stamps belong to these '
                'images, that the poses are of the camera (z forward), and the intrinsics')
-        if reasons := draft.reasons:
-            kinds = Counter(reason.partition(':')[0] for reason in reasons)
+        if draft.left_out:
+            kinds = Counter(one.reason.partition(':')[0] for one in draft.left_out)
             counts = ', '.join(f'{count} {kind}' for kind, count in kinds.most_common())
-            why = (f'no landmark is good enough for a map; {len(reasons)} were left out '
-                   f'({counts}), the first one because: {reasons[0]}. Record while the camera '
-                   'moves past the objects, not only turns, or map images with depth')
-        raise NothingFoundError(why, _left_out(detections, draft))
-    built = _finish(detections, given, views, draft, errors, options, notes + pose_notes)
-    return replace(built, mount=mount)
+            why = (f'no landmark is good enough for a map; {len(left_out)} were left out '
+                   f'({counts}), the first one because: {draft.left_out[0].reason}. Record while '
+                   'the camera moves past the objects, not only turns, or map images with depth')
+        raise NothingFoundError(why, left_out)
+    landmarks, shown = _one_of_each(views, draft.landmarks)
+    quality = explained_boxes(views, landmarks, shown)
+    report = MappingReport(
+        len(detections), int(views.viewpoints.max()) + 1, quality.boxes, len(landmarks.centers),
+        quality.explained, quality.median_iou, *pose_changes(given, views), left_out,
+        tuple(notes + pose_notes))
+    landmark_map = builder.map_of(landmarks, shown, given, views, errors)
+    return BuiltMap(landmark_map, report, shown, views.poses, mount)
 
 
 class _Draft(NamedTuple):
@@ -209,48 +201,125 @@ class _Draft(NamedTuple):
 
     landmarks: Landmarks
     shown: NDArray[np.int64]
-    left_out: Landmarks
-    reasons: list[str]
-    evidence_against: Evidence
+    left_out: tuple[LeftOut, ...]
 
 
-def _draft(views: Views, options: MappingOptions, rng: np.random.Generator, tell: Progress
-           ) -> _Draft:
-    """Return the landmarks that the views show, for the poses that they have."""
-    landmarks, shown = no_landmarks(), np.full(len(views.frames), -1, dtype=np.int64)
-    for number in range(options.discovery_rounds):
-        found = _discover(views, shown < 0, options, rng, tell)
-        tell('fitting landmarks', number / options.discovery_rounds)
-        landmarks, shown = _settle(views, join_landmarks(landmarks, found), options)
-    evidence = gather_evidence(views, landmarks, shown)
-    reasons = reasons_against(landmarks, evidence, options)
-    kept = np.array([reason is None for reason in reasons], dtype=np.bool_)
-    landmarks, left_out = landmarks.select(kept), landmarks.select(~kept)
-    # boxes of what is left out may belong to what stays
-    shown = associate(views, landmarks, options.association_iou)
-    landmarks = fit_landmarks(views, landmarks, group_boxes(shown, len(landmarks.centers)))
-    return _Draft(landmarks, associate(views, landmarks, options.association_iou), left_out,
-                  [reason for reason in reasons if reason is not None], evidence.select(~kept))
+class _Builder(NamedTuple):
+    """What all stages of building share."""
 
+    detections: PosedDetections
+    options: MappingOptions
+    rng: np.random.Generator
+    tell: Progress
 
-def _discover(views: Views, free: NDArray[np.bool_], options: MappingOptions,
-              rng: np.random.Generator, tell: Progress) -> Landmarks:
-    """Return landmarks that explain the free boxes, class by class and minute by minute.
+    def draft(self, views: Views) -> _Draft:
+        """Return the landmarks that the views show, for the poses that they have."""
+        landmarks, shown = Landmarks.none(), np.full(len(views.frames), -1, dtype=np.int64)
+        for number in range(_DISCOVERY_ROUNDS):
+            found = self._discover(views, shown < 0)
+            self.tell('fitting landmarks', number / _DISCOVERY_ROUNDS)
+            landmarks, shown = self._settle(views, Landmarks.joined(landmarks, found))
+        evidence = gather_evidence(views, landmarks, shown)
+        reasons = reasons_against(landmarks, evidence, self.options)
+        left_out = tuple(LeftOut(
+            self.detections.class_names[landmarks.classes[row]], rounded(landmarks.centers[row]),
+            int(evidence.support[row]), int(evidence.viewpoints[row]), reason)
+            for row, reason in enumerate(reasons) if reason is not None)
+        landmarks = landmarks.select(np.array([one is None for one in reasons], dtype=np.bool_))
+        # boxes of what is left out may belong to what stays
+        landmarks = fit_landmarks(views, landmarks, associate(views, landmarks))
+        return _Draft(landmarks, associate(views, landmarks), left_out)
 
-    Landmarks that a window of time has found explain boxes of the next one, so that the work grows
-    with the length of the recording only.
-    """
-    free = free & thin_out(views, options.frames_per_viewpoint)[views.frames]
-    found = [no_landmarks()]
-    for first, last in _windows(views.stamps_s):
-        tell('finding landmarks', first / len(views.stamps_s))
-        window = views.between(first, last)
-        left = free[views.offsets[first]:views.offsets[last]].copy()
-        left &= associate(window, found[-1], SUPPORT_IOU) < 0
-        found.append(join_landmarks(*(
-            triangulate(window, np.nonzero(left & (window.classes == number))[0], options, rng)
-            for number in np.unique(window.classes[left]))))
-    return join_landmarks(*found)
+    def _discover(self, views: Views, free: NDArray[np.bool_]) -> Landmarks:
+        """Return landmarks that explain the free boxes, class by class and minute by minute.
+
+        Landmarks that a window of time has found explain boxes of the next one, so that the work
+        grows with the length of the recording only.
+        """
+        free = free & thin_out(views, _FRAMES_PER_VIEWPOINT)[views.frames]
+        found = [Landmarks.none()]
+        for first, last in _windows(views.stamps_s):
+            self.tell('finding landmarks', first / len(views.stamps_s))
+            window = views.between(first, last)
+            left = free[views.offsets[first]:views.offsets[last]].copy()
+            left &= associate(window, found[-1], SUPPORT_IOU) < 0
+            found.append(Landmarks.joined(*(
+                triangulate(window, np.nonzero(left & (window.classes == number))[0],
+                            self.options.min_viewpoints, self.rng)
+                for number in np.unique(window.classes[left]))))
+        return Landmarks.joined(*found)
+
+    def _settle(self, views: Views, landmarks: Landmarks) -> tuple[Landmarks, NDArray[np.int64]]:
+        """Associate, merge and fit until landmarks and boxes agree; return both."""
+        for _ in range(SETTLING_ROUNDS):
+            shown = associate(views, landmarks)
+            pairs = [(first, second) for first, second, _ in close_pairs(landmarks)
+                     if landmarks.classes[first] == landmarks.classes[second]]
+            landmarks, shown = _keep(*merge_doubles(views, landmarks, shown, pairs), shown)
+            seen = [len(np.unique(views.viewpoints[views.frames[rows]]))
+                    for rows in group_boxes(shown, len(landmarks.centers))]
+            landmarks = fit_landmarks(views, landmarks, shown).select(
+                np.array(seen, dtype=np.int64) >= self.options.min_viewpoints)
+        return landmarks, associate(views, landmarks)
+
+    def with_poses(self, given: Views, odometry: NDArray[np.float64] | None, draft: _Draft
+                   ) -> tuple[Views, _Draft, PoseErrors | None, list[str]]:
+        """Return the views with refined poses, the landmarks that fit them, errors, and notes.
+
+        Poses are refined where their errors are given, or estimated and significant. None: they
+        are taken as exact.
+        """
+        views, errors, notes = given, self.options.pose_errors, list[str]()
+        is_estimated = errors is None and self.options.estimate_pose_errors
+        if is_estimated:
+            self.tell('estimating pose errors', 0.0)
+            errors = significant_pose_errors(given, draft.landmarks, draft.shown)
+        if errors is None:
+            return views, draft, None, [] if odometry is None else [
+                'odometry is not used: the poses are taken as they are']
+        for number in range(_REBUILDS + 1):
+            self.tell('refining poses', number / (_REBUILDS + 1))
+            steps, link_note = None, ''
+            if odometry is not None:
+                steps, link_note = link_frames(given, odometry, errors,
+                                               self.options.odometry_errors)
+            # Errors of the poses split objects in two. Poses and parts move towards each other in
+            # turns, until the parts merge.
+            for _ in range(REFINEMENTS):
+                views, landmarks = refine_jointly(given, views, draft.landmarks, draft.shown,
+                                                  errors, steps=steps)
+                landmarks, shown = self._settle(views, landmarks)
+                draft = draft._replace(landmarks=landmarks, shown=shown)
+            if number < _REBUILDS:
+                draft = self.draft(views)
+                if is_estimated:
+                    # objects that were split before tell more now
+                    errors = estimate_pose_errors(given, draft.landmarks, draft.shown,
+                                                  views) or errors
+        if is_estimated:
+            notes.append(estimated_note(errors))
+        return views, draft, errors, notes + ([link_note] if link_note else [])
+
+    def map_of(self, landmarks: Landmarks, shown: NDArray[np.int64], given: Views, views: Views,
+               errors: PoseErrors | None) -> LandmarkMap:
+        """Return the map of landmarks, with labels that are the class names."""
+        count = len(landmarks.centers)
+        evidence = gather_evidence(views, landmarks, shown)
+        evidence = evidence._replace(position_sigma=np.hypot(
+            evidence.position_sigma,
+            left_by_poses(views, np.square(pose_errors(given, views)), shown, count)))
+        shared = None if errors is None else shared_by_neighbours(views, shown, count, errors)
+        weights = [_class_weights(self.detections, boxes) for boxes in group_boxes(shown, count)]
+        details = tuple(
+            evidence.details(row, LandmarkDetails(
+                class_weights=one if len(one) > 1 else None,
+                shared_sigma=None if shared is None else float(shared[row, 0]),
+                shared_sigma_deg=None if shared is None else float(shared[row, 1]),
+                source=self.options.source))
+            for row, one in enumerate(weights))
+        names = tuple(one[0][0] for one in weights)
+        return LandmarkMap(self.options.frame_id, unused_ids(names), names, names,
+                           landmarks.centers, *landmarks.axes_and_quats(), details)
 
 
 def _windows(stamps_s: NDArray[np.float64]) -> list[tuple[int, int]]:
@@ -265,21 +334,6 @@ def _windows(stamps_s: NDArray[np.float64]) -> list[tuple[int, int]]:
         begin_s = stamps_s[last] - _OVERLAP_S
 
 
-def _settle(views: Views, landmarks: Landmarks, options: MappingOptions
-            ) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Associate, merge and fit until landmarks and boxes agree; return both."""
-    for _ in range(options.settling_rounds):
-        shown = associate(views, landmarks, options.association_iou)
-        pairs = [(first, second) for first, second, _ in close_pairs(landmarks)
-                 if landmarks.classes[first] == landmarks.classes[second]]
-        landmarks, shown = _keep(*merge_doubles(views, landmarks, shown, pairs, options), shown)
-        boxes = group_boxes(shown, len(landmarks.centers))
-        seen = [len(np.unique(views.viewpoints[views.frames[rows]])) >= options.min_viewpoints
-                for rows in boxes]
-        landmarks = fit_landmarks(views, landmarks, boxes).select(np.array(seen, dtype=np.bool_))
-    return landmarks, associate(views, landmarks, options.association_iou)
-
-
 def _keep(landmarks: Landmarks, into: NDArray[np.int64], shown: NDArray[np.int64]
           ) -> tuple[Landmarks, NDArray[np.int64]]:
     """Return the landmarks that are no part of another, and the landmark of each box."""
@@ -288,95 +342,16 @@ def _keep(landmarks: Landmarks, into: NDArray[np.int64], shown: NDArray[np.int64
     return landmarks.select(is_kept), numbers[shown]
 
 
-def _one_of_each(views: Views, landmarks: Landmarks, options: MappingOptions
-                 ) -> tuple[Landmarks, NDArray[np.int64]]:
+def _one_of_each(views: Views, landmarks: Landmarks) -> tuple[Landmarks, NDArray[np.int64]]:
     """Return landmarks without doubles, fitted to their boxes, and the landmark of each box."""
     while True:
-        shown = associate(views, landmarks, options.association_iou)
-        found, of_found = _keep(*resolve_doubles(views, landmarks, shown, options), shown)
+        shown = associate(views, landmarks)
+        found, of_found = _keep(*resolve_doubles(views, landmarks, shown), shown)
         is_shown = np.bincount(of_found[of_found >= 0], minlength=len(found.centers)) > 0
         if is_shown.sum() == len(landmarks.centers):
             return landmarks, shown
         landmarks = found.select(is_shown)
-        shown = associate(views, landmarks, options.association_iou)
-        landmarks = fit_landmarks(views, landmarks, group_boxes(shown, len(landmarks.centers)))
-
-
-def _with_poses(given: Views, odometry: NDArray[np.float64] | None, draft: _Draft,
-                options: MappingOptions, rng: np.random.Generator, tell: Progress
-                ) -> tuple[Views, _Draft, PoseErrors | None, list[str]]:
-    """Return the views with refined poses, the landmarks that fit them, errors, and notes.
-
-    Poses are refined where their errors are given, or estimated and significant. None: they are
-    taken as exact.
-    """
-    views, errors, notes = given, options.pose_errors, list[str]()
-    is_estimated = errors is None and options.estimate_pose_errors
-    if is_estimated:
-        tell('estimating pose errors', 0.0)
-        errors = significant_pose_errors(given, draft.landmarks, draft.shown)
-    if errors is None:
-        return views, draft, None, [] if odometry is None else [
-            'odometry is not used: the poses are taken as they are']
-    for number in range(options.rebuilds + 1):
-        tell('refining poses', number / (options.rebuilds + 1))
-        steps, link_note = None, ''
-        if odometry is not None:
-            steps, link_note = link_frames(given, odometry, errors, options.odometry_errors)
-        # Errors of the poses split objects in two. Poses and parts move towards each other in
-        # turns, until the parts merge.
-        for _ in range(options.refinements):
-            views, landmarks = refine_jointly(given, views, draft.landmarks, draft.shown, errors,
-                                              steps=steps)
-            landmarks, shown = _settle(views, landmarks, options)
-            draft = draft._replace(landmarks=landmarks, shown=shown)
-        if number < options.rebuilds:
-            draft = _draft(views, options, rng, tell)
-            if is_estimated:
-                # objects that were split before tell more now
-                errors = estimate_pose_errors(given, draft.landmarks, draft.shown, views) or errors
-    if is_estimated:
-        notes.append(estimated_note(errors))
-    return views, draft, errors, notes + ([link_note] if link_note else [])
-
-
-def _finish(detections: PosedDetections, given: Views, views: Views, draft: _Draft,
-            errors: PoseErrors | None, options: MappingOptions, notes: Sequence[str]) -> BuiltMap:
-    """Return the map of a draft, with labels that are the class names, and its report."""
-    landmarks, shown = _one_of_each(views, draft.landmarks, options)
-    count = len(landmarks.centers)
-    evidence = gather_evidence(views, landmarks, shown)
-    explained, median_iou = explained_boxes(views, landmarks, shown)
-    report = MappingReport(
-        len(detections), int(views.viewpoints.max()) + 1, len(detections.classes), count,
-        explained, median_iou, *pose_changes(given, views), _left_out(detections, draft),
-        tuple(notes))
-    evidence = evidence._replace(position_sigma=np.hypot(
-        evidence.position_sigma,
-        left_by_poses(views, np.square(pose_errors(given, views)), shown, count)))
-    shared = None if errors is None else shared_by_neighbours(views, shown, count, errors)
-    weights = [_class_weights(detections, boxes) for boxes in group_boxes(shown, count)]
-    details = tuple(
-        evidence.details(row, LandmarkDetails(
-            class_weights=one if len(one) > 1 else None,
-            shared_sigma=None if shared is None else float(shared[row, 0]),
-            shared_sigma_deg=None if shared is None else float(shared[row, 1]),
-            source=options.source))
-        for row, one in enumerate(weights))
-    names = tuple(one[0][0] for one in weights)
-    return BuiltMap(
-        LandmarkMap(options.frame_id, unused_ids(names), names, names, landmarks.centers,
-                    *ellipsoid_numbers(landmarks.bases), details),
-        report, shown, map_from_cameras(views))
-
-
-def _left_out(detections: PosedDetections, draft: _Draft) -> tuple[LeftOut, ...]:
-    """Return what a draft leaves out, the landmark with the greatest support first."""
-    against = draft.evidence_against
-    return tuple(LeftOut(
-        detections.class_names[draft.left_out.classes[row]], rounded(draft.left_out.centers[row]),
-        int(against.support[row]), int(against.viewpoints[row]), draft.reasons[row])
-        for row in np.argsort(-against.support, kind='stable'))
+        landmarks = fit_landmarks(views, landmarks, associate(views, landmarks))
 
 
 def _class_weights(detections: PosedDetections, rows: NDArray[np.int64]

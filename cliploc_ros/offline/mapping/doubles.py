@@ -17,11 +17,10 @@ from scipy.spatial import cKDTree
 
 from cliploc_ros.core.geometry.ellipsoid import STANDS_IN, normalized_lengths
 from cliploc_ros.offline.mapping.association import ious_with
-from cliploc_ros.offline.mapping.evidence import REACH, is_expected
+from cliploc_ros.offline.mapping.evidence import MIN_MEDIAN_IOU, REACH, is_expected
 from cliploc_ros.offline.mapping.fitting import fit_ellipsoid
 from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes
-from cliploc_ros.offline.mapping.options import MappingOptions
-from cliploc_ros.offline.mapping.views import Views, camera_centers
+from cliploc_ros.offline.mapping.views import Views
 
 # Two boxes of one image show one thing if their IoU is above the first number. One is within the
 # other if it shares more than the second number of its area. Below the third number of the other's
@@ -33,6 +32,8 @@ _LEAST_LIFT, _LEAST_SHARE = 1 / 3, 0.15
 # A part has a box of its own at times, a thing on another one in this share of the images of both.
 # All are guesses, between the doubles and the neighbours of four rooms and TUM fr3.
 _LEAST_STEADY = 0.3
+# Landmarks of one thing are fitted together, unless the mean IoU of their boxes falls by more.
+_MERGE_LOSS = 0.1
 
 
 def close_pairs(landmarks: Landmarks) -> list[tuple[int, int, float]]:
@@ -97,7 +98,7 @@ def _rates_in_view(views: Views, landmarks: Landmarks, rows_of: Sequence[NDArray
     Of the frames with both of their places in view: those that have a box, or should have one by
     those that have one.
     """
-    cameras = camera_centers(views)
+    cameras = views.centers
     seen, in_view = np.zeros((2, len(cameras)), dtype=np.bool_), []
     for number, is_seen in zip(pair, seen, strict=True):
         center, frames = landmarks.centers[number], views.frames[rows_of[number]]
@@ -122,7 +123,7 @@ def find_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
 
 
 def resolve_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
-                    options: MappingOptions, chosen: NDArray[np.bool_] | None = None
+                    chosen: NDArray[np.bool_] | None = None
                     ) -> tuple[Landmarks, NDArray[np.int64]]:
     """Return all landmarks, and the one (L,) that each of the chosen is one thing with.
 
@@ -133,7 +134,7 @@ def resolve_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
         return [pair for pair in find_doubles(views, landmarks, shown)
                 if chosen is None or chosen[list(pair)].all()]
 
-    landmarks, into = merge_doubles(views, landmarks, shown, doubles(shown), options)
+    landmarks, into = merge_doubles(views, landmarks, shown, doubles(shown))
     shown = np.where(shown < 0, -1, into[shown])
     fits = [ious_with(views, rows, center, basis).sum() for rows, center, basis in zip(
         group_boxes(shown, len(into)), landmarks.centers, landmarks.bases, strict=True)]
@@ -145,8 +146,7 @@ def resolve_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
 
 
 def merge_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
-                  pairs: Iterable[tuple[int, int]], options: MappingOptions
-                  ) -> tuple[Landmarks, NDArray[np.int64]]:
+                  pairs: Iterable[tuple[int, int]]) -> tuple[Landmarks, NDArray[np.int64]]:
     """Fit those of the pairs that are one thing together, in the order given.
 
     They stay two where the boxes of either do not fit the common ellipsoid. Of two landmarks the
@@ -168,8 +168,8 @@ def merge_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
         before = [ious_with(views, rows_of[number], centers[number], bases[number])
                   for number in (keep, drop)]
         after = np.split(ious_with(views, rows, fit.center, fit.basis), [len(before[0])])
-        if not (_fits(np.concatenate(before), np.concatenate(after), 1.0, options)
-                and all(_fits(*ious, options.min_median_iou, options)
+        if not (_fits(np.concatenate(before), np.concatenate(after), 1.0)
+                and all(_fits(*ious, MIN_MEDIAN_IOU)
                         for ious in zip(before, after, strict=True))):
             continue
         centers[keep], bases[keep], rows_of[keep] = fit.center, fit.basis, np.sort(rows)
@@ -178,8 +178,6 @@ def merge_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
     return merged._replace(others=names[names[:, 1] != merged.classes[names[:, 0]]]), into
 
 
-def _fits(before: NDArray[np.float64], after: NDArray[np.float64], enough: float,
-          options: MappingOptions) -> bool:
+def _fits(before: NDArray[np.float64], after: NDArray[np.float64], enough: float) -> bool:
     """Tell by the IoUs of boxes, before and after, if they fit enough, or hardly worse."""
-    return len(before) == 0 or bool(
-        after.mean() >= min(enough, before.mean() - options.merge_loss))
+    return len(before) == 0 or bool(after.mean() >= min(enough, before.mean() - _MERGE_LOSS))

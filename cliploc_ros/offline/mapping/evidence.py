@@ -1,8 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How well the frames support each landmark."""
+"""How well the frames support each landmark, and which of them show its place.
 
-from dataclasses import replace
+Walls are in no map. A place is in view only if the frame also shows another landmark close to its
+direction that is not nearer.
+"""
+
+from dataclasses import dataclass, replace
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -20,13 +25,31 @@ from cliploc_ros.offline.mapping.landmarks import (
     project_box,
 )
 from cliploc_ros.offline.mapping.options import MappingOptions
-from cliploc_ros.offline.mapping.views import Views, camera_centers
+from cliploc_ros.offline.mapping.views import Views
 
 #: A landmark is expected from no farther away than this times the greatest distance at which it
 #: was detected.
 REACH = 1.2
+#: Of the boxes of a landmark in a map.
+MIN_MEDIAN_IOU = 0.5
+#: The centre of a large landmark may deviate by this share of its size.
+MAX_SIGMA_SHARE = 0.1
 # IoU from which a landmark explains a box of its class.
 _EXPLAINED_IOU = 0.3
+
+
+# A place is in view if the frame shows another landmark this close to its direction, and not
+# nearer: otherwise a wall may hide it. It is out of view if landmarks or boxes hide this share.
+# Guesses.
+_BESIDE_DEG, _HIDDEN_SHARE = 20.0, 0.4
+# A landmark as near as this share of a place's distance is beside the place, not before it.
+_BESIDE_SHARE = 0.8
+# A class with fewer boxes is taken to be seen at the sizes of its boxes and of all classes only.
+_FEW_BOXES = 20
+_LEAST_QUANTILE = 0.1
+# Points in a box at which the kernel asks whether something hides it: a 5 x 5 grid in the ellipse.
+_GRID = np.array([(x, y) for x in (-0.8, -0.4, 0.0, 0.4, 0.8) for y in (-0.8, -0.4, 0.0, 0.4, 0.8)
+                  if x * x + y * y < 1.0])
 
 
 class Evidence(NamedTuple):
@@ -62,7 +85,7 @@ class Evidence(NamedTuple):
 
 def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> Evidence:
     """Return the evidence for each landmark from the boxes that show it."""
-    cameras = camera_centers(views)
+    cameras = views.centers
     columns: list[tuple[float, ...]] = []
     for center, basis, rows in zip(landmarks.centers, landmarks.bases,
                                    group_boxes(shown, len(landmarks.centers)), strict=True):
@@ -127,8 +150,7 @@ def reasons_against(landmarks: Landmarks, evidence: Evidence, options: MappingOp
             for number, basis in enumerate(landmarks.bases)]
 
 
-def _reason(evidence: Evidence, number: int, size_m: float, options: MappingOptions
-            ) -> str | None:
+def _reason(evidence: Evidence, number: int, size_m: float, options: MappingOptions) -> str | None:
     """Return the first reason against a landmark, or None."""
     viewpoints, ratio = evidence.viewpoints[number], evidence.seen_ratio[number]
     baseline, sigma = evidence.baseline_deg[number], evidence.position_sigma[number]
@@ -140,9 +162,9 @@ def _reason(evidence: Evidence, number: int, size_m: float, options: MappingOpti
     if baseline < options.min_baseline_deg:
         return f'seen from one side only: {_floor(baseline)} degrees, not ' \
                f'{options.min_baseline_deg:g}'
-    if sigma > max(options.max_position_sigma_m, options.max_position_sigma_share * size_m):
+    if sigma > max(options.max_position_sigma_m, MAX_SIGMA_SHARE * size_m):
         return f'its position is uncertain: {sigma:.2f} m'
-    if evidence.median_iou[number] < options.min_median_iou:
+    if evidence.median_iou[number] < MIN_MEDIAN_IOU:
         return f'its boxes do not fit one ellipsoid: median IoU {evidence.median_iou[number]:.2f}'
     return None
 
@@ -152,9 +174,26 @@ def _floor(value: float) -> str:
     return f'{np.floor(10.0 * value) / 10.0:.1f}'
 
 
+@dataclass(frozen=True)
+class BoxQuality:
+    """How well landmarks explain boxes."""
+
+    boxes: int
+    #: Share of the boxes that a landmark of their class overlaps by more than an IoU of 0.3
+    explained: float
+    median_iou: float  #: Of these
+
+    @staticmethod
+    def of(ious: NDArray[np.float64]) -> 'BoxQuality':
+        """Return the quality of boxes by the best IoU of each with a landmark of its class."""
+        is_explained = ious > _EXPLAINED_IOU
+        return BoxQuality(len(ious), float(is_explained.mean()) if len(ious) else 0.0,
+                          float(np.median(ious[is_explained])) if is_explained.any() else 0.0)
+
+
 def explained_boxes(views: Views, landmarks: Landmarks, shown: NDArray[np.int64] | None = None
-                    ) -> tuple[float, float]:
-    """Return the share of boxes that landmarks explain, and the median IoU of these boxes.
+                    ) -> BoxQuality:
+    """Return how well landmarks explain boxes.
 
     The landmark that a box shows explains it although its class is another one.
     """
@@ -163,12 +202,186 @@ def explained_boxes(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
         for number, rows in enumerate(group_boxes(shown, len(landmarks.centers))):
             own = ious_with(views, rows, landmarks.centers[number], landmarks.bases[number])
             ious[rows] = np.maximum(ious[rows], own)
-    return explained(ious)
+    return BoxQuality.of(ious)
 
 
-def explained(ious: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the share of boxes that landmarks explain, by their best IoUs, and the median IoU."""
-    is_explained = ious > _EXPLAINED_IOU
-    if not is_explained.any():
-        return 0.0, 0.0
-    return float(is_explained.mean()), float(np.median(ious[is_explained]))
+class Sight(NamedTuple):
+    """In how many viewpoints each of L places was in view, and its landmark seen."""
+
+    #: (L,): viewpoints
+    expected: NDArray[np.int64]
+    seen: NDArray[np.int64]
+    #: (L,): frames
+    expected_frames: NDArray[np.int64]
+    seen_frames: NDArray[np.int64]
+
+    @property
+    def seen_ratio(self) -> NDArray[np.float64]:
+        """Return the share (L,) of the frames in view in which each landmark was seen."""
+        return np.asarray(self.seen_frames / np.maximum(1, self.expected_frames))
+
+    def words(self, place: int) -> str:
+        """Return in how many frames a landmark was expected and seen, in words."""
+        return (f'expected in {self.expected_frames[place]} frames, seen in '
+                f'{self.seen_frames[place]}')
+
+    def select(self, rows: slice | NDArray[np.int64]) -> 'Sight':
+        """Return some of the places."""
+        return Sight(*(column[rows] for column in self))
+
+
+def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
+             is_solid: NDArray[np.bool_]) -> Sight:
+    """Return in which frames places were in view, and in which of them their landmark was seen.
+
+    Class -1 is one that no box has. Solid places have an object, which may hide others.
+    """
+    count = len(places.centers)
+    extents = _least_extents(views, int(places.classes.max(initial=0)))
+    least = np.where(places.classes < 0, extents[-1], extents[places.classes])
+    radii = np.linalg.norm(places.bases, axis=1).max(axis=1, initial=0.0)
+    in_view = _in_view(
+        views, places.centers, places.bases, radii, 2.0 * radii / np.maximum(least, 1e-6), least,
+        is_solid, shown, np.cos(np.radians(_BESIDE_DEG)), _HIDDEN_SHARE)
+    rows, was_seen = np.nonzero(shown >= 0)[0], np.zeros_like(in_view)
+    was_seen[views.frames[rows], shown[rows]] = True
+
+    def viewpoints(of_frames: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Return the number of viewpoints (L,) that have one of some frames (F, L)."""
+        frames, rows = np.nonzero(of_frames)
+        distinct = np.unique(views.viewpoints[frames] * count + rows) % max(count, 1)
+        return np.bincount(distinct, minlength=count)
+
+    in_view |= was_seen
+    return Sight(viewpoints(in_view), viewpoints(was_seen), in_view.sum(axis=0),
+                 was_seen.sum(axis=0))
+
+
+def _least_extents(views: Views, last_class: int) -> NDArray[np.float64]:
+    """Return from which size on boxes are detected, by class, on the plane z = 1.
+
+    The last entry is that of all classes together.
+    """
+    sides = np.maximum(views.edges[:, 2:] - views.edges[:, :2], 0.0)
+    extents = np.sqrt(sides.prod(axis=1))
+    whole = ~views.is_open.any(axis=1)
+    overall = float(np.quantile(extents[whole], _LEAST_QUANTILE)) if whole.any() else 0.0
+    result = np.full(last_class + 2, overall)
+    for number in range(last_class + 1):
+        own = extents[whole & (views.classes == number)]
+        if len(own) >= _FEW_BOXES:
+            result[number] = np.quantile(own, _LEAST_QUANTILE)
+        elif len(own):
+            result[number] = max(overall, float(own.min()))
+    return result
+
+
+@compiled
+def _in_view(views, centers, bases, radii, reaches, least, is_solid, shown, beside_cosine,
+             hidden_share):
+    """Return which places are in view in each frame (F, L)."""
+    count = len(centers)
+    farthest = reaches.max() if count else 0.0
+    boxes, offsets = np.empty((count, 4)), np.empty((count, 3))
+    distances, near = np.empty(count), np.empty(count, dtype=np.int64)
+    was_seen = np.zeros(count, dtype=np.bool_)
+    in_view = np.zeros((len(views.rotations), count), dtype=np.bool_)
+    for frame in range(len(views.rotations)):
+        first, last = views.offsets[frame], views.offsets[frame + 1]
+        in_front = _project_near(views.rotations[frame], views.translations[frame], centers, bases,
+                                 farthest, boxes, offsets, distances, near)
+        for row in range(first, last):
+            if shown[row] >= 0:
+                was_seen[shown[row]] = True
+        for i in range(in_front):
+            place = near[i]
+            box = boxes[place]
+            if distances[place] > reaches[place] or not is_in_image(box, views.bounds[frame]):
+                continue
+            # large enough to be detected
+            if (box[2] - box[0]) * (box[3] - box[1]) < least[place] * least[place]:
+                continue
+            if not _has_beside(place, near[:in_front], was_seen, offsets, distances,
+                               beside_cosine):
+                continue
+            in_view[frame, place] = _hidden(
+                place, near[:in_front], boxes, distances, radii, is_solid, shown, views.edges,
+                first, last) <= hidden_share
+        for row in range(first, last):
+            if shown[row] >= 0:
+                was_seen[shown[row]] = False
+    return in_view
+
+
+@compiled
+def _project_near(rotation, translation, centers, bases, farthest, boxes, offsets, distances,
+                  near):
+    """Write box, offset and distance of the places in front of a camera; return their number."""
+    count = 0
+    for place in range(len(centers)):
+        z = translation[2]
+        for k in range(3):
+            z += rotation[2, k] * centers[place, k]
+        if not 0.0 < z <= farthest:
+            continue
+        if not project_box(rotation, translation, centers[place], bases[place], boxes[place]):
+            continue
+        square = 0.0
+        for i in range(3):
+            value = translation[i]
+            for k in range(3):
+                value += rotation[i, k] * centers[place, k]
+            offsets[place, i] = value
+            square += value * value
+        distances[place] = sqrt(square)
+        near[count] = place
+        count += 1
+    return count
+
+
+@compiled
+def _has_beside(place, near, was_seen, offsets, distances, beside_cosine):
+    """Tell whether a frame shows another landmark beside a place or behind it."""
+    for other in near:
+        if other == place or not was_seen[other]:
+            continue
+        if distances[other] < _BESIDE_SHARE * distances[place]:
+            continue
+        cosine = (offsets[other] * offsets[place]).sum() / (distances[other] * distances[place])
+        if cosine > beside_cosine:
+            return True
+    return False
+
+
+@compiled
+def _hidden(place, near, boxes, distances, radii, is_solid, shown, edges, first, last):
+    """Return which share of a place landmarks in front of it hide, or boxes of no landmark."""
+    box = boxes[place]
+    x0, y0 = 0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3])
+    a, b = 0.5 * (box[2] - box[0]), 0.5 * (box[3] - box[1])
+    count = 0
+    for k in range(len(_GRID)):
+        x, y = x0 + a * _GRID[k, 0], y0 + b * _GRID[k, 1]
+        is_hidden = False
+        for other in near:
+            if (is_solid[other] and other != place
+                    and distances[other] + radii[other] < distances[place]
+                    and _covers(boxes[other], x, y)):
+                is_hidden = True
+                break
+        if not is_hidden:
+            for row in range(first, last):
+                if shown[row] < 0 and _covers(edges[row], x, y):
+                    is_hidden = True
+                    break
+        if is_hidden:
+            count += 1
+    return count / len(_GRID)
+
+
+@compiled
+def _covers(box, x, y):
+    """Tell whether a point lies in the ellipse of a box."""
+    dx = (2.0 * x - box[0] - box[2]) / (box[2] - box[0])
+    dy = (2.0 * y - box[1] - box[3]) / (box[3] - box[1])
+    return dx * dx + dy * dy < 1.0

@@ -9,7 +9,6 @@ the Cauchy loss c^2/2 log(1 + r^2/c^2). A weak prior draws the logarithms of the
 their mean, since boxes from similar directions leave the thickness open.
 """
 
-from collections.abc import Sequence
 from math import log, sqrt
 from typing import NamedTuple
 
@@ -21,6 +20,7 @@ from cliploc_ros.offline.mapping.landmarks import (
     LANDMARK_SIZE,
     POSE_SIZE,
     Landmarks,
+    group_boxes,
     linearize_box,
     move_ellipsoid,
 )
@@ -32,6 +32,7 @@ LOSS_SCALE = 1.5
 _AXIS_SPREAD = 0.7
 # An ellipsoid that is not wholly in front of a camera costs what four edges this far off cost.
 _BEHIND_RESIDUAL = 20.0
+_BEHIND_COST = 4.0 * 20.0
 _MAX_DAMPING = 1e7
 _LEAST_IMPROVEMENT = 1e-4
 # Greatest change of a logarithm, and of the centre in greatest semi-axes, in one step.
@@ -49,12 +50,12 @@ class Fit(NamedTuple):
     information: NDArray[np.float64]
 
 
-def fit_landmarks(views: Views, landmarks: Landmarks, boxes: Sequence[NDArray[np.int64]],
-                  iterations: int = 30) -> Landmarks:
-    """Return landmarks, each fitted to its boxes; one without boxes stays as it is."""
+def fit_landmarks(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
+                  iterations: int = 30, among: NDArray[np.bool_] | None = None) -> Landmarks:
+    """Return all landmarks, those among some or all (L,) fitted to the boxes that show them."""
     centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
-    for number, rows in enumerate(boxes):
-        if len(rows):
+    for number, rows in enumerate(group_boxes(shown, len(centers))):
+        if len(rows) and (among is None or among[number]):
             fit = fit_ellipsoid(views, rows, centers[number], bases[number], iterations)
             centers[number], bases[number] = fit.center, fit.basis
     return landmarks._replace(centers=centers, bases=bases)
@@ -221,4 +222,108 @@ def add_axis_prior(basis, information, gradient):
     # hold keeps the equations regular, and has no target.
     for off in (4, 5, 7):
         information[off, off] += 0.5 / (_AXIS_SPREAD * _AXIS_SPREAD)
+    return cost
+
+
+class Linear(NamedTuple):
+    """m boxes that show landmarks: residuals, their weights, derivatives by landmark and pose."""
+
+    #: (m,): rows of the boxes, and the landmark that each shows
+    rows: NDArray[np.int64]
+    numbers: NDArray[np.int64]
+    #: (m, 4), (m, 4), (m, 4, 9), (m, 4, 6): in standard deviations; open edges weigh 0
+    residuals: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    by_landmark: NDArray[np.float64]
+    by_pose: NDArray[np.float64]
+
+
+def linearize_boxes(views: Views, shown: NDArray[np.int64], landmarks: Landmarks) -> Linear:
+    """Return residuals and derivatives of the boxes that show landmarks."""
+    rows = np.nonzero(shown >= 0)[0]
+    linear = Linear(rows, shown[rows], np.zeros((len(rows), 4)), np.zeros((len(rows), 4)),
+                    np.zeros((len(rows), 4, LANDMARK_SIZE)), np.zeros((len(rows), 4, POSE_SIZE)))
+    _linearize_all(views, landmarks.centers, landmarks.bases, *linear)
+    return linear
+
+
+@compiled
+def _linearize_all(views, centers, bases, rows, numbers, residuals, weights, by_landmark, by_pose):
+    """Write residuals, weights and derivatives, in standard deviations; open edges weigh 0."""
+    box = np.empty(4)
+    for place in range(len(rows)):
+        row, number = rows[place], numbers[place]
+        frame = views.frames[row]
+        if not linearize_box(views.rotations[frame], views.translations[frame], centers[number],
+                             bases[number], box, by_landmark[place], by_pose[place]):
+            continue
+        for edge in range(4):
+            if views.is_open[row, edge]:
+                continue
+            residuals[place, edge] = edge_residual(views, row, edge, box)
+            weights[place, edge] = robust_weight(residuals[place, edge])
+            by_landmark[place, edge] *= views.stiffness[row, edge]
+            by_pose[place, edge] *= views.stiffness[row, edge]
+
+
+@compiled
+def move_all(centers, bases, steps, new_centers, new_bases):
+    """Write ellipsoids moved by steps (L, 9), each within the range of its linearization."""
+    for number in range(len(centers)):
+        limit_step(steps[number], bases[number])
+        move_ellipsoid(centers[number], bases[number], steps[number], new_centers[number],
+                       new_bases[number])
+
+
+@compiled
+def accumulate_all(views, rows, landmarks, centers, bases, of_landmarks, of_poses, of_boxes,
+                   landmark_gradient, pose_gradient):
+    """Add up the normal equations of all boxes; return their cost, the axis prior included."""
+    cost, box = 0.0, np.empty(4)
+    by_landmark, by_motion = np.empty((4, LANDMARK_SIZE)), np.empty((4, POSE_SIZE))
+    for place in range(len(rows)):
+        row, landmark = rows[place], landmarks[place]
+        frame = views.frames[row]
+        rotation = views.rotations[frame]
+        share = views.weights[frame]
+        if not linearize_box(rotation, views.translations[frame], centers[landmark],
+                             bases[landmark], box, by_landmark, by_motion):
+            cost += share * _BEHIND_COST
+            continue
+        # a pose's error in the map's axes moves the map against it in the camera's
+        by_pose = np.concatenate((-by_motion[:, :3] @ rotation, -by_motion[:, 3:] @ rotation),
+                                 axis=1)
+        x, y, z = views.levers[frame]
+        for edge in range(4):
+            across = by_pose[edge, :3]
+            by_pose[edge, 3] += y * across[2] - z * across[1]
+            by_pose[edge, 4] += z * across[0] - x * across[2]
+            by_pose[edge, 5] += x * across[1] - y * across[0]
+        for edge in range(4):
+            residual = edge_residual(views, row, edge, box)
+            if residual == 0.0:
+                continue
+            cost += share * robust_cost(residual)
+            stiffness = views.stiffness[row, edge]
+            weight = share * robust_weight(residual) * stiffness * stiffness
+            pull = share * robust_weight(residual) * stiffness * residual
+            for i in range(LANDMARK_SIZE):
+                landmark_gradient[landmark, i] += pull * by_landmark[edge, i]
+                for j in range(LANDMARK_SIZE):
+                    of_landmarks[landmark, i, j] += (weight * by_landmark[edge, i]
+                                                     * by_landmark[edge, j])
+            for i in range(POSE_SIZE):
+                pose_gradient[frame, i] += pull * by_pose[edge, i]
+                for j in range(POSE_SIZE):
+                    of_poses[frame, i, j] += weight * by_pose[edge, i] * by_pose[edge, j]
+                for j in range(LANDMARK_SIZE):
+                    of_boxes[place, i, j] += weight * by_pose[edge, i] * by_landmark[edge, j]
+    for landmark in range(len(centers)):
+        lower = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
+        cost += add_axis_prior(bases[landmark], lower, landmark_gradient[landmark])
+        for i in range(LANDMARK_SIZE):
+            for j in range(i + 1):
+                of_landmarks[landmark, i, j] += lower[i, j]
+                if i != j:
+                    of_landmarks[landmark, j, i] += lower[i, j]
     return cost

@@ -21,26 +21,12 @@ from scipy.sparse import bsr_matrix
 from scipy.sparse.linalg import LinearOperator, cg
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.kernels.compiled import compiled
-from cliploc_ros.offline.mapping.fitting import (
-    add_axis_prior,
-    edge_residual,
-    limit_step,
-    robust_cost,
-    robust_weight,
-)
-from cliploc_ros.offline.mapping.landmarks import (
-    LANDMARK_SIZE,
-    POSE_SIZE,
-    Landmarks,
-    linearize_box,
-    move_ellipsoid,
-)
+from cliploc_ros.offline.mapping.fitting import accumulate_all, move_all
+from cliploc_ros.offline.mapping.landmarks import LANDMARK_SIZE, POSE_SIZE, Landmarks
 from cliploc_ros.offline.mapping.odometry import Steps
 from cliploc_ros.offline.mapping.options import INSTANT_S, PoseErrors
-from cliploc_ros.offline.mapping.views import Views, camera_centers
+from cliploc_ros.offline.mapping.views import Views
 
-_BEHIND_COST = 4.0 * 20.0
 _SOLVER_ITERATIONS = 200
 _SOLVER_TOLERANCE = 1e-3
 _LEAST_IMPROVEMENT = 1e-3
@@ -131,9 +117,7 @@ def refine_jointly(given: Views, views: Views, landmarks: Landmarks, shown: NDAr
     odometry between successive frames; views has the poses to start from. It takes at most this
     number of steps of Levenberg and Marquardt.
     """
-    rows = np.nonzero(shown >= 0)[0]
-    problem = Problem(views, rows, shown[rows], PosePrior.of(views.stamps_s, errors), anchors,
-                      steps)
+    problem = Problem(views, shown, PosePrior.of(views.stamps_s, errors), anchors, steps)
     state = State(views, landmarks, pose_errors(given, views))
     cost, equations = problem.linearize(state)
     damping = 1e-4
@@ -159,7 +143,7 @@ def pose_errors(given: Views, present: Views) -> NDArray[np.float64]:
     Errors are those of the rig's first camera. Another camera's centre is off by its lever's turn,
     too.
     """
-    offsets = camera_centers(present) - camera_centers(given)
+    offsets = present.centers - given.centers
     turns = np.einsum('fji,fjk->fik', present.rotations, given.rotations)
     rotvecs = Rotation.from_matrix(turns).as_rotvec()
     return np.concatenate([offsets - np.cross(rotvecs, given.levers), rotvecs], axis=1)
@@ -184,9 +168,9 @@ class State(NamedTuple):
         """Return the state after steps (L, 9) and (F, 6)."""
         centers = np.empty_like(self.landmarks.centers)
         bases = np.empty_like(self.landmarks.bases)
-        _move_all(self.landmarks.centers, self.landmarks.bases, landmark_steps, centers, bases)
+        move_all(self.landmarks.centers, self.landmarks.bases, landmark_steps, centers, bases)
         turned = Rotation.from_rotvec(pose_steps[:, 3:]).as_matrix().transpose(0, 2, 1)
-        origins = camera_centers(self.views)
+        origins = self.views.centers
         rotations = np.ascontiguousarray(self.views.rotations @ turned)
         shifts = pose_steps[:, :3] + np.cross(pose_steps[:, 3:], self.views.levers)
         translations = -np.einsum('fij,fj->fi', rotations, origins + shifts)
@@ -196,11 +180,10 @@ class State(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What stays the same over the iterations: m boxes and the landmark that each shows."""
+    """What stays the same over the iterations."""
 
     views: Views
-    rows: NDArray[np.int64]
-    landmarks: NDArray[np.int64]
+    shown: NDArray[np.int64]  #: (n,): the landmark that each box shows, -1 for none: m show one
     prior: PosePrior
     anchors: Anchors | None = None
     steps: Steps | None = None
@@ -208,11 +191,12 @@ class Problem(NamedTuple):
     def linearize(self, state: State) -> tuple[float, Equations]:
         """Return the cost of a state and its normal equations."""
         count, frames = len(state.landmarks.centers), len(state.errors)
+        rows = np.nonzero(self.shown >= 0)[0]
         arrays = (np.zeros((count, LANDMARK_SIZE, LANDMARK_SIZE)),
                   np.zeros((frames, POSE_SIZE, POSE_SIZE)),
-                  np.zeros((len(self.rows), POSE_SIZE, LANDMARK_SIZE)),
+                  np.zeros((len(rows), POSE_SIZE, LANDMARK_SIZE)),
                   np.zeros((count, LANDMARK_SIZE)), np.zeros((frames, POSE_SIZE)))
-        cost = _accumulate(state.views, self.rows, self.landmarks, state.landmarks.centers,
+        cost = accumulate_all(state.views, rows, self.shown[rows], state.landmarks.centers,
                            state.landmarks.bases, *arrays)
         equations = Equations(*arrays)
         if self.anchors is not None:
@@ -265,69 +249,10 @@ class Problem(NamedTuple):
 
     def coupling(self, of_boxes: NDArray[np.float64], frames: int, count: int) -> bsr_matrix:
         """Return the part (6 F, 9 L) of the equations that joins poses and landmarks."""
-        order = np.lexsort((self.landmarks, self.views.frames[self.rows]))
-        starts = np.searchsorted(self.views.frames[self.rows][order], np.arange(frames + 1))
-        return bsr_matrix((of_boxes[order], self.landmarks[order], starts),
+        rows = np.nonzero(self.shown >= 0)[0]
+        order = np.lexsort((self.shown[rows], self.views.frames[rows]))
+        starts = np.searchsorted(self.views.frames[rows], np.arange(frames + 1))
+        return bsr_matrix((of_boxes[order], self.shown[rows][order], starts),
                           shape=(frames * POSE_SIZE, count * LANDMARK_SIZE))
 
 
-@compiled
-def _move_all(centers, bases, steps, new_centers, new_bases):
-    for number in range(len(centers)):
-        limit_step(steps[number], bases[number])
-        move_ellipsoid(centers[number], bases[number], steps[number], new_centers[number],
-                       new_bases[number])
-
-
-@compiled
-def _accumulate(views, rows, landmarks, centers, bases, of_landmarks, of_poses, of_boxes,
-                landmark_gradient, pose_gradient):
-    """Add up the normal equations of all boxes; return their cost, the axis prior included."""
-    cost, box = 0.0, np.empty(4)
-    by_landmark, by_motion = np.empty((4, LANDMARK_SIZE)), np.empty((4, POSE_SIZE))
-    for place in range(len(rows)):
-        row, landmark = rows[place], landmarks[place]
-        frame = views.frames[row]
-        rotation = views.rotations[frame]
-        share = views.weights[frame]
-        if not linearize_box(rotation, views.translations[frame], centers[landmark],
-                             bases[landmark], box, by_landmark, by_motion):
-            cost += share * _BEHIND_COST
-            continue
-        # a pose's error in the map's axes moves the map against it in the camera's
-        by_pose = np.concatenate((-by_motion[:, :3] @ rotation, -by_motion[:, 3:] @ rotation),
-                                 axis=1)
-        x, y, z = views.levers[frame]
-        for edge in range(4):
-            across = by_pose[edge, :3]
-            by_pose[edge, 3] += y * across[2] - z * across[1]
-            by_pose[edge, 4] += z * across[0] - x * across[2]
-            by_pose[edge, 5] += x * across[1] - y * across[0]
-        for edge in range(4):
-            residual = edge_residual(views, row, edge, box)
-            if residual == 0.0:
-                continue
-            cost += share * robust_cost(residual)
-            stiffness = views.stiffness[row, edge]
-            weight = share * robust_weight(residual) * stiffness * stiffness
-            pull = share * robust_weight(residual) * stiffness * residual
-            for i in range(LANDMARK_SIZE):
-                landmark_gradient[landmark, i] += pull * by_landmark[edge, i]
-                for j in range(LANDMARK_SIZE):
-                    of_landmarks[landmark, i, j] += (weight * by_landmark[edge, i]
-                                                     * by_landmark[edge, j])
-            for i in range(POSE_SIZE):
-                pose_gradient[frame, i] += pull * by_pose[edge, i]
-                for j in range(POSE_SIZE):
-                    of_poses[frame, i, j] += weight * by_pose[edge, i] * by_pose[edge, j]
-                for j in range(LANDMARK_SIZE):
-                    of_boxes[place, i, j] += weight * by_pose[edge, i] * by_landmark[edge, j]
-    for landmark in range(len(centers)):
-        lower = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
-        cost += add_axis_prior(bases[landmark], lower, landmark_gradient[landmark])
-        for i in range(LANDMARK_SIZE):
-            for j in range(i + 1):
-                of_landmarks[landmark, i, j] += lower[i, j]
-                if i != j:
-                    of_landmarks[landmark, j, i] += lower[i, j]
-    return cost

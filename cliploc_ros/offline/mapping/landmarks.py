@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.simulation.detector import SHOWN_SHARE
+from cliploc_ros.offline.simulation import SHOWN_SHARE
 
 #: Numbers of a landmark: centre, then the upper triangle of D, row by row.
 LANDMARK_SIZE = 9
@@ -205,6 +205,27 @@ class Landmarks(NamedTuple):
         own = np.stack([np.arange(len(self.classes)), self.classes], axis=1)
         return np.concatenate([own[self.classes >= 0], self.others])
 
+    @staticmethod
+    def none() -> 'Landmarks':
+        """Return no landmarks."""
+        return Landmarks(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
+
+    @staticmethod
+    def joined(*parts: 'Landmarks') -> 'Landmarks':
+        """Return the landmarks of all parts."""
+        starts = np.cumsum([0, *(len(one.classes) for one in parts)])
+        shifted = [one._replace(others=one.others + np.array([start, 0]))
+                   for one, start in zip(parts, starts[:-1].tolist(), strict=True)]
+        columns = zip(Landmarks.none(), *shifted, strict=True)
+        return Landmarks(*(np.concatenate(column) for column in columns))
+
+    def axes_and_quats(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return semi-axes (L, 3) [m] and quaternions x, y, z, w (L, 4)."""
+        semi_axes = np.linalg.norm(self.bases, axis=1)
+        rotations = self.bases / semi_axes[:, None, :]
+        rotations[np.linalg.det(rotations) < 0.0] *= -1.0
+        return semi_axes, Rotation.from_matrix(rotations).as_quat()
+
     def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> 'Landmarks':
         """Return some of the landmarks."""
         places = np.full(len(self.classes), -1, dtype=np.int64)
@@ -236,34 +257,11 @@ def classes_of(landmark_map: LandmarkMap, row: int) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def no_landmarks() -> Landmarks:
-    """Return none."""
-    return Landmarks(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
-
-
-def join_landmarks(*parts: Landmarks) -> Landmarks:
-    """Return the landmarks of all parts."""
-    starts = np.cumsum([0, *(len(one.classes) for one in parts)])
-    shifted = [one._replace(others=one.others + np.array([start, 0]))
-               for one, start in zip(parts, starts[:-1].tolist(), strict=True)]
-    columns = zip(no_landmarks(), *shifted, strict=True)
-    return Landmarks(*(np.concatenate(column) for column in columns))
-
-
 def group_boxes(shown: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
     """Return the boxes of each of a number of landmarks, in ascending order."""
     order = np.argsort(shown, kind='stable')
     bounds = np.searchsorted(shown[order], np.arange(count + 1))
     return [order[bounds[number]:bounds[number + 1]] for number in range(count)]
-
-
-def ellipsoid_numbers(bases: NDArray[np.float64]
-                      ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return semi-axes (L, 3) and quaternions x, y, z, w (L, 4) of bases (L, 3, 3)."""
-    semi_axes = np.linalg.norm(bases, axis=1)
-    rotations = bases / semi_axes[:, None, :]
-    rotations[np.linalg.det(rotations) < 0.0] *= -1.0
-    return semi_axes, Rotation.from_matrix(rotations).as_quat()
 
 
 def unused_ids(class_names: Sequence[str], used: Iterable[str] = ()) -> tuple[str, ...]:

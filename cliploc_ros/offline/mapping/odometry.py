@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.offline.mapping.landmarks import POSE_SIZE
 from cliploc_ros.offline.mapping.options import OdometryErrors, PoseErrors
-from cliploc_ros.offline.mapping.views import Views, camera_centers
+from cliploc_ros.offline.mapping.views import Views
 
 # From this length on, in standard deviations, the loss is linear.
 _LOSS_SCALE = 3.0
@@ -69,12 +69,10 @@ class Steps(NamedTuple):
         axes = np.arange(POSE_SIZE)
         jacobian[:, axes, axes], jacobian[:, axes, POSE_SIZE + axes] = -1.0, 1.0
         # a turn of the rig moves what odometry predicts, and both cameras
-        ahead = np.einsum('fji,fj->if', views.rotations[firsts], self.shifts)
-        for column, (x, y, z) in ((0, ahead + views.levers[firsts].T),
-                                  (POSE_SIZE, -views.levers[seconds].T)):
-            jacobian[:, 0, column + 4], jacobian[:, 0, column + 5] = -z, y
-            jacobian[:, 1, column + 3], jacobian[:, 1, column + 5] = z, -x
-            jacobian[:, 2, column + 3], jacobian[:, 2, column + 4] = -y, x
+        ahead = np.einsum('fji,fj->fi', views.rotations[firsts], self.shifts)
+        for column, arms in ((3, ahead + views.levers[firsts]),
+                             (POSE_SIZE + 3, -views.levers[seconds])):
+            jacobian[:, :3, column:column + 3] = np.cross(np.eye(3), arms[:, None])
         weighted = jacobian * weights[:, :, None]
         blocks = weighted.transpose(0, 2, 1) @ jacobian
         pulls = np.einsum('mij,mi->mj', weighted, residuals.reshape(-1, POSE_SIZE))
@@ -199,14 +197,12 @@ class _Known:
                      + np.square(far_m) * (np.square(sigmas[:, 1]) + sigma_rad ** 2))
         of_both = np.sqrt(np.column_stack([of_shifts, of_turns]))
         residuals = _residuals(self._given, frames[firsts], frames[seconds], shifts, turns)
-        by_poses = (camera_centers(self._given, frames[seconds])
-                    - camera_centers(self._given, frames[firsts]))
+        by_poses = (self._given.centers[frames[seconds]] - self._given.centers[frames[firsts]])
         # p is the rest of the motion by the poses after that by odometry
         ahead = (by_poses * (by_poses - residuals[0])).sum(axis=1)
         motions_m = np.stack([far_m, np.linalg.norm(by_poses, axis=1)])
         lengths = np.linalg.norm(residuals, axis=2).T
-        motions = np.column_stack([motions_m.max(axis=0),
-                                   Rotation.from_matrix(turns).magnitude()])
+        motions = np.column_stack([motions_m.max(axis=0), Rotation.from_matrix(turns).magnitude()])
         return _Compared(shifts, turns, sigmas, (lengths / of_both).max(axis=1),
                          motions > _CONTRADICTION * of_both, motions_m,
                          ahead / np.maximum(far_m, 1e-9))
@@ -217,7 +213,7 @@ def _residuals(views: Views, firsts: NDArray[np.int64], seconds: NDArray[np.int6
                ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return p and q (m, 3) for measured motions from first to second frames."""
     axes = views.rotations[firsts].transpose(0, 2, 1)
-    offsets = (camera_centers(views, seconds) - camera_centers(views, firsts)
+    offsets = (views.centers[seconds] - views.centers[firsts]
                - np.einsum('mij,mj->mi', axes, shifts))
     rotations = views.rotations[seconds].transpose(0, 2, 1) @ (axes @ turns).transpose(0, 2, 1)
     return offsets, Rotation.from_matrix(rotations).as_rotvec()

@@ -73,32 +73,13 @@ _ODOMETRY_ERRORS = OdometryErrors()
 class MappingOptions:
     """Options of mapping."""
 
-    #: Standard deviation of a box's edge: [px], and as a share of the box's extent; both are added
-    #: in squares
-    edge_sigma_px: float = 2.0
-    edge_sigma_share: float = 0.04
-    #: An edge this near to the image border is open: the object may extend beyond it [px]
-    border_px: float = 3.0
-    pairs_per_box: int = 3  #: Hypotheses that each box is the seed of
-    #: At most this number of frames of a viewpoint are searched for new landmarks
-    frames_per_viewpoint: int = 8
     min_viewpoints: int = 3  #: A landmark needs support from this number of viewpoints
-    #: How often boxes without a landmark are searched for new ones, and how often after that
-    #: landmarks are associated, merged and fitted
-    discovery_rounds: int = 2
-    settling_rounds: int = 3
-    association_iou: float = 0.2  #: A box and a landmark that overlap less do not belong together
-    #: Landmarks of one thing are fitted together, unless the mean IoU of their boxes falls by more
-    #: than this
-    merge_loss: float = 0.1
     #: Share of the frames showing a landmark's place in which it must be detected. Chance
     #: arrangements of boxes are seen rarely, but so are objects that others hide.
     min_seen_ratio: float = 0.03
     min_baseline_deg: float = 20.0  #: Least angle between two of its directions [deg]
-    #: Greatest deviation of a centre: [m], or as a share of the landmark's size
+    #: Greatest deviation of a centre [m]; of a large landmark, see evidence.MAX_SIGMA_SHARE
     max_position_sigma_m: float = 0.05
-    max_position_sigma_share: float = 0.1
-    min_median_iou: float = 0.5  #: Of a landmark's boxes
     #: Refine the poses with the landmarks, as far as they may be off; None: poses are exact
     pose_errors: PoseErrors | None = None
     #: Without pose_errors, estimate them, and refine the poses where they are significant
@@ -106,9 +87,6 @@ class MappingOptions:
     #: Of odometry between frames, which joins the poses while they are refined
     odometry_errors: OdometryErrors = _ODOMETRY_ERRORS
     refine_mount: bool = False  #: Correct the mount of the camera, which all poses share
-    rebuilds: int = 1  #: How often the map is built again with refined poses
-    #: How often poses and landmarks are refined together before each of these, and after all
-    refinements: int = 3
     #: What the map says of itself: its coordinate frame, and where it comes from
     frame_id: str = 'map'
     source: str = 'build_map'
@@ -127,8 +105,6 @@ class CheckOptions:
 
     #: Of the relocalizer that will use the map
     relocalizer: RelocalizerOptions = field(default_factory=RelocalizerOptions)
-    #: How boxes belong to landmarks, and how landmarks are fitted
-    mapping: MappingOptions = field(default_factory=MappingOptions)
     folds: int = 5  #: Cross-validation: each fold is judged with landmarks fitted to the others
     #: Folds take blocks of this length in turn [s]; a fold is not fitted to frames this near to
     #: one that it judges [s]

@@ -22,6 +22,7 @@ from scipy.optimize import minimize
 from scipy.sparse import csr_matrix
 
 from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.offline.mapping.fitting import linearize_boxes
 from cliploc_ros.offline.mapping.joint import (
     PosePrior,
     Problem,
@@ -32,7 +33,6 @@ from cliploc_ros.offline.mapping.joint import (
 )
 from cliploc_ros.offline.mapping.landmarks import POSE_SIZE, Landmarks, group_boxes
 from cliploc_ros.offline.mapping.options import INSTANT_S, PoseErrors
-from cliploc_ros.offline.mapping.systematic import linearize_boxes
 from cliploc_ros.offline.mapping.views import Views
 
 # The estimate uses at most this number of frames and landmarks: more add time, hardly precision.
@@ -92,8 +92,7 @@ def estimate_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[np.i
     views, refined = _pick(given, frames, rows), _pick(start, frames, rows)
     errors, logs = _START, np.log([_START.sigma_m, _START.sigma_deg, _START.correlation_s, 1.0])
     for _ in range(_ROUNDS):
-        refined, landmarks = refine_jointly(views, refined, landmarks, shown, errors,
-                                            _REFINEMENTS)
+        refined, landmarks = refine_jointly(views, refined, landmarks, shown, errors, _REFINEMENTS)
         found = minimize(_cost_function(views, refined, landmarks, shown), logs,
                          method='Nelder-Mead', bounds=list(zip(_LOWEST, _HIGHEST, strict=True)),
                          options={'maxfev': _EVALUATIONS, 'xatol': 0.05, 'fatol': 0.1,
@@ -135,15 +134,14 @@ def _cost_function(given: Views, refined: Views, landmarks: Landmarks, shown: ND
 
     The boxes are linearized at refined poses and landmarks.
     """
-    rows = np.nonzero(shown >= 0)[0]
     frames, size = len(given.rotations), len(landmarks.centers)
     nothing = PosePrior(np.zeros((frames, POSE_SIZE)), np.zeros((frames, POSE_SIZE)))
-    problem = Problem(refined, rows, shown[rows], nothing)
+    problem = Problem(refined, shown, nothing)
     errors = pose_errors(given, refined)
     _, equations = problem.linearize(State(refined, landmarks, errors))
     joint = problem.coupling(equations.of_boxes, frames, size).toarray()
-    linear = linearize_boxes(refined, rows, shown[rows], landmarks)
-    shares = refined.weights[refined.frames[rows], None] * linear.weights
+    linear = linearize_boxes(refined, shown, landmarks)
+    shares = refined.weights[refined.frames[linear.rows], None] * linear.weights
     squares, weights = float((shares * linear.residuals ** 2).sum()), float(shares.sum())
 
     def cost(logs: NDArray[np.float64]) -> float:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.offline.mapping.association import associate
+from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU, associate
+from cliploc_ros.offline.mapping.building import SETTLING_ROUNDS
 from cliploc_ros.offline.mapping.doubles import resolve_doubles
 from cliploc_ros.offline.mapping.evidence import (
     Evidence,
@@ -23,15 +24,10 @@ from cliploc_ros.offline.mapping.evidence import (
     reasons_against,
 )
 from cliploc_ros.offline.mapping.fitting import fit_landmarks
-from cliploc_ros.offline.mapping.landmarks import (
-    Landmarks,
-    ellipsoid_numbers,
-    group_boxes,
-    landmarks_of_map,
-)
+from cliploc_ros.offline.mapping.landmarks import Landmarks, landmarks_of_map
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.mapping.views import Views, camera_centers, check_input, make_views
+from cliploc_ros.offline.mapping.views import Views, check_input, make_views
 
 # Boxes overlap less with a landmark that is off than with a fitted one. The first rounds take
 # them from this IoU on.
@@ -64,8 +60,7 @@ class RefitMap:
 
 
 def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
-              chosen: NDArray[np.bool_] | None = None, options: MappingOptions | None = None
-              ) -> RefitMap:
+              chosen: NDArray[np.bool_] | None = None) -> RefitMap:
     """Fit the chosen landmarks of a map to the boxes that show them.
 
     Ids, labels, classes and class weights stay; a landmark that is one thing with others gets
@@ -84,9 +79,8 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
         Detections and map do not belong together, or the detections are unusable; the message
         says what to correct.
     """
-    options = options or MappingOptions()
-    views = make_views(detections, options)
-    notes = check_input(detections, views, options)
+    views = make_views(detections)
+    notes = check_input(detections, views)
     given = landmarks_of_map(landmark_map, detections.class_names)
     chosen = np.ones(len(landmark_map), dtype=np.bool_) if chosen is None else chosen
     known = np.isin(views.classes, given.classes)
@@ -95,87 +89,60 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
             "the recording has no boxes of the map's classes; map: "
             f'{", ".join(sorted(set(landmark_map.class_ids)))}; recording: '
             f'{", ".join(sorted(detections.class_names))}; rename the classes of the map')
-    settled, part_of = _settle(views, given, chosen, options)
+    settled = given
+    for min_iou in (*_FIRST_IOUS, *[ASSOCIATION_IOU] * SETTLING_ROUNDS):
+        shown = associate(views, settled, min_iou)
+        settled = fit_landmarks(views, settled, shown, among=chosen)
+    settled, part_of = resolve_doubles(views, settled, associate(views, settled), chosen)
     is_own = part_of == np.arange(len(chosen))
-    shown = _associate_some(views, settled, is_own, options.association_iou)
+    shown = associate(views, settled, among=is_own)
     evidence = gather_evidence(views, settled, shown)
     reasons = [reason if is_chosen else None for reason, is_chosen in zip(
-        _reasons(views, given, settled, part_of, evidence, landmark_map, options), chosen,
-        strict=True)]
+        _reasons(views, given, settled, part_of, evidence, landmark_map), chosen, strict=True)]
     is_fitted = np.array([reason is None for reason in reasons]) & chosen
     share_known = float(known.mean())
-    share_before, iou_before = explained_boxes(views, given)
-    share_settled, _ = explained_boxes(views, settled.select(is_own))
+    before = explained_boxes(views, given)
+    share_before = before.explained / share_known
+    share_settled = explained_boxes(views, settled.select(is_own)).explained / share_known
     if share_before < _LEAST_EXPLAINED * share_settled:
         raise MappingError(
-            f'the map does not lie where the boxes are: it explains '
-            f'{share_before / share_known:.0%} of them as given, and '
-            f"{share_settled / share_known:.0%} after fitting; bring it into the recording's "
+            f'the map does not lie where the boxes are: it explains {share_before:.0%} of them '
+            f"as given, and {share_settled:.0%} after fitting; bring it into the recording's "
             'coordinate frame and to metres first')
     if not (is_fitted | ~chosen).any():
         raise MappingError(
             f'no landmark can be fitted, the first one because: {reasons[0]}; as given, the map '
-            f'explains {share_before / share_known:.0%} of the boxes: is it in their coordinate '
-            'frame?')
+            f'explains {share_before:.0%} of the boxes: is it in their coordinate frame?')
     # boxes of what is not fitted may belong to what is
     landmarks = settled._replace(
         centers=np.where(is_fitted[:, None], settled.centers, given.centers),
         bases=np.where(is_fitted[:, None, None], settled.bases, given.bases))
-    shown = _associate_some(views, landmarks, is_fitted | ~chosen, options.association_iou)
-    landmarks = _fit(views, landmarks, shown, is_fitted)
+    shown = associate(views, landmarks, among=is_fitted | ~chosen)
+    landmarks = fit_landmarks(views, landmarks, shown, among=is_fitted)
     evidence = gather_evidence(views, landmarks, shown)
-    share, iou = explained_boxes(views, landmarks.select(is_fitted | ~chosen))
+    after = explained_boxes(views, landmarks.select(is_fitted | ~chosen))
     details = list(landmark_map.joined(part_of).details)
     for row in np.nonzero(is_fitted)[0]:
         details[row] = evidence.details(int(row), replace(
             details[row], shared_sigma=None, shared_sigma_deg=None))
-    semi_axes, quats_xyzw = ellipsoid_numbers(landmarks.bases)
+    semi_axes, quats_xyzw = landmarks.axes_and_quats()
     fitted = is_fitted[:, None]
     return RefitMap(
         replace(landmark_map, centers=np.where(fitted, landmarks.centers, landmark_map.centers),
                 semi_axes=np.where(fitted, semi_axes, landmark_map.semi_axes),
                 quats_xyzw=np.where(fitted, quats_xyzw, landmark_map.quats_xyzw),
                 details=tuple(details)),
-        tuple(reasons), part_of, tuple(notes), share_before / share_known, share / share_known,
-        iou_before, iou)
-
-
-def _settle(views: Views, given: Landmarks, chosen: NDArray[np.bool_], options: MappingOptions
-            ) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Associate and fit until the chosen landmarks and their boxes agree, and resolve doubles.
-
-    Returns the landmarks, and the one (L,) that each of them is part of.
-    """
-    landmarks = given
-    for min_iou in (*_FIRST_IOUS, *[options.association_iou] * options.settling_rounds):
-        landmarks = _fit(views, landmarks, associate(views, landmarks, min_iou), chosen)
-    shown = associate(views, landmarks, options.association_iou)
-    return resolve_doubles(views, landmarks, shown, options, chosen)
-
-
-def _associate_some(views: Views, landmarks: Landmarks, rows: NDArray[np.bool_], min_iou: float
-                    ) -> NDArray[np.int64]:
-    """Return which of some landmarks each box shows, by its row among all, -1 for none."""
-    shown = associate(views, landmarks.select(rows), min_iou)
-    return np.append(np.nonzero(rows)[0], -1)[shown]
-
-
-def _fit(views: Views, landmarks: Landmarks, shown: NDArray[np.int64], chosen: NDArray[np.bool_]
-         ) -> Landmarks:
-    """Return the landmarks, the chosen ones fitted to the boxes that show them."""
-    boxes = group_boxes(shown, len(landmarks.centers))
-    return fit_landmarks(views, landmarks, [rows if is_chosen else rows[:0] for rows, is_chosen
-                                            in zip(boxes, chosen, strict=True)])
+        tuple(reasons), part_of, tuple(notes), share_before, after.explained / share_known,
+        before.median_iou, after.median_iou)
 
 
 def _reasons(views: Views, given: Landmarks, landmarks: Landmarks, part_of: NDArray[np.int64],
-             evidence: Evidence, landmark_map: LandmarkMap, options: MappingOptions
-             ) -> list[str | None]:
+             evidence: Evidence, landmark_map: LandmarkMap) -> list[str | None]:
     """Return why each landmark could not be fitted; None where it was."""
-    reasons = reasons_against(landmarks, evidence, options)
+    reasons = reasons_against(landmarks, evidence, MappingOptions())
     moved_m = np.linalg.norm(landmarks.centers - given.centers, axis=1)
     sizes_m = np.linalg.norm(given.bases, axis=1).max(axis=1)
-    cameras = camera_centers(views)
+    cameras = views.centers
     for row in range(len(reasons)):
         if part_of[row] != row:
             reasons[row] = f"is one object with '{landmark_map.landmark_ids[part_of[row]]}'"

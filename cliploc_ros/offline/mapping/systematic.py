@@ -12,7 +12,6 @@ where g are the gradients J^T W r of single viewpoints: edges of one viewpoint e
 sum takes that into account (the sandwich estimator, White 1980).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -22,20 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
-from cliploc_ros.core.kernels.compiled import compiled
-from cliploc_ros.offline.mapping.fitting import (
-    LOSS_SCALE,
-    edge_residual,
-    fit_landmarks,
-    robust_weight,
-)
-from cliploc_ros.offline.mapping.landmarks import (
-    LANDMARK_SIZE,
-    POSE_SIZE,
-    Landmarks,
-    group_boxes,
-    linearize_box,
-)
+from cliploc_ros.offline.mapping.fitting import LOSS_SCALE, Linear, fit_landmarks, linearize_boxes
+from cliploc_ros.offline.mapping.landmarks import LANDMARK_SIZE, POSE_SIZE, Landmarks, group_boxes
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.views import Views
 
@@ -53,6 +40,8 @@ _MAX_STRETCH = 0.5
 _MOUNT_PRIOR = np.repeat([0.05, np.radians(3.0)], 3)
 # A part that the boxes leave more uncertain than this share of the prior is not observable.
 _OBSERVABLE = 0.5
+_MOUNT = ('x (right)', 'y (down)', 'z (forward)', 'rotation about x', 'rotation about y',
+          'rotation about z')
 _MOUNT_STEPS = 10
 
 
@@ -74,15 +63,6 @@ class Correction:
     follows: bool = False
 
 
-class Linear(NamedTuple):
-    """m boxes: residuals (m, 4), their weights, and derivatives by landmark and pose."""
-
-    residuals: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    by_landmark: NDArray[np.float64]
-    by_pose: NDArray[np.float64]
-
-
 class _Cause(NamedTuple):
     """A cause of residuals: G numbers."""
 
@@ -91,10 +71,34 @@ class _Cause(NamedTuple):
     units: tuple[str, ...]
     factors: tuple[float, ...]  # from the numbers' own units to those shown
     effects_px: tuple[float, ...]  # of one shown unit
-    # returns the derivatives (m, 4, G) of the residuals of some rows
-    differentiate: Callable[[Views, NDArray[np.int64], Linear], NDArray[np.float64]]
-    # returns views with the numbers (G,) applied
-    apply: Callable[[Views, NDArray[np.float64]], Views]
+    camera: Camera
+    boxes: NDArray[np.bool_]  # (n,): those of the camera
+    # (F, 6, G): how the map moves in the cameras; None: the numbers are intrinsics
+    motions: NDArray[np.float64] | None
+
+    def differentiate(self, views: Views, linear: Linear) -> NDArray[np.float64]:
+        """Return the derivatives (m, 4, G) of residuals."""
+        if self.motions is not None:
+            return np.einsum('mep,mpg->meg', linear.by_pose,
+                             self.motions[views.frames[linear.rows]])
+        # a measured edge e = (px - c) / f gets smaller with f and c, its residual greater
+        by_number = np.zeros((len(views.edges), 4, 4))
+        for axis, focal in enumerate((self.camera.fx, self.camera.fy)):
+            sides = [axis, axis + 2]
+            by_number[:, sides, axis] = (views.edges * views.stiffness)[:, sides]
+            by_number[:, sides, 2 + axis] = (views.stiffness / focal)[:, sides]
+        return by_number[linear.rows] * self.boxes[linear.rows, None, None]
+
+    def apply(self, views: Views, values: NDArray[np.float64]) -> Views:
+        """Return views with the numbers (G,) applied."""
+        if self.motions is not None:
+            return _move_map(views, self.motions @ values)
+        scale = np.tile(1.0 + np.clip(values[:2], -_MAX_STRETCH, _MAX_STRETCH), 2)
+        shift = np.tile(values[2:] / [self.camera.fx, self.camera.fy], 2)
+        own = self.boxes[:, None]
+        # deviations are in pixels: else a longer focal length would shrink all residuals
+        return views._replace(edges=np.where(own, (views.edges - shift) / scale, views.edges),
+                              stiffness=views.stiffness * np.where(own, scale, 1.0))
 
 
 class _Fit(NamedTuple):
@@ -116,18 +120,18 @@ def find_corrections(detections: PosedDetections, views: Views, landmarks: Landm
     The landmarks are fitted to these boxes. Each camera is corrected on its own, while the
     landmarks fit the boxes of all.
     """
-    rows, found = _sample(shown), list[Correction]()
+    shown, found = _sample(shown), list[Correction]()
     for number, camera in enumerate(detections.cameras):
-        if np.count_nonzero(views.cameras[views.frames[rows]] == number) < _MIN_BOXES:
+        if np.count_nonzero(views.cameras[views.frames[shown >= 0]] == number) < _MIN_BOXES:
             continue
         name = f' of {detections.camera_names[number]}' if len(detections.cameras) > 1 else ''
-        causes = _intrinsics(camera), _mount(camera), _stamps(camera, views, number)
-        fits = [_fit(cause, number, views, landmarks, rows, shown[rows]) for cause in causes]
+        causes = _causes(camera, views, number)
+        fits = [_fit(cause, views, landmarks, shown) for cause in causes]
         best = max(fits, key=lambda one: one.is_significant * one.corrections[0].explained)
         for cause, fit in zip(causes, fits, strict=True):
             follows = False
             if fit is not best and fit.is_significant:
-                again = _fit(cause, number, best.views, best.landmarks, rows, shown[rows])
+                again = _fit(cause, best.views, best.landmarks, shown)
                 more = again.corrections[0].explained * (1.0 - best.corrections[0].explained)
                 follows = not (again.is_significant and more > _MIN_EXPLAINED)
             found += [replace(one, name=one.name + name, follows=follows)
@@ -135,52 +139,32 @@ def find_corrections(detections: PosedDetections, views: Views, landmarks: Landm
     return found
 
 
-def _intrinsics(camera: Camera) -> _Cause:
-    focal = np.array([camera.fx, camera.fy, camera.fx, camera.fy])
-
-    def differentiate(views: Views, rows: NDArray[np.int64], linear: Linear
-                      ) -> NDArray[np.float64]:
-        # a measured edge e = (px - c) / f gets smaller with f and c, its residual greater
-        by_number = np.zeros((len(rows), 4, 4))
-        for axis in (0, 1):
-            sides = [axis, axis + 2]
-            by_number[:, sides, axis] = (views.edges * views.stiffness)[rows][:, sides]
-            by_number[:, sides, 2 + axis] = (views.stiffness / focal)[rows][:, sides]
-        return by_number
-
-    def apply(views: Views, values: NDArray[np.float64]) -> Views:
-        scale = np.tile(1.0 + np.clip(values[:2], -_MAX_STRETCH, _MAX_STRETCH), 2)
-        shift = np.tile(values[2:], 2)
-        # deviations are in pixels: else a longer focal length would shrink all residuals
-        return views._replace(edges=(views.edges - shift / focal) / scale,
-                              stiffness=views.stiffness * scale)
-
-    return _Cause('intrinsics', ('focal length fx', 'focal length fy', 'principal point cx',
-                                 'principal point cy'),
-                  ('%', '%', 'px', 'px'), (100.0, 100.0, 1.0, 1.0), (3.0, 3.0, 1.0, 1.0),
-                  differentiate, apply)
-
-
-def _mount(camera: Camera) -> _Cause:
+def _causes(camera: Camera, views: Views, number: int) -> tuple[_Cause, ...]:
+    """Return the causes of residuals of a camera, given its number among the cameras."""
     focal = 0.5 * (camera.fx + camera.fy)
     degree_px = float(np.radians(1.0)) * focal
-    return _Cause('mount', ('mount x (right)', 'mount y (down)', 'mount z (forward)',
-                            'mount rotation about x', 'mount rotation about y',
-                            'mount rotation about z'),
-                  ('cm', 'cm', 'cm', 'deg', 'deg', 'deg'),
-                  # the numbers move the map in the camera: the camera moves against it
-                  (-100.0,) * 3 + (-float(np.degrees(1.0)),) * 3,
-                  (focal / 200.0, focal / 200.0, 1.5, degree_px, degree_px,
-                   300.0 * degree_px / focal),
-                  lambda views, rows, linear: linear.by_pose,
-                  lambda views, values: _move_map(
-                      views, np.tile(values, (len(views.rotations), 1))))
+    own = views.cameras == number
+    twists, of_camera = _twists(views, own), (camera, own[views.frames])
+    speeds = np.abs(twists[own, 3:]).max(axis=1) + np.abs(twists[own, :3]).max(axis=1) / 2.0
+    return (
+        _Cause('intrinsics', ('focal length fx', 'focal length fy', 'principal point cx',
+                              'principal point cy'),
+               ('%', '%', 'px', 'px'), (100.0, 100.0, 1.0, 1.0), (3.0, 3.0, 1.0, 1.0),
+               *of_camera, None),
+        # the numbers move the map in the camera: the camera moves against it
+        _Cause('mount', tuple(f'mount {name}' for name in _MOUNT), ('cm',) * 3 + ('deg',) * 3,
+               (-100.0,) * 3 + (-float(np.degrees(1.0)),) * 3,
+               (focal / 200.0, focal / 200.0, 1.5, degree_px, degree_px,
+                300.0 * degree_px / focal), *of_camera, own[:, None, None] * np.eye(POSE_SIZE)),
+        _Cause('stamps', ('stamps of the images',), ('ms',), (1000.0,),
+               (focal * float(np.quantile(speeds, 0.9)) / 1000.0,), *of_camera,
+               twists[:, :, None]))
 
 
-def _stamps(camera: Camera, views: Views, number: int) -> _Cause:
-    # how the map moves in the camera (F, 6) [m/s] [rad/s], by central differences
+def _twists(views: Views, is_own: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return how the map moves in a camera (F, 6) [m/s] [rad/s], by central differences."""
     rotations, translations = views.rotations, views.translations
-    own = np.nonzero(views.cameras == number)[0]
+    own = np.nonzero(is_own)[0]
     later, earlier = np.arange(len(rotations)), np.arange(len(rotations))
     later[own[:-1]], earlier[own[1:]] = own[1:], own[:-1]
     seconds = (views.stamps_s[later] - views.stamps_s[earlier])[:, None]
@@ -189,13 +173,7 @@ def _stamps(camera: Camera, views: Views, number: int) -> _Cause:
     shifts = translations[later] - np.einsum('fij,fj->fi', turns, translations[earlier])
     twists = np.concatenate([shifts, Rotation.from_matrix(turns).as_rotvec()], axis=1)
     smooth = (seconds > 0.0) & (seconds < 0.5)
-    twists = np.where(smooth, twists / np.where(smooth, seconds, 1.0), 0.0)
-    speeds = np.abs(twists[:, 3:]).max(axis=1) + np.abs(twists[:, :3]).max(axis=1) / 2.0
-    pixels_per_ms = 0.5 * (camera.fx + camera.fy) * float(np.quantile(speeds[own], 0.9)) / 1000.0
-    return _Cause('stamps', ('stamps of the images',), ('ms',), (1000.0,), (pixels_per_ms,),
-                  lambda views, rows, linear: np.einsum(
-                      'mep,mp->me', linear.by_pose, twists[views.frames[rows]])[:, :, None],
-                  lambda views, values: _move_map(views, values[0] * twists))
+    return np.where(smooth, twists / np.where(smooth, seconds, 1.0), 0.0)
 
 
 def _move_map(views: Views, motions: NDArray[np.float64]) -> Views:
@@ -206,51 +184,61 @@ def _move_map(views: Views, motions: NDArray[np.float64]) -> Views:
         translations=np.einsum('fij,fj->fi', turns, views.translations) + motions[:, :3])
 
 
-def _fit(cause: _Cause, camera: int, given: Views, landmarks: Landmarks, rows: NDArray[np.int64],
-         numbers: NDArray[np.int64]) -> _Fit:
-    """Return the numbers of a cause that fit one camera best."""
-    values, views = np.zeros(len(cause.names)), given
-    viewpoints = given.viewpoints[given.frames[rows]]
-    frames = given.cameras == camera
-    boxes = frames[given.frames]
-    own = boxes[rows]
-    linear = linearize_boxes(views, rows, numbers, landmarks)
-    cost, own_before = _cost_of(linear), _cost_of(linear, own)
-    for _ in range(_STEPS):
-        step, deviations = _solve(cause.differentiate(views, rows, linear) * own[:, None, None],
-                                  linear, numbers, viewpoints)
-        applied = cause.apply(given, values + step)
-        moved = given._replace(**{
-            name: np.where(mine.reshape(-1, *[1] * (getattr(given, name).ndim - 1)),
-                           getattr(applied, name), getattr(given, name))
-            for name, mine in (('rotations', frames), ('translations', frames), ('edges', boxes),
-                               ('stiffness', boxes))})
-        refitted = _refit(moved, landmarks, rows, numbers)
-        trial = linearize_boxes(moved, rows, numbers, refitted)
-        if _cost_of(trial) >= cost:
+class _Descent(NamedTuple):
+    """The numbers (G,) of a cause that fit best, their deviations, and what fits them."""
+
+    values: NDArray[np.float64]
+    deviations: NDArray[np.float64]
+    views: Views
+    landmarks: Landmarks
+    linear: Linear
+
+
+def _descend(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[np.int64],
+             start: NDArray[np.float64], prior: NDArray[np.float64], steps: int, precision: float
+             ) -> _Descent:
+    """Return the numbers of a cause that fit best, from a start.
+
+    The prior (G,) are inverse variances about zero. No step is taken after one below the precision
+    times the deviations.
+    """
+    values, views = start, cause.apply(given, start) if start.any() else given
+    linear = linearize_boxes(views, shown, landmarks)
+
+    def cost_of(linear: Linear, values: NDArray[np.float64]) -> float:
+        # the prior's cost on the scale of _cost_of, whose residuals have LOSS_SCALE
+        return _cost_of(linear) + float((prior * values ** 2).sum()) / LOSS_SCALE ** 2
+
+    for _ in range(steps):
+        step, deviations = _solve(views, cause.differentiate(views, linear), linear, values, prior)
+        moved = cause.apply(given, values + step)
+        refitted = fit_landmarks(moved, landmarks, shown, _REFIT_STEPS)
+        trial = linearize_boxes(moved, shown, refitted)
+        if cost_of(trial, values + step) >= cost_of(linear, values):
             break
         values, views, landmarks, linear = values + step, moved, refitted, trial
-        cost = _cost_of(linear)
-        if (np.abs(step) < 0.2 * deviations).all():
+        if (np.abs(step) < precision * deviations).all():
             break
-    explained = max(0.0, 1.0 - _cost_of(linear, own) / max(own_before, 1e-12))
+    return _Descent(values, deviations, views, landmarks, linear)
+
+
+def _fit(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> _Fit:
+    """Return the numbers of a cause that fit best."""
+    nothing = np.zeros(len(cause.names))
+    found = _descend(cause, given, landmarks, shown, nothing, nothing, _STEPS, 0.2)
+    own = cause.boxes[found.linear.rows]
+    before = _cost_of(linearize_boxes(given, shown, landmarks), own)
+    explained = max(0.0, 1.0 - _cost_of(found.linear, own) / max(before, 1e-12))
     corrections = []
     for value, deviation, name, unit, factor, effect in zip(
-            values, deviations, cause.names, cause.units, cause.factors, cause.effects_px,
-            strict=True):
+            found.values, found.deviations, cause.names, cause.units, cause.factors,
+            cause.effects_px, strict=True):
         effect_px = abs(float(value) * factor) * effect
         corrections.append(Correction(
             cause.cause, name, unit, float(value) * factor, float(deviation) * abs(factor),
             effect_px, bool(abs(value) > _SIGNIFICANT * deviation and effect_px > _NOTABLE_PX
                             and explained > _MIN_EXPLAINED), explained))
-    return _Fit(tuple(corrections), views, landmarks)
-
-
-def _refit(views: Views, landmarks: Landmarks, rows: NDArray[np.int64],
-           numbers: NDArray[np.int64]) -> Landmarks:
-    """Return the landmarks fitted to some rows, whose landmarks are numbers."""
-    boxes = [rows[places] for places in group_boxes(numbers, len(landmarks.centers))]
-    return fit_landmarks(views, landmarks, boxes, _REFIT_STEPS)
+    return _Fit(tuple(corrections), found.views, found.landmarks)
 
 
 def _cost_of(linear: Linear, rows: NDArray[np.bool_] | slice = slice(None)) -> float:
@@ -259,58 +247,30 @@ def _cost_of(linear: Linear, rows: NDArray[np.bool_] | slice = slice(None)) -> f
     return float(-np.log(weights[weights > 0.0]).sum())
 
 
-def linearize_boxes(views: Views, rows: NDArray[np.int64], numbers: NDArray[np.int64],
-                    landmarks: Landmarks) -> Linear:
-    """Return residuals and derivatives of some rows, whose landmarks are numbers."""
-    count = len(rows)
-    linear = Linear(np.zeros((count, 4)), np.zeros((count, 4)),
-                    np.zeros((count, 4, LANDMARK_SIZE)), np.zeros((count, 4, POSE_SIZE)))
-    _linearize_all(views, rows, numbers, landmarks.centers, landmarks.bases, *linear)
-    return linear
-
-
-@compiled
-def _linearize_all(views, rows, numbers, centers, bases, residuals, weights, by_landmark,
-                   by_pose):
-    """Write residuals, weights and derivatives, in standard deviations; open edges weigh 0."""
-    box = np.empty(4)
-    for place in range(len(rows)):
-        row, number = rows[place], numbers[place]
-        frame = views.frames[row]
-        if not linearize_box(views.rotations[frame], views.translations[frame], centers[number],
-                             bases[number], box, by_landmark[place], by_pose[place]):
-            continue
-        for edge in range(4):
-            if views.is_open[row, edge]:
-                continue
-            residuals[place, edge] = edge_residual(views, row, edge, box)
-            weights[place, edge] = robust_weight(residuals[place, edge])
-            by_landmark[place, edge] *= views.stiffness[row, edge]
-            by_pose[place, edge] *= views.stiffness[row, edge]
-
-
-def _solve(derivatives: NDArray[np.float64], linear: Linear, numbers: NDArray[np.int64],
-           viewpoints: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _solve(views: Views, derivatives: NDArray[np.float64], linear: Linear,
+           values: NDArray[np.float64], prior: NDArray[np.float64]
+           ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the step (G,) of a cause's numbers, and their standard deviations (G,)."""
-    free, residuals = _without_landmarks(derivatives, linear, numbers)
-    weights = linear.weights
-    information = np.einsum('meg,me,meh->gh', free, weights, free)
+    free, residuals = _without_landmarks(derivatives, linear)
+    information = np.einsum('meg,me,meh->gh', free, linear.weights, free) + np.diag(prior)
     scale = np.sqrt(np.maximum(np.diag(information), 1e-12))
     scaled = information / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))
     inverse = np.linalg.inv(scaled) / np.outer(scale, scale)
-    step = -inverse @ np.einsum('meg,me,me->g', free, weights, residuals)
-    left = residuals + free @ step
+    step = -inverse @ (np.einsum('meg,me,me->g', free, linear.weights, residuals) + prior * values)
+    viewpoints = views.viewpoints[views.frames[linear.rows]]
     gradients = np.zeros((viewpoints.max() + 1, len(step)))
-    np.add.at(gradients, viewpoints, np.einsum('meg,me->mg', free, weights * left))
-    return step, np.sqrt(np.maximum(np.diag(inverse @ gradients.T @ gradients @ inverse), 1e-24))
+    np.add.at(gradients, viewpoints, np.einsum(
+        'meg,me->mg', free, linear.weights * (residuals + free @ step)))
+    covariance = (inverse @ gradients.T @ gradients @ inverse
+                  + inverse @ np.diag(prior) @ inverse)
+    return step, np.sqrt(np.maximum(np.diag(covariance), 1e-24))
 
 
-def _without_landmarks(derivatives: NDArray[np.float64], linear: Linear,
-                       numbers: NDArray[np.int64]
+def _without_landmarks(derivatives: NDArray[np.float64], linear: Linear
                        ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return derivatives and residuals, less what corrections of the landmarks explain."""
     free, residuals = derivatives.copy(), linear.residuals.copy()
-    for rows in group_boxes(numbers, int(numbers.max()) + 1):
+    for rows in group_boxes(linear.numbers, int(linear.numbers.max()) + 1):
         if len(rows) == 0:
             continue
         by_landmark, weights = linear.by_landmark[rows], linear.weights[rows]
@@ -342,66 +302,38 @@ class MountCorrection(NamedTuple):
         turn = Rotation.from_matrix(self.given_from_corrected[:3, :3]).as_rotvec()
         factors = np.repeat([100.0, np.degrees(1.0)], 3)
         values = np.concatenate([self.given_from_corrected[:3, 3], turn]) * factors
-        names = ('x (right)', 'y (down)', 'z (forward)', 'rotation about x', 'rotation about y',
-                 'rotation about z')
         seen = self.deviations < _OBSERVABLE * _MOUNT_PRIOR
         rows = [f'mount corrected: {name} {value:+.2f} +- {deviation:.2f} {unit}'
                 for name, value, deviation, unit, is_seen
-                in zip(names, values, self.deviations * factors,
+                in zip(_MOUNT, values, self.deviations * factors,
                        ('cm',) * 3 + ('degrees',) * 3, seen, strict=True) if is_seen]
-        if hidden := [name for name, is_seen in zip(names, seen, strict=True) if not is_seen]:
+        if hidden := [name for name, is_seen in zip(_MOUNT, seen, strict=True) if not is_seen]:
             rows.append(f'mount not observable from this motion: {", ".join(hidden)}; turn the '
                         'camera about another axis')
         return rows
 
 
-def refine_mount(given: Views, landmarks: Landmarks, shown: NDArray[np.int64], start: Views
-                 ) -> MountCorrection:
-    """Return the correction of the mount that fits the boxes best.
+def refine_mount(detections: PosedDetections, given: Views, landmarks: Landmarks,
+                 shown: NDArray[np.int64], start: Views) -> MountCorrection:
+    """Return the correction of the mount of the only camera that fits the boxes best.
 
     The landmarks are fitted to the poses of start: the given views, or those of an earlier
     correction.
     """
-    rows = _sample(shown)
-    numbers, views, weights = shown[rows], start, _MOUNT_PRIOR ** -2
-    viewpoints = given.viewpoints[given.frames[rows]]
     # by how much the map was moved in the cameras (6,): translation, rotation
     turn = start.rotations[0] @ given.rotations[0].T
     values = np.concatenate([start.translations[0] - turn @ given.translations[0],
                              Rotation.from_matrix(turn).as_rotvec()])
-
-    def cost_of(linear: Linear, values: NDArray[np.float64]) -> float:
-        # the prior's cost on the scale of _cost_of, whose residuals have LOSS_SCALE
-        return _cost_of(linear) + float((weights * values ** 2).sum()) / LOSS_SCALE ** 2
-
-    def equations() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return information (6, 6), and the gradients of single viewpoints."""
-        free, residuals = _without_landmarks(linear.by_pose, linear, numbers)
-        gradients = np.zeros((viewpoints.max() + 1, 6))
-        np.add.at(gradients, viewpoints,
-                  np.einsum('meg,me->mg', free, linear.weights * residuals))
-        return np.einsum('meg,me,meh->gh', free, linear.weights, free), gradients
-
-    linear = linearize_boxes(views, rows, numbers, landmarks)
-    for _ in range(_MOUNT_STEPS):
-        information, gradients = equations()
-        trial = values - np.linalg.solve(information + np.diag(weights),
-                                         gradients.sum(axis=0) + weights * values)
-        moved = _move_map(given, np.tile(trial, (len(given.rotations), 1)))
-        refitted = _refit(moved, landmarks, rows, numbers)
-        trial_linear = linearize_boxes(moved, rows, numbers, refitted)
-        if cost_of(trial_linear, trial) >= cost_of(linear, values):
-            break
-        values, views, landmarks, linear = trial, moved, refitted, trial_linear
-    information, gradients = equations()
-    inverse = np.linalg.inv(information + np.diag(weights))
-    deviations = np.sqrt(np.diag(inverse @ (gradients.T @ gradients + np.diag(weights))
-                                 @ inverse))
-    motion = make_transform(Rotation.from_rotvec(values[3:]).as_matrix(), values[:3])
-    return MountCorrection(views, invert_transform(motion), deviations)
+    _, mount, _ = _causes(detections.cameras[0], given, 0)
+    found = _descend(mount, given, landmarks, _sample(shown), values, _MOUNT_PRIOR ** -2,
+                     _MOUNT_STEPS, 0.0)
+    motion = make_transform(Rotation.from_rotvec(found.values[3:]).as_matrix(), found.values[:3])
+    return MountCorrection(found.views, invert_transform(motion), found.deviations)
 
 
 def _sample(shown: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the boxes that show landmarks, evenly chosen where they are many."""
+    """Return the landmark that each of some boxes shows, -1 for the others, evenly chosen."""
     rows = np.nonzero(shown >= 0)[0]
-    return rows[::max(1, -(-len(rows) // _MAX_BOXES))]
+    rows, sample = rows[::max(1, -(-len(rows) // _MAX_BOXES))], np.full(len(shown), -1)
+    sample[rows] = shown[rows]
+    return sample

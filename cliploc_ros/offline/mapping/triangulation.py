@@ -8,7 +8,6 @@ hypothesis with the greatest support is fitted to that support and takes its box
 next. Every box is the seed of some hypotheses, so that rare objects get their share.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from math import sqrt
 
@@ -17,13 +16,13 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.mapping.evidence import gather_evidence
 from cliploc_ros.offline.mapping.fitting import descend, fit_ellipsoid
 from cliploc_ros.offline.mapping.landmarks import (
     LANDMARK_SIZE,
     Landmarks,
     box_iou,
     group_boxes,
-    no_landmarks,
     project_box,
 )
 from cliploc_ros.offline.mapping.options import MappingOptions
@@ -55,7 +54,8 @@ _MAX_GAP_S = 30.0
 _MAX_MISS = 0.6
 _MAX_RADIUS_RATIO = 1.6
 _MIN_DEPTH_M = 0.1
-_PAIR_STEPS = 6
+# Hypotheses that each box is the seed of, and the steps in which each is fitted.
+_PAIRS_PER_BOX, _PAIR_STEPS = 3, 6
 #: A frame supports a landmark that overlaps one of its boxes more than this.
 SUPPORT_IOU = 0.45
 
@@ -106,12 +106,38 @@ def depth_hypotheses(views: Views, rows: NDArray[np.int64]
     return centers, radii[:, None, None] * np.eye(3)
 
 
-def depth_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
-                baselines_deg: NDArray[np.float64]) -> float | None:
+def scaled_depths(views: Views, detections: PosedDetections, landmarks: Landmarks,
+                  shown: NDArray[np.int64]) -> tuple[Views, list[str]]:
+    """Return the views with depth of the right scale, and notes; each camera has its own scale.
+
+    The landmarks are fitted to boxes only; those with enough parallax tell the scale.
+    MappingError: a scale is so far off that depth must have another unit.
+    """
+    baselines_deg = gather_evidence(views, landmarks, shown).baseline_deg
+    measured = add_depths(views, detections)
+    kept, notes = np.ones(len(detections.cameras)), list[str]()
+    for number, name in enumerate(detections.camera_names):
+        scale = _depth_scale(measured, landmarks, np.where(
+            views.cameras[views.frames] == number, shown, -1), baselines_deg)
+        if scale is None or abs(scale - 1.0) < _LEAST_CORRECTION:
+            continue
+        of = f' of {name}' if len(kept) > 1 else ''
+        if not 1.0 / _UNIT_FACTOR < scale < _UNIT_FACTOR:
+            raise MappingError(
+                f'measured depth{of} is {1.0 / scale:.3g} times what boxes and poses say: wrong '
+                f'unit? multiply `depth_unit` by {scale:.3g}, check the poses are in metres, or '
+                'leave depth out')
+        kept[number] = scale
+        notes.append(f'measured depth{of} is {1.0 / scale:.3f} times what boxes and poses say; '
+                     'it is corrected by that')
+    return (add_depths(views, detections, kept) if notes else measured), notes
+
+
+def _depth_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
+                 baselines_deg: NDArray[np.float64]) -> float | None:
     """Return true depth divided by measured depth; None where too few landmarks tell.
 
-    The landmarks are fitted to boxes only; those with enough parallax tell. The array shown (n,)
-    is -1 for boxes of other cameras.
+    The array shown (n,) is -1 for boxes of other cameras.
     """
     ratios = []
     for number, rows in enumerate(group_boxes(shown, len(landmarks.centers))):
@@ -125,40 +151,17 @@ def depth_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
     return float(np.median(ratios)) if len(ratios) >= _LEAST_LANDMARKS else None
 
 
-def correct_scale(views: Views, detections: PosedDetections, scales: Sequence[float | None]
-                  ) -> tuple[Views, list[str]]:
-    """Return the views with depth of the right scale, and notes; each camera has its own scale.
-
-    MappingError: a scale is so far off that depth must have another unit.
-    """
-    kept, notes = np.ones(len(scales)), list[str]()
-    for number, scale in enumerate(scales):
-        if scale is None or abs(scale - 1.0) < _LEAST_CORRECTION:
-            continue
-        name = f' of {detections.camera_names[number]}' if len(scales) > 1 else ''
-        if not 1.0 / _UNIT_FACTOR < scale < _UNIT_FACTOR:
-            raise MappingError(
-                f'measured depth{name} is {1.0 / scale:.3g} times what boxes and poses say: wrong '
-                f'unit? multiply `depth_unit` by {scale:.3g}, check the poses are in metres, or '
-                'leave depth out')
-        kept[number] = scale
-        notes.append(f'measured depth{name} is {1.0 / scale:.3f} times what boxes and poses say; '
-                     'it is corrected by that')
-    return (add_depths(views, detections, kept) if notes else views), notes
-
-
-def triangulate(views: Views, rows: NDArray[np.int64], options: MappingOptions,
+def triangulate(views: Views, rows: NDArray[np.int64], min_viewpoints: int,
                 rng: np.random.Generator) -> Landmarks:
     """Return landmarks that explain boxes of one class, given in the order of time.
 
     Each is the hypothesis that covers the most free boxes; a box belongs to at most one.
     """
-    if len(rows) < options.min_viewpoints:
-        return no_landmarks()
-    seeds = np.repeat(rows, options.pairs_per_box)
+    if len(rows) < min_viewpoints:
+        return Landmarks.none()
+    seeds = np.repeat(rows, _PAIRS_PER_BOX)
     of_pairs = _pair_hypotheses(views, rows, seeds, rng.random(len(seeds)))
-    centers, bases = map(np.concatenate, zip(of_pairs, depth_hypotheses(views, rows),
-                                             strict=True))
+    centers, bases = map(np.concatenate, zip(of_pairs, depth_hypotheses(views, rows), strict=True))
     frames, starts = np.unique(views.frames[rows], return_index=True)
     starts = np.append(starts, len(rows))
     supports = [_support(views, rows, frames, starts, center, basis)
@@ -174,17 +177,17 @@ def triangulate(views: Views, rows: NDArray[np.int64], options: MappingOptions,
         gains = np.bincount(of_boxes[is_free[boxes]], minlength=len(centers))
         gains[discarded] = 0
         best = int(np.argmax(gains))
-        if gains[best] < options.min_viewpoints:
+        if gains[best] < min_viewpoints:
             break
         discarded[best] = True
         own = supports[best]
         center, basis, support = _settle(views, rows[is_free[rows]], own[is_free[own]],
                                          centers[best], bases[best])
-        if len(np.unique(viewpoints[support])) >= options.min_viewpoints:
+        if len(np.unique(viewpoints[support])) >= min_viewpoints:
             found.append((center, basis))
             is_free[support] = False
     if not found:
-        return no_landmarks()
+        return Landmarks.none()
     return Landmarks(np.array([center for center, _ in found]),
                      np.array([basis for _, basis in found]),
                      np.full(len(found), views.classes[rows[0]]))

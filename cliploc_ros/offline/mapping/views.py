@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.simulation import EDGE_SIGMA_PX, EDGE_SIGMA_SHARE
 
+# An edge this near to the image border is open: the object may extend beyond it.
+_BORDER_PX = 3.0
 # Two frames less than this apart in both show a landmark from one viewpoint.
 _VIEWPOINT_DISTANCE_M = 0.1
 _VIEWPOINT_ANGLE_DEG = 5.0
@@ -53,6 +56,24 @@ class Views(NamedTuple):
     depths: NDArray[np.float64]
     depth_stiffness: NDArray[np.float64]
 
+    @property
+    def centers(self) -> NDArray[np.float64]:
+        """Return where the cameras were (F, 3) [m]."""
+        return np.asarray(-np.einsum('fji,fj->fi', self.rotations, self.translations))
+
+    @property
+    def poses(self) -> NDArray[np.float64]:
+        """Return the poses map_from_camera (F, 4, 4) of all frames."""
+        poses = np.tile(np.eye(4), (len(self.rotations), 1, 1))
+        poses[:, :3, :3] = self.rotations.transpose(0, 2, 1)
+        poses[:, :3, 3] = self.centers
+        return poses
+
+    def with_poses(self, map_from_camera: NDArray[np.float64]) -> 'Views':
+        """Return the same views with other poses (F, 4, 4)."""
+        rotations, translations = _inverses(map_from_camera)
+        return self._replace(rotations=rotations, translations=translations)
+
     def between(self, first: int, last: int) -> 'Views':
         """Return the frames from first up to last, last excluded; nothing is copied."""
         frames = slice(first, last)
@@ -66,7 +87,7 @@ class Views(NamedTuple):
             self.bounds[frames], self.depths[boxes], self.depth_stiffness[boxes])
 
 
-def make_views(detections: PosedDetections, options: MappingOptions) -> Views:
+def make_views(detections: PosedDetections) -> Views:
     """Return what the kernels read of posed detections."""
     boxes_px, is_open = detections.bboxes_xyxy, detections.open_edges
     of_boxes = detections.frame_cameras[detections.frames]
@@ -76,7 +97,7 @@ def make_views(detections: PosedDetections, options: MappingOptions) -> Views:
     bounds_px = np.concatenate([0.0 * sizes[:, :2], sizes[:, 2:]], axis=1)
     if is_open is None:
         boxes_px = np.clip(boxes_px, 0.0, sizes[of_boxes])
-        is_open = at_border(boxes_px, sizes[of_boxes], options.border_px)
+        is_open = at_border(boxes_px, sizes[of_boxes])
     else:
         for number, bounds in enumerate(bounds_px):
             own, own_open = boxes_px[of_boxes == number], is_open[of_boxes == number]
@@ -84,10 +105,10 @@ def make_views(detections: PosedDetections, options: MappingOptions) -> Views:
                                     own[:, 2:].max(axis=0, initial=-np.inf)])
             bounds_px[number] = np.where(own_open.any(axis=0), reach, bounds)
     extents_px = np.tile(boxes_px[:, 2:] - boxes_px[:, :2], 2)
-    deviations_px = np.hypot(options.edge_sigma_px, options.edge_sigma_share * extents_px)
+    deviations_px = np.hypot(EDGE_SIGMA_PX, EDGE_SIGMA_SHARE * extents_px)
     viewpoints = number_viewpoints(detections)
     return Views(
-        *camera_from_map(detections.map_from_camera),
+        *_inverses(detections.map_from_camera),
         np.ascontiguousarray(detections.stamps_s, dtype=np.float64), detections.frame_cameras,
         _levers(detections), viewpoints, 1.0 / np.bincount(viewpoints)[viewpoints],
         detections.frame_offsets, detections.frames, detections.classes,
@@ -96,14 +117,13 @@ def make_views(detections: PosedDetections, options: MappingOptions) -> Views:
         np.zeros(len(boxes_px)), np.zeros(len(boxes_px)))
 
 
-def at_border(boxes_px: NDArray[np.float64], sizes: NDArray[np.float64], border_px: float
-              ) -> NDArray[np.bool_]:
+def at_border(boxes_px: NDArray[np.float64], sizes: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which edges of boxes (n, 4) lie at the border of their images.
 
     The sizes (n, 4), or (4,), are width, height, width, height [px].
     """
-    return np.hstack([boxes_px[:, :2] <= border_px,
-                      boxes_px[:, 2:] >= sizes[..., 2:] - border_px])
+    return np.hstack([boxes_px[:, :2] <= _BORDER_PX,
+                      boxes_px[:, 2:] >= sizes[..., 2:] - _BORDER_PX])
 
 
 def _levers(detections: PosedDetections) -> NDArray[np.float64]:
@@ -128,11 +148,10 @@ def _levers(detections: PosedDetections) -> NDArray[np.float64]:
     return levers
 
 
-def camera_from_map(map_from_camera: NDArray[np.float64]
-                    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _inverses(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rotations (F, 3, 3) and translations (F, 3) of the inverses of poses (F, 4, 4)."""
-    rotations = np.ascontiguousarray(map_from_camera[:, :3, :3].transpose(0, 2, 1))
-    translations = -np.einsum('fij,fj->fi', rotations, map_from_camera[:, :3, 3])
+    rotations = np.ascontiguousarray(poses[:, :3, :3].transpose(0, 2, 1))
+    translations = -np.einsum('fij,fj->fi', rotations, poses[:, :3, 3])
     return rotations, np.ascontiguousarray(translations)
 
 
@@ -146,21 +165,6 @@ def thin_out(views: Views, most: int) -> NDArray[np.bool_]:
     totals = np.empty_like(places)
     totals[order] = np.maximum(counts[of_frames], most)
     return np.asarray((places * most) // totals != ((places - 1) * most) // totals)
-
-
-def map_from_cameras(views: Views) -> NDArray[np.float64]:
-    """Return the poses map_from_camera (F, 4, 4) of all frames."""
-    poses = np.tile(np.eye(4), (len(views.rotations), 1, 1))
-    poses[:, :3, :3] = views.rotations.transpose(0, 2, 1)
-    poses[:, :3, 3] = camera_centers(views)
-    return poses
-
-
-def camera_centers(views: Views, frames: NDArray[np.int64] | slice = slice(None)
-                   ) -> NDArray[np.float64]:
-    """Return where the camera was in some frames, or in all (k, 3) [m]."""
-    return np.asarray(-np.einsum('fji,fj->fi', views.rotations[frames],
-                                 views.translations[frames]))
 
 
 def number_viewpoints(detections: PosedDetections) -> NDArray[np.int64]:
@@ -185,7 +189,8 @@ def number_viewpoints(detections: PosedDetections) -> NDArray[np.int64]:
     return viewpoints
 
 
-def check_input(detections: PosedDetections, views: Views, options: MappingOptions) -> list[str]:
+def check_input(detections: PosedDetections, views: Views,
+                min_viewpoints: int = MappingOptions.min_viewpoints) -> list[str]:
     """Return notes on the input.
 
     MappingError: no map can be made of it; the message says what to correct.
@@ -194,9 +199,9 @@ def check_input(detections: PosedDetections, views: Views, options: MappingOptio
         raise MappingError(f'the {len(detections)} frames have no detections; check the detector, '
                            'its classes and its confidence threshold')
     viewpoints = int(views.viewpoints.max()) + 1
-    if viewpoints < options.min_viewpoints:
+    if viewpoints < min_viewpoints:
         raise MappingError(f'the camera took {viewpoints} viewpoints, at least '
-                           f'{options.min_viewpoints} are needed; move it around the objects, and '
+                           f'{min_viewpoints} are needed; move it around the objects, and '
                            'check that the poses are those of the images')
     # the pose moves faster than any camera does
     jumps = np.sort(np.concatenate([

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.depth_image import depths_of_boxes
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
@@ -19,7 +20,7 @@ from cliploc_ros.models.devices import set_threads
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions, ImageTextEncoder
 from cliploc_ros.offline.datasets.frames import RawFrame
-from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.datasets.observations import camera_from_numbers
 from cliploc_ros.offline.mapping.views import at_border
 
 #: The most detections of an image that are used, as in the relocalizer node.
@@ -35,12 +36,11 @@ class SeenFrame:
     camera: str
     stamp_ns: int
     map_from_camera: NDArray[np.float64]  #: (4, 4)
-    #: (2,), (4,): width and height, and fx, fy, cx, cy of the undistorted image [px]
-    image_size: NDArray[np.int64]
-    intrinsics: NDArray[np.float64]
+    #: (6,): width, height, fx, fy, cx, cy of the undistorted image [px]
+    camera_numbers: NDArray[np.float64]
     bboxes_xyxy: NDArray[np.float64]  #: (n, 4): undistorted [px]
-    #: (n, 4) or (0, 4): see PosedDetections; without rows for a lens without distortion
-    open_edges: NDArray[np.bool_]
+    open_edges: NDArray[np.bool_]  #: (n, 4): see PosedDetections
+    is_distorted: bool  #: The open edges cannot be told from the undistorted boxes
     #: (n,)
     class_ids: NDArray[np.str_]
     scores: NDArray[np.float64]
@@ -51,6 +51,11 @@ class SeenFrame:
     #: Time taken [ms]
     detector_ms: float
     clip_ms: float
+
+    @property
+    def pinhole(self) -> Camera:
+        """Return the camera of the undistorted image."""
+        return camera_from_numbers(self.camera_numbers[:2], self.camera_numbers[2:])
 
     def to_bytes(self) -> bytes:
         """Return the frame as bytes, without pickles."""
@@ -107,10 +112,9 @@ class RunNetworks:
         detections = self.detect(frame.image_rgb).usable(camera.width, camera.height,
                                                          MAX_DETECTIONS)
         detected = time.perf_counter()
-        bboxes, open_edges = detections.bboxes_xyxy, np.empty((0, 4), dtype=np.bool_)
+        bboxes, size = detections.bboxes_xyxy, [camera.width, camera.height]
+        open_edges = at_border(bboxes, np.array(size * 2))
         if not camera.is_pinhole:
-            open_edges = at_border(bboxes, np.array([camera.width, camera.height] * 2),
-                                   MappingOptions.border_px)
             bboxes = camera.bboxes_in_pixels(camera.normalize_bboxes(bboxes))
         rows = np.nonzero((bboxes[:, 2:] > bboxes[:, :2]).all(axis=1))[0]  # never true of NaN
         sound = detections.select(rows)
@@ -122,9 +126,8 @@ class RunNetworks:
             depths, spreads = depths_of_boxes(frame.depth, camera, sound.bboxes_xyxy)
         return SeenFrame(
             raw.place, raw.camera, raw.stamp_ns, frame.map_from_camera,
-            np.array([camera.width, camera.height]),
-            np.array([camera.fx, camera.fy, camera.cx, camera.cy]), bboxes[rows],
-            open_edges if camera.is_pinhole else open_edges[rows],
+            np.array([*size, camera.fx, camera.fy, camera.cx, camera.cy]), bboxes[rows],
+            open_edges[rows], not camera.is_pinhole,
             np.array(sound.class_ids, dtype=np.str_), sound.scores,
             embeddings.astype(np.float16), depths, spreads,
             (detected - start) * 1e3, (embedded - detected) * 1e3)

@@ -30,27 +30,20 @@ from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets.frames import Frames, RawFrame
-from cliploc_ros.offline.datasets.observations import (
-    Recorded,
-    camera_from_numbers,
-    load_recorded,
-    save_recorded,
-)
+from cliploc_ros.offline.datasets.observations import Recorded, load_recorded, save_recorded
 from cliploc_ros.offline.datasets.poses import Poses
-from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import (
     PosedDetections,
     group_cameras,
     names_of_group,
 )
-from cliploc_ros.offline.mapping.views import at_border
 from cliploc_ros.offline.recording.networks import LoadNetworks, SeenFrame
 from cliploc_ros.units import NS_PER_S
 
 logger = logging.getLogger(__name__)
-# The unit of depth is judged by the boxes of this number of frames.
 # In the name of an observation file beside its source.
 _BESIDE = '.cliploc-'
+# The unit of depth is judged by the boxes of this number of frames.
 _FRAMES_FOR_UNIT = 10
 _UNKNOWN = np.full((4, 4), np.nan)
 
@@ -288,21 +281,14 @@ def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, Keyfr
     camera_names = tuple(filters)
     rows = np.array([camera_names.index(one.camera) for one in seen])
     if frames.varies:
-        own = [camera_from_numbers(one.image_size, one.intrinsics) for one in seen]
-        cameras, rows = group_cameras(own)
+        cameras, rows = group_cameras([one.pinhole for one in seen])
         camera_names = names_of_group(cameras)
-        seen = [_seen_by(one, camera, cameras[row])
-                for one, camera, row in zip(seen, own, rows, strict=True)]
+        seen = [_seen_by(one, cameras[row]) for one, row in zip(seen, rows, strict=True)]
     names = np.concatenate([one.class_ids for one in seen])
     class_names, classes = np.unique(names, return_inverse=True)
     depths = np.concatenate([one.depths for one in seen])
     has_depth = bool(np.isfinite(depths).any())
-    open_edges = np.concatenate([one.open_edges for one in seen])
-    if 0 < len(open_edges) < len(names):  # some lenses have distortion
-        open_edges = np.concatenate([
-            one.open_edges if len(one.open_edges) else at_border(
-                one.bboxes_xyxy, np.tile(one.image_size, 2), MappingOptions.border_px)
-            for one in seen])
+    are_told = len(names) > 0 and any(one.is_distorted for one in seen)
     detections = PosedDetections(
         cameras=cameras,
         map_from_camera=np.array([one.map_from_camera for one in seen]),
@@ -316,7 +302,8 @@ def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, Keyfr
                        else None),
         embeddings=(np.concatenate([one.embeddings for one in seen])
                     if any(one.embeddings.shape[1] for one in seen) else None),
-        encoder_key=encoder_key, open_edges=open_edges if len(open_edges) else None,
+        encoder_key=encoder_key,
+        open_edges=np.concatenate([one.open_edges for one in seen]) if are_told else None,
         camera_rows=None if camera_names == ('',) else rows,
         camera_names=camera_names)
     return Recorded(
@@ -326,15 +313,12 @@ def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, Keyfr
         sum(one.without_pose for one in filters.values()), described)
 
 
-def _seen_by(seen: SeenFrame, camera: Camera, other: Camera) -> SeenFrame:
+def _seen_by(seen: SeenFrame, other: Camera) -> SeenFrame:
     """Return the boxes of a frame as another pinhole of its place shows them."""
-    if camera == other:
+    if seen.pinhole == other:
         return seen
-    boxes, is_open = seen.bboxes_xyxy, seen.open_edges
-    if not len(is_open):
-        is_open = at_border(boxes, np.tile(seen.image_size, 2), MappingOptions.border_px)
-    return replace(seen, bboxes_xyxy=other.bboxes_in_pixels(camera.normalize_bboxes(boxes)),
-                   open_edges=is_open)
+    rays = seen.pinhole.normalize_bboxes(seen.bboxes_xyxy)
+    return replace(seen, bboxes_xyxy=other.bboxes_in_pixels(rays), is_distorted=True)
 
 
 def _camera_of(seen: list[SeenFrame], where: str, images: int, varies: bool) -> Camera:
@@ -345,15 +329,14 @@ def _camera_of(seen: list[SeenFrame], where: str, images: int, varies: bool) -> 
     if not seen:
         raise DatasetError(f'{where} none of {images} images has a pose; interpolate over wider '
                            'gaps with `max_gap`, or record poses with the images')
-    first = seen[0]
-    for one in seen:
-        if not varies and ((one.image_size != first.image_size).any()
-                           or (one.intrinsics != first.intrinsics).any()):
-            raise DatasetError(f'{where} the camera changes at {one.stamp_ns / NS_PER_S:.6f}, but '
-                               'observations of one name have one camera; name several with '
-                               '`cameras`')
+    camera = seen[0].pinhole
+    other = next((one for one in seen if one.pinhole != camera), None)
+    if other is not None and not varies:
+        raise DatasetError(f'{where} the camera changes at {other.stamp_ns / NS_PER_S:.6f}, but '
+                           'observations of one name have one camera; name several with '
+                           '`cameras`')
     check_depth_unit(np.concatenate([one.depths for one in seen]), where.removesuffix(':'))
-    return camera_from_numbers(first.image_size, first.intrinsics)
+    return camera
 
 
 def _settings(options: DetectorOptions | ClipOptions) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from cliploc_ros.core.map.landmark_details import OPTIONAL_FIELDS, LandmarkDetai
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping.labelling import choose_medoids
-from cliploc_ros.offline.mapping.landmarks import ellipsoid_numbers
+from cliploc_ros.offline.mapping.landmarks import Landmarks as Ellipsoids
 
 KNOWN_FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation', *OPTIONAL_FIELDS)
 #: Edited numbers are rounded to these, so that the file holds exactly what the studio shows.
@@ -176,7 +176,7 @@ def shape_fields(center: NDArray[np.float64], basis: NDArray[np.float64]) -> dic
 
     The basis' columns are orthogonal semi-axes [m].
     """
-    (lengths,), (quat_xyzw,) = ellipsoid_numbers(basis[None])
+    (lengths,), (quat_xyzw,) = Ellipsoids.none()._replace(bases=basis[None]).axes_and_quats()
     return {'center': rounded(center),
             'semi_axes': rounded(np.maximum(lengths, LEAST_SEMI_AXIS_M)),
             'orientation': rounded(quat_xyzw)}

@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.offline.mapping.evidence import widest_angle_deg
 from cliploc_ros.offline.mapping.fitting import Fit, fit_ellipsoid
-from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.mapping.views import Views, camera_centers, make_views
+from cliploc_ros.offline.mapping.views import Views, make_views
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.edits import EditError
@@ -199,10 +198,10 @@ def fit_boxes(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64],
         cameras=tuple(cameras), map_from_camera=map_from_camera,
         stamps_s=np.arange(count, dtype=np.float64), frame_offsets=np.arange(count + 1),
         bboxes_xyxy=bboxes_xyxy, class_names=('drawn',), classes=np.zeros(count, dtype=np.int64),
-        scores=np.ones(count), camera_rows=np.arange(count)), MappingOptions())
+        scores=np.ones(count), camera_rows=np.arange(count)))
     # each box was drawn for itself: none shares the error of a detector that stood still
     views = views._replace(weights=np.ones(count))
-    origins = camera_centers(views)
+    origins = views.centers
     start, radius = _meeting_point(views, origins)
     # a sphere, one stretched along each axis of the map, and one along a diagonal
     sphere = radius * np.eye(3)

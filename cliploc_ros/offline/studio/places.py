@@ -24,7 +24,7 @@ from cliploc_ros.offline.mapping.check.relocalization import (
 )
 from cliploc_ros.offline.mapping.check.report import GridCheck
 from cliploc_ros.offline.mapping.options import CheckOptions
-from cliploc_ros.offline.simulation.detector import DetectorModel, guess_detector
+from cliploc_ros.offline.simulation import DetectorModel, guess_detector
 from cliploc_ros.offline.studio.landmark import Landmarks, map_of
 from cliploc_ros.offline.studio.recording import Recording
 
@@ -94,16 +94,15 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Cover
 def _detector(landmark_map: LandmarkMap, recording: Recording | None
               ) -> tuple[DetectorModel, str]:
     """Return the detector of a recording, or else a guess, and in words what it is."""
-    guess = guess_detector(landmark_map, (_OPTIONS.mapping.edge_sigma_px,
-                                          _OPTIONS.mapping.edge_sigma_share))
+    guess = guess_detector(landmark_map)
     if recording is None:
         return guess, 'without a recording, the camera and the detector are guesses'
     detections = recording.detections
     if len(detections.classes):
         witness = recording.witness(landmark_map)
         if (witness.shown >= 0).any():
-            return measure_detector(landmark_map, detections, recording.views, witness,
-                                    recording.options), 'the detector is as in the recording'
+            return measure_detector(landmark_map, detections, recording.views, witness
+                                    ), 'the detector is as in the recording'
     return (replace(guess, camera=detections.cameras[0]),
             'no box of the recording shows a landmark: the detector is a guess')
 

@@ -31,12 +31,12 @@ from cliploc_ros.offline.mapping.check.relocalization import (
 from cliploc_ros.offline.mapping.fitting import fit_ellipsoid
 from cliploc_ros.offline.mapping.labelling import embed_landmarks
 from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map
-from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions
+from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.refit import refit_map
 from cliploc_ros.offline.mapping.sightings import Sighting, find_sightings, outlines_in_view
 from cliploc_ros.offline.mapping.views import Views, make_views
-from cliploc_ros.offline.simulation.labels import LabelModel
+from cliploc_ros.offline.simulation import LabelModel
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.edits import Change, EditError
 from cliploc_ros.offline.studio.landmark import Encoded, Landmarks, looks_of, map_of
@@ -61,12 +61,11 @@ class Recording:
 
     def __init__(self, detections: PosedDetections, images: Images | None = None):
         self.detections, self.images = detections, images
-        self.options = MappingOptions()
 
     @cached_property
     def views(self) -> Views:
         """The arrays that the kernels of mapping read."""
-        return make_views(self.detections, self.options)
+        return make_views(self.detections)
 
     def witness(self, landmark_map: LandmarkMap) -> Witness:
         """Return what the boxes say of a map."""
@@ -77,7 +76,7 @@ class Recording:
         if not landmarks:
             return {}
         shown = associate(self.views, landmarks_of_map(
-            map_of(landmarks), self.detections.class_names), self.options.association_iou)
+            map_of(landmarks), self.detections.class_names))
         return dict(zip(landmarks, group_boxes(shown, len(landmarks)), strict=True))
 
     def outlines(self, landmarks: Landmarks, view: int) -> list[Outline]:
@@ -150,7 +149,7 @@ class Recording:
             raise EditError(f"landmark '{locked[0]}' is locked: unlock it first")
         chosen = np.array([key in set(landmark_ids) for key in landmarks])
         # the others keep their boxes, so that none takes those of its neighbour
-        refit = refit_map(self.detections, map_of(landmarks), chosen, self.options)
+        refit = refit_map(self.detections, map_of(landmarks), chosen)
         reasons = {key: reason for key, reason in zip(landmarks, refit.reasons, strict=True)
                    if reason is not None and key in landmark_ids}
         fitted = [key for key in landmark_ids if key not in reasons]

@@ -15,7 +15,6 @@ from cliploc_ros.offline.mapping.check.landmark_faults import (
     find_map_overlaps,
 )
 from cliploc_ros.offline.mapping.check.report import SERIOUS
-from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.edits import EditError
@@ -163,7 +162,7 @@ class ReviewQueue:
         if recording is not None and self.has_boxes:
             views, witness = recording.views, recording.witness(landmark_map)
         overlaps = find_map_overlaps(landmark_map, witness, views)
-        found = check_landmarks(landmark_map, witness, overlaps, MappingOptions())
+        found = check_landmarks(landmark_map, witness, overlaps)
         ids = list(landmarks)
         self._checks = {one.landmark_id: one for one in found}
         self._duplicates = [(ids[one.first], ids[one.second]) for one in overlaps

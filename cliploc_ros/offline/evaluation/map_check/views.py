@@ -17,7 +17,6 @@ from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.check.relocalization import Trial
 from cliploc_ros.offline.mapping.check.report import Advice
 from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map
-from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.sightings import find_sightings, outlines_in_view
 from cliploc_ros.offline.mapping.views import make_views
@@ -67,11 +66,9 @@ class ViewPainter:
     @cached_property
     def _shown(self) -> list[NDArray[np.int64]]:
         """Return the boxes that show each landmark."""
-        options = MappingOptions()
         return group_boxes(associate(
-            make_views(self._detections, options),
-            landmarks_of_map(self._map, self._detections.class_names), options.association_iou),
-            len(self._map))
+            make_views(self._detections),
+            landmarks_of_map(self._map, self._detections.class_names)), len(self._map))
 
     def _near(self, view: Trial) -> Iterator[tuple[int, str]]:
         """Yield the frames near to a view, the nearest first, and how far they are off."""

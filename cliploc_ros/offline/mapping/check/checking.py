@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The entry point of checking: a map and, if there is one, a recording in, a report out."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -24,13 +24,13 @@ from cliploc_ros.offline.mapping.check.relocalization import (
     ImageOf,
     PosedObservation,
     RecordedKeyframes,
+    Tell,
     Trial,
-    box_quality,
+    each_pose,
     make_folds,
     measure_detector,
     sample_frames,
     try_observations,
-    try_poses,
     try_recording,
 )
 from cliploc_ros.offline.mapping.check.report import (
@@ -41,13 +41,13 @@ from cliploc_ros.offline.mapping.check.report import (
     check_keyframes,
     find_measures,
 )
-from cliploc_ros.offline.mapping.evidence import best_ious
+from cliploc_ros.offline.mapping.evidence import BoxQuality, best_ious, explained_boxes
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.systematic import find_corrections
 from cliploc_ros.offline.mapping.tilt import tilt_note
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views
-from cliploc_ros.offline.simulation.detector import DetectorModel, guess_detector
+from cliploc_ros.offline.simulation import DetectorModel, guess_detector
 
 _NOTES = (
     'similarities of crops and labels are simulated, except for queries: labels of equal text '
@@ -90,17 +90,16 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
     recorded = None if detections is None else detections.map_from_camera
     if detections is None:
         notes.append(_NO_RECORDING)
-        model = guess_detector(landmark_map, (options.mapping.edge_sigma_px,
-                                              options.mapping.edge_sigma_share))
+        model = guess_detector(landmark_map)
     else:
         tell('judging landmarks', 0.0)
-        views = make_views(detections, options.mapping)
-        notes += check_input(detections, views, options.mapping)
-        witness = hear_witness(views, landmark_map, detections.class_names, options.mapping)
+        views = make_views(detections)
+        notes += check_input(detections, views)
+        witness = hear_witness(views, landmark_map, detections.class_names)
         if not (witness.shown >= 0).any():
             raise MappingError(_unrelated(landmark_map, detections))
-        models = [measure_detector(landmark_map, detections, views, witness, options.mapping,
-                                   number) for number in range(len(detections.cameras))]
+        models = [measure_detector(landmark_map, detections, views, witness, number)
+                  for number in range(len(detections.cameras))]
         model = models[0]
         if len(models) > 1:
             notes.append(f'the grid has one camera, {detections.camera_names[0]}, the first of '
@@ -114,15 +113,15 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
     overlaps = find_map_overlaps(landmark_map, witness, views)
     places = make_grid(landmark_map, None if detections is None else detections.of_first_camera,
                        options)
-    grid = judge_grid(places, model, try_poses(
-        model, landmark_map, places.poses, options,
+    grid = judge_grid(places, model, _told(
+        each_pose(model, landmark_map, places.poses, options), len(places.poses),
         partial(tell, 'relocalizing on the grid')), options.headings)
     report = CheckReport(
-        landmarks=tuple(check_landmarks(landmark_map, witness, overlaps, options.mapping)),
+        landmarks=tuple(check_landmarks(landmark_map, witness, overlaps)),
         overlaps=tuple(overlaps), look_alikes=tuple(find_look_alikes(landmark_map)),
         grid=grid, recording=recording,
-        queries=tuple(try_observations(landmark_map, queries, options,
-                                       partial(tell, 'relocalizing queries'))),
+        queries=tuple(_told(try_observations(landmark_map, queries, options), len(queries),
+                            partial(tell, 'relocalizing queries'))),
         notes=tuple(notes), map_ids=landmark_map.landmark_ids,
         keyframes=None if layer is None else check_keyframes(layer, grid, recorded))
     tell('done', 1.0)
@@ -140,9 +139,19 @@ def judge_grid(grid: Grid, model: DetectorModel, trials: Sequence[Trial], headin
     trials = trials[:count * headings]
     verdicts = np.array([one.verdict for one in trials]).reshape(count, headings)
     visible = np.array([model.expected_detections(pose) for pose in grid.poses[:len(trials)]])
-    return GridCheck(grid.positions[:count], grid.is_near[:count],
-                     (verdicts == 'accepted').sum(axis=1), (verdicts == 'misled').sum(axis=1),
-                     visible.reshape(count, headings), grid.spacing_m, tuple(trials))
+    return GridCheck(
+        grid.positions[:count], grid.is_near[:count], grid.poses[:len(trials)], grid.spacing_m,
+        (verdicts == 'accepted').sum(axis=1), (verdicts == 'misled').sum(axis=1),
+        visible.reshape(count, headings), tuple(trials))
+
+
+def _told(trials: Iterator[Trial], count: int, tell: Tell) -> list[Trial]:
+    """Return trials, a number of which is expected, and tell the share that is done."""
+    done = []
+    for trial in trials:
+        done.append(trial)
+        tell(len(done) / count)
+    return done
 
 
 def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
@@ -156,22 +165,22 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
         ious = best_ious(views, fold.landmarks)[np.isin(views.frames, fold.frames) & is_known]
         folds.append(fold)
         held_out.append(ious)
-        blocks.append(BlockQuality(len(fold.frames), len(fold.rows), box_quality(ious)))
+        blocks.append(BlockQuality(len(fold.frames), len(fold.rows), BoxQuality.of(ious)))
         tell('cross-validating', len(folds) / options.folds)
     trials = try_recording(landmark_map, detections, witness.shown, folds, options,
                            partial(tell, 'relocalizing recorded frames'), keyframes)
     sampled = sample_frames(detections, options.frames)
-    simulated = [trial for number, model in enumerate(models) for trial in try_poses(
-        model, landmark_map,
-        detections.map_from_camera[sampled[detections.frame_cameras[sampled] == number]], options,
+    own = [sampled[detections.frame_cameras[sampled] == number] for number in range(len(models))]
+    simulated = [trial for model, frames in zip(models, own, strict=True) for trial in _told(
+        each_pose(model, landmark_map, detections.map_from_camera[frames], options), len(frames),
         partial(tell, 'relocalizing simulated frames'))]
     tell('looking for systematic errors', 0.0)
     return RecordingCheck(
         frames=len(detections), boxes=len(detections.classes),
         duration_s=float(detections.stamps_s[-1] - detections.stamps_s[0]),
         path_xyz=detections.map_from_camera[:, :3, 3],
-        as_given=box_quality(best_ious(views, witness.landmarks)),
-        held_out=box_quality(np.concatenate(held_out)), folds=tuple(blocks),
+        as_given=explained_boxes(views, witness.landmarks),
+        held_out=BoxQuality.of(np.concatenate(held_out)), folds=tuple(blocks),
         trials=tuple(trials), simulated=tuple(simulated),
         corrections=tuple(find_corrections(detections, views, witness.fitted, witness.shown)),
         edge_scale=models[0].edge_scale)

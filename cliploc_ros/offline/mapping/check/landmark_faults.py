@@ -15,16 +15,16 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import misspelt_classes
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.doubles import close_pairs, find_doubles
-from cliploc_ros.offline.mapping.evidence import Evidence, gather_evidence
-from cliploc_ros.offline.mapping.fitting import fit_landmarks
-from cliploc_ros.offline.mapping.landmarks import (
-    Landmarks,
-    classes_of,
-    group_boxes,
-    landmarks_of_map,
+from cliploc_ros.offline.mapping.evidence import (
+    MAX_SIGMA_SHARE,
+    MIN_MEDIAN_IOU,
+    Evidence,
+    gather_evidence,
+    look_for,
 )
+from cliploc_ros.offline.mapping.fitting import fit_landmarks
+from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of, landmarks_of_map
 from cliploc_ros.offline.mapping.options import MappingOptions
-from cliploc_ros.offline.mapping.update.sight import look_for
 from cliploc_ros.offline.mapping.views import Views
 from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
 
@@ -49,7 +49,7 @@ class Overlap(NamedTuple):
     is_duplicate: bool
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LandmarkCheck:
     """What is known of one landmark. Values that nothing tells are None."""
 
@@ -58,15 +58,16 @@ class LandmarkCheck:
     class_id: str
     center: tuple[float, float, float]  #: [m]
     #: Frames that show it, and frames that should
-    support: int | None
-    expected: int | None
-    seen_ratio: float | None  #: Share of the latter in which it was detected
+    support: int | None = None
+    expected: int | None = None
+    seen_ratio: float | None = None  #: Share of the latter in which it was detected
     #: Greatest angle between two directions from which it was seen [deg]
-    baseline_deg: float | None
-    position_sigma_m: float | None  #: Standard deviation of its centre on the worst axis [m]
+    baseline_deg: float | None = None
+    #: Standard deviation of its centre on the worst axis [m]
+    position_sigma_m: float | None = None
     #: From its centre to where its boxes put it [m]; None where they may put it anywhere
-    offset_m: float | None
-    median_iou: float | None  #: Of its boxes
+    offset_m: float | None = None
+    median_iou: float | None = None  #: Of its boxes
     thinness: float  #: Least semi-axis divided by the greatest one
     #: Landmarks that lie in it, and their normalized distances
     overlaps: tuple[tuple[str, float], ...]
@@ -88,16 +89,15 @@ class Witness(NamedTuple):
     fitted_sigmas: NDArray[np.float64]  #: (L,): deviations of these centres [m]
 
 
-def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str, ...],
-                 options: MappingOptions) -> Witness:
+def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str, ...]) -> Witness:
     """Return what a recording says of a map."""
     landmarks = landmarks_of_map(landmark_map, class_names)
-    shown = associate(views, landmarks, options.association_iou)
+    shown = associate(views, landmarks)
     evidence = gather_evidence(views, landmarks, shown)
     # a landmark that nothing shows may be hidden
     sight = look_for(views, landmarks, shown, np.ones(len(landmarks.centers), dtype=np.bool_))
     expected = np.where(evidence.support == 0, sight.expected_frames, evidence.expected)
-    fitted = fit_landmarks(views, landmarks, group_boxes(shown, len(landmarks.centers)))
+    fitted = fit_landmarks(views, landmarks, shown)
     return Witness(class_names, landmarks, shown, evidence, expected, fitted,
                    gather_evidence(views, fitted, shown).position_sigma)
 
@@ -117,10 +117,10 @@ def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views:
 
 
 def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
-                    overlaps: list[Overlap], options: MappingOptions) -> list[LandmarkCheck]:
+                    overlaps: list[Overlap]) -> list[LandmarkCheck]:
     """Return each landmark's check, the worst first; among equals, the least seen first.
 
-    Without a recording, support comes from the map's own fields. The options have the limits.
+    Without a recording, support comes from the map's own fields.
     """
     ids, classes = landmark_map.landmark_ids, landmark_map.class_ids
     partners: list[list[tuple[int, Overlap]]] = [[] for _ in ids]
@@ -137,8 +137,8 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
         semi_axes = landmark_map.semi_axes[row]
         x, y, z = landmark_map.centers[row].tolist()
         check = LandmarkCheck(
-            ids[row], landmark_map.labels[row], classes[row], (x, y, z),
-            **_support(landmark_map, row, witness),
+            landmark_id=ids[row], label=landmark_map.labels[row], class_id=classes[row],
+            center=(x, y, z), **_support(landmark_map, row, witness),
             thinness=float(semi_axes.min() / semi_axes.max()),
             overlaps=tuple((ids[other], one.distance) for other, one in others))
         faults = [(1.5, f'is the same object as {ids[other]}: delete one of them')
@@ -149,7 +149,7 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
                           (1.6, f"has the class '{classes[row]}', which the detector does not "
                                 f'have{hint}: correct its class_id'))
         if not faults:
-            faults += _support_faults(check, float(np.linalg.norm(semi_axes)), options)
+            faults += _support_faults(check, float(np.linalg.norm(semi_axes)))
         faults += [(0.4, f'lies in {ids[other]} of class {classes[other]}: one object under two '
                          'classes, or one on the other; keep one if it is one object')
                    for other, one in others if witness is None and not one.is_duplicate]
@@ -193,29 +193,24 @@ def _class_of_label(label: str, class_id: str, by_words: Mapping[tuple[str, ...]
 
 def _support(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> dict[str, Any]:
     """Return the numbers of a landmark's support: from a recording, or from the map itself."""
-    names = ('support', 'expected', 'seen_ratio', 'baseline_deg', 'position_sigma_m', 'offset_m',
-             'median_iou')
     if witness is None:
         given = landmark_map.details[row] if landmark_map.details else LandmarkDetails()
-        values: tuple[Any, ...] = (
-            given.support, None, given.seen_ratio, given.baseline_deg, given.position_sigma, None,
-            None)
-    elif (support := int(witness.evidence.support[row])) == 0:
-        expected = int(witness.expected[row])
-        values = (0, expected, 0.0 if expected else None, None, None, None, None)
-    else:
-        evidence = witness.evidence
-        offset = float(np.linalg.norm(witness.fitted.centers[row]
-                                      - witness.landmarks.centers[row]))
-        is_told = offset > _OFFSET_SIGMAS * witness.fitted_sigmas[row] or offset < _MIN_OFFSET_M
-        values = (support, int(witness.expected[row]), float(evidence.seen_ratio[row]),
-                  float(evidence.baseline_deg[row]), float(evidence.position_sigma[row]),
-                  offset if is_told else None, float(evidence.median_iou[row]))
-    return dict(zip(names, values, strict=True))
+        return {'support': given.support, 'seen_ratio': given.seen_ratio,
+                'baseline_deg': given.baseline_deg, 'position_sigma_m': given.position_sigma}
+    evidence, expected = witness.evidence, int(witness.expected[row])
+    if evidence.support[row] == 0:
+        return {'support': 0, 'expected': expected, 'seen_ratio': 0.0 if expected else None}
+    offset = float(np.linalg.norm(witness.fitted.centers[row] - witness.landmarks.centers[row]))
+    is_told = offset > _OFFSET_SIGMAS * witness.fitted_sigmas[row] or offset < _MIN_OFFSET_M
+    return {'support': int(evidence.support[row]), 'expected': expected,
+            'seen_ratio': float(evidence.seen_ratio[row]),
+            'baseline_deg': float(evidence.baseline_deg[row]),
+            'position_sigma_m': float(evidence.position_sigma[row]),
+            'offset_m': offset if is_told else None,
+            'median_iou': float(evidence.median_iou[row])}
 
 
-def _support_faults(check: LandmarkCheck, size_m: float, options: MappingOptions
-                    ) -> list[tuple[float, str]]:
+def _support_faults(check: LandmarkCheck, size_m: float) -> list[tuple[float, str]]:
     """Return the faults of a landmark's support, with a weight each."""
     support, expected, ratio = check.support, check.expected, check.seen_ratio
     if support == 0:
@@ -224,25 +219,25 @@ def _support_faults(check: LandmarkCheck, size_m: float, options: MappingOptions
         return [(1.4, f'is never detected, although {expected} frames should show it: delete it '
                       'if it is gone, or map again')]
     faults = []
-    if support is not None and support < options.min_viewpoints:
+    if support is not None and support < MappingOptions.min_viewpoints:
         frames = 'frame' if support == 1 else 'frames'
         faults.append((1.1, f'was seen in {support} {frames}: record it from more sides'))
-    if ratio is not None and ratio < options.min_seen_ratio:
+    if ratio is not None and ratio < MappingOptions.min_seen_ratio:
         faults.append((1.2, f'is detected in {ratio:.1%} of the frames that should show it: '
                             'delete it if it has moved, or is hard to detect'))
     iou, baseline, sigma = check.median_iou, check.baseline_deg, check.position_sigma_m
-    if iou is not None and iou < options.min_median_iou:
+    if iou is not None and iou < MIN_MEDIAN_IOU:
         faults.append((1.2, f'does not fit its boxes (median IoU {iou:.2f}), as if it had moved '
                             'or were two objects: delete it or map again'))
-    if baseline is not None and baseline < options.min_baseline_deg:
+    if baseline is not None and baseline < MappingOptions.min_baseline_deg:
         faults.append((0.7, f'was seen from one side only, {baseline:.0f} degrees wide: record it '
                             'from another side'))
     if (offset := check.offset_m) is not None and offset > max(
             _MIN_OFFSET_M, _OFFSET_SHARE * size_m, _OFFSET_SIGMAS * (sigma or 0.0)):
         faults.append((1.1, f'is {offset * 100:.0f} cm away from where its boxes put it: delete '
                             'it or map again'))
-    if sigma is not None and sigma > max(options.max_position_sigma_m,
-                                         options.max_position_sigma_share * size_m):
+    if sigma is not None and sigma > max(MappingOptions.max_position_sigma_m,
+                                         MAX_SIGMA_SHARE * size_m):
         faults.append((0.7, f'may be {sigma * 100:.0f} cm off (standard deviation): record it '
                             'from more sides'))
     return faults

@@ -3,7 +3,6 @@
 """The places of a map: a grid of camera positions, and pairs of places that look alike."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +28,8 @@ RADIUS_M = 2.0
 _LEAST_SHARE = 0.6
 
 
-class Grid(NamedTuple):
+@dataclass(frozen=True)
+class Grid:
     """P positions with H headings each."""
 
     positions: NDArray[np.float64]  #: (P, 3): [m]

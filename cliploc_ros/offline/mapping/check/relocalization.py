@@ -26,15 +26,18 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.offline.mapping.check.landmark_faults import Witness
-from cliploc_ros.offline.mapping.evidence import REACH, best_ious, explained, is_expected
-from cliploc_ros.offline.mapping.fitting import fit_landmarks
-from cliploc_ros.offline.mapping.landmarks import Landmarks, ellipsoid_numbers, group_boxes
+from cliploc_ros.offline.mapping.evidence import MIN_MEDIAN_IOU, REACH, best_ious, is_expected
+from cliploc_ros.offline.mapping.fitting import fit_landmarks, linearize_boxes
+from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes
 from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.mapping.systematic import linearize_boxes
-from cliploc_ros.offline.mapping.views import Views, camera_centers
-from cliploc_ros.offline.simulation.detector import GUESSED_MIN_SIDE_PX, DetectorModel, Sightings
-from cliploc_ros.offline.simulation.labels import LabelModel
+from cliploc_ros.offline.mapping.views import Views
+from cliploc_ros.offline.simulation import (
+    GUESSED_MIN_SIDE_PX,
+    DetectorModel,
+    LabelModel,
+    Sightings,
+)
 
 _MAX_SAMPLED_FRAMES = 600
 _CLUTTER_IOU = 0.1
@@ -75,16 +78,6 @@ class RecordedKeyframes(NamedTuple):
             detections.camera_of(frame))
 
 
-@dataclass(frozen=True)
-class BoxQuality:
-    """How well landmarks explain boxes."""
-
-    boxes: int
-    #: Share of the boxes that a landmark of their class overlaps by more than an IoU of 0.3
-    explained: float
-    median_iou: float  #: Of these
-
-
 def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterator[Fold]:
     """Return the folds of a recording, each with the map as the others show it.
 
@@ -92,13 +85,12 @@ def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterato
     fitted again, to the boxes outside of the fold; it is left out if they are too few. A landmark
     that does not fit its boxes, or has none, stays as it is: a robot would use it as it is.
     """
-    stamps_s, mapping = views.stamps_s, options.mapping
+    stamps_s = views.stamps_s
     elapsed = stamps_s - stamps_s[0]
     block_s = min(options.block_s, max(float(elapsed[-1]), 1e-9) / options.folds)
     of_frames = (elapsed / block_s).astype(np.int64) % options.folds
     gap_s = min(options.gap_s, 0.25 * float(elapsed[-1]) / options.folds)
-    fits = witness.evidence.median_iou >= mapping.min_median_iou
-    all_boxes = group_boxes(witness.shown, len(fits))
+    fits = witness.evidence.median_iou >= MIN_MEDIAN_IOU
     for number in range(options.folds):
         judged = np.nonzero(of_frames == number)[0]
         if len(judged) == 0:
@@ -109,30 +101,22 @@ def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterato
         nearest = np.minimum(np.abs(times[after] - stamps_s),
                              np.abs(times[(after - 1).clip(0)] - stamps_s))
         training = nearest > gap_s
-        kept, boxes = np.ones(len(fits), dtype=np.bool_), []
-        for row, rows in enumerate(all_boxes):
-            rows = rows[training[views.frames[rows]] & fits[row]]
-            if fits[row]:
-                seen_from = np.unique(views.viewpoints[views.frames[rows]])
-                kept[row] = len(seen_from) >= mapping.min_viewpoints
-            boxes.append(rows if kept[row] else rows[:0])
-        yield Fold(judged, np.nonzero(kept)[0],
-                   fit_landmarks(views, witness.landmarks, boxes).select(kept), training)
-
-
-def box_quality(ious: NDArray[np.float64]) -> BoxQuality:
-    """Return how well landmarks explain boxes, by the best IoU of each with one of its class."""
-    return BoxQuality(len(ious), *explained(ious))
+        shown = np.where(training[views.frames], witness.shown, -1)
+        is_enough = np.array([len(np.unique(views.viewpoints[views.frames[rows]]))
+                              for rows in group_boxes(shown, len(fits))]
+                             ) >= MappingOptions.min_viewpoints
+        fitted = fit_landmarks(views, witness.landmarks, shown, among=fits & is_enough)
+        kept = is_enough | ~fits
+        yield Fold(judged, np.nonzero(kept)[0], fitted.select(kept), training)
 
 
 def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
-                     witness: Witness, options: MappingOptions, camera: int = 0
-                     ) -> DetectorModel:
+                     witness: Witness, camera: int = 0) -> DetectorModel:
     """Return the detector of a recording, on the images of one of its cameras.
 
     A landmark that was never detected does not exist: the model never detects it.
     """
-    landmarks, cameras = witness.landmarks, camera_centers(views)
+    landmarks, cameras = witness.landmarks, views.centers
     frames = detections.every(-(-len(detections) // _MAX_SAMPLED_FRAMES))
     reach, sightings = np.zeros(len(landmark_map)), []
     for row, rows in enumerate(group_boxes(witness.shown, len(landmark_map))):
@@ -158,13 +142,12 @@ def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, vie
             *detections.frame_offsets[frame:frame + 2])])[0])
         clutter.append((unknown.bboxes_xyxy, unknown.class_ids))
     # the robust deviation of closed edges, in standard deviations
-    rows = np.nonzero(witness.shown >= 0)[0]
-    linear = linearize_boxes(views, rows, witness.shown[rows], landmarks)
+    linear = linearize_boxes(views, witness.shown, landmarks)
     residuals = np.abs(linear.residuals[linear.weights > 0.0])
     scale = float(np.clip(1.4826 * np.median(residuals), 0.3, 5.0)) if len(residuals) else 1.0
     return DetectorModel(
         landmark_map, detections.cameras[camera], tuple(sightings), witness.evidence.seen_ratio,
-        reach, (options.edge_sigma_px, options.edge_sigma_share), scale, min_side, tuple(clutter))
+        reach, scale, min_side, tuple(clutter))
 
 
 class PosedObservation(NamedTuple):
@@ -230,40 +213,36 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
     taken_at = None if keyframes is None else _frames_of(keyframes.layer, detections)
     trials: list[Trial] = []
     for fold in folds:
-        frames = [frame for frame in fold.frames.tolist() if frame in chosen]
-        if not frames:
-            continue
-        relocalizer = None
+        relocalizer = localizer = None
         if len(fold.rows):
-            semi_axes, quats_xyzw = ellipsoid_numbers(fold.landmarks.bases)
+            semi_axes, quats_xyzw = fold.landmarks.axes_and_quats()
             relocalizer = make_relocalizer(replace(
                 landmark_map.select(fold.rows.tolist()), centers=fold.landmarks.centers,
                 semi_axes=semi_axes, quats_xyzw=quats_xyzw), options)
-        localizer = None
         if keyframes is not None and fold.training[taken_at].any():
             localizer = KeyframeLocalizer(keyframes.layer.select(fold.training[taken_at]))
-        for frame in frames:
-            observation = simulated(detections, frame, shown, labels, options.random_seed)
-            seen = shown[slice(*detections.frame_offsets[frame:frame + 2])]
-            pose, stamp_s = detections.map_from_camera[frame], float(detections.stamps_s[frame])
+        for frame in filter(chosen.__contains__, fold.frames.tolist()):
             tell((len(trials) + 1) / len(chosen))
-            known = int(np.isin(seen, fold.rows).sum())
-            is_judged = known >= min(LANDMARKS_FOR_A_POSE, int((seen >= 0).sum()))
+            seen = shown[slice(*detections.frame_offsets[frame:frame + 2])]
+            count, known = int((seen >= 0).sum()), int(np.isin(seen, fold.rows).sum())
+            is_judged = known >= min(LANDMARKS_FOR_A_POSE, count)
+            pose, stamp_s = detections.map_from_camera[frame], float(detections.stamps_s[frame])
             if relocalizer is None:
                 trials.append(Trial('refused', pose[:3, 3], pose[:3, 2], len(seen), 0, None,
                                     None, 'the other parts show no landmark', stamp_s,
                                     is_judged=is_judged))
                 continue
+            observation = simulated(detections, frame, shown, labels, options.random_seed)
             judge = partial(try_view, relocalizer, replace(
                 observation, similarities=np.asarray(observation.similarities)[:, fold.rows]),
-                pose, int((seen >= 0).sum()), options, stamp_s)
-            trial = replace(judge(), is_judged=is_judged)
+                pose, count, options, stamp_s)
+            trial = judge()
             if (localizer is not None and keyframes is not None
                     and (image := keyframes.image_of(frame)) is not None):
-                both = judge(ImageRecognizer(localizer, query_features(image),
-                                             observation.camera))
-                trial = replace(both, by_objects=trial.verdict, is_judged=is_judged)
-            trials.append(trial)
+                trial = replace(judge(ImageRecognizer(
+                    localizer, query_features(image), observation.camera)),
+                    by_objects=trial.verdict)
+            trials.append(replace(trial, is_judged=is_judged))
     return sorted(trials, key=lambda one: one.stamp_s or 0.0)
 
 
@@ -279,16 +258,6 @@ def sample_frames(detections: PosedDetections, limit: int) -> NDArray[np.int64]:
     count = len(detections)
     step = max(1, -(-count // limit))
     return detections.every(step, min(step // 2, count - 1))
-
-
-def try_poses(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np.float64],
-              options: CheckOptions, tell: Tell) -> list[Trial]:
-    """Relocalize simulated frames, see each_pose; tell is told the share that is done."""
-    trials = []
-    for trial in each_pose(model, landmark_map, poses, options):
-        trials.append(trial)
-        tell(len(trials) / len(poses))
-    return trials
 
 
 def each_pose(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np.float64],
@@ -309,14 +278,11 @@ def each_pose(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np
 
 
 def try_observations(landmark_map: LandmarkMap, observations: Sequence[PosedObservation],
-                     options: CheckOptions, tell: Tell) -> list[Trial]:
-    """Relocalize observations with recorded similarities."""
+                     options: CheckOptions) -> Iterator[Trial]:
+    """Relocalize observations with recorded similarities, one at each step."""
     relocalizer = make_relocalizer(landmark_map, options)
-    trials = []
-    for number, (one, pose, stamp_s) in enumerate(observations, start=1):
-        trials.append(try_view(relocalizer, one, pose, len(one.detections), options, stamp_s))
-        tell(number / len(observations))
-    return trials
+    for one, pose, stamp_s in observations:
+        yield try_view(relocalizer, one, pose, len(one.detections), options, stamp_s)
 
 
 def count_verdicts(trials: Sequence[Trial]) -> dict[str, int]:

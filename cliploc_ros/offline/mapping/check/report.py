@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import NEAR_DEG, NEAR_M
 from cliploc_ros.offline.mapping.check.landmark_faults import LandmarkCheck, Overlap
-from cliploc_ros.offline.mapping.check.places import LookAlike
+from cliploc_ros.offline.mapping.check.places import Grid, LookAlike
 from cliploc_ros.offline.mapping.check.relocalization import (
     LANDMARKS_FOR_A_POSE,
-    BoxQuality,
     Trial,
     count_verdicts,
 )
+from cliploc_ros.offline.mapping.evidence import BoxQuality
 from cliploc_ros.offline.mapping.options import Thresholds
 from cliploc_ros.offline.mapping.systematic import Correction
 
@@ -114,17 +114,14 @@ class RecordingCheck:
 
 
 @dataclass(frozen=True)
-class GridCheck:
+class GridCheck(Grid):
     """Relocalization over a grid of camera positions."""
 
-    positions: NDArray[np.float64]  #: (P, 3): [m]
-    is_near: NDArray[np.bool_]  #: (P,): the recording passed near; without a recording, all
     #: (P,): headings of each position in which a right, and a wrong pose is accepted
     accepted: NDArray[np.int64]
     misled: NDArray[np.int64]
     #: (P, H): how many landmarks the detector finds on average, by heading
     visible: NDArray[np.float64]
-    spacing_m: float
     trials: tuple[Trial, ...]  #: Heading by heading of each position
 
     @property
@@ -153,8 +150,8 @@ class GridCheck:
                 {'x_y_z': row, 'near_recording': bool(near), 'accepted': int(accepted),
                  'misled': int(misled), 'expected_detections': visible.round(2).tolist()}
                 for row, near, accepted, misled, visible in zip(
-                    self.positions.round(3).tolist(), self.is_near, self.accepted, self.misled,
-                    self.visible, strict=True)],
+                    self.positions.round(3).tolist(), self.is_near, self.accepted,
+                    self.misled, self.visible, strict=True)],
             'misled': [one.as_dict() for one in self.trials if one.verdict == 'misled']}
 
 
@@ -167,18 +164,17 @@ class KeyframeCheck:
     #: (F,): recorded frames within reach of a keyframe; empty without a recording
     recorded: NDArray[np.bool_]
     headings: NDArray[np.int64]  #: (P,): headings of each grid position within reach
-    positions: NDArray[np.float64]  #: (P, 3): of the grid [m]
-    is_near: NDArray[np.bool_]  #: (P,): see GridCheck
+    grid: Grid
 
     @property
     def without(self) -> NDArray[np.int64]:
         """Return the rows of the grid positions near the recording that no keyframe reaches."""
-        return np.nonzero(self.is_near & (self.headings == 0))[0]
+        return np.nonzero(self.grid.is_near & (self.headings == 0))[0]
 
     @property
     def reached_positions(self) -> float:
         """Return the share of the grid positions near the recording with a heading in reach."""
-        near = int(self.is_near.sum())
+        near = int(self.grid.is_near.sum())
         return 1.0 - len(self.without) / near if near else 0.0
 
     def as_dict(self) -> dict[str, Any]:
@@ -188,7 +184,7 @@ class KeyframeCheck:
             'recorded_frames_in_reach': float(self.recorded.mean()) if len(self.recorded)
             else None,
             'positions_in_reach_near_recording': self.reached_positions,
-            'positions_without': self.positions[self.without].round(3).tolist()}
+            'positions_without': self.grid.positions[self.without].round(3).tolist()}
 
 
 @dataclass(frozen=True)
@@ -284,33 +280,28 @@ class CheckReport:
 
 def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
     """Return the figures of a report that have a threshold."""
-    measures: list[Measure] = []
-
-    def demand(*numbers: Any) -> None:
-        measures.append(Measure(*numbers))
-
-    views = [*report.grid.trials, *report.queries]
-    demand('landmarks with a serious fault', report.faulty, limits.max_faulty, True)
-    demand('pairs of duplicates', report.duplicates, limits.max_duplicates, True, 'count')
-    demand('pairs of places that look alike', len(report.look_alikes), limits.max_look_alikes,
-           True, 'count')
-    if (recording := report.recording) is not None:
+    views, recording = [*report.grid.trials, *report.queries], report.recording
+    measures = [
+        Measure('landmarks with a serious fault', report.faulty, limits.max_faulty, True),
+        Measure('pairs of duplicates', report.duplicates, limits.max_duplicates, True, 'count'),
+        Measure('pairs of places that look alike', len(report.look_alikes),
+                limits.max_look_alikes, True, 'count')]
+    if recording is not None:
         views += recording.trials
         if recording.can_judge_boxes:
-            demand('held-out boxes explained', recording.held_out.explained,
-                   limits.min_explained, False)
-            demand('held-out median IoU', recording.held_out.median_iou, limits.min_iou, False,
-                   'number')
-        if recording.can_judge_frames:
-            demand(f'recorded frames accepted {report.evidence}',
-                   share(recording.judged, 'accepted'), limits.min_accepted, False)
-        else:  # a map of a walk that passes each object once
-            demand('recorded frames accepted with simulated boxes',
-                   share(recording.simulated, 'accepted'), limits.min_accepted, False)
-    demand(f'positions with a heading accepted {report.evidence}', report.accepted_positions,
-           limits.min_positions, False)
-    demand('views that mislead a robot', share(views, 'misled'), limits.max_misled, True)
-    return measures
+            measures += [Measure('held-out boxes explained', recording.held_out.explained,
+                                 limits.min_explained, False),
+                         Measure('held-out median IoU', recording.held_out.median_iou,
+                                 limits.min_iou, False, 'number')]
+        # the second one: a map of a walk that passes each object once
+        how, trials = ((report.evidence, recording.judged) if recording.can_judge_frames else
+                       ('with simulated boxes', recording.simulated))
+        measures.append(Measure(f'recorded frames accepted {how}', share(trials, 'accepted'),
+                                limits.min_accepted, False))
+    return [*measures,
+            Measure(f'positions with a heading accepted {report.evidence}',
+                    report.accepted_positions, limits.min_positions, False),
+            Measure('views that mislead a robot', share(views, 'misled'), limits.max_misled, True)]
 
 
 def _percent(value: float, digits: int) -> str:
@@ -320,8 +311,7 @@ def _percent(value: float, digits: int) -> str:
 
 def count_by_objects(trials: Sequence[Trial]) -> dict[str, int]:
     """Return how many trials are accepted, refused and misled without keyframes."""
-    return count_verdicts([replace(one, verdict=one.by_objects or one.verdict)
-                           for one in trials])
+    return count_verdicts([replace(one, verdict=one.by_objects or one.verdict) for one in trials])
 
 
 def share(trials: Sequence[Trial], verdict: str) -> float:
@@ -337,7 +327,7 @@ def check_keyframes(layer: KeyframeLayer, grid: GridCheck,
                        np.array([one.forward for one in grid.trials]))
     return KeyframeCheck(
         len(layer), int(layer.offsets[-1]), in_reach(layer, poses[:, :3, 3], poses[:, :3, 2]),
-        reached.reshape(-1, grid.headings).sum(axis=1), grid.positions, grid.is_near)
+        reached.reshape(grid.visible.shape).sum(axis=1), grid)
 
 
 def in_reach(layer: KeyframeLayer, positions: NDArray[np.float64],

@@ -6,6 +6,7 @@ The recording may have a coordinate frame of its own, a little off, and its pose
 they may come from the relocalizer. The landmarks that are still in their places tell both.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,19 +17,14 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.ellipsoid import normalized_lengths
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.mapping.association import associate
+from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU, associate
+from cliploc_ros.offline.mapping.building import REFINEMENTS
 from cliploc_ros.offline.mapping.fitting import fit_ellipsoid
 from cliploc_ros.offline.mapping.joint import Anchors, pose_changes, pose_errors, refine_jointly
-from cliploc_ros.offline.mapping.landmarks import (
-    Landmarks,
-    group_boxes,
-    join_landmarks,
-    landmarks_of_map,
-    no_landmarks,
-)
+from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.pose_noise import significant_pose_errors
-from cliploc_ros.offline.mapping.views import Views, camera_from_map, map_from_cameras
+from cliploc_ros.offline.mapping.views import Views
 
 # A position is known no better than this [m]: objects are no ellipsoids. A guess.
 _LEAST_SIGMA_M = 0.01
@@ -57,28 +53,14 @@ _MEDIAN_LENGTH, _SIGNIFICANT = 1.54, 22.5
 class OldMap(NamedTuple):
     """L landmarks of the old map as the recording's classes name them."""
 
+    map: LandmarkMap  #: With details of each landmark
     landmarks: Landmarks  #: Class -1: no box of the recording has a class of this landmark
     sigmas: NDArray[np.float64]  #: (L,): deviations of the centres [m]
-    details: tuple[LandmarkDetails, ...]
-    landmark_ids: tuple[str, ...]
-    class_ids: tuple[str, ...]
 
     @property
     def names(self) -> set[tuple[int, int]]:
         """Return all pairs of a landmark and one of its classes."""
         return {(row, name) for row, name in self.landmarks.names.tolist()}
-
-    def shown(self, views: Views, min_iou: float, is_gone: NDArray[np.bool_] | None = None,
-              others: Landmarks | None = None) -> NDArray[np.int64]:
-        """Return the old landmark (n,) that each box shows, or L + the other one; -1 for none.
-
-        Those that are gone (L,) have none.
-        """
-        kept = np.ones(len(self.sigmas), dtype=np.bool_) if is_gone is None else ~is_gone
-        others = others or no_landmarks()
-        rows = np.concatenate([np.nonzero(kept)[0],
-                               len(kept) + np.arange(len(others.centers)), [-1]])
-        return rows[associate(views, join_landmarks(self.landmarks.select(kept), others), min_iou)]
 
 
 def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...]) -> OldMap:
@@ -86,8 +68,8 @@ def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...]) -> OldMap:
     details = old.details or (LandmarkDetails(),) * len(old)
     sigmas = np.array([_UNKNOWN_SIGMA_M if one.position_sigma is None
                        else one.position_sigma for one in details])
-    return OldMap(landmarks_of_map(old, class_names), np.maximum(sigmas, _LEAST_SIGMA_M), details,
-                  old.landmark_ids, old.class_ids)
+    return OldMap(replace(old, details=details), landmarks_of_map(old, class_names),
+                  np.maximum(sigmas, _LEAST_SIGMA_M))
 
 
 class Refits(NamedTuple):
@@ -147,14 +129,12 @@ def align(given: Views, known: OldMap, options: MappingOptions) -> Aligned:
     """Return the views with poses in the coordinate frame of the old map."""
     views, total = given, np.eye(4)
     for number in range(_ROUNDS):
-        min_iou = options.association_iou if number else _LOOSE_IOU
-        found = refit(views, known.landmarks, known.shown(views, min_iou),
-                      options.min_viewpoints)
+        shown = associate(views, known.landmarks, ASSOCIATION_IOU if number else _LOOSE_IOU)
+        found = refit(views, known.landmarks, shown, options.min_viewpoints)
         if np.count_nonzero(found.is_known) < MIN_CONFIRMED:
             break
         step = _offset(known, found)
-        rotations, translations = camera_from_map(step @ map_from_cameras(views))
-        views = views._replace(rotations=rotations, translations=translations)
+        views = views.with_poses(step @ views.poses)
         total = step @ total
         middle = known.landmarks.centers[found.is_known].mean(axis=0)
         if np.linalg.norm(step[:3, :3] @ middle + step[:3, 3] - middle) < _SETTLED_M:
@@ -164,7 +144,7 @@ def align(given: Views, known: OldMap, options: MappingOptions) -> Aligned:
     offset_deg = float(np.degrees(Rotation.from_matrix(total[:3, :3]).magnitude()))
     errors, estimated = options.pose_errors, None
     if errors is None and options.estimate_pose_errors:
-        shown = known.shown(views, options.association_iou)
+        shown = associate(views, known.landmarks)
         found = refit(views, known.landmarks, shown, options.min_viewpoints)
         errors = estimated = significant_pose_errors(views, found.landmarks, shown)
     refined = views if errors is None else _refine(views, known, errors, options)
@@ -202,8 +182,8 @@ def _refine(aligned: Views, known: OldMap, errors: PoseErrors, options: MappingO
     """Return the views with poses refined against the old landmarks that are in their place."""
     views = aligned
     anchors = Anchors(known.landmarks.centers, known.sigmas)
-    for _ in range(options.refinements):
-        shown = known.shown(views, options.association_iou)
+    for _ in range(REFINEMENTS):
+        shown = associate(views, known.landmarks)
         found = refit(views, known.landmarks, shown, options.min_viewpoints)
         away = has_moved(known.landmarks, known.sigmas, found)
         shown[np.isin(shown, np.nonzero(away)[0])] = -1
@@ -226,8 +206,7 @@ def has_moved(old: Landmarks, sigmas: NDArray[np.float64], found: Refits) -> NDA
     return far
 
 
-def deviations(old: Landmarks, sigmas: NDArray[np.float64], found: Refits
-               ) -> NDArray[np.float64]:
+def deviations(old: Landmarks, sigmas: NDArray[np.float64], found: Refits) -> NDArray[np.float64]:
     """Return by how many standard deviations (L,) old and new positions of landmarks differ."""
     covariances = found.covariances + np.square(sigmas)[:, None, None] * np.eye(3)
     return normalized_lengths(found.landmarks.centers - old.centers, covariances)

@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, concatenated
 from cliploc_ros.offline.mapping.labelling import embed_landmarks
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.update.alignment import OldMap, has_moved
@@ -126,15 +126,11 @@ def renew_embeddings(old: LandmarkEmbeddings | None, landmark_ids: Sequence[str]
         return seen
     if why_not_comparable(kept, detections):
         return kept
-    ids = np.array(landmark_ids)
-    first, second = kept.in_order(ids[kept.is_known].tolist()), seen.in_order(
-        ids[~kept.is_known].tolist())
-    return LandmarkEmbeddings(
-        kept.encoder_key, first.landmark_ids + second.landmark_ids,
-        np.concatenate([first.means, second.means]),
-        np.concatenate([first.medoids, second.medoids]),
-        np.concatenate([first.medoid_offsets, len(first.medoids) + second.medoid_offsets[1:]])
-    ).in_order(landmark_ids)
+    known = dict(zip(landmark_ids, kept.is_known.tolist(), strict=True))
+    parts = [one.in_order([name for name in landmark_ids if known[name] == is_known])
+             for one, is_known in ((kept, True), (seen, False))]
+    return concatenated(parts, parts[0].landmark_ids + parts[1].landmark_ids).in_order(
+        landmark_ids)
 
 
 class _LookModel(NamedTuple):

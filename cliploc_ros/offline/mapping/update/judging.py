@@ -14,17 +14,11 @@ from numpy.typing import NDArray
 from scipy.special import betaln, expit
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.offline.mapping.association import find_overlaps
+from cliploc_ros.offline.mapping.association import associate, find_overlaps
 from cliploc_ros.offline.mapping.building import LeftOut, NothingFoundError, build_map, rounded
 from cliploc_ros.offline.mapping.doubles import Relation, close_pairs, relation
-from cliploc_ros.offline.mapping.evidence import gather_evidence
-from cliploc_ros.offline.mapping.landmarks import (
-    Landmarks,
-    group_boxes,
-    join_landmarks,
-    landmarks_of_map,
-    no_landmarks,
-)
+from cliploc_ros.offline.mapping.evidence import MIN_MEDIAN_IOU, Sight, gather_evidence, look_for
+from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.pose_noise import left_by_poses
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
@@ -36,8 +30,7 @@ from cliploc_ros.offline.mapping.update.alignment import (
     has_moved,
     refit,
 )
-from cliploc_ros.offline.mapping.update.sight import Sight, look_for
-from cliploc_ros.offline.mapping.views import Views, map_from_cameras
+from cliploc_ros.offline.mapping.views import Views
 
 # A recording in which objects are seen less or more often than before changes all ratios.
 _FACTOR_RANGE = (0.3, 2.0)
@@ -107,18 +100,18 @@ def judge(detections: PosedDetections, views: Views, known: OldMap, options: Map
     The views have poses in the coordinate frame of the map.
     """
     count = len(known.landmarks.centers)
-    finds = _find_new(detections, views, _free(views, known, options), options)
+    finds = _find_new(detections, views, _free(views, known), options)
     # old landmarks and finds compete for the boxes: an old one may have those of a neighbour
-    shown, _ = _look(views, known, finds, np.zeros(count, dtype=np.bool_), options)
+    shown, _ = _look(views, known, finds, np.zeros(count, dtype=np.bool_))
     refits = refit(views, known.landmarks, np.where(shown < count, shown, -1),
                    options.min_viewpoints)
     displaced = has_moved(known.landmarks, known.sigmas, refits)
-    finds = _with_displaced(finds, refits, displaced, known.class_ids)
-    shown, sight = _look(views, known, finds, displaced, options)
+    finds = _with_displaced(finds, refits, displaced, known.map.class_ids)
+    shown, sight = _look(views, known, finds, displaced)
     is_gone = displaced | _is_absent(known, sight.select(slice(count)), _GONE_BELOW)
     # a new object may be in the place of an old one of which a wrong box remains
     finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 1.0)
-    _, sight = _look(views, known, finds, is_gone, options)
+    _, sight = _look(views, known, finds, is_gone)
     # finds are seen about as often as the old landmarks, which come first
     ratios = sight.seen_ratio[:count][sight.seen[:count] > 0]
     usual = float(np.median(ratios)) if len(ratios) else 1.0
@@ -128,27 +121,26 @@ def judge(detections: PosedDetections, views: Views, known: OldMap, options: Map
         f'place, not {100 * least:.1f} %, {_MIN_NEW_SHARE:g} of what is usual'
         for ratio in sight.seen_ratio[count:]], sight)
     # new objects hide old places
-    shown, sight = _look(views, known, finds, is_gone, options)
+    shown, sight = _look(views, known, finds, is_gone)
     # an old landmark is hardly there if a find with more boxes is in its place
-    of_old, of_new = _boxes(shown, count, finds)
+    boxes = np.bincount(shown[shown >= 0], minlength=count + len(finds.details))
     limits = np.full(count, _GONE_BELOW)
     for new, row, _ in _pairs_between(finds.landmarks, known.landmarks):
-        if len(of_new[new]) > len(of_old[row]):
+        if boxes[count + new] > boxes[row]:
             limits[row] = _GONE_BELOW_IF_TAKEN
     is_gone = displaced | _is_absent(known, sight.select(slice(count)), limits)
-    shown, sight = _look(views, known, finds, is_gone, options)
+    shown, sight = _look(views, known, finds, is_gone)
     finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 0.0)
     # objects that are gone hide nothing
-    shown, sight = _look(views, known, finds, is_gone, options)
+    shown, sight = _look(views, known, finds, is_gone)
     own = sight.select(slice(count))
     is_gone |= _is_absent(known, own, limits)
     shown[np.isin(shown, np.nonzero(is_gone)[0])] = -1
     of_landmarks = np.where(shown < count, shown, -1)
     refits = refit(views, known.landmarks, of_landmarks, options.min_viewpoints)
     fits = gather_evidence(views, refits.landmarks, of_landmarks).median_iou
-    is_rare = ((own.seen_ratio < _MIN_SHARE_IN_PLACE * usual)
-               & (own.expected >= LEAST_VIEWS))
-    is_there = (~is_gone & ~is_rare & (fits >= options.min_median_iou)
+    is_rare = ((own.seen_ratio < _MIN_SHARE_IN_PLACE * usual) & (own.expected >= LEAST_VIEWS))
+    is_there = (~is_gone & ~is_rare & (fits >= MIN_MEDIAN_IOU)
                 & (refits.is_known | (_probability_there(known, own) > _THERE_ABOVE)))
     # boxes put it elsewhere, but may not make a landmark there: then nothing says that it is gone
     is_doubtful = (is_gone & ~_is_absent(known, own, limits)) | (
@@ -177,7 +169,7 @@ def _probability_there(known: OldMap, sight: Sight) -> NDArray[np.float64]:
     seen = sight.seen > 0
     share = float(sight.seen[seen].sum()) / max(1.0, float(sight.expected[seen].sum()))
     given = np.array([np.nan if one.seen_ratio is None else one.seen_ratio
-                      for one in known.details])
+                      for one in known.map.details])
     ratios = np.where(np.isnan(given), min(_SEEN_RATIO, share), given)
     told = seen & ~np.isnan(given)
     if told.any():
@@ -205,33 +197,26 @@ def _log_evidence(sight: Sight, ratios: NDArray[np.float64], views: float) -> ND
     return np.asarray(betaln(a + sight.seen, b + sight.expected - sight.seen) - betaln(a, b))
 
 
-def _look(views: Views, known: OldMap, finds: Finds, is_gone: NDArray[np.bool_],
-          options: MappingOptions) -> tuple[NDArray[np.int64], Sight]:
+def _look(views: Views, known: OldMap, finds: Finds, is_gone: NDArray[np.bool_]
+          ) -> tuple[NDArray[np.int64], Sight]:
     """Return the landmark or find that each box shows, and the sight of all their places."""
-    shown = known.shown(views, options.association_iou, is_gone, finds.landmarks)
+    places = Landmarks.joined(known.landmarks, finds.landmarks)
     is_solid = np.concatenate([~is_gone, np.ones(len(finds.details), dtype=np.bool_)])
-    return shown, look_for(views, join_landmarks(known.landmarks, finds.landmarks), shown,
-                           is_solid)
+    shown = associate(views, places, among=is_solid)
+    return shown, look_for(views, places, shown, is_solid)
 
 
-def _boxes(shown: NDArray[np.int64], count: int, finds: Finds
-           ) -> tuple[list[NDArray[np.int64]], list[NDArray[np.int64]]]:
-    """Return the boxes of each of the old landmarks, and of each of the finds."""
-    boxes = group_boxes(shown, count + len(finds.details))
-    return boxes[:count], boxes[count:]
-
-
-def _free(views: Views, known: OldMap, options: MappingOptions) -> NDArray[np.bool_]:
+def _free(views: Views, known: OldMap) -> NDArray[np.bool_]:
     """Tell which boxes (n,) may show new objects: those that no old landmark fits well.
 
     Nor is a box free on a landmark that has at least as many of its own: it may be another name
     for it.
     """
-    own = known.shown(views, options.min_median_iou)
+    own = associate(views, known.landmarks, MIN_MEDIAN_IOU)
     nameless = find_overlaps(
         views._replace(classes=np.zeros_like(views.classes)),
         Landmarks(known.landmarks.centers, known.landmarks.bases,
-                  np.zeros_like(known.landmarks.classes)), options.min_median_iou)
+                  np.zeros_like(known.landmarks.classes)), MIN_MEDIAN_IOU)
     others = own[nameless.boxes] < 0
     on, count = nameless.landmarks[others], len(known.sigmas)
     is_named = np.bincount(own[own >= 0], minlength=count) >= np.bincount(on, minlength=count)
@@ -243,10 +228,10 @@ def _free(views: Views, known: OldMap, options: MappingOptions) -> NDArray[np.bo
 def _find_new(detections: PosedDetections, views: Views, is_free: NDArray[np.bool_],
               options: MappingOptions) -> Finds:
     """Return the landmarks that the free boxes show, for the poses of the views."""
-    nothing = Finds(no_landmarks(), (), (), ())
+    nothing = Finds(Landmarks.none(), (), (), ())
     if not is_free.any():
         return nothing
-    posed = detections.with_poses(map_from_cameras(views)).select_boxes(is_free)
+    posed = detections.with_poses(views.poses).select_boxes(is_free)
     try:
         built = build_map(posed, replace(options, pose_errors=None, estimate_pose_errors=False,
                                          refine_mount=False))
@@ -264,7 +249,7 @@ def _with_displaced(finds: Finds, refits: Refits, displaced: NDArray[np.bool_],
                                                      finds.landmarks)}
     rows = rows[[moved not in again for moved in range(len(rows))]]
     return finds._replace(
-        landmarks=join_landmarks(finds.landmarks, refits.landmarks.select(rows)),
+        landmarks=Landmarks.joined(finds.landmarks, refits.landmarks.select(rows)),
         class_ids=finds.class_ids + tuple(class_ids[row] for row in rows.tolist()),
         details=finds.details + (LandmarkDetails(),) * len(rows))
 
@@ -277,16 +262,16 @@ def _without_copies(views: Views, finds: Finds, old: Landmarks, known: OldMap,
     two landmarks that lie in one another, the boxes are those of one object: parts of it, or
     another name for it. If they only touch, frames that show both tell them apart.
     """
-    of_old, of_new = _boxes(shown, len(old.centers), finds)
-    reasons: list[str | None] = [None] * len(of_new)
-    every = join_landmarks(old, finds.landmarks)
+    count = len(old.centers)
+    boxes = group_boxes(shown, count + len(finds.details))
+    reasons: list[str | None] = [None] * len(finds.details)
+    every = Landmarks.joined(old, finds.landmarks)
     for new, row, distance in _pairs_between(finds.landmarks, old):
         is_one_class = old.classes[row] == finds.landmarks.classes[new]
-        if len(of_old[row]) >= max(1.0, majority * len(of_new[new])) and (
+        if len(boxes[row]) >= max(1.0, majority * len(boxes[count + new])) and (
                 (is_one_class and distance < LEAST_MOVE_SHAPES)
-                or relation(views, every, of_old + of_new, (row, len(of_old) + new))
-                is not Relation.TWO):
-            reasons[new] = f'it is {known.landmark_ids[row]} in its place'
+                or relation(views, every, boxes, (row, count + new)) is not Relation.TWO):
+            reasons[new] = f'it is {known.map.landmark_ids[row]} in its place'
     return finds.without(reasons, sight)
 
 
@@ -294,7 +279,7 @@ def _pairs_between(new: Landmarks, old: Landmarks) -> list[tuple[int, int, float
     """Return pairs of a new and an old landmark that stand in one another, see close_pairs."""
     count = len(new.centers)
     return [(first, second - count, distance) for first, second, distance
-            in close_pairs(join_landmarks(new, old)) if first < count <= second]
+            in close_pairs(Landmarks.joined(new, old)) if first < count <= second]
 
 
 class Shown(NamedTuple):
@@ -323,8 +308,8 @@ def gather_objects(aligned: Aligned, known: OldMap, judged: Judgement, options: 
     numbers = np.full(count + len(finds.details) + 1, -1, dtype=np.int64)
     numbers[places] = np.arange(len(places))
     shown = numbers[judged.shown]
-    refits = refit(views, join_landmarks(known.landmarks.select(in_place), finds.landmarks), shown,
-                   options.min_viewpoints)
+    landmarks = Landmarks.joined(known.landmarks.select(in_place), finds.landmarks)
+    refits = refit(views, landmarks, shown, options.min_viewpoints)
     left_m = left_by_poses(views, np.square(aligned.changes), shown, len(places))
     refits = refits._replace(
         covariances=refits.covariances + np.square(left_m)[:, None, None] * np.eye(3))

@@ -9,6 +9,7 @@ that differs significantly was nudged: the new one counts alone. An ellipsoid wi
 position_sigma was made by hand, and stays.
 """
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -19,10 +20,11 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU, associate
 from cliploc_ros.offline.mapping.building import LeftOut, left_out_lines, rounded
 from cliploc_ros.offline.mapping.doubles import find_doubles
-from cliploc_ros.offline.mapping.evidence import Evidence, gather_evidence
-from cliploc_ros.offline.mapping.landmarks import ellipsoid_numbers, landmarks_of_map, unused_ids
+from cliploc_ros.offline.mapping.evidence import MIN_MEDIAN_IOU, Evidence, Sight, gather_evidence
+from cliploc_ros.offline.mapping.landmarks import landmarks_of_map, unused_ids
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.pose_noise import estimated_note
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
@@ -49,8 +51,7 @@ from cliploc_ros.offline.mapping.update.judging import (
     gather_objects,
     judge,
 )
-from cliploc_ros.offline.mapping.update.sight import Sight
-from cliploc_ros.offline.mapping.views import Views, check_input, make_views, map_from_cameras
+from cliploc_ros.offline.mapping.views import Views, check_input, make_views
 
 _ROWS_SHOWN = 40
 # A larger offset of the recording's coordinate frame from the map's is noted [m] [deg].
@@ -162,13 +163,13 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
         what to correct.
     """
     options = options or MappingOptions()
-    given = make_views(detections, options)
-    notes = check_input(detections, given, options)
+    given = make_views(detections)
+    notes = check_input(detections, given, options.min_viewpoints)
     known = known_landmarks(old, detections.class_names)
     aligned = align(given, known, options)
     judged = judge(detections, aligned.views, known, options)
-    loose, well = (int((known.shown(aligned.views, min_iou) >= 0).sum())
-                   for min_iou in (options.association_iou, options.min_median_iou))
+    loose, well = (int((associate(aligned.views, known.landmarks, min_iou) >= 0).sum())
+                   for min_iou in (ASSOCIATION_IOU, MIN_MEDIAN_IOU))
     _check_belongs(judged, well / max(1, loose))
     objects = gather_objects(aligned, known, judged, options)
     unlike = why_not_comparable(embeddings, detections)
@@ -178,7 +179,7 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     elif embeddings is not None:
         looks = compare_looks(embeddings, old.landmark_ids, detections, objects)
     fates = decide_fates(known, judged, objects, looks)
-    updated = _renew(old, known, aligned.views, objects, fates, judged, detections.class_names)
+    updated = _renew(known, aligned.views, objects, fates, judged, detections.class_names)
     kept = np.setdiff1d(np.arange(len(old)), fates.missing)
     rows_of = np.full(len(objects.owners) + 1, -1, dtype=np.int64)
     has_object = fates.objects[kept] >= 0
@@ -186,8 +187,8 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     rows_of[fates.new] = len(kept) + np.arange(len(fates.new))
     without_doubles, shown, first_new, joined = _one_of_each(
         updated, aligned.views, rows_of[objects.shown], len(kept), detections.class_names)
-    notes += _notes(old, known, aligned, detections) + joined
-    lists = _describe(old, updated, objects, fates, judged)
+    notes += _notes(known, aligned, detections) + joined
+    lists = _describe(known.map, updated, objects, fates, judged)
     lists['new'] = tuple(one for one in lists['new']
                          if one.landmark_id in without_doubles.landmark_ids)
     report = UpdateReport(
@@ -197,7 +198,7 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
         **lists,
         left_out=tuple(sorted(judged.finds.left_out, key=lambda one: -one.support)),
         notes=tuple(notes))
-    return UpdatedMap(without_doubles, report, shown, first_new, map_from_cameras(aligned.views),
+    return UpdatedMap(without_doubles, report, shown, first_new, aligned.views.poses,
                       renew_embeddings(embeddings, without_doubles.landmark_ids, detections,
                                        shown))
 
@@ -215,8 +216,7 @@ def _check_belongs(judged: Judgement, well_share: float) -> None:
             'errors, or build a new map')
 
 
-def _notes(old: LandmarkMap, known: OldMap, aligned: Aligned, detections: PosedDetections
-           ) -> list[str]:
+def _notes(known: OldMap, aligned: Aligned, detections: PosedDetections) -> list[str]:
     """Return what the user should know of the input."""
     notes = []
     if aligned.estimated is not None:
@@ -224,27 +224,28 @@ def _notes(old: LandmarkMap, known: OldMap, aligned: Aligned, detections: PosedD
     if aligned.offset_m > _LEAST_OFFSET_M or aligned.offset_deg > _LEAST_OFFSET_DEG:
         notes.append(f'the poses are {aligned.offset_m * 100:.1f} cm and {aligned.offset_deg:.1f} '
                      'degrees off the map as a whole; this is corrected')
-    unseen = sorted({old.class_ids[row] for row in np.nonzero(known.landmarks.classes < 0)[0]})
+    unseen = sorted({known.map.class_ids[row]
+                     for row in np.nonzero(known.landmarks.classes < 0)[0]})
     if unseen:
         notes.append(f'the recording has no box of the class {", ".join(unseen[:5])}; '
                      'landmarks of it are kept: the detector may not know it')
-    last_seen = max((one.last_seen or 0.0 for one in known.details), default=0.0)
+    last_seen = max((one.last_seen or 0.0 for one in known.map.details), default=0.0)
     if last_seen > float(detections.stamps_s[-1]):
         notes.append(f'the recording ends at {detections.stamps_s[-1]:.0f} s, before the map was '
                      f'last seen at {last_seen:.0f} s: an older recording, or another clock')
     return notes
 
 
-def _renew(old: LandmarkMap, known: OldMap, views: Views, objects: Shown, fates: Fates,
-          judged: Judgement, class_names: tuple[str, ...]) -> LandmarkMap:
+def _renew(known: OldMap, views: Views, objects: Shown, fates: Fates, judged: Judgement,
+           class_names: tuple[str, ...]) -> LandmarkMap:
     """Return the new map: the old landmarks that are left, in their order, then new ones.
 
     The class names are those of the recording; the views have its poses in the map.
     """
-    evidence = gather_evidence(views, objects.landmarks, objects.shown)
-    centers, details = old.centers.copy(), list(known.details)
+    evidence, old = gather_evidence(views, objects.landmarks, objects.shown), known.map
+    centers, details = old.centers.copy(), list(old.details)
     semi_axes, quats = old.semi_axes.copy(), old.quats_xyzw.copy()
-    new_axes, new_quats = ellipsoid_numbers(objects.landmarks.bases)
+    new_axes, new_quats = objects.landmarks.axes_and_quats()
     for row in fates.confirmed:
         number = fates.objects[row]
         one = _looked_for(details[row], objects.sight, number)
@@ -317,11 +318,10 @@ def _one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], f
 def _refitted(known: OldMap, objects: Shown, fates: Fates) -> dict[int, float]:
     """Return the weight of the new centre for the confirmed landmarks that are fitted again."""
     rows = np.array([row for row in fates.confirmed
-                     if known.details[row].position_sigma is not None
+                     if known.map.details[row].position_sigma is not None
                      and objects.refits.is_known[fates.objects[row]]], dtype=np.int64)
     refits, old_sigmas = objects.refits.select(fates.objects[rows]), known.sigmas[rows]
-    nudged = deviations(known.landmarks.select(rows), old_sigmas, refits
-                        ) > LEAST_MOVE_SIGMAS
+    nudged = deviations(known.landmarks.select(rows), old_sigmas, refits) > LEAST_MOVE_SIGMAS
     weights = np.where(nudged, 1.0, old_sigmas ** 2 / (old_sigmas ** 2 + refits.sigmas ** 2))
     better = nudged | (refits.sigmas < old_sigmas)
     return dict(zip(rows[better].tolist(), weights[better].tolist(), strict=True))
@@ -347,42 +347,40 @@ def _in_new_place(details: LandmarkDetails, sight: Sight, evidence: Evidence, nu
 def _describe(old: LandmarkMap, updated: LandmarkMap, objects: Shown, fates: Fates,
              judged: Judgement) -> dict[str, tuple[UpdatedLandmark, ...]]:
     """Return the lists of an UpdateReport."""
-    places = dict(zip(updated.landmark_ids, range(len(updated)), strict=True))
+    places = dict(zip(updated.landmark_ids, updated.centers, strict=True))
+    in_place, in_old_place = objects.sight.words, judged.sight.words
 
-    def seen_in(sight: Sight, number: int) -> str:
-        return f'expected in {sight.expected_frames[number]} frames, seen in ' \
-               f'{sight.seen_frames[number]}'
-
-    def item(row: int, evidence: str) -> UpdatedLandmark:
-        """Return one landmark of the old map."""
-        name, center = old.landmark_ids[row], old.centers[row]
-        now = updated.centers[places[name]] if name in places else center
-        rivals = fates.rivals.get(int(fates.objects[row]), ()) if row in fates.moved else ()
-        return UpdatedLandmark(name, old.labels[row], old.class_ids[row], rounded(now),
-                               round(float(np.linalg.norm(now - center)), 3), evidence,
-                               old.details[row].last_seen if old.details else None,
-                               tuple(old.landmark_ids[rival] for rival in rivals))
+    def listed(rows: NDArray[np.int64], words: Callable[[int], str]
+               ) -> tuple[UpdatedLandmark, ...]:
+        """Return landmarks of the old map, each with its evidence in words."""
+        found = []
+        for row in rows.tolist():
+            center = places.get(old.landmark_ids[row], old.centers[row])
+            rivals = fates.rivals.get(int(fates.objects[row]), ()) if row in fates.moved else ()
+            found.append(UpdatedLandmark(
+                old.landmark_ids[row], old.labels[row], old.class_ids[row], rounded(center),
+                round(float(np.linalg.norm(center - old.centers[row])), 3), words(row),
+                old.details[row].last_seen, tuple(old.landmark_ids[rival] for rival in rivals)))
+        return tuple(found)
 
     def moved(row: int) -> str:
         number = fates.objects[row]
         way = float(np.linalg.norm(objects.landmarks.centers[number] - old.centers[row]))
         left = ('an object of another look is in its old place' if judged.is_there[row]
-                else f'old place {seen_in(judged.sight, row)}')
+                else f'old place {in_old_place(row)}')
         return (f'moved by {way:.2f} m: {left}; new place seen in '
                 f'{objects.sight.seen_frames[number]} of {objects.sight.expected_frames[number]}')
 
     return {
-        'confirmed': tuple(item(row, seen_in(objects.sight, fates.objects[row]))
-                           for row in fates.confirmed),
-        'moved': tuple(item(row, moved(row)) for row in fates.moved),
-        'missing': tuple(item(row, seen_in(judged.sight, row)) for row in fates.missing),
-        'not_observed': tuple(item(row, seen_in(judged.sight, row))
-                              for row in fates.not_observed),
-        'doubtful': tuple(item(row, f'{seen_in(judged.sight, row)}: it stays; delete it if it is '
-                               'not there')
-                          for row in fates.not_observed if judged.is_doubtful[row]),
+        'confirmed': listed(fates.confirmed, lambda row: in_place(fates.objects[row])),
+        'moved': listed(fates.moved, moved),
+        'missing': listed(fates.missing, in_old_place),
+        'not_observed': listed(fates.not_observed, in_old_place),
+        'doubtful': listed(
+            fates.not_observed[judged.is_doubtful[fates.not_observed]],
+            lambda row: f'{in_old_place(row)}: it stays; delete it if it is not there'),
         'new': tuple(UpdatedLandmark(
             updated.landmark_ids[place], updated.labels[place], updated.class_ids[place],
-            rounded(updated.centers[place]), 0.0, seen_in(objects.sight, number),
+            rounded(updated.centers[place]), 0.0, in_place(number),
             updated.details[place].last_seen)
             for place, number in enumerate(fates.new, len(updated) - len(fates.new)))}
