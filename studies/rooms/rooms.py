@@ -236,18 +236,8 @@ def _robot_view(color: Callable[[], tuple[Image, Camera]]
         cy=(camera.cy - top + 0.5) * scale - 0.5)
 
 
-@dataclass(frozen=True)
-class _Nowhere:
-    """The poses of images whose poses nobody knows."""
-
-    span_ns: tuple[int, int]
-
-    def pose_at(self, stamp_ns: int) -> Floats | None:
-        return np.eye(4)
-
-
 def _without_poses(folder: Path) -> Frames:
-    """Return images without poses, by a usual camera."""
+    """Return images whose poses nobody knows, by a usual camera."""
     paths = sorted(one for one in folder.iterdir() if one.suffix.lower() in ('.jpg', '.png'))
     if not paths:
         raise DatasetError(f'{folder}: has no images')
@@ -257,8 +247,8 @@ def _without_poses(folder: Path) -> Frames:
     height, width = first.shape[:2]
     focal = 0.5 * width / np.tan(np.radians(0.5 * _USUAL_VIEW_DEG))
     camera = Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
-    files = [ImageFile(row * NS_PER_S, path, camera) for row, path in enumerate(paths)]
-    return folder_frames(folder, files, _Nowhere((0, len(files) * NS_PER_S)))
+    files = [ImageFile(row * NS_PER_S, path, camera, np.eye(4)) for row, path in enumerate(paths)]
+    return folder_frames(folder, files)
 
 
 def _measured_verticals(folder: Path, raws: tuple[RawFrame, ...]) -> Floats | None:

@@ -69,7 +69,7 @@ class Recording:
 
     def witness(self, landmark_map: LandmarkMap) -> Witness:
         """Return what the boxes say of a map."""
-        return hear_witness(self.views, landmark_map, self.detections.class_names, self.options)
+        return hear_witness(self.views, landmark_map, self.detections.class_names)
 
     def boxes_of(self, landmarks: Landmarks) -> dict[str, NDArray[np.int64]]:
         """Return the boxes that show each landmark; a box shows one at most."""
