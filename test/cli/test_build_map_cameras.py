@@ -16,8 +16,7 @@ from demo.truth import read_objects
 
 ASSETS = RIG.parent
 ALL = tuple(MOUNTS)
-NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
-            '--clip-pretrained', ASSETS / 'clip.safetensors', '--image', 'image/compressed',
+NETWORKS = ('--model', ASSETS / 'yolo.pt', '--no-clip', '--image', 'image/compressed',
             '--keyframes', 0, 0)
 
 
@@ -89,7 +88,7 @@ def test_each_camera_has_keyframes(built):
     ('--pose-topic', '/robot', '--mount', *(value for name in ALL for value in MOUNTS[name]))])
 def test_poses_of_each_camera_or_of_the_robot_give_the_same_map(bag, built, tmp_path, poses):
     out = tmp_path / 'again.yaml'
-    assert run(build_map, '--bag', bag, '--cameras', *ALL, *NETWORKS, *poses, '--no-clip',
+    assert run(build_map, '--bag', bag, '--cameras', *ALL, *NETWORKS, *poses,
                '--out', out) == 0
     again, first = LandmarkMap.from_file(out), LandmarkMap.from_file(built[ALL])
     assert len(again) == len(first)

@@ -22,7 +22,6 @@ from cliploc_ros.offline.datasets.observations import load_observations, save_ob
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.relocalization import sample_frames
-from cliploc_ros.offline.mapping.joint import pose_errors
 from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.update.updating import update_map
@@ -116,21 +115,18 @@ def test_four_cameras_are_nearer_the_truth_than_one():
 
 @pytest.mark.parametrize('odometry', [False, True])
 def test_cameras_share_the_errors_of_the_robot(odometry):
-    def left(names, seed):
-        detections, true = drive(*names, move=wandering(seed))
+    left = {}
+    for names in (('front',), tuple(RIG)):
+        detections, true = drive(*names, move=wandering(0), seconds=30.0)
         if odometry:
             detections = replace(detections, odom_from_camera=true)
         built = build_map(detections, MappingOptions(pose_errors=ERRORS))
-        assert len(built.landmark_map) == len(ROOM)
-        offsets = built.map_from_camera[:, :3, 3] - true[:, :3, 3]
-        return offsets.std(axis=0).mean(), built
-    one, four = (np.mean([left(names, seed)[0] for seed in (0, 1)])
-                 for names in (('front',), tuple(RIG)))
-    built = left(tuple(RIG), 0)[1]
+        left[names] = (built.map_from_camera - true)[:, :3, 3].std(axis=0).mean()
+    one, four = left.values()
     print(f'\nposes off by: one camera {1e3 * one:.0f} mm, four {1e3 * four:.0f} mm')
     assert four < (1.0 if odometry else 0.6) * one
     if odometry:
-        assert any(' 399 of 399 ' in one for one in built.report.notes)
+        assert any(' 239 of 239 ' in one for one in built.report.notes)
 
 
 def test_a_rig_stays_rigid():
@@ -140,25 +136,6 @@ def test_a_rig_stays_rigid():
                       for poses in (built.map_from_camera, true))
     print(f'\ndistances of cameras off by {1e3 * np.abs(refined - given).mean():.2f} mm')
     assert np.abs(refined - given).mean() < 2e-3
-
-
-def test_a_turn_of_the_robot_is_one_error_of_all_cameras():
-    """The levers take the shift out that a turn of the robot gives each camera."""
-    turn = Rotation.from_rotvec([0.0, 0.0, 0.02]).as_matrix()
-
-    def move(stamps_s, poses):
-        moved = poses.copy()
-        front = poses @ mount_of('front')  # about the first camera
-        moved[:, :3, :3] = turn @ poses[:, :3, :3]
-        moved[:, :3, 3] = front[:, :3, 3] + np.einsum(
-            'ij,fj->fi', turn, poses[:, :3, 3] - front[:, :3, 3])
-        return moved
-    given, present = (make_views(drive(*RIG, move=one)[0], MappingOptions())
-                      for one in (move, lambda stamps_s, poses: poses))
-    np.testing.assert_allclose(np.linalg.norm(given.levers[given.cameras == 2], axis=1),
-                               2.0 * _LEVER_M, atol=2e-3)
-    np.testing.assert_allclose(pose_errors(given, present),
-                               np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -0.02], (400, 1)), atol=2e-4)
 
 
 def test_viewpoints_and_samples_are_those_of_each_camera():

@@ -4,14 +4,13 @@ import array
 import math
 
 import pytest
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.messages import parse_class_map
-from cliploc_ros.ros.node.parameters import ParameterRow, markdown_table
+from cliploc_ros.ros.node.parameters import ParameterRow
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
 TEXT = ParameterRow('text', 'a', 'Some text.')
@@ -63,16 +62,6 @@ def test_whatever_comes_it_is_allowed_or_refused(value):
             assert row.validated(validated) == validated
             if row in (COUNT, LENGTH):
                 assert row.low <= validated <= row.high
-
-
-@pytest.mark.parametrize('name', TABLES)
-def test_the_markdown_table_holds_the_defaults(name):
-    rows = [[cell.strip() for cell in line.strip('|').split('|')]
-            for line in markdown_table(TABLES[name]).splitlines()[2:]]
-    assert all(len(cells) == 6 for cells in rows)
-    assert {cells[0].strip('`'): yaml.safe_load(cells[1].strip('`')) for cells in rows} == {
-        row.name: row.default for row in TABLES[name]}
-    assert [cells[4] == '' for cells in rows] == [row.read_only for row in TABLES[name]]
 
 
 @pytest.mark.parametrize('name', TABLES)

@@ -49,18 +49,6 @@ def test_boxes_are_of_another_image_or_convention(queries, change, level, expect
     assert tuple(found) == pytest.approx(expected)
 
 
-def test_a_family_counts_false_accepts_alone_and_in_order(capsys):
-    assert run(['families', '--requests', '8', '--only', 'K scaled']) == 0
-    *_, last = capsys.readouterr().out.strip().split('\n\n')
-    rows = [row.strip('| ').split(' | ')[1:6] for row in last.splitlines()[2:]]
-    assert [row[0] for row in rows] == ['alone', 'first five', 'later']
-    # two levels; a mode alone, two modes in order: 12 worlds' queries, and 7 images of one world
-    assert [int(row[1]) for row in rows] == [24, 20, 8]
-    for row in rows:
-        requests, right, accepted, false = map(int, row[1:])
-        assert false <= accepted <= requests and right <= requests
-
-
 def test_the_table_counts_each_request_once(capsys):
     assert run(['stress', '--worlds', '1', '--kinds', 'room', '--only', 'two identical']) == 0
     _, _, *rows = capsys.readouterr().out.strip().splitlines()
