@@ -16,13 +16,15 @@ from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.camera_check import CameraCheck, Extent
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.detector_check import DetectorCheck
-from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+from cliploc_ros.core.fit.camera_fit import ERRORS, corrected, fit_camera
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN
 from cliploc_ros.offline.evaluation.trials import PosedQuery
 from studies import wrong_sensors
 
@@ -52,6 +54,41 @@ def query(rng, noise_px=1.0, pose=None):
 
 def localized(localizer, queries):
     return [localizer.answer(Query((one.observation,), run=None)) for one in queries]
+
+
+def matches(boxes, map_from_camera):
+    """Rows of residuals_of for known matches, and the pose (3, 3), (3,)."""
+    left, top, right, bottom = CAMERA.normalize_bboxes(boxes).T
+    half_x, half_y = (right - left) / 2, (bottom - top) / 2
+    pairs = np.column_stack([(left + right) / 2, (top + bottom) / 2, half_x, half_y, ROOM.centers,
+                             ROOM.shapes, 0.06 * (half_x + half_y) + 0.003,
+                             np.zeros((len(boxes), 2))])
+    pose = invert_transform(map_from_camera)
+    return pairs, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy()
+
+
+@pytest.mark.parametrize('errors', [
+    (0.4, 0.0, 0.1, -0.05, 0.0, 0.0, 0.0), (-0.4, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0, 0.0, -0.3, 0.2, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.3)])
+def test_errors_of_a_camera_are_found_with_the_pose(errors, rng):
+    errors, information, vector = np.array(errors), np.zeros((ERRORS, ERRORS)), np.zeros(ERRORS)
+    for _ in range(12):
+        pose = place(rng)
+        right, rotation, translation = matches(boxes_of(ROOM, pose), pose)
+        # the boxes of which these are the corrected ones
+        pairs = right.copy()
+        for axis, scale in enumerate(np.exp(errors[0] + errors[1] * np.array([0.5, -0.5]))):
+            pairs[:, axis] = scale * (right[:, axis] + 2.0 * errors[4 + axis]
+                                      * right[:, 2 + axis]) + errors[2 + axis]
+            pairs[:, 2 + axis] = scale * np.exp(errors[6]) * right[:, 2 + axis]
+        np.testing.assert_allclose(corrected(pairs, errors)[:, :4], right[:, :4], atol=1e-12)
+        pairs[:, :4] += rng.normal(0.0, 0.002, (len(pairs), 4))
+        fit = fit_camera(pairs, np.ones((len(pairs), 4), dtype=bool), VERTICAL_UNKNOWN, rotation,
+                         translation, np.full(ERRORS, 1.0))
+        information += fit.information
+        vector += fit.information @ fit.errors + fit.errors
+    np.testing.assert_allclose(np.linalg.solve(information + np.eye(ERRORS), vector), errors,
+                               atol=0.03)
 
 
 @pytest.mark.parametrize(('focal', 'noise_px'), [(1.0, 0.5), (1.03, 1.0), (0.97, 2.0)])

@@ -181,6 +181,24 @@ def test_identical_rooms_fail_the_check(rooms_report):
     assert sum(one.verdict == 'accepted' for one in rooms_report.grid.trials) == 0
 
 
+def test_a_robot_that_is_misled_into_the_double_is_advice_on_the_double(rooms_report):
+    grid = rooms_report.grid
+    seen = next(one for one in grid.trials if one.landmarks > 3)
+
+    def misled_to(estimate):
+        trial = replace(seen, verdict='misled', estimate=np.array(estimate), error_m=10.0)
+        return [one.text for one in give_advice(replace(
+            rooms_report, grid=replace(grid, trials=(*grid.trials, trial))))]
+
+    side = np.sign(5.0 - seen.position[0])  # to the other room
+    into_double = misled_to(seen.position + np.array([10.0 * side, 0.2, 0.0]))
+    assert 'accepted in the wrong' in into_double[0]
+    assert not any('would be misled' in text for text in into_double)
+    elsewhere = misled_to(seen.position + np.array([0.0, 7.0, 0.0]))
+    assert 'accepted in the wrong' not in elsewhere[0]
+    assert any('misled by 10.0 m' in text for text in elsewhere)
+
+
 @pytest.mark.parametrize('least', [0.0, 1.0])
 def test_limits_decide(least):
     report = check_map(TABLE, options=QUICK, thresholds=Thresholds(min_positions=least,

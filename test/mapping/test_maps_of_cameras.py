@@ -22,6 +22,7 @@ from cliploc_ros.offline.datasets.observations import load_observations, save_ob
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.relocalization import sample_frames
+from cliploc_ros.offline.mapping.joint import pose_errors
 from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.update.updating import update_map
@@ -136,6 +137,25 @@ def test_a_rig_stays_rigid():
                       for poses in (built.map_from_camera, true))
     print(f'\ndistances of cameras off by {1e3 * np.abs(refined - given).mean():.2f} mm')
     assert np.abs(refined - given).mean() < 2e-3
+
+
+def test_a_turn_of_the_robot_is_one_error_of_all_cameras():
+    """The levers take the shift out that a turn of the robot gives each camera."""
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.02]).as_matrix()
+
+    def move(stamps_s, poses):
+        moved = poses.copy()
+        front = poses @ mount_of('front')  # about the first camera
+        moved[:, :3, :3] = turn @ poses[:, :3, :3]
+        moved[:, :3, 3] = front[:, :3, 3] + np.einsum(
+            'ij,fj->fi', turn, poses[:, :3, 3] - front[:, :3, 3])
+        return moved
+    given, present = (make_views(drive(*RIG, move=one)[0], MappingOptions())
+                      for one in (move, lambda stamps_s, poses: poses))
+    np.testing.assert_allclose(np.linalg.norm(given.levers[given.cameras == 2], axis=1),
+                               2.0 * _LEVER_M, atol=2e-3)
+    np.testing.assert_allclose(pose_errors(given, present),
+                               np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -0.02], (400, 1)), atol=2e-4)
 
 
 def test_viewpoints_and_samples_are_those_of_each_camera():

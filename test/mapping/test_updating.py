@@ -278,6 +278,32 @@ def test_looks_tell_a_moved_object_from_a_new_one():
     assert other.embeddings.means[0] @ looks[0] > 0.99
 
 
+def test_what_is_left_out_has_its_reason():
+    things = make_things(12)
+    later = join_maps(things, replace(things.select([0]), centers=np.array([[1.9, 0.0, 0.8]])))
+    poses = np.array([look_at(np.array([-2.6, y, 1.1])) for y in np.linspace(-0.3, 0.3, 30)])
+    report = update_map(things, see(later, poses, noise_px=1.0)).report
+    assert report.new == ()
+    (one,) = [one for one in report.left_out if np.hypot(one.center[0] - 1.9, one.center[1]) < 0.6]
+    assert one.support >= 20
+    assert one.reason.startswith('seen from one side')
+    assert any(one.reason in line for line in report.lines())
+
+
+def test_an_object_that_could_be_either_of_two_says_so():
+    things = make_things(12)
+    alike = things.semi_axes.copy()
+    alike[7] = alike[1]
+    things = replace(things, semi_axes=alike)
+    later = without(moved(things, {1: (1.7, 0.0, 0.8)}), 7)
+    report = update_map(things, see(later, POSES)).report
+    (one,) = report.moved
+    (gone,) = report.missing
+    assert {one.landmark_id, gone.landmark_id} == {'thing_1', 'thing_7'}
+    assert one.rivals == (gone.landmark_id,)
+    assert 'they look alike' in one.line()
+
+
 def test_new_ids_are_unused():
     things = make_things(12)
     old = without(replace(things, landmark_ids=('book_1', 'cup_1', *things.landmark_ids[2:])), 3)

@@ -161,3 +161,11 @@ def test_it_tells_how_far_the_robot_is_from_where_it_was(source):
     assert source.moved_since(stamp(10.5), 0.0) == (0.0, 0.0)
     assert source.moved_since(stamp(9.4), 0.0) is None
     assert source.moved_since(stamp(10.6), 0.0) is None
+
+
+def test_no_speed_is_taken_across_a_restart(source):
+    talk(source, 9.0, 10.0)
+    restarted = message(11.0)
+    restarted.pose.pose.position.x = -100.0
+    source.take(restarted)
+    assert source.speeds_by_poses(0.0) is None

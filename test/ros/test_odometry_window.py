@@ -147,6 +147,12 @@ def test_where_a_robot_may_be_after_a_silence(speed_m_s, turn_deg_s, silence_s, 
         assert talk(window, 5.0 + silence_s, x_m, degrees) == restarts
 
 
+def test_a_slow_source_that_misses_two_messages_goes_on():
+    window = OdometryWindow(30.0)
+    for moment in (0.0, 1.0, 2.0, 3.0, 6.0, 7.0, 9.0):
+        assert not talk(window, moment, 0.3 * moment)
+
+
 def on_an_arc(seconds, speed_m_s, turn_rad_s=0.4):
     """Where a robot is that has driven along an arc: position, and heading [rad]."""
     radius_m, angle = speed_m_s / turn_rad_s, turn_rad_s * seconds
