@@ -19,27 +19,26 @@ import argparse
 import ast
 import copy
 import gc
+import multiprocessing
 import os
 import pickle
 import random
 import re
-import selectors
-import shutil
 import signal
 import sys
 import tempfile
 import time
-import traceback
+import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from functools import cache
+from functools import cache, partial
 from importlib.machinery import SourceFileLoader
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from types import CodeType, FunctionType
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import pytest
 from _pytest.runner import runtestprotocol
@@ -59,6 +58,7 @@ _SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
 _QUIET = ('-q', '-x', '-p', 'no:cacheprovider', '-p', 'no:rerunfailures', '-p', 'no:xdist')
 # Calls whose arguments may be exchanged, or whose exchange no type checker lets pass.
 _ALIKE = re.compile(r'(^|\.)(max|min|maximum|minimum|hypot|logaddexp|isinstance|cast)$')
+_FORK = multiprocessing.get_context('fork')
 _LOGS = re.compile(r'(self\._?)?([\w.]+\.get_)?log(ger)?(\(\))?\.(debug|info|warning|error)\(')
 # A test with a fault may take so much longer [s], and a fault may cost this time in all.
 _PATIENCE_S, _MOST_S = 60.0, 20.0
@@ -375,11 +375,6 @@ class Tests:
         """Return how long a test takes."""
         return self.records[name].seconds
 
-    def leave_out(self, name: str) -> None:
-        """Forget a test that fails without a fault."""
-        for line in self.records[name].lines:
-            self._of_line[line].discard(name)
-
 
 @cache
 def _sources() -> list[tuple[str, list[tuple[int, str]]]]:
@@ -396,8 +391,8 @@ class Judge:
 
     def __init__(self, mutants: Sequence[Mutant], tests: Tests, workers: int) -> None:
         self.outcomes: list[Outcome] = []
-        self._waiting: list[tuple[Mutant, str]] = [(one, '') for one in reversed(mutants)]
-        self._tests, self._workers = tests, workers
+        self._parts = [mutants[number::workers] for number in range(workers)]
+        self._tests = tests
         self._is_sound: dict[str, bool] = {}
         self._items: dict[str, Any] = {}
         self._functions: dict[tuple[str, str, int], list[FunctionType]] = defaultdict(list)
@@ -414,52 +409,52 @@ class Judge:
         return True
 
     def run(self) -> None:
-        """Try all faults."""
-        with selectors.DefaultSelector() as running:
-            while self._waiting or running.get_map():
-                while self._waiting and len(running.get_map()) < self._workers:
-                    self._begin(running)
-                ready = {key.fd for key, _ in running.select(1.0)}
-                for key in list(running.get_map().values()):
-                    is_late = time.monotonic() > key.data.ends_at
-                    if key.fd in ready or is_late:
-                        running.unregister(key.fd)
-                        os.close(key.fd)
-                        self._take(key.data, _finish(key.data, is_late and key.fd not in ready))
+        """Try all faults; each worker tries a part of them."""
+        started = [_start(partial(self._outcomes, part)) for part in self._parts]
+        for one in started:
+            self.outcomes += _finish(*one)
 
-    def _begin(self, running: selectors.BaseSelector) -> None:
-        mutant, alone = self._waiting.pop()
-        names = [alone] if alone else self._tests.of(mutant)
-        if self._items:
-            names = [name for name in names if name in self._items]
-        if not names:
-            self.outcomes.append(Outcome(mutant, 0))
-            return
-        folder = Path(tempfile.mkdtemp(prefix='mutant-'))
-        allowed = _PATIENCE_S + 4.0 * sum(self._tests.seconds(name) for name in names)
-        pid = os.fork()
-        if not pid:
-            _be_child(folder, lambda: self._try(None if alone else mutant, names, folder))
-        running.register(os.pidfd_open(pid), selectors.EVENT_READ, _Job(
-            mutant, names, bool(alone), folder, pid, time.monotonic() + allowed))
+    def _outcomes(self, mutants: Sequence[Mutant]) -> list[Outcome]:
+        return [self._outcome(one) for one in mutants]
 
-    def _try(self, mutant: Mutant | None, names: list[str], folder: Path) -> int:
-        """Run tests in this process, a child; return whether one fails."""
+    def _outcome(self, mutant: Mutant) -> Outcome:
+        names = [name for name in self._tests.of(mutant)
+                 if self._is_sound.get(name, True) and (not self._items or name in self._items)]
+        while names:
+            killer = self._killer(mutant, names)
+            if killer in self._tests.records and killer not in self._is_sound:
+                self._is_sound[killer] = not self._killer(None, [killer])
+            if self._is_sound.get(killer, True):
+                return Outcome(mutant, len(names), killer)
+            names.remove(killer)
+        return Outcome(mutant, 0)
+
+    def _killer(self, mutant: Mutant | None, names: list[str]) -> str:
+        """Return the first test that fails, 'time', an exit code, or ''."""
+        allowed = _PATIENCE_S + 4.0 * sum(map(self._tests.seconds, names))
+        with tempfile.TemporaryDirectory(prefix='mutant-', ignore_cleanup_errors=True) as folder:
+            return str(_finish(*_start(
+                lambda: self._try(mutant, names, Path(folder) / 'tmp')), allowed))
+
+    def _try(self, mutant: Mutant | None, names: list[str], folder: Path) -> str:
+        """Run tests in this process, a child; return the first that fails."""
+        for stream in (1, 2):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
         if not self._items:
             if mutant is not None:
                 _plant_at_import(mutant)
-            return int(pytest.main([*_QUIET, '--basetemp', str(folder / 'tmp'), *names],
-                                   [_Failures(folder / 'failed')]))
+            failures = _Failures()
+            code = int(pytest.main([*_QUIET, '--basetemp', str(folder), *names], [failures]))
+            return failures.first or (f'exit code {code}' if code else '')
         if mutant is not None:
             self._plant(mutant)
         items = [self._items[name] for name in names]
-        items[0].config._tmp_path_factory._basetemp = folder / 'tmp'
-        (folder / 'tmp').mkdir()
+        items[0].config._tmp_path_factory._basetemp = folder
+        folder.mkdir()
         for item, following in pairwise([*items, None]):
             if any(one.failed for one in runtestprotocol(item, log=False, nextitem=following)):
-                (folder / 'failed').write_text(item.nodeid)
-                return 1
-        return 0
+                return str(item.nodeid)
+        return ''
 
     def _plant(self, mutant: Mutant) -> None:
         """Give a function the code with a fault."""
@@ -469,68 +464,43 @@ class Judge:
         for function in self._functions[str(PROJECT / mutant.file), *mutant.function]:
             function.__code__ = faulty
 
-    def _take(self, job: '_Job', killer: str) -> None:
-        if job.is_check:
-            self._is_sound[job.names[0]] = not killer
-            if killer:
-                self._tests.leave_out(job.names[0])
-            self._waiting.append((job.mutant, ''))
-        elif killer in self._tests.records and killer not in self._is_sound:
-            self._waiting.append((job.mutant, killer))
-        else:
-            self.outcomes.append(Outcome(job.mutant, len(job.names), killer))
-            if len(self.outcomes) % 10 == 0:
-                print(f'{len(self.outcomes)} tried', file=sys.stderr, flush=True)
 
+def _start(work: Callable[[], object]) -> tuple[Any, Any]:
+    """Start work in a child, a process group of its own; return it and what has its result."""
+    here, there = _FORK.Pipe(duplex=False)
 
-class _Job(NamedTuple):
-    mutant: Mutant
-    names: list[str]
-    is_check: bool  #: Without the fault
-    folder: Path
-    pid: int
-    ends_at: float
-
-
-def _be_child(folder: Path, work: Callable[[], int]) -> NoReturn:
-    code = 2
-    try:
+    def run() -> None:
         os.setpgid(0, 0)
-        with (folder / 'log').open('w') as log:
-            os.dup2(log.fileno(), 1)
-            os.dup2(log.fileno(), 2)
-        code = work()
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        os._exit(code)
+        there.send(work())
+
+    child = _FORK.Process(target=run)
+    child.start()
+    there.close()
+    return child, here
 
 
-def _finish(job: _Job, is_late: bool) -> str:
-    """End a job; return the test that failed, 'time', an exit code, or ''."""
-    if is_late:
-        os.kill(job.pid, signal.SIGKILL)
-    status = os.waitstatus_to_exitcode(os.waitpid(job.pid, 0)[1])
-    with suppress(ProcessLookupError):  # what its tests started
-        os.killpg(job.pid, signal.SIGKILL)
-    failed = job.folder / 'failed'
-    killer = 'time' if is_late else failed.read_text() if failed.exists() else ''
-    shutil.rmtree(job.folder, ignore_errors=True)
-    return killer or (f'exit code {status}' if status else '')
+def _finish(child: Any, here: Any, limit_s: float | None = None) -> Any:
+    """Return the result of a child, 'time' or an exit code; end what it started."""
+    try:
+        result = here.recv() if here.poll(limit_s) else 'time'
+    except EOFError:
+        child.join()
+        result = f'exit code {child.exitcode}'
+    with suppress(ProcessLookupError):
+        os.killpg(child.pid, signal.SIGKILL)
+    child.join()
+    return result
 
 
 class _Failures:
-    """A plugin of pytest that writes the first test that fails."""
+    """A plugin of pytest that keeps the first test that fails."""
 
-    def __init__(self, file: Path) -> None:
-        self._file = file
+    first = ''
 
     def pytest_runtest_logreport(self, report: Any) -> None:
-        if report.failed and not self._file.exists():
-            self._file.write_text(report.nodeid)
+        self.first = self.first or (report.nodeid if report.failed else '')
 
-    def pytest_collectreport(self, report: Any) -> None:
-        self.pytest_runtest_logreport(report)
+    pytest_collectreport = pytest_runtest_logreport
 
 
 def _plant_at_import(mutant: Mutant) -> None:
@@ -553,27 +523,19 @@ def _codes_of(code: CodeType) -> Iterator[CodeType]:
 def judge(mutants: Sequence[Mutant], workers: int) -> list[Outcome]:
     """Return the outcome of each fault. Kernels are judged in a process of their own."""
     kernels = [one for one in mutants if one.is_compiled]
-    others = [one for one in mutants if not one.is_compiled]
-    outcomes = []
-    if kernels:
-        pid = os.fork()
-        if not pid:
-            _be_child(RECORDS, lambda: _judge_kernels(kernels, workers))
-        os.waitpid(pid, 0)
-        outcomes += pickle.loads((RECORDS / 'kernels.pickle').read_bytes())
+    outcomes = list(_finish(*_start(lambda: _judge_kernels(kernels, workers))))
     import hypothesis, numba, scipy.optimize, scipy.spatial, scipy.stats, yaml  # noqa: E401,F401,I001
 
-    tests = Tests('compiled')
+    tests, others = Tests('compiled'), [one for one in mutants if not one.is_compiled]
     at_import = Judge([one for one in others if one.function is None], tests, workers)
     at_import.run()
     return outcomes + at_import.outcomes + _judge_functions(
         [one for one in others if one.function is not None], tests, workers)
 
 
-def _judge_kernels(mutants: Sequence[Mutant], workers: int) -> int:
+def _judge_kernels(mutants: Sequence[Mutant], workers: int) -> list[Outcome]:
     _plain_kernels()
-    _write('kernels', _judge_functions(mutants, Tests('plain'), workers))
-    return 0
+    return _judge_functions(mutants, Tests('plain'), workers)
 
 
 def _judge_functions(mutants: Sequence[Mutant], tests: Tests, workers: int) -> list[Outcome]:
@@ -590,23 +552,17 @@ def report(outcomes: Sequence[Outcome]) -> str:
     """Return a table by folder, and the faults that no test noticed."""
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     for one in outcomes:
-        kind = 'killed' if one.killer else 'survived' if one.tests else 'not run'
         folder = str(Path(one.mutant.file).parent.relative_to(PACKAGE))
-        for row in (folder, f'{folder.split("/")[0]}, all',
-                    'kernels' if one.mutant.is_compiled else 'Python', 'all'):
-            counts[row][kind] += 1
+        for row in {folder, f'{folder.split("/")[0]}, all', 'all',
+                    'kernels' if one.mutant.is_compiled else 'Python'}:
+            counts[row]['killed' if one.killer else 'survived' if one.tests else 'not run'] += 1
     text = f'{"folder":28}{"killed":>8}{"survived":>10}{"not run":>9}{"share":>7}\n'
-    for row in sorted(counts):
-        killed, survived, not_run = (counts[row][kind]
-                                     for kind in ('killed', 'survived', 'not run'))
-        text += (f'{row:28}{killed:8}{survived:10}{not_run:9}'
-                 f'{killed / counts[row].total():7.2f}\n')
-    text += '\nno test noticed (tests that run the line):\n'
-    for one in sorted(outcomes):
-        if not one.killer:
-            text += (f'{one.mutant.file}:{one.mutant.line}: {one.mutant.what} ({one.tests}): '
-                     f'{planted(one.mutant)[1]}\n')
-    return text
+    for row, its in sorted(counts.items()):
+        text += (f'{row:28}{its["killed"]:8}{its["survived"]:10}{its["not run"]:9}'
+                 f'{its["killed"] / its.total():7.2f}\n')
+    return text + '\nno test noticed (tests that run the line):\n' + ''.join(
+        f'{one.mutant.file}:{one.mutant.line}: {one.mutant.what} ({one.tests}): '
+        f'{planted(one.mutant)[1]}\n' for one in sorted(outcomes) if not one.killer)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -642,6 +598,7 @@ def main() -> int:
     part.add_argument('--only', default='', help='faults in FILE or FILE:LINE alone')
     part.set_defaults(run=run)
     arguments = parser.parse_args()
+    warnings.filterwarnings('ignore', '.*use of fork', DeprecationWarning)
     return run_command(lambda: int(arguments.run(arguments)))
 
 

@@ -102,12 +102,3 @@ def test_a_class_name_leads_to_one_definition():
     names = [node.name.lstrip('_') for path in MODULES.values()
              for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ClassDef)]
     assert {name for name in names if names.count(name) > 1} <= SHARED_NAMES
-
-
-def test_the_acceptance_names_its_modules():
-    folder = PROJECT / ROOT / 'core/acceptance'
-    text = ast.get_docstring(ast.parse((folder / '__init__.py').read_text()))
-    named = [name for line in text.splitlines() if line and not line.startswith((' ', 'Whether'))
-             for name in line.split(', ') if line[0].islower()]
-    assert sorted(named) == sorted(path.stem for path in folder.glob('*.py')
-                                   if path.stem != '__init__')

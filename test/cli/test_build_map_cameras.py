@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``build_map --bag --cameras``: the demo's rig, four cameras at six places, in one recording."""
 
-
 import numpy as np
 import pytest
 from rig_bag import MOUNTS, RIG, write_rig_bag
@@ -16,8 +15,7 @@ from demo.truth import read_objects
 
 ASSETS = RIG.parent
 ALL = tuple(MOUNTS)
-NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
-            '--clip-pretrained', ASSETS / 'clip.safetensors', '--image', 'image/compressed',
+NETWORKS = ('--model', ASSETS / 'yolo.pt', '--no-clip', '--image', 'image/compressed',
             '--keyframes', 0, 0)
 
 
@@ -89,8 +87,8 @@ def test_each_camera_has_keyframes(built):
     ('--pose-topic', '/robot', '--mount', *(value for name in ALL for value in MOUNTS[name]))])
 def test_poses_of_each_camera_or_of_the_robot_give_the_same_map(bag, built, tmp_path, poses):
     out = tmp_path / 'again.yaml'
-    assert run(build_map, '--bag', bag, '--cameras', *ALL, *NETWORKS, *poses, '--no-clip',
-               '--out', out) == 0
+    assert run(build_map, '--bag', bag, '--cameras', *ALL, *NETWORKS, *poses,
+               '--no-keyframe-layer', '--out', out) == 0
     again, first = LandmarkMap.from_file(out), LandmarkMap.from_file(built[ALL])
     assert len(again) == len(first)
     np.testing.assert_allclose(again.centers, first.centers, atol=5e-3)

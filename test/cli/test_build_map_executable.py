@@ -36,14 +36,6 @@ def test_builds_a_map_and_a_report(build_map, observations, tmp_path):
     assert f'wrote {out}' in done.stdout
 
 
-def test_refines_poses_when_they_have_noise(build_map, observations, tmp_path):
-    done = build_map('--observations', observations, '--out', tmp_path / 'm.yaml', '--every', 2,
-                     '--pose-noise', 0.02, 0.5)
-    assert done.returncode == 0, done.stderr
-    assert 'poses refined by' in done.stdout
-    assert 'from 81 frames' in done.stdout
-
-
 def test_an_existing_map_stays_when_building_fails(build_map, observations, tmp_path):
     old = tmp_path / 'old.yaml'
     old.write_text('precious')

@@ -1,13 +1,17 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable replay: real recordings, a real process, a real listening node."""
+"""The executables tum_to_bag and replay: real recordings, processes and listening nodes."""
 
+import os
 import signal
+import subprocess
+import sys
 import time
 
+import cv2
 import numpy as np
 import pytest
-from executables import MS, RECORDED_QOS, START_NS, run, wait_until, write_poses
+from executables import MS, RECORDED_QOS, START_NS, TIMEOUT_S, run, wait_until, write_poses
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
@@ -17,6 +21,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from vision_msgs.msg import Detection2DArray
 
+from cliploc_ros.cli.tum_to_bag import main
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import LATCHED_QOS, BagReader, BagWriter
 from cliploc_ros.offline.datasets.intrinsics import PRESETS
@@ -192,3 +197,138 @@ def test_bad_recordings_are_refused(tmp_path):
     with BagWriter(tmp_path / 'empty') as bag:
         bag.add_topic('/pose', bag_messages.POSE)
     assert_refused(run('replay', tmp_path / 'empty'), 'empty: holds no messages')
+
+
+# Prints 'received' at the third message.
+SUBSCRIBER = """
+import rclpy
+from geometry_msgs.msg import PoseStamped
+rclpy.init()
+node = rclpy.create_node('subscriber')
+received = []
+node.create_subscription(PoseStamped, '/pose', received.append, 10)
+print('ready', flush=True)
+while len(received) < 3:
+    rclpy.spin_once(node, timeout_sec=0.1)
+print('received', flush=True)
+"""
+
+
+@pytest.fixture
+def subscriber():
+    """Start a reliable subscriber of /pose in a process of its own."""
+    process = subprocess.Popen([sys.executable, '-c', SUBSCRIBER], stdout=subprocess.PIPE,
+                               text=True)
+    assert process.stdout.readline() == 'ready\n'
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def play_to_a_stopped(subscriber, start, tmp_path, *args):
+    """Publish three messages, the last two while the subscriber's process is stopped."""
+    bag = write_poses(tmp_path / 'bag', [0, 1000, 1050])
+    replay = start('replay', bag, '--wait-for-subscribers', *args)
+    assert 'replaying' in replay.stdout.readline()
+    subscriber.send_signal(signal.SIGSTOP)
+    assert 'published 3 ' in replay.stdout.readline()
+    return replay
+
+
+def test_replay_waits_until_its_messages_have_arrived(subscriber, start, tmp_path):
+    replay = play_to_a_stopped(subscriber, start, tmp_path)
+    with pytest.raises(subprocess.TimeoutExpired):
+        replay.wait(2.0)
+    subscriber.send_signal(signal.SIGCONT)
+    assert subscriber.stdout.readline() == 'received\n'
+    _, errors = replay.communicate(timeout=TIMEOUT_S)
+    assert (replay.returncode, errors) == (0, '')
+
+
+def test_replay_names_topics_without_acknowledgement(subscriber, start, tmp_path):
+    replay = play_to_a_stopped(subscriber, start, tmp_path, '--wait-for-all-acked', 0.5)
+    _, errors = replay.communicate(timeout=TIMEOUT_S)
+    assert replay.returncode == 0
+    assert errors.startswith('warning: ') and '/pose' in errors and '0.5 s' in errors
+
+
+def read_all(bag):
+    """Return the deserialized messages by topic, after checking their stamps."""
+    by_topic = {}
+    with BagReader(bag) as reader:
+        for raw in reader.messages():
+            message = reader.deserialize(raw)
+            assert bag_messages.stamp_ns(message) == raw.stamp_ns
+            by_topic.setdefault(raw.topic, []).append(message)
+    return by_topic
+
+
+def decode_rgb(message):
+    if hasattr(message, 'format'):
+        return cv2.cvtColor(cv2.imdecode(message.data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    assert message.encoding == 'rgb8'
+    return message.data.reshape(message.height, message.width, 3)
+
+
+@pytest.mark.parametrize(('storage', 'form'), [('sqlite3', 'raw'), ('mcap', 'compressed')])
+def test_small_sequence_round_trip(make_sequence, tmp_path, run_here, storage, form):
+    sequence = make_sequence()
+    done = run_here(main, sequence.folder, tmp_path / 'bag', '--storage', storage, f'--{form}',
+                    '--detections', sequence.detections, '--prefix', 'front/camera')
+    assert done.returncode == 0, done.stderr
+    assert '4 images, 3 ground' in done.stdout
+    assert '1 images have no' in done.stdout
+
+    topics = read_all(tmp_path / 'bag')
+    images = '/front/camera/image' + ('/compressed' if form == 'compressed' else '')
+    assert list(topics) == [images, *(f'/front/camera/{name}' for name in (
+        'camera_info', 'detections', 'ground_truth'))]
+    stamps = [round(float(stamp) * 10) * 100_000_000 for stamp in sequence.stamps]
+    for name in list(topics)[:3]:
+        assert [bag_messages.stamp_ns(message) for message in topics[name]] == stamps
+        assert {one.header.frame_id for one in topics[name]} == {'camera_optical_frame'}
+    for message, expected_bgr in zip(topics[images], sequence.images_bgr, strict=True):
+        np.testing.assert_array_equal(decode_rgb(message), expected_bgr[:, :, ::-1])
+    if form == 'compressed':
+        assert {message.format for message in topics[images]} == {'rgb8; png compressed bgr8'}
+        first = (sequence.folder / 'rgb' / f'{sequence.stamps[0]}.png').read_bytes()
+        assert topics[images][0].data.tobytes() == first
+    assert [len(one.detections) for one in topics['/front/camera/detections']] == [0, 1, 2, 0]
+    (pose, *_) = topics['/front/camera/ground_truth']
+    assert pose.header.frame_id == 'world'
+    assert (bag_messages.stamp_ns(pose), pose.pose.position.x) == (stamps[1], 0)
+
+
+def test_accelerations_become_an_imu(make_sequence, tmp_path, run_here):
+    sequence = make_sequence()
+    (sequence.folder / 'accelerometer.txt').write_text('# t a\n1.25 0.5 7 -5\n1.5 0.25 8 -6\n')
+    done = run_here(main, sequence.folder, tmp_path / 'bag')
+    assert done.returncode == 0, done.stderr
+    assert '2 accelerations' in done.stdout
+    first, second = read_all(tmp_path / 'bag')['/imu']
+    assert bag_messages.stamp_ns(first) == 1_250_000_000
+    assert first.header.frame_id == 'imu'
+    assert first.orientation_covariance[0] == first.angular_velocity_covariance[0] == -1
+    one = second.linear_acceleration
+    assert (one.x, one.y, one.z) == (0.25, 8.0, -6.0)
+    (sequence.folder / 'accelerometer.txt').write_text('1.25 0.5 nan -5\n')
+    done = run_here(main, sequence.folder, tmp_path / 'other')
+    assert 'accelerometer.txt:1' in done.stderr
+    assert not (tmp_path / 'other').exists()
+
+
+def test_interruption_leaves_nothing(make_sequence, tmp_path, start):
+    sequence = make_sequence()
+    image = sequence.folder / 'rgb' / f'{sequence.stamps[0]}.png'
+    with (sequence.folder / 'rgb.txt').open('a') as file:
+        for index in range(5_000):  # many links to one image: too many to finish before the signal
+            os.link(image, sequence.folder / 'rgb' / f'{index}.png')
+            file.write(f'{200 + index} rgb/{index}.png\n')
+    process = start('tum_to_bag', sequence.folder, tmp_path / 'bag')
+    wait_until(lambda: any(tmp_path.glob('.bag.*.partial/bag/bag.db3')))
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert 'interrupted' in errors
+    assert 'Traceback' not in errors
+    assert [path.name for path in tmp_path.iterdir()] == ['sequence']

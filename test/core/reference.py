@@ -8,14 +8,15 @@ bounds and without culling.
 
 import numpy as np
 from numpy.typing import NDArray
+from scene import CAMERA, MAP_FROM_CAMERA, boxes_of
 
 from cliploc_ros.core.fit.verification import Verified, make_rig, verify_rig
 from cliploc_ros.core.geometry.ellipse import ellipse_iou
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
-from cliploc_ros.core.geometry.minimal_solvers import solve_p3p
+from cliploc_ros.core.geometry.p3p import solve_p3p
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.core.search.frame_search import Candidates
-from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Scene
+from cliploc_ros.core.search.candidates import Candidates
+from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Scene, make_scene
 
 # A pose: rotation (3, 3) and translation (3,) of camera_from_map.
 Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -34,6 +35,17 @@ def candidate_mask(candidates: Candidates, shape: tuple[int, int]) -> NDArray[np
     mask = np.zeros(shape, dtype=bool)
     mask[candidates.detections, candidates.landmarks] = True
     return mask
+
+
+def scene_of(room, map_from_camera=MAP_FROM_CAMERA, rows=slice(None), noise_px=0.0, rng=None
+             ) -> Scene:
+    """Return the scene of a frame: boxes of some landmarks, which may be any of their class."""
+    boxes = boxes_of(room, map_from_camera)[rows]
+    if noise_px:
+        boxes = boxes + rng.normal(0, noise_px, boxes.shape)
+    potential = same_class(room.class_ids, room.class_ids)[rows]
+    return make_scene(CAMERA.normalize_bboxes(boxes), room.centers, room.shapes, potential,
+                      np.argwhere(potential), 0.2)
 
 
 def sample_pose(scene: Scene, sample: NDArray[np.int64]) -> tuple[Pose | None, float]:

@@ -2,32 +2,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """A camera_info or boxes that are wrong for all objects alike: looks tell, poses are refused.
 
-A simulated room, seen from many places.
-"""
+A simulated room, seen from many places."""
 
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene import CAMERA, make_room
+from scene import CAMERA, boxes_of, make_room, see_room
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.acceptance.camera_check import CameraCheck, Extent, odds_of
+from cliploc_ros.core.acceptance.camera_check import CameraCheck, Extent
 from cliploc_ros.core.acceptance.verdict import RefusalKind
-from cliploc_ros.core.fit.camera_fit import ERRORS, camera_jacobian, corrected, fit_camera
-from cliploc_ros.core.fit.refinement import residuals_of
-from cliploc_ros.core.geometry.ellipsoid import (
-    ellipse_bboxes,
-    ellipses_in_pixels,
-    project_ellipsoids,
-)
+from cliploc_ros.core.detector_check import DetectorCheck
+from cliploc_ros.core.fit.camera_fit import ERRORS, corrected, fit_camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
+from cliploc_ros.core.relocalization import Relocalization
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN
 from cliploc_ros.offline.evaluation.trials import PosedQuery
@@ -47,19 +42,18 @@ def place(rng):
                           np.array([x, y, z]))
 
 
-def boxes_at(map_from_camera):
-    outlines = project_ellipsoids(invert_transform(map_from_camera), ROOM.centers, ROOM.shapes)
-    return ellipse_bboxes(ellipses_in_pixels(outlines, CAMERA))
-
-
 def query(rng, noise_px=1.0, pose=None):
     """A query at a place: boxes that the border of the image cuts."""
     pose = place(rng) if pose is None else pose
-    boxes = boxes_at(pose)
+    boxes = boxes_of(ROOM, pose)
     boxes = np.clip(boxes + rng.normal(0.0, noise_px, boxes.shape), 0.0, [*SIZE, *SIZE])
     rows = np.nonzero((boxes[:, 2:] - boxes[:, :2] > 8.0).all(axis=1))[0]
     return PosedQuery(0, Observation(CAMERA, Detections(
         boxes[rows], tuple(ROOM.class_ids[row] for row in rows), np.full(len(rows), 0.9))), pose)
+
+
+def localized(localizer, queries):
+    return [localizer.answer(Query((one.observation,), run=None)) for one in queries]
 
 
 def matches(boxes, map_from_camera):
@@ -73,28 +67,6 @@ def matches(boxes, map_from_camera):
     return pairs, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy()
 
 
-def localized(localizer, queries):
-    return [localizer.answer(Query((one.observation,), run=None)) for one in queries]
-
-
-def test_the_derivatives_are_those_of_the_residuals(rng):
-    pairs, rotation, translation = matches(boxes_at(place(rng)), place(rng))
-    errors = rng.normal(0.0, 0.1, ERRORS)
-
-    def residuals(errors):
-        found = np.empty(5 * len(pairs) + 3)
-        assert residuals_of(corrected(pairs, errors), VERTICAL_UNKNOWN, rotation, translation,
-                            found)
-        return found
-
-    jacobian = camera_jacobian(corrected(pairs, errors), VERTICAL_UNKNOWN, errors, rotation,
-                               translation, residuals(errors))[:, 6:]
-    steps = 1e-6 * np.eye(ERRORS)
-    expected = np.stack([(residuals(errors + one) - residuals(errors - one)) / 2e-6
-                         for one in steps], axis=1)
-    np.testing.assert_allclose(jacobian, expected, atol=1e-6 * np.abs(expected).max())
-
-
 @pytest.mark.parametrize('errors', [
     (0.4, 0.0, 0.1, -0.05, 0.0, 0.0, 0.0), (-0.4, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0),
     (0.0, 0.0, 0.0, 0.0, -0.3, 0.2, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.3)])
@@ -102,7 +74,7 @@ def test_errors_of_a_camera_are_found_with_the_pose(errors, rng):
     errors, information, vector = np.array(errors), np.zeros((ERRORS, ERRORS)), np.zeros(ERRORS)
     for _ in range(12):
         pose = place(rng)
-        right, rotation, translation = matches(boxes_at(pose), pose)
+        right, rotation, translation = matches(boxes_of(ROOM, pose), pose)
         # the boxes of which these are the corrected ones
         pairs = right.copy()
         for axis, scale in enumerate(np.exp(errors[0] + errors[1] * np.array([0.5, -0.5]))):
@@ -219,23 +191,6 @@ def test_a_view_that_stays_the_same_has_no_border(rng):
     assert extent.log_odds(CAMERA) < 1.0
 
 
-def test_odds_are_those_of_gaussians():
-    """Against the densities of one error that is measured: N(x; 0, s^2 + d^2)."""
-    deviation, measured, known = 0.05, 0.3, CALIBRATION.camera
-    information, vector = np.zeros((ERRORS, ERRORS)), np.zeros(ERRORS)
-    information[0, 0], vector[0] = deviation ** -2, measured * deviation ** -2
-
-    def density(spread):
-        variance = spread ** 2 + deviation ** 2
-        return np.exp(-0.5 * measured ** 2 / variance) / np.sqrt(variance)
-    odds = odds_of(information, vector).odds
-    focal = 2  # right, image, focal length, ...
-    assert odds[focal] - odds[0] == pytest.approx(np.log(
-        density(0.5) / density(known.focal)))
-    # the other kinds have the focal length of a right camera, or that of a wrong one
-    assert set(np.round(odds - odds[0], 6)) == set(np.round([0.0, odds[focal] - odds[0]], 6))
-
-
 def test_nothing_is_known_of_a_new_camera():
     assert CameraCheck().judge([], np.eye(6)) == (1.0, '')
 
@@ -254,3 +209,73 @@ def test_with_what_was_known_before_the_same_answer_comes_again(focal, rng):
         assert repeated.refusal_kind == found.refusal_kind
     assert again.cameras.faults == localizer.cameras.faults
     assert bool(again.cameras.faults) == (focal != 1.0)
+
+
+NOTHING_FOUND = Relocalization(False, '5 detections are too few; turn the camera to more objects',
+                               refusal_kind=RefusalKind.TOO_FEW_OBJECTS)
+BOX = [10.0, 20.0, 60.0, 90.0]
+
+
+def detections(class_id='a', score=0.9, box=BOX, count=5):
+    return Detections(np.tile(np.array(box, dtype=np.float64), (count, 1)), (class_id,) * count,
+                      np.full(count, score))
+
+
+def checked(*frames, by_class=True):
+    check = DetectorCheck(make_room(), by_class)
+    for given in frames:
+        check.add(given, given.usable(CAMERA.width, CAMERA.height, 50))
+    return check
+
+
+@pytest.mark.parametrize(('given', 'said'), [
+    (detections('62'), '62, which are'), (detections(''), 'no name'),
+    (detections('A'), "did you mean 'a'"), (detections('zebra\n[FATAL]' * 9), 'zebra [FATAL]'),
+    (detections(score=np.nan), '5 scores'), (detections(score=np.inf), '5 scores'),
+    (detections(box=[0.1, 0.2, 0.3, 0.4]), '0.2 x 0.2 px'),
+    (detections(box=[60.0, 20.0, 10.0, 90.0]), '-50 x 70 px'),
+    (detections(box=[np.nan] * 4), 'nan'), (detections(box=[900.0, 900.0, 950.0, 950.0]), '900')])
+def test_detections_of_no_use_are_the_cause_of_a_refusal(given, said):
+    check = checked(given)
+    assert [fault.is_certain for fault in check.faults] == [True]
+    found = check.explain(NOTHING_FOUND)
+    assert found.refusal_kind is RefusalKind.WRONG_DETECTIONS
+    assert said in found.reason and 'turn the camera' not in found.reason
+    assert '\n' not in found.reason and len(found.reason) < 300
+
+
+@pytest.mark.parametrize('check', [
+    checked(), checked(detections('a')), checked(see_room(make_room())),
+    checked(detections(count=0)), checked(detections('zebra'), by_class=False),
+    checked(detections('zebra'), detections('a')),
+    checked(detections(score=np.nan), detections(count=0))])
+def test_other_refusals_stay(check):
+    assert check.explain(NOTHING_FOUND) == NOTHING_FOUND
+
+
+def test_a_stranger_or_two_among_frames_with_objects_are_named_and_no_fault_of_the_detector():
+    check = checked(detections('a'), detections('zebra', count=2))
+    assert check.faults == []
+    found = check.explain(NOTHING_FOUND)
+    assert found.refusal_kind is RefusalKind.TOO_FEW_OBJECTS and 'zebra' in found.reason
+
+
+def test_a_fault_shows_over_frames_that_have_a_box_each():
+    check = checked(*[detections('zebra', count=1)] * 2)
+    assert check.faults == []
+    check.add(*[detections('62', count=1)] * 2)
+    assert check.faults[0].is_certain and '62' in check.faults[0].text
+
+
+@pytest.mark.parametrize('score', [87.0, -0.5])
+def test_odd_scores_are_doubted_and_used(score):
+    check = checked(detections(score=score))
+    assert [(fault.is_certain, f'{score:g}' in fault.text) for fault in check.faults] == [
+        (False, True)]
+    assert check.explain(NOTHING_FOUND) == NOTHING_FOUND
+
+
+def test_an_accepted_pose_is_left_alone():
+    """Keyframes alone may recognize a place."""
+    accepted = Relocalization(True, '')
+    assert checked(detections('zebra')).explain(accepted) == accepted

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Large maps: what is left out would not have counted, and a hypothesis costs little more."""
 
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -107,26 +106,6 @@ def test_a_frame_sees_what_its_boxes_can_show_and_little_more(rng, classes):
     assert len(visible) <= 3 * overlap.sum() + 3
 
 
-@pytest.mark.parametrize('count', [1, 8, 9, 64, 65, 1_000])
-def test_every_sphere_holds_what_is_below_it(rng, count):
-    centers, class_ids = rng.uniform(-5, 5, (count, 3)), np.arange(count) % 2
-    shapes = shape_matrices(rng.uniform(0.1, 0.4, (count, 3)), np.tile([0.0, 0, 0, 1], (count, 1)))
-    _, _, _, members, levels, spheres = make_groups(
-        sort_landmarks(centers, shapes, own_classes(class_ids)), np.array([0, 1]),
-        np.array([[0.1, 0.1, 0.2, 0.1], [0, 0, 0.3, 0.2]]), 0.2)
-    assert len(members) == levels[1] == count
-    assert len(spheres) == levels[-1] == levels[-2] + 1  # the last one holds all
-    reaches = spheres[:count, 4] / spheres[:count, 3]
-    for group in range(min(count, 2)):
-        assert np.ptp(reaches[members[:, 1] == group]) < 1e-9
-    assert reaches.min() > 1.0
-    for level, (first, last) in enumerate(pairwise(levels)):
-        holders = spheres[first:last][np.arange(count) // 8**level]
-        apart = np.linalg.norm(spheres[:count, :3] - holders[:, :3], axis=1)
-        assert (apart + spheres[:count, 3] <= holders[:, 3] + 1e-12).all()
-        assert (apart + spheres[:count, 4] <= holders[:, 4] + 1e-12).all()
-
-
 def test_frames_that_show_nothing_of_the_map():
     for landmarks in (no_landmarks(), sort_landmarks(np.zeros((1, 3)), np.ones((1, 6)),
                                                      own_classes([0]))):
@@ -134,16 +113,3 @@ def test_frames_that_show_nothing_of_the_map():
             groups = make_groups(landmarks, classes, np.ones((len(classes), 4)), 0.2)
             assert len(groups.starts) - 1 == len(groups.members) == len(groups.spheres) == 0
             assert visible_members(groups, HERE, 0, np.empty((2, 0), dtype=np.int64)) == 0
-
-
-def test_far_landmarks_appear_too_small():
-    """The greatest depth of a member against the outlines of spheres."""
-    radius, box, iou_threshold = 0.3, np.array([[0.0, 0, 0.4, 0.3]]), 0.2
-    shape = np.array([[radius**2, 0, 0, radius**2, 0, radius**2]])
-    farthest = make_groups(sort_landmarks(np.zeros((1, 3)), shape, own_classes([0])),
-                           np.zeros(1, dtype=np.int64), box, iou_threshold).spheres[0, 4]
-    for x in (-0.5, 0.0, 0.5):
-        direction = np.array([x, 0.2, 1.0])
-        center = direction * farthest * 1.001
-        exx, exy, eyy = project_ellipsoids(np.eye(4), center[None], shape)[0, 2:]
-        assert np.sqrt(exx * eyy - exy * exy) < iou_threshold * 0.4 * 0.3

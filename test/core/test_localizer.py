@@ -7,17 +7,20 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from scene import CAMERA, MAP_FROM_CAMERA, boxes_of, make_room, see_room
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.looks import Look, Looks
+from cliploc_ros.core.fit.covariance import odometry_deviations
+from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.localizer import KeptInstant, Localizer, instants_to_fuse
-from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.errors import OptionsError
 
 ROOM = make_room()
 SEEN = see_room(ROOM)
@@ -79,13 +82,6 @@ def test_of_too_many_frames_those_furthest_apart_remain(window):
         assert len(fused) <= 5
     assert fused[0] == 0.0 and fused[-1] == 3.0
     assert np.diff(fused).max() <= 1.6, 'all of the way'
-
-
-def test_the_newest_frame_always_remains(window):
-    for number in range(10):
-        for limit in (5, 2, 1, 3):
-            fused = window.join(number + limit / 10, 10.0 * number, limit=limit)
-            assert fused[-1] == number + limit / 10 and len(fused) <= limit
 
 
 def test_old_frames_are_dropped(window):
@@ -304,3 +300,138 @@ def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
     alone = localize(3, 1, NOTHING)
     assert alone.source == 'keyframes'
     np.testing.assert_array_equal(session.covariance_for_filter(alone), fine)
+
+
+ODOM_FROM_MAP = make_transform(Rotation.from_euler('z', 70, degrees=True).as_matrix(),
+                               np.array([30.0, -4.0, 1.0]))
+OPTIONS = RelocalizerOptions(matching='class')
+
+
+def see(room, map_from_camera, rows=None):
+    """An observation of some landmarks, whose odometry has no error."""
+    rows = np.arange(len(room)) if rows is None else np.asarray(rows, dtype=np.int64)
+    seen = Detections(boxes_of(room, map_from_camera)[rows],
+                      tuple(room.class_ids[row] for row in rows), np.full(len(rows), 0.9))
+    return Observation(CAMERA, seen, odom_from_camera=ODOM_FROM_MAP @ map_from_camera)
+
+
+def moved(map_from_camera, metres, degrees):
+    """A camera that went on and turned about its vertical axis."""
+    turn = Rotation.from_euler('y', degrees, degrees=True).as_matrix()
+    return map_from_camera @ make_transform(turn, np.array([metres, 0.0, 0.5 * metres]))
+
+
+@pytest.fixture
+def walk():
+    return [moved(MAP_FROM_CAMERA, 0.05 * step, 2.0 * step) for step in range(4)]
+
+
+def test_objects_seen_one_after_the_other_are_as_good_as_at_once(room, walk):
+    """No frame alone shows three objects that can be told apart."""
+    shares = [[0, 4, 8], [3, 7], [2, 11, 9], [1, 5]]
+    frames = [see(room, pose, rows) for pose, rows in zip(walk, shares, strict=True)]
+    relocalizer = Relocalizer(room, OPTIONS)
+    assert not any(relocalizer.relocalize([one]).accepted for one in frames)
+    found = relocalizer.relocalize(frames)
+    assert found.accepted, found.reason
+    assert pose_error(found.map_from_camera, walk[-1]) < (0.01, 0.2)
+    # of the last frame alone
+    assert [match.detection for match in found.matches] == [0, 1]
+    assert [match.landmark for match in found.matches] == shares[-1]
+
+
+@pytest.mark.filterwarnings('error')
+def test_last_frames_without_objects_take_no_confidence(room):
+    """The test for mirror images goes back to frames that show something."""
+    walk = [moved(MAP_FROM_CAMERA, 0.05 * step, 2.0 * step) for step in range(6)]
+    relocalizer = Relocalizer(room, OPTIONS)
+    confidences = [
+        relocalizer.relocalize([see(room, pose, None if step < shown else [])
+                                for step, pose in enumerate(walk)]).confidence
+        for shown in (6, 4, 2)]
+    assert confidences[0] > 0.99
+    assert confidences == pytest.approx([confidences[0]] * 3, abs=1e-3)
+
+
+def test_the_last_frame_is_the_one_asked_about(room, walk):
+    relocalizer = Relocalizer(room, OPTIONS)
+    frames = [replace(see(room, pose), stamp_ns=number) for number, pose in enumerate(walk)]
+    for last in range(4):
+        order = [frames[(last + 1 + step) % 4] for step in range(4)]
+        found = relocalizer.relocalize(order)
+        assert found.accepted
+        assert found.stamp_ns == last
+        assert pose_error(found.map_from_camera, walk[last]) < (0.01, 0.2)
+
+
+@pytest.mark.parametrize('refine', [True, False])
+def test_the_same_view_again_is_no_more_evidence(refine, room):
+    relocalizer = Relocalizer(room, replace(OPTIONS, refine=refine))
+    frame = see(room, MAP_FROM_CAMERA, [0, 1, 2, 4])
+    once, often = relocalizer.relocalize([frame]), relocalizer.relocalize([frame] * 5)
+    assert often.score == pytest.approx(5 * once.score, rel=0.02)
+    assert often.confidence == pytest.approx(once.confidence, rel=0.05)
+    assert (np.diag(often.covariance) > 0.9 * np.diag(once.covariance)).all()
+
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def knowing_up(frame, map_from_camera):
+    return replace(frame, up_in_camera=map_from_camera[:3, :3].T @ UP)
+
+
+def tilt_deg(found):
+    """Standard deviation of the tilt that a covariance states."""
+    return np.degrees(np.sqrt(np.linalg.eigvalsh(found.covariance[3:5, 3:5]).max()))
+
+
+@pytest.mark.parametrize('deviation_deg', [0.1, 0.5])
+def test_the_verticals_of_several_frames_count_as_one(deviation_deg, room):
+    """They come from one sensor on one mount, so its error does not average out."""
+    relocalizer = Relocalizer(room, replace(OPTIONS, vertical_deviation_deg=deviation_deg))
+    at_once, one_by_one = [[0, 1, 3, 8, 7]], [[0, 1], [3], [8], [7]]
+    one, four = (tilt_deg(relocalizer.relocalize([
+        knowing_up(see(room, MAP_FROM_CAMERA, rows), MAP_FROM_CAMERA) for rows in shares]))
+        for shares in (at_once, one_by_one))
+    print(f'\ntilt: the same objects in one frame {one:.3f} deg, in four {four:.3f} deg')
+    # refinement trusts four verticals more than one, and the boxes less
+    assert four == pytest.approx(one, rel=0.06)
+    assert four >= 0.95 * one
+
+
+def test_odometry_adds_more_error_to_frames_that_are_further_apart(room):
+    relocalizer, spreads = Relocalizer(room, OPTIONS), []
+    for step_m in (0.02, 0.1, 0.2):
+        poses = [moved(MAP_FROM_CAMERA, step_m * number, 0.0) for number in range(4)]
+        fused = relocalizer.relocalize([see(room, pose) for pose in poses])
+        alone = relocalizer.relocalize([see(room, poses[-1])])
+        spreads.append(np.sqrt(np.diag(fused.covariance)[:3]).max()
+                       - np.sqrt(np.diag(alone.covariance)[:3]).max())
+    assert spreads[0] < spreads[1] < spreads[2]
+
+
+def test_the_deviations_of_odometry():
+    assert not odometry_deviations(np.eye(4)).any(), 'did not move'
+    deviations = odometry_deviations(make_transform(
+        Rotation.from_euler('z', 10, degrees=True).as_matrix(), np.array([0.5, 0.0, 0.0])))
+    assert deviations[:3] == pytest.approx(0.005 + 0.03 * 0.5)
+    assert deviations[3:] == pytest.approx(np.radians(0.25 + 0.03 * 10.0 + 0.15 * 0.5))
+
+
+def test_bad_odometry_is_named(room, walk):
+    relocalizer = Relocalizer(room, OPTIONS)
+    first, last = see(room, walk[0]), see(room, walk[1])
+    scaled, broken, mirrored = (first.odom_from_camera.copy() for _ in range(3))
+    scaled[:3, :3] *= 1.01
+    broken[0, 3] = np.nan
+    mirrored[:3, 0] *= -1.0
+    for odom, named in ((None, 'missing'), (scaled, 'no rigid'), (broken, 'no rigid'),
+                        (mirrored, 'no rigid'), (np.eye(3), 'no rigid')):
+        bad = replace(first, odom_from_camera=odom)
+        for number, frames in enumerate(([bad, last], [last, bad]), 1):
+            with pytest.raises(OptionsError, match=f'frame {number} of 2 is {named}'):
+                relocalizer.relocalize(frames)
+    for count in (0, MAX_FRAMES + 1):
+        with pytest.raises(OptionsError, match=f'not {count}'):
+            relocalizer.relocalize([first] * count)

@@ -1,23 +1,32 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Writing maps, and the optional fields of a map file."""
+"""Maps, their embeddings and several maps in one: what is read, written and refused."""
 
+import os
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import yaml
-from scene import make_room
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.map.joined_map import MAX_MAPS, join_maps, parts_of, place_of
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import (
     LandmarkEmbeddings,
     embeddings_path,
     load_embeddings_of_map,
+    load_landmark_embeddings,
+    save_landmark_embeddings,
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.core.map.parameter_file import parse_written_map, read_parameter_file
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalization import in_its_map
+from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import MapError
 
 CUP = {'class_id': 'cup', 'center': [1.0, 2.0, 3.0], 'semi_axes': [0.1, 0.2, 0.3],
@@ -35,7 +44,7 @@ def read(fields):
 
 def test_a_written_map_is_read_back(tmp_path):
     room = make_room()
-    room = replace(room, labels=('yes: "quoted" \\ #1', *room.labels[1:]),
+    room = replace(room, labels=('yes: "quoted" \\ #1 \U0001f600', *room.labels[1:]),
                    details=(FULL,) + (LandmarkDetails(support=3),) * (len(room) - 1))
     write_map(tmp_path / 'map.yaml', room, ['two\nlines become one'])
     loaded = LandmarkMap.from_file(tmp_path / 'map.yaml')
@@ -45,15 +54,6 @@ def test_a_written_map_is_read_back(tmp_path):
     assert loaded.centers == pytest.approx(room.centers, abs=1e-5)
     assert loaded.semi_axes == pytest.approx(room.semi_axes, abs=1e-5)
     assert loaded.quats_xyzw == pytest.approx(room.quats_xyzw, abs=2e-5)
-
-
-@pytest.mark.parametrize('label', ['a 😀 cup', 'Käfer ☕', '\\ud83d\\ude00', 'a\u2028b "\\'])
-def test_any_text_is_read_back(tmp_path, label):
-    room = make_room()
-    write_map(tmp_path / 'map.yaml', replace(room, labels=(label, *room.labels[1:])))
-    assert LandmarkMap.from_file(tmp_path / 'map.yaml').labels[0] == label
-    tree = read_parameter_file(tmp_path / 'map.yaml')['/**']['ros__parameters']['map']
-    assert tree['landmarks'][room.landmark_ids[0]]['label'] == label
 
 
 def test_every_number_of_a_list_is_a_float(tmp_path):
@@ -139,12 +139,14 @@ def equal(one, other):
 @pytest.mark.parametrize('details', [
     (), (FULL,) * 12, (LandmarkDetails(), FULL) * 6,
     (LandmarkDetails(shared_sigma=0.02, shared_sigma_deg=0.5, support=3, last_seen=5.0),) * 12])
-@pytest.mark.parametrize('label', ['a mug', 'caf\u00e9 "x" \\ #1: [a]', 'tab\tand\nline', '\x7f'])
+@pytest.mark.parametrize('label', ['a mug', 'caf\u00e9 "x" \\ #1: [a]', 'tab\tand\nline', '\x7f',
+                                   '\\ud83d\\ude00', 'a\u2028b "\\'])
 def test_what_was_written_is_read_as_yaml_reads_it(tmp_path, details, label):
     path, room = tmp_path / 'map.yaml', make_room()
     write_map(path, replace(room, details=details, labels=(label, *room.labels[1:])), ['h\u00f6'])
     assert parse_written_map(path.read_text(encoding='utf-8')) is not None
     assert equal(LandmarkMap.from_file(path), by_yaml(path))
+    assert by_yaml(path).labels[0] == label
 
 
 @pytest.mark.parametrize(('before', 'after'), [
@@ -170,3 +172,239 @@ def test_a_changed_file_is_read_or_refused_as_by_yaml(tmp_path, before, after):
         assert str(raised.value) == str(error)
     else:
         assert equal(LandmarkMap.from_file(path), expected)
+
+
+WITH_LABEL = {'label': 'a red cup', 'class_id': 'cup', 'center': [1.0, 2.0, 3.0],
+       'semi_axes': [0.1, 0.2, 0.3], 'orientation': [0.0, 0.0, 0.0, 1.0]}
+
+
+def file_of(landmarks, frame_id='map'):
+    return {'/**': {'ros__parameters': {'map': {'frame_id': frame_id, 'landmarks': landmarks}}}}
+
+
+def write(tmp_path, content):
+    path = tmp_path / 'map.yaml'
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        path.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
+    return path
+
+
+def test_reads_every_field(tmp_path):
+    loaded = LandmarkMap.from_file(write(tmp_path, file_of({'cup_1': WITH_LABEL})))
+    assert (loaded.frame_id, loaded.landmark_ids, loaded.labels, loaded.class_ids) == (
+        'map', ('cup_1',), ('a red cup',), ('cup',))
+    assert loaded.centers.tolist() == [[1.0, 2.0, 3.0]]
+    assert loaded.semi_axes.tolist() == [[0.1, 0.2, 0.3]]
+    assert loaded.shapes[0] == pytest.approx([0.01, 0, 0, 0.04, 0, 0.09])
+
+
+def test_a_nearly_unit_quaternion_is_normalized(tmp_path):
+    tilted = WITH_LABEL | {'orientation': [0.0, 0.0, 0.7071, 0.7071]}
+    loaded = LandmarkMap.from_file(write(tmp_path, file_of({'cup_1': tilted})))
+    assert np.linalg.norm(loaded.quats_xyzw) == pytest.approx(1.0, abs=1e-12)
+    assert loaded.shapes[0] == pytest.approx([0.04, 0, 0, 0.01, 0, 0.09])
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'center': [float('nan'), 0.0, 0.0]}, 'center: .*finite'),
+    ({'center': [1e300, 0.0, 0.0]}, 'center: .*beyond'), ({'center': [0.0, 0.0]}, 'center: .*3'),
+    ({'center': [True, 0.0, 0.0]}, 'center: .*3'), ({'semi_axes': [0.1, -1.0, 0.1]}, 'semi_axes'),
+    ({'orientation': [0.0] * 4}, 'orientation: .*0'), ({'class_id': None}, 'class_id'),
+    ({'colour': 'red'}, '.*colour')])
+def test_bad_fields_are_named_with_file_and_landmark(tmp_path, change, message):
+    path = write(tmp_path, file_of({'cup_1': WITH_LABEL | change}))
+    with pytest.raises(MapError, match=f"{path}: landmark 'cup_1': {message}"):
+        LandmarkMap.from_file(path)
+
+
+@pytest.mark.parametrize(('content', 'message'), [
+    ('', 'no YAML mapping'), ('a: [1, 2', 'line 1, column 4'),
+    ('a: &x [1]\nb: *x\n', 'an alias'), ('a: 1\na: 2\n', "'a' is repeated"),
+    ('[' * 1_000_000, 'nest'),
+    (b'\x7fELF\xff\xfe\x00', 'not a text file'),
+    ('/**:\n  ros__parameters:\n    map:\n', 'frame_id, landmarks'),
+    (file_of({}), 'the map is empty'), (file_of({'a.b': WITH_LABEL}), 'without dots'),
+    (file_of({'a': {'centre': 0, **WITH_LABEL}}), "mean 'center'"),
+    (file_of({'a': WITH_LABEL}) | {'/x': {'ros__parameters': {'map': {}}}}, 'more than one map'),
+    ('!!python/object/apply:os.system [echo]', 'no YAML mapping')])
+def test_broken_and_hostile_files_are_refused(tmp_path, content, message):
+    with pytest.raises(MapError, match=message):
+        LandmarkMap.from_file(write(tmp_path, content))
+
+
+def test_what_has_no_end_is_not_read(tmp_path):
+    pipe = tmp_path / 'pipe'
+    os.mkfifo(pipe)
+    for path in ('/dev/zero', pipe, tmp_path):
+        with pytest.raises(MapError, match='regular file'):
+            LandmarkMap.from_file(path)
+
+
+def unit_rows(count, seed):
+    rows = np.random.default_rng(seed).normal(size=(count, 8))
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float16)
+
+
+@pytest.fixture
+def embeddings():
+    """Return three landmarks: two medoids, none and unknown, one."""
+    means = unit_rows(3, 0)
+    means[1] = 0.0
+    return LandmarkEmbeddings('tiny:gelu:1234', ('mug_1', 'mug_2', 'book_1'), means,
+                              unit_rows(3, 1), np.array([0, 2, 2, 3]))
+
+
+def arrays_of(embeddings):
+    return {name: np.array(value) for name, value in vars(embeddings).items()}
+
+
+def test_a_file_comes_back_as_it_was_written(tmp_path, embeddings):
+    path = embeddings_path(tmp_path / 'my.office.yaml')
+    assert path.name == 'my.office.embeddings.npz'
+    save_landmark_embeddings(path, embeddings)
+    found = load_landmark_embeddings(path)
+    assert found.encoder_key == embeddings.encoder_key
+    assert found.landmark_ids == embeddings.landmark_ids
+    for name in ('means', 'medoids', 'medoid_offsets'):
+        np.testing.assert_array_equal(getattr(found, name), getattr(embeddings, name))
+    assert found.is_known.tolist() == [True, False, True]
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
+def test_rows_take_the_order_of_a_map(embeddings):
+    ordered = embeddings.in_order(['book_1', 'new', 'mug_1'])
+    assert ordered.landmark_ids == ('book_1', 'new', 'mug_1')
+    assert ordered.is_known.tolist() == [True, False, True]
+    np.testing.assert_array_equal(ordered.means[[0, 2]], embeddings.means[[2, 0]])
+    assert ordered.medoid_offsets.tolist() == [0, 1, 1, 3]
+    np.testing.assert_array_equal(ordered.medoids, embeddings.medoids[[2, 0, 1]])
+    assert embeddings.in_order([]).medoid_offsets.tolist() == [0]
+
+
+def test_a_map_finds_the_file_next_to_it(tmp_path, embeddings):
+    map_path = tmp_path / 'office.yaml'
+    assert load_embeddings_of_map(map_path, ['mug_1']) is None
+    save_landmark_embeddings(embeddings_path(map_path), embeddings)
+    found = load_embeddings_of_map(map_path, ['added', 'mug_1'])
+    assert found.is_known.tolist() == [False, True]
+    with pytest.raises(MapError, match='another map'):
+        load_embeddings_of_map(map_path, ['chair_1'])
+
+
+WRONG = {
+    'wrong rows': ('means', unit_rows(2, 0), r'means has shape \(2, 8\)'),
+    'repeated id': ('landmark_ids', np.array(['a', 'b', 'a']), 'repeats an id'),
+    'NaN': ('means', np.full((3, 8), np.nan), 'unit length in row 0'),
+    'end': ('medoid_offsets', np.array([0, 1, 2, 2]), 'medoid_offsets goes from 0 to 2'),
+    'falling': ('medoid_offsets', np.array([0, 3, 2, 3]), 'medoid_offsets decreases')}
+
+
+@pytest.mark.parametrize(('name', 'value', 'message'), WRONG.values(), ids=WRONG)
+def test_a_malformed_array_is_refused(tmp_path, embeddings, name, value, message):
+    arrays = arrays_of(embeddings) | {name: value}
+    path = tmp_path / 'wrong.npz'
+    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
+    with pytest.raises(MapError, match=message):
+        load_landmark_embeddings(path)
+
+
+OPTIONS = RelocalizerOptions(matching='class')
+
+
+def floor(name, seed=0):
+    """Return twelve objects near the camera as a map of this name; seeds place them."""
+    rng = np.random.default_rng(seed)
+    return replace(make_room(), frame_id=name, centers=np.c_[
+        rng.uniform(-1.2, 1.2, (12, 2)), rng.uniform(1.5, 4, 12)])
+
+
+def join(*maps):
+    return join_maps(maps, [f'{one.frame_id}.yaml' for one in maps])
+
+
+def localize(landmark_map, seen, options=OPTIONS, similarities=None):
+    found = Relocalizer(landmark_map, options).relocalize(
+        [Observation(CAMERA, see_room(seen), similarities)])
+    return in_its_map(found, landmark_map)
+
+
+@pytest.mark.parametrize('place', [0, 1, 7])
+def test_the_right_one_of_different_floors_is_accepted(place):
+    """The pose is that of a search in this map alone, in the coordinate frame of this map."""
+    maps = [floor(f'floor_{number}', seed=number) for number in range(8)]
+    found, part = localize(join(*maps), maps[place])
+    alone, _ = localize(maps[place], maps[place])
+    assert found.accepted and part.landmark_map is maps[place]
+    assert max(pose_error(found.map_from_camera, MAP_FROM_CAMERA)) < 1.0
+    assert np.allclose(found.map_from_camera, alone.map_from_camera, atol=1e-6)
+    assert np.diag(found.covariance) == pytest.approx(np.diag(alone.covariance), rel=0.02)
+    assert {one.landmark for one in found.matches} == set(range(12))
+
+
+@pytest.mark.parametrize('turned', [False, True])
+def test_equal_floors_are_refused_and_both_are_named(turned):
+    maps = [floor('floor_1'), floor('floor_2')]
+    found, part = localize(join(*(maps[::-1] if turned else maps)), maps[0])
+    assert not found.accepted
+    assert found.reason.startswith(f'in {part.landmark_map.frame_id}: confidence 0.')
+    assert 'floor_1' in found.reason and 'floor_2' in found.reason
+
+
+def test_the_twin_of_a_place_is_given_in_its_own_map():
+    """One map lacks an object: the pose in the other one is likelier, but its place has a twin."""
+    whole = floor('floor_1')
+    lacking = replace(whole.select(range(11)), frame_id='floor_2',
+                      centers=whole.centers[:11] + np.array([500.0, -3.0, 0.0]))
+    found, _ = localize(join(lacking, whole), whole)
+    assert not found.accepted
+    assert 'in floor_1: ' in found.reason and 'floor_2' in found.reason
+    assert '(500.' in found.reason
+
+
+def test_many_floors_get_equal_shares_of_the_candidates():
+    """Twenty equal floors, one hypothesis for each of them at least: none is left out."""
+    maps = [floor(f'floor_{number}') for number in range(20)]
+    rows = np.full((12, 12), 0.2) + 0.2 * np.eye(12)
+    found, _ = localize(join(*maps), maps[0], RelocalizerOptions(), np.tile(rows, 20))
+    assert not found.accepted and found.reason.count('in floor_') == 2, found.reason
+    assert found.confidence < 0.3
+
+
+def test_a_search_too_short_for_all_maps_is_refused():
+    """The least number of samples is that of each map: one map alone has enough of them."""
+    maps = [floor(f'floor_{number}', seed=number) for number in range(10)]
+    rows = np.full((12, 12), 0.2) + 0.2 * np.eye(12)
+    short = RelocalizerOptions(iterations=600)
+    found, _ = localize(maps[0], maps[0], short, rows)
+    assert found.accepted
+    found, _ = localize(join(*maps), maps[0], short, np.tile(rows, 10))
+    assert not found.accepted and 'in floor_0: search' in found.reason
+
+
+def test_a_joined_map_keeps_what_its_maps_hold():
+    plain, detailed = floor('hall'), floor('attic', seed=3)
+    detailed = replace(detailed, details=tuple(
+        LandmarkDetails(class_weights=(('z', 1.0), (name, 1.0))) for name in detailed.class_ids))
+    both = join(plain, detailed)
+    assert len(both) == 24 and both.frame_id == 'hall'
+    assert both.landmark_ids[:1] == ('hall/thing_0',) and len(set(both.landmark_ids)) == 24
+    assert np.array_equal(both.centers[:12], plain.centers)
+    assert both.classes.sizes_of(both.classes.classes_of(['z'])).tolist() == [12]
+    assert [part.first for part in parts_of(both)] == [0, 12]
+    apart = both.centers[12:, 0].min() - both.centers[:12, 0].max()
+    assert apart >= 100_000 * both.semi_axes.max()
+    for part in parts_of(both):
+        pose = MAP_FROM_CAMERA.copy()
+        pose[:3, 3] += part.shift
+        place = place_of(both, pose)
+        assert place.part is part and place.name == part.landmark_map.frame_id
+        assert np.allclose(place.map_from_camera, MAP_FROM_CAMERA, atol=1e-6)
+
+
+def test_maps_that_cannot_be_told_apart_are_refused():
+    with pytest.raises(MapError, match="frame_id 'map'"):
+        join(floor('map'), floor('hall'), floor('map', seed=1))
+    with pytest.raises(MapError, match=f'at most {MAX_MAPS}'):
+        join(*[floor(f'floor_{number}') for number in range(MAX_MAPS + 1)])

@@ -72,7 +72,7 @@ def test_a_room_moves_as_odometry_says_and_a_picture_does_not(room, name):
     pose, points = room
     motion, rng = MOTIONS[name], np.random.default_rng(2)
     bearings, squares = seen_from(points, pose), []
-    for _ in range(20):
+    for _ in range(8):
         deviations = odometry_deviations(motion) * rng.normal(size=6)
         odometry = motion @ make_transform(Rotation.from_rotvec(deviations[3:]).as_matrix(),
                                            deviations[:3])

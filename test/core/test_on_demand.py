@@ -129,26 +129,3 @@ def test_without_time_for_all_crops_a_pose_must_be_as_sure():
     # one camera: all crops do not change what is known of it, but for rounding
     assert found.confidence == pytest.approx(sure, abs=1e-7) and sure > options.min_confidence
     assert not found.accepted and found.refusal_kind == 'not_all_crops'
-
-
-def test_real_boxes_need_a_part_of_their_crops(office_map, queries, observe):
-    """Boxes and poses are real, similarities are simulated; every fifth of 258 frames."""
-    shares, verdicts = [], {'all': [], 'on_demand': []}
-    for frame in list(queries)[::5]:
-        view = observe(frame)
-        for crops, found in verdicts.items():
-            options = RelocalizerOptions(crops=crops)
-            searched, result = localize_on_demand(
-                Relocalizer(office_map, options), (), view, recorded_crops(view, options))
-            right = result.solved and pose_error(result.map_from_camera,
-                                                 frame.map_from_camera)[0] < 1.0
-            found.append((result.accepted, right))
-        shares.append(np.mean(searched.observation.similarity_rows >= 0))
-    accepted = {crops: np.array(found)[:, 0] for crops, found in verdicts.items()}
-    right = {crops: np.array(found)[:, 1] for crops, found in verdicts.items()}
-    print(f'\n{np.mean(shares):.2f} of the crops; accepted: ' + ', '.join(
-        f'{crops} {one.sum()} ({(one & ~right[crops]).sum()} wrong)'
-        for crops, one in accepted.items()))
-    assert np.mean(shares) < 0.5
-    assert not (accepted['on_demand'] & ~right['on_demand']).any()
-    assert accepted['on_demand'].sum() >= accepted['all'].sum() - 1

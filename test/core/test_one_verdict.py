@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from scene import CAMERA, MAP_FROM_CAMERA, doubled_room, make_room, see_room
 
 from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.acceptance.verdict import RefusalKind
@@ -14,12 +14,11 @@ from cliploc_ros.core.fit.covariance import fuse
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
-from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 
-ROUGH, FINE = np.diag([0.01] * 3 + [1e-3] * 3), np.diag([1e-4] * 3 + [1e-5] * 3)
+FINE = np.diag([1e-4] * 3 + [1e-5] * 3)
 ROOM = make_room()
 SEEN = see_room(ROOM)
 OPTIONS = RelocalizerOptions(matching='class')
@@ -149,13 +148,7 @@ def test_a_picture_refuses_the_objects_in_it_too():
 
 def two_rooms(lacking=0):
     """The room and a copy of it 20 m away, without some of its objects."""
-    twin = ROOM.select(range(len(ROOM) - lacking))
-    return LandmarkMap(
-        'map', ROOM.landmark_ids + tuple(f'{one}_twin' for one in twin.landmark_ids),
-        ROOM.labels + twin.labels, ROOM.class_ids + twin.class_ids,
-        np.concatenate([ROOM.centers, twin.centers + np.array([20.0, 0.0, 0.0])]),
-        np.concatenate([ROOM.semi_axes, twin.semi_axes]),
-        np.concatenate([ROOM.quats_xyzw, twin.quats_xyzw]))
+    return doubled_room(np.array([20.0, 0.0, 0.0])).select(range(2 * len(ROOM) - lacking))
 
 
 @pytest.mark.parametrize('lacking', [0, 3])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is known before: a region decides between look-alikes."""
+"""What is known before: a region, a vertical, a height; what they buy, and what wrong ones do."""
 
 import math
 from dataclasses import replace
@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scene import CAMERA, MAP_FROM_CAMERA, doubled_room, make_room, see_room
-from test_joined_map import floor, join
+from scipy.spatial.transform import Rotation
+from test_map_file import floor, join
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.confidence import confidences, region_odds
@@ -84,11 +85,6 @@ def test_the_yaw_counts_across_the_seam():
     assert odds == pytest.approx([0.0, -TERMS.most])
 
 
-def test_a_camera_that_looks_up_has_no_yaw():
-    ahead = region(yaw=2.0, yaw_deviation=0.01)
-    assert region_odds(TWINS, ahead, np.eye(4)[None]) == [0.0]
-
-
 def test_a_region_decides_between_rooms_that_nearly_look_the_same():
     """The second room lacks three objects: more than by chance, too little to be sure."""
     alone = ask(LACKING)
@@ -128,12 +124,6 @@ def test_a_confident_wrong_region_accepts_nothing_and_is_named():
     assert sure.accepted and pose_error(sure.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
 
 
-def test_a_right_region_lifts_no_weak_pose():
-    alone, told = (ask(make_room(), objects=3, **known) for known in ({}, {'region': region()}))
-    assert not alone.accepted and not told.accepted
-    assert told.confidence <= ask(make_room(), objects=4).confidence
-
-
 @given(st.lists(st.tuples(st.floats(-5, 9), st.floats(-3, 0)), min_size=1, max_size=5))
 def test_no_prior_gives_more_than_the_objects_give_without_rivals(contenders):
     odds, prior = np.array(contenders).T
@@ -143,3 +133,86 @@ def test_no_prior_gives_more_than_the_objects_give_without_rivals(contenders):
     alone = [confidences(odds[[row]], poses[[row]], 2.0)[0] for row in range(len(odds))]
     assert (told <= np.array(alone) + 1e-9).all()
     assert told.sum() <= 1.0 + 1e-9
+
+
+UP_IN_CAMERA = MAP_FROM_CAMERA[2, :3]
+LEVEL = np.s_[3:5, 3:5]  # of a covariance: turns about level axes
+
+
+def with_vertical(room, up=UP_IN_CAMERA):
+    return Observation(CAMERA, see_room(room), None, up_in_camera=up)
+
+
+@pytest.mark.parametrize('tilt_deg', [
+    90.0, 180.0])
+def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries, observe):
+    """As by a wrong mount: what boxes say without it is among the rivals."""
+    relocalizer, rng = Relocalizer(office_map, RelocalizerOptions()), np.random.default_rng(0)
+    accepted, wrong = 0, 0
+    for frame in queries.main_frames():
+        up = frame.map_from_camera[2, :3]
+        axis = np.cross(up, rng.normal(size=3))
+        up = Rotation.from_rotvec(np.radians(tilt_deg) * axis / np.linalg.norm(axis)).apply(up)
+        found = relocalizer.relocalize([replace(observe(frame), up_in_camera=up)])
+        if found.accepted:
+            accepted += 1
+            wrong += pose_error(found.map_from_camera, frame.map_from_camera)[0] > 1.0
+    print(f'\nvertical off by {tilt_deg:g} deg: {accepted} of 52 accepted, {wrong} wrong')
+    assert wrong == 0
+
+
+def test_two_objects_and_the_vertical_fix_a_pose(room):
+    """But are refused, for four are asked; and without a vertical there is none."""
+    options = RelocalizerOptions(matching='class')
+    pair = np.array([0, 1])
+    observation = with_vertical(room)
+    observation = replace(observation, detections=observation.detections.select(pair))
+    found = Relocalizer(room, options).relocalize([observation])
+    assert found.solved and not found.accepted
+    assert len(found.matches) == 2
+    assert np.linalg.eigvalsh(found.covariance).min() > 0.0
+    blind = Relocalizer(room, options).relocalize([replace(observation, up_in_camera=None)])
+    assert not blind.solved
+    assert 'fewer than 3' in blind.reason
+
+
+def test_a_vertical_makes_a_pose_surer(room):
+    relocalizer = Relocalizer(room, RelocalizerOptions(matching='class'))
+    upright = relocalizer.relocalize([with_vertical(room)])
+    free = relocalizer.relocalize([with_vertical(room, None)])
+    for found in (upright, free):
+        assert pose_error(found.map_from_camera, MAP_FROM_CAMERA)[0] < 1e-2
+    assert np.trace(upright.covariance[LEVEL]) < np.trace(free.covariance[LEVEL])
+
+
+def test_a_height_that_is_wrong_leaves_no_pose_outside(room):
+    truth = MAP_FROM_CAMERA[2, 3]
+    inside = RelocalizerOptions(matching='class', height_range_m=(truth - 0.1, truth + 0.1))
+    assert Relocalizer(room, inside).relocalize([with_vertical(room, None)]).accepted
+    outside = replace(inside, height_range_m=(truth + 1.0, truth + 2.0), refine=False)
+    for hypothesis in Relocalizer(room, outside).relocalize(
+            [with_vertical(room, None)]).hypotheses:
+        assert truth + 1.0 <= hypothesis.map_from_camera[2, 3] <= truth + 2.0
+
+
+def test_the_papers_algorithms_ask_for_no_vertical(room):
+    """Where the paper's own configuration is asked for, exactly that runs."""
+    paper = RelocalizerOptions(matching='class', algorithm='bf', refine=False)
+    found = [Relocalizer(room, paper).relocalize([with_vertical(room, up)])
+             for up in (UP_IN_CAMERA, None)]
+    assert found[0].tried == found[1].tried
+    assert np.array_equal(found[0].map_from_camera, found[1].map_from_camera)
+
+
+@pytest.mark.parametrize('up', [np.zeros(3), np.full(3, np.nan), np.array([0, -2.0, 0]),
+                                np.array([1.0, 0.0])])
+def test_a_vertical_is_a_unit_vector(room, up):
+    with pytest.raises(OptionsError, match='up_in_camera'):
+        Relocalizer(room, RelocalizerOptions(matching='class')).relocalize(
+            [with_vertical(room, up)])
+
+
+@pytest.mark.parametrize('heights', [(2.0, 1.0), (1.0, 1.0), (math.nan, 2.0), (1.0,)])
+def test_a_height_range_has_two_ends(heights):
+    with pytest.raises(OptionsError, match='height_range_m'):
+        RelocalizerOptions(height_range_m=heights)

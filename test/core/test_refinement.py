@@ -1,32 +1,37 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Refinement: nearer to the truth, never worse, and sure of what the boxes fix."""
+"""Refinement of one frame and of several, its covariance, and which poses stand for a place."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from reference import verify
-from scene import CAMERA, MAP_FROM_CAMERA, see_room
+from reference import scene_of, verify
+from scene import CAMERA, MAP_FROM_CAMERA, boxes_of, make_room
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
+from cliploc_ros.core.fit.covariance import EXACT, normalized_square, refined_covariance
+from cliploc_ros.core.fit.finalists import Finalist, first_of_each_place
 from cliploc_ros.core.fit.refinement import (
+    LEAST_DEVIATION,
     LEAST_SHARE,
+    RELATIVE_DEVIATION,
+    edge_deviation,
     jacobian_of,
     move,
     refine_rig,
     residuals_of,
 )
-from cliploc_ros.core.fit.verification import make_rig
-from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
+from cliploc_ros.core.fit.verification import choose_distinct, make_rig, scores_of, verify_rig
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search.candidates import match_frame
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
-
-
-def see(room, noise_px=0.0, rng=None):
-    boxes = see_room(room).bboxes_xyxy
-    if noise_px:
-        boxes = boxes + rng.normal(0, noise_px, boxes.shape)
-    potential = np.array(room.class_ids)[:, None] == np.array(room.class_ids)[None]
-    return make_scene(CAMERA.normalize_bboxes(boxes), room.centers, room.shapes, potential,
-                      np.argwhere(potential), 0.2)
 
 
 def refine(scene, rotation, translation, vertical):
@@ -55,7 +60,7 @@ def error_of(rotation, translation):
 
 
 def test_a_perfect_view_leads_to_the_truth(room, rng):
-    scene = see(room)
+    scene = scene_of(room)
     perfect = verify(scene, *shaken(rng, 0.0, 0.0)).score
     for _ in range(50):
         found = refine(scene, *shaken(rng, 0.08, 1.5), VERTICAL_UNKNOWN)
@@ -68,7 +73,7 @@ def test_a_perfect_view_leads_to_the_truth(room, rng):
 def test_it_is_nearer_the_truth_than_before_and_hardly_ever_scores_less(room, rng):
     before, after = [], []
     for _ in range(200):
-        scene, start = see(room, 3.0, rng), shaken(rng, 0.15, 3.0)
+        scene, start = scene_of(room, noise_px=3.0, rng=rng), shaken(rng, 0.15, 3.0)
         before.append(error_of(*start)[0])
         found = refine(scene, *start, VERTICAL_UNKNOWN)
         assert found.score >= LEAST_SHARE * verify(scene, *start).score
@@ -82,7 +87,7 @@ def test_it_is_nearer_the_truth_than_before_and_hardly_ever_scores_less(room, rn
 
 def test_nothing_to_go_by_changes_nothing(room):
     away = np.diag([-1.0, 1.0, -1.0])
-    found = refine(see(room), away, np.zeros(3), VERTICAL_UNKNOWN)
+    found = refine(scene_of(room), away, np.zeros(3), VERTICAL_UNKNOWN)
     assert found.score == 0.0
     assert not found.information.any()
     np.testing.assert_array_equal(found.rotation, away)
@@ -90,7 +95,7 @@ def test_nothing_to_go_by_changes_nothing(room):
 
 
 def test_derivatives_are_those_of_differences(room, rng):
-    scene = see(room)
+    scene = scene_of(room)
     pairs = np.concatenate([scene.box_ellipses, room.centers, room.shapes,
                             np.tile([0.02, 4.0, 0.1], (len(room), 1))], axis=1)
     pairs[::3, 15] = 0.0  # without depth
@@ -105,3 +110,237 @@ def test_derivatives_are_those_of_differences(room, rng):
                 assert residuals_of(pairs, vertical, *moved, values)
             np.testing.assert_allclose(jacobian[:, axis], (there - back) / 2e-6, rtol=1e-4,
                                        atol=1e-4)
+
+
+FRAMES = 4
+
+
+@pytest.fixture
+def walk(rng):
+    """Poses of a camera that walks and turns; the last is the reference."""
+    poses = [MAP_FROM_CAMERA]
+    for _ in range(FRAMES - 1):
+        step = make_transform(Rotation.from_rotvec(rng.normal(0, 0.05, 3)).as_matrix(),
+                              rng.normal(0, 0.2, 3))
+        poses.append(poses[-1] @ step)
+    return np.array(poses)
+
+
+def rig_of(room, poses):
+    camera_from_reference = np.array([*(invert_transform(pose) @ poses[-1]
+                                        for pose in poses[:-1]), np.eye(4)])
+    return make_rig([scene_of(room, pose) for pose in poses], camera_from_reference,
+                    np.tile(VERTICAL_UNKNOWN, (len(poses), 1)), np.zeros(len(room)))
+
+
+def split(map_from_camera):
+    inverse = invert_transform(map_from_camera)
+    return inverse[:3, :3].copy(), inverse[:3, 3].copy()
+
+
+def nearby(pose, rng, metres, degrees):
+    turn = Rotation.from_rotvec(np.radians(degrees) * rng.normal(size=3))
+    return make_transform(turn.as_matrix() @ pose[:3, :3], pose[:3, 3] + metres * rng.normal(
+        size=3))
+
+
+def test_the_score_is_the_sum_of_the_frames_scores(room, walk, rng):
+    rig = rig_of(room, walk)
+    shift = invert_transform(walk[-1]) @ nearby(walk[-1], rng, 0.03, 0.5)
+    alone = []
+    for pose in walk:  # the rig moves as one
+        moved = walk[-1] @ shift @ invert_transform(walk[-1]) @ pose
+        alone.append(verify(scene_of(room, pose), *split(moved)))
+    assert min(one.score for one in alone) > 1.0
+    found = verify_rig(rig, *split(walk[-1] @ shift))
+    assert found.score == pytest.approx(sum(one.score for one in alone), abs=1e-9)
+    np.testing.assert_array_equal(found.landmarks,
+                                  np.concatenate([one.landmarks for one in alone]))
+    np.testing.assert_allclose(found.ious, np.concatenate([one.ious for one in alone]), atol=1e-9)
+
+
+def test_frames_of_a_large_map_are_joined_with_their_groups(room, walk):
+    count = 20
+    shifts = np.repeat(np.c_[30.0 * np.arange(count), np.zeros((count, 2))], len(room), axis=0)
+    many = LandmarkMap(
+        'map', tuple(f'{i}' for i in range(count * len(room))), room.labels * count,
+        room.class_ids * count, np.tile(room.centers, (count, 1)) + shifts,
+        np.tile(room.semi_axes, (count, 1)), np.tile(room.quats_xyzw, (count, 1)))
+    scenes = []
+    for rows in ([0, 1, 2, 3, 5], [], [4, 7], [6]):  # no two frames show the same classes
+        boxes = boxes_of(room, walk[len(scenes)])[rows]
+        seen = Detections(boxes, tuple(room.class_ids[row] for row in rows), np.ones(len(rows)))
+        scenes.append(match_frame(many, Observation(CAMERA, seen),
+                                  RelocalizerOptions(matching='class'))[0])
+    assert [len(scene.groups.starts) - 1 for scene in scenes] == [3, 0, 1, 1]
+    cameras = np.array([invert_transform(pose) @ walk[-1] for pose in walk])
+    rig = make_rig(scenes, cameras, np.tile(VERTICAL_UNKNOWN, (FRAMES, 1)),
+                   many.position_sigmas)
+    place = 3
+    reference = walk[-1].copy()
+    reference[0, 3] += 30.0 * place
+    found = verify_rig(rig, *split(reference))
+    np.testing.assert_array_equal(
+        found.landmarks, place * len(room) + np.array([0, 1, 2, 3, 5, 4, 7, 6]))
+    assert found.ious.min() > 0.6
+
+
+def test_the_best_at_each_place_are_chosen(room, walk, rng):
+    rig = rig_of(room, walk)
+    near = [nearby(walk[-1], rng, 0.02, 0.3) for _ in range(6)]
+    far = walk[-1].copy()
+    far[2, 3] -= 1.0
+    poses = [*near[:3], far, *near[3:]]
+    rotations, translations = (np.array(part) for part in zip(*map(split, poses), strict=True))
+    scores = scores_of(rig, rotations, translations)
+    rows = choose_distinct(scores, rotations, translations, 5)
+    assert len(rows) == 2
+    assert rows[1] == 3
+    assert scores[rows[0]] == scores.max() > scores[3]
+    rows = choose_distinct(scores, rotations, translations, 1)
+    np.testing.assert_array_equal(rows, [int(np.argmax(scores))])
+
+
+ROOM = make_room()
+BY_CLASS = RelocalizerOptions(matching='class')
+
+
+def boxes_at(map_from_camera, noise_px=0.0, rng=None):
+    boxes = boxes_of(ROOM, map_from_camera)
+    return boxes if rng is None else boxes + rng.normal(0, noise_px, boxes.shape)
+
+
+def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None, shared=None,
+           wrong_share=0.0, camera=CAMERA, deviations=EXACT):
+    """The pose of the last camera in a map with these centres, and its covariance."""
+    scenes = [make_scene(camera.normalize_bboxes(boxes_at(pose, noise_px, rng)), centers,
+                         ROOM.shapes, np.eye(len(ROOM), dtype=bool), np.empty((0, 2), int), 0.05)
+              for pose in poses]
+    rig = make_rig(scenes, np.array([invert_transform(pose) @ poses[-1] for pose in poses]),
+                   np.tile(VERTICAL_UNKNOWN, (len(poses), 1)), np.full(len(ROOM), sigma))
+    start = invert_transform(poses[-1])
+    found = refine_rig(rig, start[:3, :3].copy(), start[:3, 3].copy())
+    stamps = np.arange(len(poses)) if stamps is None else np.array(stamps)
+    return (invert_transform(make_transform(found.rotation, found.translation)),
+            refined_covariance(rig, found.rotation, found.translation, stamps, shared,
+                               wrong_share, camera_deviations=deviations))
+
+
+def turning(count):
+    return [MAP_FROM_CAMERA @ make_transform(Rotation.from_euler(
+        'y', 2.0 * step, degrees=True).as_matrix(), np.zeros(3)) for step in range(count)]
+
+
+def move_landmarks(rng, pose):
+    return {'centers': ROOM.centers + rng.normal(0, 0.1, ROOM.centers.shape)}
+
+
+def move_map(rng, pose):
+    """About the camera: all landmarks share an error of 5 cm and 2 degrees."""
+    turn = Rotation.from_rotvec(rng.normal(0, np.radians(2.0), 3)).as_matrix()
+    return {'centers': (ROOM.centers - pose[:3, 3]) @ turn.T + pose[:3, 3]
+            + rng.normal(0, 0.05, 3)}
+
+
+INTRINSICS = np.array([0.04, 0.02, 0.02, 0.02, 0.0, 0.0, 0.0])
+
+
+def change_camera(rng, pose):
+    focal, aspect, x, y = INTRINSICS[:4] * rng.normal(size=4)
+    return {'camera': replace(
+        CAMERA, fx=CAMERA.fx * np.exp(focal + aspect / 2), cx=CAMERA.cx + 500 * x,
+        fy=CAMERA.fy * np.exp(focal - aspect / 2), cy=CAMERA.cy + 500 * y)}
+
+
+# What is wrong, what the map or the camera states of it, and the greatest share without that.
+STATED = {
+    'landmarks': (move_landmarks, {'sigma': 0.1}, {'sigma': DEFAULT_SIGMA_M}, 0.6),
+    'the map': (move_map, {'shared': np.tile([0.05, np.radians(2.0)], (len(ROOM), 1))}, {}, 0.5),
+    'intrinsics': (change_camera, {'deviations': INTRINSICS}, {}, 0.7)}
+
+
+@pytest.mark.parametrize('frames', [1, 4])
+@pytest.mark.parametrize('what', STATED)
+def test_errors_are_covered_where_they_are_stated(what, frames):
+    rng, squares, poses = np.random.default_rng(5), [], turning(frames)
+    disturb, stated, unknown, most = STATED[what]
+    for _ in range(100):
+        wrong, seed = disturb(rng, poses[-1]), int(rng.integers(1000))
+        squares.append([normalized_square(*fitted(
+            poses, **{'centers': ROOM.centers, 'sigma': 0.01} | wrong | known, noise_px=2.0,
+            rng=np.random.default_rng(seed)), poses[-1]) for known in (stated, unknown)])
+    within = (np.array(squares) < chi2.ppf(0.95, 6)).mean(axis=0)
+    print(f'\n{what}, {frames} frames: {within} in the 95 % ellipsoids, stated and not')
+    assert within[0] >= 0.87
+    assert within[1] <= most
+
+
+def test_errors_of_landmarks_do_not_average_out_over_frames():
+    one, four = (fitted([MAP_FROM_CAMERA] * count, ROOM.centers, 0.2)[1]
+                 for count in (1, 4))
+    np.testing.assert_allclose(four, one, rtol=0.1, atol=1e-6)
+
+
+def test_the_covariance_holds_the_chance_that_an_object_is_wrong():
+    def added_in(centers):
+        return (fitted([MAP_FROM_CAMERA], centers, 0.02, wrong_share=0.07)[1]
+                - fitted([MAP_FROM_CAMERA], centers, 0.02)[1])
+
+    added = added_in(ROOM.centers)
+    assert np.linalg.eigvalsh(added).min() > -1e-9
+    assert np.trace(added[:3, :3]) > 0.01 * np.trace(
+        fitted([MAP_FROM_CAMERA], ROOM.centers, 0.02)[1][:3, :3])
+    displaced = ROOM.centers.copy()
+    displaced[4] += [0.15, 0.1, 0.0]
+    assert np.trace(added_in(displaced)[:3, :3]) > np.trace(added[:3, :3])
+
+
+def test_odometry_is_a_walk_through_the_frames_in_order_of_time():
+    """The reference first, last or between: steps add up outwards from it."""
+    way = [MAP_FROM_CAMERA @ make_transform(np.eye(3), np.array([0.3 * step, 0.0, 0.0]))
+           for step in (0, 1, 2, 1)]
+    middle = fitted([*way[:3], way[1]], ROOM.centers, 0.0, stamps=[0, 1, 3, 2])[1]
+    end = fitted([*way[:3], way[1]], ROOM.centers, 0.0, stamps=[0, 1, 2, 9])[1]
+    assert np.trace(middle[:3, :3]) < np.trace(end[:3, :3])
+
+
+def test_an_edge_is_as_uncertain_as_box_and_landmark():
+    box, center = np.array([0.1, 0.0, 0.2, 0.1]), np.array([0.0, 0.0, 4.0])
+    own = RELATIVE_DEVIATION * 0.3 + LEAST_DEVIATION
+    assert edge_deviation(box, center, 0.0, np.eye(3), np.zeros(3)) == pytest.approx(own)
+    seen = edge_deviation(box, center, 0.2, np.eye(3), np.zeros(3))
+    assert seen == pytest.approx(np.hypot(own, 0.05))
+
+
+def test_a_map_states_what_its_landmarks_share():
+    assert not ROOM.shared_sigmas.any()
+    stated = replace(ROOM, details=(LandmarkDetails(shared_sigma=0.1, shared_sigma_deg=3.0),
+                                    *[LandmarkDetails()] * (len(ROOM) - 1)))
+    assert stated.shared_sigmas[0] == pytest.approx([0.1, np.radians(3.0)])
+    assert not stated.shared_sigmas[1:].any()
+    frame = Observation(CAMERA, Detections(boxes_at(MAP_FROM_CAMERA), ROOM.class_ids,
+                                           np.ones(len(ROOM))))
+    plain, shared = (Relocalizer(one, BY_CLASS).relocalize([frame]).covariance for one in (
+        ROOM, replace(ROOM, details=(stated.details[0],) * len(ROOM))))
+    # it does not shrink with the number of landmarks
+    np.testing.assert_allclose(np.diag(shared - plain), [0.01] * 3 + [np.radians(3.0) ** 2] * 3,
+                               rtol=0.1)
+
+
+def pose_at(x_m, yaw_deg=0.0):
+    rotation = Rotation.from_euler('z', yaw_deg, degrees=True).as_matrix()
+    return Finalist(rotation, -rotation @ np.array([x_m, 0.0, 0.0]), 1.0, 1, 0,
+                    np.arange(3))
+
+
+FOUND = [pose_at(0.0), pose_at(0.3), pose_at(2.0), pose_at(0.0, 30.0), pose_at(2.1, 5.0)]
+
+
+def test_the_first_in_the_given_order_stands_for_its_place():
+    assert first_of_each_place([0, 1, 2, 3, 4], FOUND, 8) == [0, 2, 3]
+    assert first_of_each_place([4, 1, 3, 2, 0], FOUND, 8) == [4, 1, 3]
+
+
+def test_no_more_than_a_count():
+    assert first_of_each_place([2, 0, 3], FOUND, 2) == [2, 0]
+    assert first_of_each_place([], FOUND, 2) == []

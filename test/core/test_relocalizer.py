@@ -44,17 +44,6 @@ def test_equal_seeds_repeat_and_negative_ones_vary(room, observation):
     assert len(set(scores(-1))) > 1
 
 
-def test_hypotheses_are_distinct_and_best_first(room, observation):
-    hypotheses = Relocalizer(room, RelocalizerOptions(algorithm='bf')).relocalize(
-        [observation]).hypotheses
-    assert len(hypotheses) > 1
-    assert hypotheses[0].confidence == max(one.confidence for one in hypotheses)
-    for row, one in enumerate(hypotheses):
-        for other in hypotheses[:row]:
-            distance, angle = pose_error(one.map_from_camera, other.map_from_camera)
-            assert distance > 0.5 or angle > 20.0
-
-
 def only(observation, rows):
     rows = np.array(rows, dtype=np.int64)
     return Observation(observation.camera, observation.detections.select(rows),

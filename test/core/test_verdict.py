@@ -1,29 +1,46 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The evidence for a pose, the numbers that weigh it, and what a refusal says."""
+"""The evidence for a pose, the numbers that weigh it, its covariance, and what a refusal says."""
 
 import importlib.util
 import math
 import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import yaml
 from scene import CAMERA, make_room, see_room
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION, FILE
+from cliploc_ros.core.acceptance.confidence import (
+    Setting,
+    confidences,
+    none_right,
+    tilt_handicaps,
+    utilities,
+)
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, chance_genuine
+from cliploc_ros.core.acceptance.look_alikes import lead_over_twin, turned_about_axis
+from cliploc_ros.core.acceptance.support import Support, compared_frame, one_thing, support
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, Rival, refusal
-from cliploc_ros.core.fit.covariance import share_within
-from cliploc_ros.core.geometry.transforms import RIGHT_M
+from cliploc_ros.core.fit.covariance import pose_covariance, share_within
+from cliploc_ros.core.fit.finalists import Match
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import RIGHT_M, make_transform, pose_difference
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.offline.datasets.observations import load_queries
+from cliploc_ros.core.search.scene import make_scene
+from cliploc_ros.core.succession import succeed
+from cliploc_ros.offline.datasets.queries import load_queries
 from cliploc_ros.offline.evaluation.trials import make_queries
+from studies.acceptance.troubles import exchange_landmarks
 
 OPTIONS = RelocalizerOptions()
 SURE = Evidence(inliers=9, likely=0.99)
@@ -88,7 +105,7 @@ def test_the_confidence_counts_the_published_covariance():
 
 
 @pytest.fixture(scope='module')
-def office(shared_data):
+def office_queries(shared_data):
     folder = shared_data / 'tum_fr3_office'
     landmark_map = LandmarkMap.from_file(folder / 'map.yaml')
     recorded = load_queries(folder / 'queries.npz', landmark_map.landmark_ids)
@@ -96,9 +113,9 @@ def office(shared_data):
 
 
 @pytest.mark.parametrize('knows_vertical', [False, True])
-def test_no_pose_is_its_own_look_alike(office, knows_vertical):
+def test_no_pose_is_its_own_look_alike(office_queries, knows_vertical):
     """Frames 12 and 14, and 3 with a vertical, were: the twin slid back when it was refined."""
-    landmark_map, queries = office
+    landmark_map, queries = office_queries
     relocalizer = Relocalizer(landmark_map, OPTIONS)
     for number in (3, 12, 14):
         query = queries[number]
@@ -112,8 +129,8 @@ def test_no_pose_is_its_own_look_alike(office, knows_vertical):
 
 
 @pytest.mark.full
-def test_mirror_images_are_refused(office):
-    landmark_map, queries = office
+def test_mirror_images_are_refused(office_queries):
+    landmark_map, queries = office_queries
     relocalizer = Relocalizer(landmark_map, replace(OPTIONS, matching='class'))
     accepted = 0
     for query in queries[::4]:
@@ -126,16 +143,448 @@ def test_mirror_images_are_refused(office):
 
 
 def test_each_number_states_its_unit_and_meaning_and_the_command_that_fits_it():
-    sections = yaml.safe_load(FILE.read_text())
-    assert [*sections] == [*CALIBRATION._fields]
-    for name, section in sections.items():
-        command = section['command']
-        if command != 'by definition':
-            module = re.fullmatch(r'python -m ([\w.]+)( \w+)?', command)[1]
-            assert importlib.util.find_spec(module), command
-        for term, entry in section['terms'].items():
-            assert {*entry} == {'value', 'unit', 'meaning'}, f'{name}.{term}'
-            loaded = getattr(CALIBRATION, name)
-            assert entry['value'] == (loaded[term] if name == 'common' else getattr(loaded, term))
-            assert entry['unit']
-            assert len(entry['meaning']) > 10
+    for section in yaml.safe_load(FILE.read_text()).values():
+        if section['command'] != 'by definition':
+            module = re.fullmatch(r'python -m ([\w.]+)( \w+)?', section['command'])[1]
+            assert importlib.util.find_spec(module)
+        assert all({*entry} == {'value', 'unit', 'meaning'} for entry in section['terms'].values())
+
+
+WRONG_MOUNT = CALIBRATION.attitude.wrong_mount
+# Optical axes of a level camera that looks along the map's x axis: right, down, forward.
+LEVEL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+
+
+def turned(axis, degrees):
+    """Poses (m, 4, 4) of a level camera, turned about an axis of its own."""
+    poses = np.tile(np.eye(4), (len(degrees), 1, 1))
+    poses[:, :3, :3] = LEVEL @ Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+    return poses
+
+
+@pytest.mark.parametrize('axis', ['x', 'z'])
+def test_the_more_a_camera_is_tilted_the_more_speaks_against_it(axis):
+    against = tilt_handicaps(turned(axis, np.arange(0, 181, 15)[:, None]), 40.0)
+    assert (np.diff(against) >= 0.0).all()
+    # handheld and downward cameras lose nothing, cameras upside down all
+    assert (against[:5] == 0.0).all()
+    assert 0.0 < against[6] < 2.0
+    assert against[-1] == WRONG_MOUNT
+
+
+def test_the_heading_does_not_matter_nor_a_deviation_of_zero():
+    assert (tilt_handicaps(turned('y', np.arange(0, 360, 30)[:, None]), 40.0) == 0.0).all()
+    assert (tilt_handicaps(turned('z', np.arange(0, 181, 15)[:, None]), 0.0) == 0.0).all()
+
+
+@pytest.mark.parametrize('deviations_m', [(0.3, 0.3, 0.3), (0.5, 0.1, 0.02), (2.0, 1.0, 0.1),
+                                          (0.4, 0.4, 0.01)])
+def test_the_share_within_a_distance_is_that_of_drawn_positions(deviations_m, rng):
+    turn = Rotation.random(random_state=1).as_matrix()
+    covariance = np.eye(6)
+    covariance[:3, :3] = turn @ np.diag(np.square(deviations_m)) @ turn.T
+    drawn = rng.normal(size=(200_000, 3)) * deviations_m
+    share = (np.linalg.norm(drawn, axis=1) < 1.0).mean()
+    assert share_within(1.0, covariance) == pytest.approx(share, abs=0.04)
+
+
+def test_the_likeliest_hypothesis_leads_and_without_refinement_the_greatest_score(
+        office_map, queries, observe):
+    likeliest = Relocalizer(office_map, RelocalizerOptions(tilt_deviation_deg=0.0))
+    greatest = Relocalizer(office_map, RelocalizerOptions(refine=False))
+    differ = 0
+    for frame in list(queries.main_frames())[:20:4]:
+        found = likeliest.relocalize([observe(frame)]).hypotheses
+        worth = utilities([one.support for one in found])
+        assert (np.diff(worth) <= 0.0).all()
+        scores = [one.score for one in found]
+        differ += scores != sorted(scores, reverse=True)
+        scores = [one.score for one in greatest.relocalize([observe(frame)]).hypotheses]
+        assert scores == sorted(scores, reverse=True)
+    assert differ > 0
+
+
+@pytest.mark.parametrize('matching', ['hybrid', 'class'])
+def test_another_place_is_hardly_ever_accepted(matching, office_map, queries, thresholds):
+    """The map's own objects, at places that they exchanged: whatever fits is wrong."""
+    asked = make_queries(queries, office_map, every_frame=True)[::3]
+    accepted, options = [], RelocalizerOptions(matching=matching)
+    for seed in range(2):
+        elsewhere, _ = exchange_landmarks(office_map, asked, 1.0, np.random.default_rng(seed))
+        relocalizer = Relocalizer(elsewhere, options)
+        accepted += [relocalizer.relocalize([one.observation]).accepted for one in asked]
+    print(f'\n{matching}: {sum(accepted)} of {len(accepted)} accepted in another place')
+    assert np.mean(accepted) <= thresholds['trust']['accepted_elsewhere'][matching]
+
+
+APART = np.array([[0, 0, 10, 10], [100, 0, 110, 10], [200, 0, 210, 10]], dtype=np.float64)
+
+
+@pytest.fixture
+def compared(office_map, queries):
+    """A frame whose boxes are three that lie apart and one that nearly repeats the third."""
+    boxes = np.concatenate([APART, [[201.0, 0.0, 210.0, 10.0]]])
+    camera = Camera(640, 480, *queries.intrinsics_fx_fy_cx_cy)
+    detections = Detections(boxes, ('chair', *office_map.class_ids[4:5], 'none', 'none'),
+                            np.ones(4))
+    similarities = np.zeros((4, len(office_map)), dtype=np.float32)
+    similarities[1, 4] = 1.0
+    scene = make_scene(camera.normalize_bboxes(boxes), office_map.centers, office_map.shapes,
+                       np.ones((4, len(office_map)), dtype=bool), np.empty((0, 2), int), 0.2)
+    return compared_frame(office_map, detections, scene, similarities, np.arange(len(boxes)))
+
+
+@pytest.fixture
+def measure(office_map):
+    """Measure the support of a pose."""
+    return partial(support, office_map)
+
+
+def test_several_boxes_on_one_landmark_count_once(measure, compared, queries):
+    found = measure([compared], queries[0].map_from_camera[None],
+                    [[Match(0, 3, 0.5), Match(1, 3, 0.7), Match(2, 4, 0.6)]])
+    assert (found.inliers, found.score) == (2, pytest.approx(1.3))
+
+
+def test_several_landmarks_behind_one_box_count_once(measure, compared, queries):
+    found = measure([compared], queries[0].map_from_camera[None],
+                    [[Match(2, 1, 0.5), Match(3, 2, 0.7), Match(0, 3, 0.6)]])
+    assert (found.inliers, found.score) == (2, pytest.approx(1.2))
+
+
+def test_what_no_landmark_explains_counts_against_a_pose(measure, compared, queries,
+                                                         office_map):
+    poses = np.tile(queries[0].map_from_camera, (2, 1, 1))
+    # chair and the class of landmark 4 are in the map, 'none' is not
+    assert 'chair' in office_map.class_ids and 'none' not in office_map.class_ids
+    assert measure([compared], poses[:1], [[Match(0, 3, 0.5), Match(1, 4, 0.5)]]).unexplained == 0
+    assert measure([compared], poses[:1], [[Match(1, 4, 0.5), Match(2, 3, 0.5)]]).unexplained == 1
+    # seen twice, missed twice: one object, as are those that are explained twice
+    twice = measure([compared] * 2, poses, [[Match(1, 4, 0.5)]] * 2)
+    assert (twice.inliers, twice.unexplained) == (1, 1)
+
+
+def test_labels_and_classes_support_a_pose(measure, compared, queries, office_map):
+    poses, matches = queries[0].map_from_camera[None], [[Match(1, 4, 0.5)]]
+    found = measure([compared], poses, matches)
+    count = len(office_map)
+    # one of all columns is 1, the others are 0
+    assert found.likeness == pytest.approx(np.sqrt(count - 1), rel=1e-4)
+    own = office_map.class_ids.count(office_map.class_ids[4])
+    # as common as in any building, which is more than in this map
+    common = CALIBRATION.common[office_map.class_ids[4]]
+    assert common > own / count
+    assert (found.rarity, found.unlabelled) == (pytest.approx(-np.log(common)), 0)
+    by_class = measure([compared._replace(
+        similarities=None, similarity_rows=np.full(4, -1))], poses, matches)
+    assert (by_class.likeness, by_class.unlabelled) == (0.0, 1)
+    assert by_class.misfit == found.misfit > 0
+
+
+def test_an_object_in_several_frames_counts_once(measure, compared, queries):
+    poses = np.tile(queries[0].map_from_camera, (2, 1, 1))
+    once = measure([compared], poses[:1], [[Match(1, 4, 0.5)]])
+    twice = measure([compared, compared], poses, [[Match(1, 4, 0.5)], [Match(1, 4, 0.7)]])
+    assert twice == replace(once, score=pytest.approx(0.6))
+    both = measure([compared, compared], poses, [[Match(1, 4, 0.5)], [Match(0, 3, 0.7)]])
+    assert (both.inliers, both.score) == (2, pytest.approx(1.2))
+
+
+def poses_at(*positions):
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, 0, 3] = positions
+    return poses
+
+
+STRONG, LITTLE = Support(7, 5.0, 10.0, 14.0, 14.0), Support(3, 1.5, 10.0, 2.0, 4.0)
+FORTY, ORIGIN = Setting(40), (0.0, 0.0, 0.0)
+
+
+def share(supports, poses, setting):
+    """Return the confidences of poses that objects support."""
+    return confidences(utilities(supports), poses, none_right(setting))
+
+
+def test_confidence_is_shared_by_poses_that_differ():
+    alone = share([STRONG], poses_at(0), FORTY)[0]
+    first, second = share([STRONG, STRONG], poses_at(0, 5), FORTY)
+    assert alone > 0.99
+    assert first == pytest.approx(second)
+    assert 0.45 < first <= 0.5
+
+
+def test_poses_that_agree_speak_for_each_other():
+    assert share([STRONG, STRONG], poses_at(0, 0.6), FORTY).min() > 0.99
+    turned = poses_at(0, 0.6)
+    turned[1, :3, :3] = Rotation.from_euler('z', 90, degrees=True).as_matrix()
+    assert share([STRONG, STRONG], turned, FORTY).max() <= 0.5
+
+
+def test_a_large_map_takes_confidence_and_a_known_vertical_gives_some():
+    fair = Support(4, 3.0, 8.0, 6.0, 8.0)
+    small, large, level, vague = (share([fair], poses_at(0), setting)[0] for setting in (
+        Setting(20), Setting(2000), Setting(2000, 1.0), Setting(2000, 45.0)))
+    assert large < level < small
+    assert vague == large
+    # a better vertical than any that the fit has seen says no more than the best of those
+    assert (share([fair], poses_at(0), Setting(2000, 0.01))
+            == share([fair], poses_at(0), Setting(2000, 0.5)))
+
+
+def test_little_support_is_little_confidence():
+    weak, rival = share([LITTLE, LITTLE], poses_at(0, 5), FORTY)
+    assert weak + rival < 0.3
+    assert share([Support()], poses_at(0), FORTY)[0] < 0.01
+
+
+def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
+    highest = 0.0
+    for _ in range(200):
+        count = rng.integers(1, 9)
+        supports = [Support(int(rng.integers(0, 9)), rng.uniform(0, 9), rng.uniform(0, 30),
+                            rng.uniform(0, 20)) for _ in range(count)]
+        found = share(supports, poses_at(*5.0 * np.arange(count)), FORTY)
+        # none is more certain than .9999, so none is less likely than .0001
+        assert (found >= 0).all() and found.sum() <= 1.0 + 1e-4 * count
+        highest = max(highest, found.sum())
+    assert highest > 0.99, 'some of them are nearly certain'
+
+
+@pytest.mark.parametrize(('evidence', 'options', 'reason'), [
+    (Evidence(3, 0.995), {'min_inliers': 4}, '3 objects matched < 4; turn the camera'),
+    (Evidence(3, 0.995), {}, ''),
+    (Evidence(5, 0.5, rival=Rival(0.3, ORIGIN)), {},
+     'confidence 0.50 < 0.99; ambiguous, another pose has 0.3; '),
+    (Evidence(5, 0.5, rival=Rival(0.1, ORIGIN)), {},
+     'confidence 0.50 < 0.99; 5 objects matched, 0 unexplained; '),
+    (Evidence(8, 0.95), {'min_confidence': 0.9}, ''),
+    (Evidence(8, 0.98999), {}, 'confidence 0.98 < 0.99; 8 objects matched'),
+    (Evidence(8, 0.29), {}, 'confidence 0.29 < 0.99; 8 objects matched'),
+    (Evidence(5, 0.995, coverage=0.5), {'algorithm': 'bf'},
+     'search stopped after 50 % of the samples'),
+    (Evidence(5, 0.995, coverage=0.5, tried=100), {},
+     'search stopped after 100 < 500 hypotheses'),
+    (Evidence(5, 0.995, coverage=0.5, tried=5000), {}, ''),
+    (Evidence(5, 0.995, coverage=0.5, tried=5000, meetings=2), {},
+     'confidence 0.91 < 0.99; pose met only 2 times in 5000 samples; raise iterations'),
+    (Evidence(5, 0.995, meetings=1), {'algorithm': 'ransac'}, 'confidence 0.77 < 0.99; pose met'),
+    (Evidence(5, 0.995), {'iterations': 100, 'algorithm': 'b-prosac'}, 'iterations 100 < 500'),
+    (Evidence(5, 0.995, earlier=(0.0,) * 6), {},
+     'mean confidence 0.14 < 0.5 of the last 7 frames in this pose'),
+    (Evidence(5, 0.995, earlier=(0.0, 0.99, 0.0)), {}, 'mean confidence 0.49 < 0.5'),
+    (Evidence(5, 0.995, earlier=(0.0, 0.99)), {}, '')])
+def test_refusal_names_its_reason(evidence, options, reason):
+    refused = refusal(evidence, RelocalizerOptions(**{'min_confidence': 0.99} | options))
+    answer = refused.reason if refused else ''
+    assert answer.startswith(reason)
+    assert bool(answer) == bool(reason)
+    assert len(f'refused: {answer}') <= 120
+
+
+def garbage(rng, kind):
+    """Ten boxes that mean nothing: anywhere, nearly one, five of them twice, or the image."""
+    corners = rng.uniform((0, 0), (600, 440), (10, 2))
+    boxes = np.concatenate([corners, corners + rng.uniform(10, 200, (10, 2))], axis=1)
+    if kind == 'nearly one box':
+        boxes = boxes[:1] + rng.normal(0, 2, (10, 4))
+    elif kind == 'repeated boxes':
+        boxes = np.repeat(boxes[:5], 2, axis=0)
+    elif kind == 'the whole image':
+        boxes = np.array([[0.0, 0.0, 640.0, 480.0]]) + rng.normal(0, 5, (10, 4))
+    return boxes
+
+
+@pytest.mark.full
+@pytest.mark.parametrize('kind', ['random boxes', 'nearly one box', 'repeated boxes',
+                                  'the whole image'])
+def test_garbage_is_never_accepted(kind, office_map, rng):
+    relocalizer = Relocalizer(office_map, RelocalizerOptions(matching='class',
+                                                             algorithm='ransac'))
+    classes = np.array(sorted(set(office_map.class_ids)))
+    accepted = 0
+    for _ in range(100):
+        detections = Detections(garbage(rng, kind), tuple(map(str, rng.choice(classes, 10))),
+                                np.full(10, 0.9)).usable(640, 480, 50)
+        accepted += relocalizer.relocalize([Observation(
+            Camera(640, 480, 535.4, 539.2, 320.1, 247.6), detections)]).accepted
+    print(f'\n{kind}: {accepted} of 200 garbage frames accepted')
+    assert accepted == 0
+
+
+def test_covariance_is_that_of_simulated_boxes(rng):
+    """The linearized covariance against the scatter of poses solved from noisy boxes."""
+    from cliploc_ros.core.fit.covariance import _VARIANCE_INFLATION
+    from cliploc_ros.core.geometry.p3p import solve_p3p
+    centers = np.array([[-1.0, 0.2, 4.0], [1.2, -0.3, 5.0], [0.1, 0.9, 3.0]])
+    seen = centers[:, :2] / centers[:, 2:]
+    sizes, scatter = np.full((3, 2), 0.1), 0.01
+    poses = []
+    for _ in range(2_000):
+        noisy = np.c_[seen + rng.normal(size=(3, 2)) * sizes * scatter, np.ones(3)]
+        rotations, translations = solve_p3p(
+            noisy / np.linalg.norm(noisy, axis=1, keepdims=True), centers)
+        best = np.argmin(np.linalg.norm(translations, axis=1))
+        pose = np.eye(4)
+        pose[:3, :3] = rotations[best].T
+        pose[:3, 3] = -rotations[best].T @ translations[best]
+        poses.append(pose_difference(np.eye(4), pose))
+    covariance = pose_covariance(np.eye(4), centers, sizes, scatter) / _VARIANCE_INFLATION
+    expected = np.sqrt(np.diag(covariance))
+    assert np.std(poses, axis=0) == pytest.approx(expected, rel=0.1)
+
+
+def test_covariance_of_an_undetermined_pose_is_large_not_infinite():
+    centers = np.array([[0.0, 0.0, 4.0]] * 3)
+    covariance = pose_covariance(np.eye(4), centers, np.full((3, 2), 0.1), 0.1)
+    assert np.isfinite(covariance).all()
+    assert np.linalg.eigvalsh(covariance).min() > 0
+    assert covariance.max() > 1
+
+
+OWN = np.diag([0.04, 0.01, 0.02, 0.001, 0.002, 0.003])
+
+
+def at(x=0.0, degrees=0.0):
+    return make_transform(Rotation.from_euler('z', degrees, degrees=True).as_matrix(),
+                          np.array([x, 0.0, 0.0]))
+
+
+def test_a_better_answer_tells_what_it_knows_better():
+    _, known = succeed(None, at(), at(), OWN)
+    better = OWN.copy()
+    better[1, 1] = 0.001
+    given, after = succeed(known, at(), at(), better)
+    assert after.covariance[1, 1] == pytest.approx(0.001, rel=1e-2)
+    assert after.covariance[0, 0] == pytest.approx(0.04, rel=1e-2)
+    assert given[1, 1] < 0.002 and given[0, 0] > 100.0
+
+
+def test_a_robot_that_drove_on_is_told_anew():
+    _, known = succeed(None, at(), at(), OWN)
+    near, far = (succeed(known, at(way), at(way), OWN)[0] for way in (0.5, 50.0))
+    assert near[0, 0] > 10.0 * OWN[0, 0]
+    assert far[0, 0] < 2.0 * OWN[0, 0]
+
+
+def test_a_contradiction_makes_both_answers_less_certain():
+    _, known = succeed(None, at(), at(), 2.0 * OWN)
+    agreeing, contradicting = (succeed(known, at(), at(x), OWN) for x in (0.0, 1.5))
+    doubt = 1.5**2 / (3.0 * OWN[0, 0]) / chi2.ppf(0.99, 6)
+    assert doubt == pytest.approx(1.115, abs=1e-3)
+    np.testing.assert_allclose(contradicting[0], doubt * agreeing[0], rtol=1e-9)
+    np.testing.assert_allclose(contradicting[1].covariance, doubt * agreeing[1].covariance,
+                               rtol=1e-9)
+    just_agreeing = succeed(known, at(), at(1.4), OWN)
+    np.testing.assert_allclose(just_agreeing[0], agreeing[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize('answers', [1, 20])
+def test_an_outlier_hardly_moves_the_filter_and_a_misled_one_recovers(answers):
+    known = None
+    for _ in range(answers):
+        _, known = succeed(known, at(), at(), 0.01 * OWN)
+    _, misled = succeed(known, at(), at(0.4), 0.01 * OWN)
+    assert np.linalg.norm(pose_difference(at(), misled.map_from_camera)[:3]) < 0.25
+    for _ in range(10):
+        _, misled = succeed(misled, at(), at(), 0.01 * OWN)
+    assert np.linalg.norm(pose_difference(at(), misled.map_from_camera)[:3]) < 0.1
+
+
+ROOM = make_room()
+UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # looks along y, z is up
+
+
+def together(first, second):
+    return Detections(np.concatenate([first.bboxes_xyxy, second.bboxes_xyxy]),
+                      first.class_ids + second.class_ids,
+                      np.concatenate([first.scores, second.scores]))
+
+
+def support_of(landmark_map, detections):
+    found = Relocalizer(landmark_map, RelocalizerOptions(matching='class')).relocalize(
+        [Observation(CAMERA, detections)])
+    return found.hypotheses[0].support
+
+
+def test_boxes_that_overlap_show_one_thing():
+    boxes = np.array([[0, 0, 100, 100], [0, 0, 100, 100], [0, 0, 60, 100], [0, 0, 30, 100],
+                      [40, 40, 60, 60]], dtype=float)
+    np.testing.assert_allclose(one_thing(boxes)[0], [1.0, 1.0, 0.5, 0.0, 0.0])
+    assert one_thing(np.empty((0, 4))).shape == (0, 0)
+
+
+def test_one_thing_under_two_class_names_counts_once():
+    """The map has each landmark under a second class, and the image each box."""
+    seen = see_room(ROOM)
+    renamed = tuple(f'also {name}' for name in ROOM.class_ids)
+    both = LandmarkMap('map', (*ROOM.landmark_ids, *(f'{one}_2' for one in ROOM.landmark_ids)),
+                       ROOM.labels * 2, ROOM.class_ids + renamed, *(
+                           np.tile(one, (2, 1)) for one in (ROOM.centers, ROOM.semi_axes,
+                                                            ROOM.quats_xyzw)))
+    alone = support_of(ROOM, seen)
+    twice = support_of(both, together(seen, replace(seen, class_ids=renamed)))
+    assert (twice.inliers, twice.score) == pytest.approx((alone.inliers, alone.score), abs=0.2)
+    assert twice.unlabelled == pytest.approx(alone.unlabelled, abs=0.2)
+
+
+def test_a_second_box_of_an_explained_thing_is_not_unexplained():
+    """Its class is another one of the map; a box elsewhere is unexplained."""
+    seen = see_room(ROOM)
+    again = replace(seen.select(np.arange(1)), class_ids=(ROOM.class_ids[1],))
+    elsewhere = replace(again, bboxes_xyxy=np.array([[2.0, 400.0, 60.0, 470.0]]))
+    base = support_of(ROOM, seen).unexplained
+    assert support_of(ROOM, together(seen, again)).unexplained == pytest.approx(base, abs=0.01)
+    assert support_of(ROOM, together(seen, elsewhere)).unexplained == pytest.approx(base + 1.0)
+    two = together(elsewhere, elsewhere)
+    assert support_of(ROOM, together(seen, two)).unexplained == pytest.approx(base + 1.0)
+
+
+def arrangement(off_m):
+    """Things above each other, every second one beside the axis by a distance [m]."""
+    count = 6
+    centers = np.c_[off_m * (np.arange(count) % 2) * np.array([1, 1, 1, -1, 1, 1]),
+                    np.zeros(count), 0.4 * np.arange(count)]
+    names = tuple(f'thing {row}' for row in range(count))
+    return LandmarkMap('map', names, names, names, centers,
+                       np.tile([0.12, 0.12, 0.15], (count, 1)),
+                       np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)))
+
+
+def test_a_turn_about_an_axis_that_all_objects_share_is_a_rival():
+    """Things on one axis fix all but the turn about it; things beside it fix that, too."""
+    camera = make_transform(UP, np.array([0.0, -2.5, 1.0]))
+    on_axis, spread = arrangement(0.06), arrangement(0.8)
+    rows = np.arange(6)
+    turned = turned_about_axis(arrangement(0.0), camera, rows)
+    away = np.linalg.norm(turned[:, None, :3, 3] - arrangement(0.0).centers, axis=2)
+    np.testing.assert_allclose(away, np.tile(away[0], (len(turned), 1)), atol=1e-9)
+    assert len(turned) >= 7
+    assert len(turned_about_axis(ROOM, camera, np.arange(12))) == 0
+    # a camera that is not verified yet lowers the confidence, too
+    options = RelocalizerOptions(matching='class', min_confidence=0.75)
+    found = [Relocalizer(one, options).relocalize(
+        [Observation(CAMERA, see_room(one, camera), up_in_camera=camera[2, :3])])
+        for one in (on_axis, spread)]
+    assert [one.accepted for one in found] == [False, True]
+    assert found[0].evidence.distinct < 0.8
+    assert found[1].evidence.distinct > 0.95
+
+
+def shown(counts, likenesses, first=0):
+    """The support of a pose that explains some boxes, from the first one on."""
+    rows = {(0, first + row): np.array([count, count, 0.0, likeness, 0.0, 0.0, 0.0])
+            for row, (count, likeness) in enumerate(zip(counts, likenesses, strict=True))}
+    return Support(inliers=sum(counts), likeness=sum(likenesses), shown=rows)
+
+
+def test_labels_tell_places_apart_and_what_one_place_lacks_does_not():
+    pose = shown([1] * 6, [2.0] * 6)
+    assert lead_over_twin(pose, pose) == pytest.approx(0.0)
+    # labels of places that are alike err together
+    assert 2.0 < lead_over_twin(pose, shown([1] * 6, [0.0] * 6)) < 2.5
+    # the twin lacks two of the objects: as much as one place of two that is out of date
+    assert 0.0 < lead_over_twin(pose, shown([1] * 4, [2.0] * 4)) < 1.4
+    # a pose elsewhere that explains one of them: each of the others counts as its label says
+    assert lead_over_twin(pose, shown([1], [2.0])) == pytest.approx(5 * 0.88, abs=0.01)
+    # the same, but the landmarks around are alike: what the image shows has moved
+    assert lead_over_twin(pose, shown([1], [2.0]), 0.7) < 1.4

@@ -8,12 +8,9 @@ import numpy as np
 import pytest
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.evaluation.summary import Summary
 from demo.map_review import (
     Sightings,
-    console_lines,
     review_map,
-    section,
 )
 from demo.truth import TrueObject
 
@@ -73,18 +70,3 @@ def test_missed_objects_say_why(review):
         'can_1': 'mapped as mug; 6 images show it; detected in none',
         'book_1': 'left out as book, seen from one side; 3 images show it; detected in none',
         'bowl_1': 'no image shows it'}
-
-
-def test_the_terminal_and_the_page_say_the_same(review):
-    lines = list(console_lines(review))
-    assert lines[0].startswith('2 of 6 objects found, 4 missed, 3 false; centres 3.5 cm off')
-    assert len(lines) == 1 + 4 + 3
-    errors = np.array([[0.1, 0.3, 2.0, np.inf]])
-    summary = Summary('auto', (0, 1, 2, 3), errors, errors > 1, errors, errors, errors,
-                      np.zeros((1, 4), int), np.zeros((1, 4), int), np.zeros(4, int))
-    html = section(review, {'built map': summary}, 30)
-    assert lines[0] in html
-    assert '<td>0.25</td><td>0.50</td><td>0.50</td>' in html
-    assert '<td>2 of 4</td><td>2</td>' in html
-    assert '<script>' not in html
-    assert html.count('&lt;script&gt;') == 2  # a label among the missed, and as what is there

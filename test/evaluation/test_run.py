@@ -1,24 +1,41 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Runs: on any number of processes, broken off and resumed; and tuning."""
+"""Runs of methods: on any number of processes, broken off and resumed; their names and figures."""
 
 import multiprocessing
 import os
 import signal
 from contextlib import closing
 from dataclasses import replace
+from itertools import combinations
 
+import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from scene import make_room
 
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.errors import OptionsError
+from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.files.log import Log
-from cliploc_ros.offline.datasets.observations import Queries
-from cliploc_ros.offline.evaluation.methods import parse_methods
+from cliploc_ros.offline.datasets.queries import Queries
+from cliploc_ros.offline.evaluation.drawing import draw_map, png_of, spread_names
+from cliploc_ros.offline.evaluation.figures import (
+    precision_recall,
+)
+from cliploc_ros.offline.evaluation.methods import PAPER_METHODS, parse_methods
 from cliploc_ros.offline.evaluation.run import count_trials, read_results, run_methods
-from cliploc_ros.offline.evaluation.summary import notes, summarize
-from cliploc_ros.offline.evaluation.trials import make_queries
+from cliploc_ros.offline.evaluation.summary import (
+    Summary,
+    as_markdown,
+    as_text,
+    compare,
+    find_best,
+    notes,
+    summarize,
+    table_rows,
+)
+from cliploc_ros.offline.evaluation.trials import Result, make_queries
 
 PAPER = RelocalizerOptions(iterations=60)
 
@@ -148,3 +165,158 @@ def test_crops_on_demand_are_a_part_of_all(room, questions):
     assert sum(summary.refusals.values()) == len(refused)
     kinds = ', '.join(f'{count} {kind}' for kind, count in summary.refusals.items())
     assert f'auto refused: {kinds}.' in notes([summary])
+
+
+FIVE = RelocalizerOptions(iterations=500, k=5, random_seed=4)
+
+
+def test_all_are_the_papers_ten():
+    methods = parse_methods(['all'], FIVE, 40)
+    assert tuple(method.name for method in methods) == PAPER_METHODS
+    for method in methods:
+        assert f'{method.options.matching}_{method.options.algorithm}' == method.name
+        assert (method.options.iterations, method.options.k) == (500, 5)
+        assert method.draws_nothing == method.name.endswith('_bf')
+
+
+def test_auto_is_what_the_node_does():
+    method, = parse_methods(['auto'], FIVE, 40)
+    assert method.options == RelocalizerOptions(random_seed=4)
+
+
+def test_named_sets_of_options(tmp_path):
+    path = tmp_path / 'mine.yaml'
+    path.write_text('wide: {base: hybrid_b-prosac, k: 9}\nstrict: {min_confidence: 0.9}\n')
+    wide, strict = parse_methods([str(path)], FIVE, 40)
+    assert (wide.name, wide.options.k, wide.options.iterations) == ('wide', 9, 500)
+    assert (strict.options.min_confidence, strict.options.iterations) == (0.9, 10_000)
+
+
+def test_keyframes_are_for_auto_and_what_is_based_on_it(tmp_path):
+    path = tmp_path / 'mine.yaml'
+    path.write_text('strict: {min_confidence: 0.9}\nobjects: {keyframes: false}\n'
+                    'wide: {base: hybrid_b-prosac}\n')
+    methods = parse_methods(['auto', 'clip_bf', str(path)], FIVE, 40)
+    assert [one.name for one in methods if one.keyframes] == ['auto', 'strict']
+
+
+@pytest.mark.parametrize(('text', 'named'), [
+    ('wide: {keyframes: 3}', 'mine.yaml: wide: keyframes: 3 is no bool'),
+    ('wide: {kk: 9}', "mine.yaml: wide: 'kk' is none of base, matching"),
+    ('wide: {k: many}', "mine.yaml: wide: k: 'many' is no int"),
+    ('wide: 3', 'mine.yaml: wide: is not a mapping'),
+    ('wide: {base: best}', "'best' is none of"),
+    ('auto: {k: 2}', "two different methods are called 'auto'"),
+    ('[1, 2]', 'holds no YAML mapping'), ('{', 'not valid YAML')])
+def test_bad_files_are_named(tmp_path, text, named):
+    path = tmp_path / 'mine.yaml'
+    path.write_text(text)
+    with pytest.raises(CliplocError) as caught:
+        parse_methods(['auto', str(path)], FIVE, 40)
+    assert named in str(caught.value)
+
+
+def make_summary(errors, method='auto', accepted=None, confidence=None):
+    errors = np.atleast_2d(np.array(errors, dtype=float))
+    shape = errors.shape
+    return Summary(
+        method, tuple(range(shape[1])), errors,
+        np.zeros(shape, bool) if accepted is None else np.atleast_2d(accepted),
+        np.zeros(shape) if confidence is None else np.atleast_2d(confidence), np.full(shape, 2.0),
+        np.ones(shape), np.ones(shape, int), np.full(shape, 500), np.full(shape[1], 5))
+
+
+def make_result(**changes):
+    fields = {
+        'method': 'clip_bf', 'trial': 0, 'query': 3, 'timestamp': 1.5, 'boxes': 4, 'solved': True,
+        'accepted': True, 'map_from_camera': np.eye(4).tolist(), 'error_m': 0.5, 'error_deg': 2.0,
+        'score': 3.0, 'confidence': 0.5, 'nees': 3.0, 'inliers': 4, 'hypotheses': 9,
+        'best_iteration': 2, 'coverage': 1.0, 'reason': '', 'search_ms': 1.0}
+    return Result(**(fields | changes))
+
+
+def test_success_and_errors():
+    one = make_summary([[0.1, 0.4, np.inf, 3.0], [0.1, 0.9, 0.2, 3.0]])
+    assert one.success(0.25) == 3 / 8
+    assert one.success(1.0) == 5 / 8
+    assert one.success_deviation(1.0) == pytest.approx(0.125)
+    assert one.median_error_m == pytest.approx((0.4 + 0.9) / 2)
+    assert one.mean_error_m == pytest.approx((0.1 + 0.4 + 3.0 + 0.1 + 0.9 + 0.2 + 3.0) / 7)
+
+
+def test_precision_and_recall():
+    one = make_summary([0.1, 0.4, 2.0, np.inf], accepted=[True, False, True, False])
+    assert (one.false_accepts(), one.precision(), one.recall()) == (1, 0.5, 0.5)
+    none = make_summary([np.inf, np.inf])
+    assert (none.precision(), none.recall()) == (1.0, 1.0)
+    assert none.precision_interval() == (0.0, 1.0)
+    assert np.isnan(none.mean_error_m)
+
+
+def test_the_interval_of_the_precision_counts_queries():
+    """Trials of one query are not independent, so more trials do not narrow it."""
+    once = make_summary([0.1] * 10, accepted=[True] * 10)
+    often = make_summary([[0.1] * 10] * 5, accepted=[[True] * 10] * 5)
+    assert once.precision_interval() == (pytest.approx(0.722, abs=1e-3), 1.0)
+    assert often.precision_interval() == once.precision_interval()
+
+
+def test_summaries_keep_the_order_and_the_missing():
+    results = [make_result(trial=trial, query=query, error_m=None if query == 7 else 0.1 * trial)
+               for trial in range(3) for query in (3, 7)]
+    one, = summarize(results)
+    assert one.queries == (3, 7)
+    assert one.errors_m.tolist() == [[0.0, np.inf], [0.1, np.inf], [0.2, np.inf]]
+
+
+def test_what_is_noise():
+    good, same = make_summary([0.1] * 50), make_summary([0.1] * 50)
+    bad = make_summary([2.0] * 25 + [0.1] * 25)
+    assert compare(good, same).is_noise
+    assert not compare(good, bad).is_noise
+    assert compare(good, bad).mean == 0.5
+    slightly = make_summary([2.0] * 2 + [0.1] * 48)
+    assert compare(good, slightly).is_noise
+
+
+def test_the_table_marks_noise_and_cut_searches():
+    good = make_summary([[0.1] * 40] * 2, 'hybrid_bf')
+    near = make_summary([[0.1] * 39 + [2.0]] * 2, 'clip_ransac')
+    bad = make_summary([[2.0] * 40] * 2, 'mine')
+    assert find_best([bad, near, good]) is good
+    rows = table_rows([good, near, bad])
+    assert rows[1][:3] == ('hybrid', 'bf', '1.00 / 1.00 / 1.00 ± .00')
+    assert rows[2][2].endswith(' ~')
+    assert rows[3][:3] == ('mine', '', '.00 / .00 / .00 ± .00')
+    assert as_markdown(rows).splitlines()[2].startswith('| hybrid | bf | 1.00')
+    assert all(len(line) < 130 for line in as_text(rows).splitlines())
+    assert rows[1][-2:] == ('1.00 (.00 to 1.00)', '0 of 0')
+    assert 'fitted on simulated' in notes([good, near])[1]
+    assert 'hybrid_bf' in notes([good, near])[2]
+
+
+def test_precision_falls_as_recall_rises():
+    one = make_summary([0.1, 0.1, 2.0, 0.1, np.inf], confidence=[5.0, 4.0, 3.0, 3.0, 9.0])
+    recall, precision = precision_recall(one)
+    assert recall.tolist() == pytest.approx([1 / 3, 2 / 3, 1.0])
+    assert precision.tolist() == pytest.approx([1.0, 1.0, 0.75])
+    assert len(precision_recall(make_summary([2.0, np.inf]))[0]) == 0
+
+
+@pytest.mark.parametrize('inches', [8.0, 1.5], ids=['large', 'small'])
+def test_names_do_not_cover_each_other(inches):
+    room = make_room()
+    figure = Figure(figsize=(inches, inches), layout='constrained')
+    axes = figure.add_subplot(aspect='equal')
+    draw_map(axes, room)
+    axes.autoscale_view()
+    spread_names(figure)
+    names = [one for one in axes.texts if one.get_visible()]
+    boxes = [one.get_window_extent() for one in names]
+    assert not any(first.overlaps(second) for first, second in combinations(boxes, 2))
+    assert all(axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1 for box in boxes)
+    assert (len(names) == len(room)) == (inches > 2.0), 'a small map has no room for all'
+    highest = room.landmark_ids[int(np.argmax(room.centers[:, 2]))]
+    assert highest in [one.get_text() for one in names]
+    image = cv2.imdecode(np.frombuffer(png_of(figure, 50), np.uint8), cv2.IMREAD_COLOR)
+    assert image.shape[0] == pytest.approx(50 * inches, abs=1)

@@ -1,22 +1,28 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps built from a simulated walk, whose landmarks are known; also as a library."""
+"""Maps built from simulated walks, whose landmarks are known; with depth; of a floor."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from disturbed_poses import disturb, draw_errors
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from walk import CAMERA, CLASSES, look_at, make_table, nearest_errors, see, walk_around, without
 
+from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import MappingError, ModelError
 from cliploc_ros.offline.make_map import find_labeller, make_map, update_map
-from cliploc_ros.offline.mapping.building import _windows, build_map
+from cliploc_ros.offline.mapping.association import find_overlaps, ious_with
+from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.views import make_views, number_viewpoints, thin_out
+from studies.speed.floors import CLASS_NAMES, Floor, SeenFloor, make_floor, see_floor
 
 
 def test_every_landmark_is_found_where_it_is():
@@ -107,15 +113,6 @@ def test_joint_refinement_corrects_poses_and_landmarks():
     assert plain.report.pose_change_m == 0.0
 
 
-def test_objects_behind_one_another_do_not_confuse_it():
-    table = make_table()
-    low = np.array([look_at(np.array([2.4 * np.cos(a), 2.4 * np.sin(a), 0.9]))
-                    for a in np.linspace(0, 5, 80)])
-    built = build_map(see(table, low, noise_px=1.0))
-    assert len(built.landmark_map) == len(table)
-    assert nearest_errors(built.landmark_map, table).max() < 0.02
-
-
 @pytest.mark.parametrize(('change', 'message'), [
     (lambda one: one.select_frames([3]), 'took 1 viewpoints'),
     (lambda one: one.with_poses(np.tile(one.map_from_camera[0], (len(one), 1, 1))),
@@ -159,37 +156,6 @@ def test_boxes_cut_by_the_image_border_do_not_shrink_a_landmark():
     assert CLASSES[detections.classes[0]] == built.class_ids[0]
 
 
-def test_one_object_under_two_names_becomes_class_weights():
-    table = make_table()
-    detections = see(table, walk_around(frames=90))
-    built = build_map(detections)
-    row = int(np.flatnonzero(np.array(built.landmark_map.class_ids) == 'bottle')[0])
-    classes = detections.classes.copy()
-    boxes = np.flatnonzero(built.shown == row)
-    classes[boxes[::4]] = CLASSES.index('cup')
-    renamed = build_map(replace(detections, classes=classes))
-    assert len(renamed.landmark_map) == len(table)
-    same = np.linalg.norm(renamed.landmark_map.centers - built.landmark_map.centers[row],
-                          axis=1).argmin()
-    assert renamed.landmark_map.class_ids[same] == 'bottle'
-    assert dict(renamed.landmark_map.details[same].class_weights) == pytest.approx(
-        {'bottle': 0.75, 'cup': 0.25}, abs=0.02)
-    others = [one for number, one in enumerate(renamed.landmark_map.details) if number != same]
-    assert all(one.class_weights is None for one in others)
-    assert renamed.report.explained == 1.0
-
-
-@pytest.mark.parametrize(('stamps_s', 'expected'), [
-    ([0.0, 1.0, 2.0], [(0, 3)]),
-    (np.arange(0.0, 200.0), [(0, 90), (60, 150), (120, 200)]),
-    ([0.0, 1.0, 500.0, 501.0], [(0, 2), (2, 4)]),
-    ([0.0, 89.0, 90.0], [(0, 2), (1, 3)]),
-    ([7.0, 7.0, 7.0], [(0, 3)]),
-])
-def test_windows_cover_every_frame(stamps_s, expected):
-    assert _windows(np.array(stamps_s)) == expected
-
-
 def test_a_camera_that_stands_still_gives_few_frames():
     poses = np.repeat(walk_around(5, turn_deg=90.0), [40, 1, 3, 2, 1], axis=0)
     seen = see(make_table(), poses)
@@ -230,3 +196,131 @@ def test_labels_are_class_names_where_clip_is_missing(tmp_path):
     words.write_text('cup: [our cup]')
     with pytest.raises(ModelError, match='no_clip'):
         find_labeller(detections, None, words)
+
+
+def measure_depth(detections, table, scale=1.0, holes=0.0, seed=0):
+    """Add the depth of the surface of the ellipsoid that each box shows, with errors."""
+    rng = np.random.default_rng(seed)
+    depths = np.full(len(detections.classes), np.nan, dtype=np.float32)
+    for row, frame in enumerate(detections.frames):
+        camera_from_map = invert_transform(detections.map_from_camera[frame])
+        centers = table.centers @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
+        pixels = centers[:, :2] / centers[:, 2:] * 500.0 + [320.0, 240.0]
+        box = detections.bboxes_xyxy[row]
+        nearest = np.linalg.norm(pixels - 0.5 * (box[:2] + box[2:]), axis=1).argmin()
+        if rng.random() >= holes:
+            surface = centers[nearest, 2] - 0.8 * table.semi_axes[nearest].min()
+            depths[row] = scale * surface * rng.normal(1.0, 0.02)
+    return replace(detections, depths=depths, depth_spreads=np.full_like(depths, 0.02))
+
+
+def test_depth_replaces_parallax():
+    table, poses = make_table(), walk_around(frames=12, turn_deg=12.0)
+    boxes = see(table, poses, noise_px=1.0)
+    with pytest.raises(MappingError, match='good enough'):
+        build_map(boxes)
+    built = build_map(measure_depth(boxes, table, holes=0.2)).landmark_map
+    errors = nearest_errors(built, table)
+    assert np.sum(errors < 0.12) >= 7
+    assert np.median(errors) < 0.06
+
+
+def test_with_parallax_boxes_decide_and_an_error_of_scale_is_corrected():
+    table = make_table()
+    boxes = see(table, walk_around(), noise_px=1.0)
+    built = build_map(measure_depth(boxes, table, scale=1.15))
+    note, = (note for note in built.report.notes if 'depth' in note)
+    assert ' is 1.1' in note and 'corrected' in note
+    assert len(built.landmark_map) == len(table)
+    assert nearest_errors(built.landmark_map, table).max() < 0.01
+
+
+@pytest.mark.parametrize(('scale', 'factor'), [(5.0, '5'), (0.2, '0.2')])
+def test_depth_in_another_unit_is_refused(scale, factor):
+    table = make_table()
+    boxes = see(table, walk_around(frames=30))
+    with pytest.raises(MappingError, match=rf'depth is {factor}.* `depth_unit`'):
+        build_map(measure_depth(boxes, table, scale=scale))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A built map next to the true one."""
+
+    #: True objects that enough frames show, those of them that were found, those that were not,
+    #: and landmarks that are no object or an object a second time
+    visible: int
+    found: int
+    missed: int
+    false: int
+    #: (found,): distances of the centres of what was found [m]
+    center_errors_m: NDArray[np.float64]
+
+
+def compare_maps(built: LandmarkMap, seen: SeenFloor, floor: Floor, min_frames: int = 10
+                 ) -> Comparison:
+    """Compare a built map with the truth.
+
+    A landmark and an object of one class belong together if they are nearest to each other and
+    nearer than the object's greatest semi-axis.
+    """
+    true_map = floor.landmark_map
+    counts = np.bincount(seen.true_landmarks[seen.true_landmarks >= 0],
+                         minlength=len(true_map.centers))
+    errors = np.full(len(true_map.centers), np.inf)
+    for name in set(built.class_ids) & set(true_map.class_ids):
+        ours = np.nonzero([one == name for one in built.class_ids])[0]
+        theirs = np.nonzero([one == name for one in true_map.class_ids])[0]
+        _, nearest = cKDTree(true_map.centers[theirs]).query(built.centers[ours])
+        distances, back = cKDTree(built.centers[ours]).query(true_map.centers[theirs])
+        mutual = nearest[back] == np.arange(len(theirs))
+        near = distances < true_map.semi_axes[theirs].max(axis=1)
+        errors[theirs] = np.where(mutual & near, distances, np.inf)
+    found, visible = np.isfinite(errors), counts >= min_frames
+    return Comparison(int(visible.sum()), int((found & visible).sum()),
+                      int((visible & ~found).sum()), len(built.centers) - int(found.sum()),
+                      errors[found])
+
+
+@pytest.fixture(scope='module')
+def floor():
+    return make_floor(150)
+
+
+@pytest.fixture(scope='module')
+def seen(floor):
+    return see_floor(floor, 1080)
+
+
+def test_mapping_finds_the_objects_of_a_floor(floor, seen):
+    built = build_map(seen.detections).landmark_map
+    against = compare_maps(built, seen, floor)
+    print(f'{against.found} of {against.visible} objects found, {against.false} false, centre '
+          f'error {100 * np.median(against.center_errors_m):.2f} cm')
+    assert against.found + against.missed == against.visible > 100
+    assert against.found >= 0.9 * against.visible
+    assert against.false <= 2
+    assert np.median(against.center_errors_m) < 0.005
+
+
+def test_far_landmarks_are_passed_over_without_a_loss(floor, seen):
+    views = make_views(seen.detections, MappingOptions())
+    landmarks = landmarks_of_map(floor.landmark_map, CLASS_NAMES)
+    landmarks.classes[7] = -1  # of a class that the recording does not know
+    found = find_overlaps(views, landmarks, 0.2)
+    expected = [
+        (row, number) for number in range(len(landmarks.centers))
+        for row in np.nonzero((views.classes == landmarks.classes[number]) & (ious_with(
+            views, np.arange(len(views.classes)), landmarks.centers[number],
+            landmarks.bases[number]) > 0.2))[0]]
+    assert list(zip(found.boxes.tolist(), found.landmarks.tolist(), strict=True)) == sorted(
+        expected)
+    assert len(expected) > 1000
+
+
+def test_no_landmarks_and_no_boxes(seen):
+    views = make_views(seen.detections, MappingOptions())
+    none = landmarks_of_map(make_floor(1).landmark_map, ())
+    assert none.classes.tolist() == [-1]
+    assert len(find_overlaps(views, none, 0.2).boxes) == 0
+    assert len(find_overlaps(views.between(0, 0), none, 0.2).boxes) == 0

@@ -10,12 +10,15 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from scene import make_layer, make_room
 from scipy.spatial.transform import Rotation
 from walk import CAMERA, join_maps, make_table, moved, see, walk_around
 
+from cliploc_ros.cli.check_map import main
 from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.core.keyframes.layer import layer_path, save_layer
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError, OptionsError
 from cliploc_ros.offline.evaluation.map_check.page import DATA, PAGE, write_report
@@ -25,30 +28,30 @@ from cliploc_ros.offline.mapping.check.advice import give_advice
 from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.landmark_faults import (
     check_landmarks,
-    find_map_overlaps,
     hear_witness,
 )
-from cliploc_ros.offline.mapping.check.places import LookAlike, find_look_alikes, make_grid
+from cliploc_ros.offline.mapping.check.places import find_look_alikes, make_grid
 from cliploc_ros.offline.mapping.check.relocalization import (
     make_folds,
     measure_detector,
     try_recording,
 )
-from cliploc_ros.offline.mapping.check.report import Measure
-from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
+from cliploc_ros.offline.mapping.check.report import check_keyframes, in_reach
+from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions, Thresholds
 from cliploc_ros.offline.mapping.systematic import find_corrections
 from cliploc_ros.offline.mapping.views import make_views
-from cliploc_ros.offline.simulation import EDGE_SIGMA_PX, EDGE_SIGMA_SHARE, LabelModel
+from cliploc_ros.offline.simulation.labels import LabelModel
 
 NOUNS = ('apple', 'brick', 'candle', 'drum', 'engine', 'flag', 'globe', 'hammer', 'iron')
 TABLE = replace(make_table(), labels=NOUNS)
 QUICK = CheckOptions(relocalizer=RelocalizerOptions(iterations=300), frames=12, max_positions=9,
                      headings=4, spacing_m=2.0)
+MAPPING = MappingOptions()
 
 
 def witness_of(table, detections):
-    views = make_views(detections)
-    return views, hear_witness(views, table, detections.class_names)
+    views = make_views(detections, MAPPING)
+    return views, hear_witness(views, table, detections.class_names, MAPPING)
 
 
 @pytest.fixture(scope='module')
@@ -109,7 +112,7 @@ def test_a_misspelt_class_is_named_with_the_right_one(detections, is_recorded):
     right = TABLE.class_ids[4]
     wrong = replace(TABLE, class_ids=(*TABLE.class_ids[:4], f'{right}k', *TABLE.class_ids[5:]))
     _, witness = witness_of(wrong, detections) if is_recorded else (None, None)
-    worst, *others = check_landmarks(wrong, witness, [])
+    worst, *others = check_landmarks(wrong, witness, [], MAPPING)
     assert worst.landmark_id == 'thing_4'
     (fault,) = worst.faults
     assert f"'{right}k'" in fault and f"mean '{right}'?" in fault
@@ -123,7 +126,7 @@ def test_a_misspelt_class_is_named_with_the_right_one(detections, is_recorded):
 def test_a_label_of_another_class_is_a_fault(label, class_id, other):
     ids = ('cup', class_id, 'book', *TABLE.class_ids[3:])
     named = replace(TABLE, class_ids=ids, labels=('a cup', label, 'a book', *TABLE.labels[3:]))
-    faults = {one.landmark_id: one.faults for one in check_landmarks(named, None, [])}
+    faults = {one.landmark_id: one.faults for one in check_landmarks(named, None, [], MAPPING)}
     assert [f"'{label}', a {other} by" in fault for fault in faults.pop(TABLE.landmark_ids[1])
             ] == [True] * (other is not None)
     assert not any(faults.values())
@@ -136,7 +139,7 @@ def test_boxes_that_leave_a_place_open_do_not_say_that_a_landmark_moved(detectio
     boxes = detections.bboxes_xyxy.copy()
     boxes[own, 0], boxes[own, 1], boxes[own, 2] = 0.0, 0.0, 640.0
     _, witness = witness_of(TABLE, replace(detections, bboxes_xyxy=boxes))
-    (one,) = [one for one in check_landmarks(TABLE, witness, [])
+    (one,) = [one for one in check_landmarks(TABLE, witness, [], MAPPING)
               if one.landmark_id == 'thing_4']
     assert not any(' cm away' in fault for fault in one.faults)
 
@@ -145,38 +148,10 @@ def test_a_shifted_landmark_is_told_its_offset(detections):
     shifted = moved(TABLE, {4: TABLE.centers[4] + (0.12, 0.0, 0.0)})
     _, witness = witness_of(shifted, detections)
     assert np.linalg.norm(witness.fitted.centers[4] - TABLE.centers[4]) < 0.01
-    worst, *_ = check_landmarks(shifted, witness, [])
+    worst, *_ = check_landmarks(shifted, witness, [], MAPPING)
     assert worst.landmark_id == 'thing_4'
     assert worst.offset_m == pytest.approx(0.12, abs=0.01)
     assert any('is 12 cm away' in fault for fault in worst.faults)
-
-
-@pytest.mark.parametrize('is_recorded', [False, True])
-def test_every_doubled_landmark_is_a_duplicate(detections, is_recorded):
-    doubled = join_maps(TABLE, replace(TABLE, centers=TABLE.centers + 0.01))
-    views, witness = witness_of(doubled, detections) if is_recorded else (None, None)
-    overlaps = [one for one in find_map_overlaps(doubled, witness, views) if one.is_duplicate]
-    assert {(one.first, one.second) for one in overlaps} == {(row, row + 9) for row in range(9)}
-
-
-def test_neighbours_that_frames_show_apart_are_no_duplicates():
-    # two of one class whose normalized distance is 0.45
-    axes = np.array([[0.1, 0.1, 0.3], [0.3, 0.1, 0.1]])
-    pair = LandmarkMap('map', ('a', 'b'), ('a', 'b'), ('cup', 'cup'),
-                       np.array([[0.0, 0.0, 0.8], [0.14, 0.0, 0.8]]), axes,
-                       np.array([[0.0, 0.0, 0.0, 1.0]] * 2))
-    views, witness = witness_of(pair, see(pair, walk_around()))
-    (alone,), (recorded,) = (find_map_overlaps(pair, *known)
-                             for known in ((None, None), (witness, views)))
-    assert 0.3 < alone.distance < 0.5
-    assert alone.is_duplicate
-    assert not recorded.is_duplicate
-
-
-def test_a_symmetric_place_is_one_place(report):
-    pair = LookAlike((5.7, 3.5, 0.8), (5.8, 3.5, 0.8), (), 6, 1.0, 0, 180.0)
-    advice = give_advice(replace(report, look_alikes=(pair,)))
-    assert any('x 5.7, y 3.5' in one.text and '180 degrees' in one.text for one in advice)
 
 
 @pytest.mark.parametrize('turn_deg', [0.0, 35.0, -120.0])
@@ -224,14 +199,6 @@ def test_a_robot_that_is_misled_into_the_double_is_advice_on_the_double(rooms_re
     assert any('misled by 10.0 m' in text for text in elsewhere)
 
 
-def test_a_hand_written_map_gets_a_shorter_report():
-    report = check_map(TABLE, options=QUICK)
-    assert report.recording is None
-    assert report.as_dict()['recording'] is None
-    assert any('no recording' in note for note in report.notes)
-    assert all(one.support is None for one in report.landmarks)
-
-
 @pytest.mark.parametrize('least', [0.0, 1.0])
 def test_limits_decide(least):
     report = check_map(TABLE, options=QUICK, thresholds=Thresholds(min_positions=least,
@@ -269,18 +236,6 @@ def test_systematic_errors_are_measured(spoil, name, value, tolerance):
                 if one.is_significant and not one.follows}) == 1
     # a turned mount and a shifted principal point look much the same
     assert found[name].explained > 0.8 * max(one.explained for one in found.values())
-
-
-def test_a_landmark_of_one_block_is_missing_from_its_fold():
-    detections = see(TABLE, walk_around(frames=120))
-    # thing_0 is a book: its boxes outside of the first four seconds go
-    _, witness = witness_of(TABLE, detections)
-    rest = detections.select_boxes((witness.shown != 0) | (detections.frames < 20))
-    views, witness = witness_of(TABLE, rest)
-    folds = list(make_folds(views, witness, QUICK))
-    assert sorted(np.concatenate([one.frames for one in folds])) == list(range(120))
-    assert 0 not in folds[0].rows
-    assert all(0 in one.rows for one in folds[1:])
 
 
 def test_frames_for_which_no_landmark_is_left_count_as_refused(detections):
@@ -322,23 +277,6 @@ def test_stretches_without_landmarks_become_advice(detections):
     assert re.search(r': \d frames at [456] s', text), text
 
 
-def test_a_side_that_was_passed_twice_is_told_once(report):
-    recording = report.recording
-    first = recording.trials[0]
-    stretch = [replace(first, verdict='refused', landmarks=0)] * 3
-    twice = replace(recording, trials=(*stretch, replace(first, verdict='accepted'), *stretch[1:]))
-    (told,) = [one.text for one in give_advice(replace(report, recording=twice))
-               if one.text.startswith('record this side')]
-    assert '5 frames of 2' in told
-
-
-@pytest.mark.parametrize(('value', 'limit', 'shown'), [
-    (0.005952, 0.01, '0.6 %'), (0.1234, 0.05, '12 %'), (1.0, 0.9, '100 %'),
-    (0.8961, 0.9, '89.61 %')])
-def test_shares_have_two_digits_where_these_tell(value, limit, shown):
-    assert Measure('a share', value, limit, is_most=False).show(value) == shown
-
-
 def test_too_few_views_are_named_as_the_cause(detections):
     # two of nine objects are not in the map
     part = TABLE.select(range(7))
@@ -351,20 +289,20 @@ def test_too_few_views_are_named_as_the_cause(detections):
 def test_detector_has_the_misses_and_noise_of_the_recording():
     detections = see(TABLE, walk_around(frames=200), noise_px=4.0, missed=0.4)
     views, witness = witness_of(TABLE, detections)
-    model = measure_detector(TABLE, detections, views, witness)
+    model = measure_detector(TABLE, detections, views, witness, MAPPING)
     rng, poses = np.random.default_rng(0), detections.map_from_camera
     counts = [len(model.detect(pose, rng)[1]) for pose in poses]
     assert np.mean(counts) == pytest.approx(len(detections.classes) / 200, rel=0.1)
     assert np.mean([model.expected_detections(pose) for pose in poses[::10]]) == pytest.approx(
         np.mean(counts), rel=0.1)
-    small = np.hypot(EDGE_SIGMA_PX, EDGE_SIGMA_SHARE * 50.0)
+    small = np.hypot(MAPPING.edge_sigma_px, MAPPING.edge_sigma_share * 50.0)
     assert model.edge_scale * small == pytest.approx(4.0, rel=0.25)
 
 
 def test_what_was_never_detected_is_never_simulated(detections):
     false = moved(TABLE, {4: TABLE.centers[4] + (0.0, 0.0, 1.0)})
     views, witness = witness_of(false, detections)
-    model = measure_detector(false, detections, views, witness)
+    model = measure_detector(false, detections, views, witness, MAPPING)
     assert all(4 not in model.in_view(pose)[0] for pose in detections.map_from_camera)
 
 
@@ -443,3 +381,67 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
     assert 'http' not in page
     assert json.loads((tmp_path / DATA).read_text())['landmarks'][0]['faults']
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([PAGE, DATA])
+
+
+ROOM = make_room()
+#: The camera looks along x, z is up.
+LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def layer_at(*poses):
+    return replace(make_layer(ROOM, len(poses), points=5), map_from_camera=np.array(poses))
+
+
+def view(x=0.0, degrees=0.0):
+    turn = Rotation.from_euler('z', degrees, degrees=True).as_matrix()
+    return make_transform(turn @ LEVEL, np.array([x, 0.0, 1.0]))
+
+
+@pytest.mark.parametrize(('x', 'degrees', 'reached'), [
+    (0.0, 0.0, True), (1.9, 0.0, True), (2.1, 0.0, False), (0.0, 39.0, True), (0.0, -41.0, False),
+    (0.9, 20.0, True), (1.1, 20.0, False), (0.0, 180.0, False)])
+def test_reach_is_near_and_in_the_same_direction(x, degrees, reached):
+    here = view(x, degrees)
+    assert in_reach(layer_at(view()), here[None, :3, 3], here[None, :3, 2]) == [reached]
+
+
+@pytest.fixture(scope='module')
+def room_report():
+    return check_map(ROOM, options=CheckOptions(max_positions=6, headings=4))
+
+
+def test_places_without_a_keyframe_are_counted_and_named(room_report):
+    grid = room_report.grid
+    everywhere = layer_at(*(make_transform(
+        Rotation.from_euler('z', angle, degrees=True).as_matrix() @ LEVEL, place)
+        for place in grid.positions for angle in range(0, 360, 30)))
+    full = check_keyframes(everywhere, grid, np.array([view(), view(50.0)]))
+    assert full.reached_positions == 1.0 and not len(full.without)
+    assert (full.headings == grid.headings).all()
+    nowhere = check_keyframes(layer_at(view(500.0)), grid, np.array([view(), view(500.0)]))
+    assert nowhere.reached_positions == 0.0
+    assert nowhere.recorded.tolist() == [False, True]
+    assert len(nowhere.without) == len(grid.positions)
+    assert len(nowhere.as_dict()['positions_without']) == len(grid.positions)
+    assert nowhere.as_dict()['recorded_frames_in_reach'] == 0.5
+    text = 'no keyframe is'
+    assert any(text in one.text for one in give_advice(replace(room_report, keyframes=nowhere)))
+    assert not any(text in one.text for one in give_advice(replace(room_report, keyframes=full)))
+    by_keyframes = replace(room_report, keyframes=full,
+                           grid=replace(grid, accepted=0 * grid.accepted))
+    assert any('only keyframes' in one.text for one in give_advice(by_keyframes))
+
+
+def test_the_report_has_keyframes_only_where_there_are_some(tmp_path, run_here):
+    write_map(tmp_path / 'room.yaml', ROOM)
+    given = [tmp_path / 'room.yaml', '--positions', '4', '--headings', '2',
+             '--min-positions', '0', '--out', tmp_path / 'out']
+    done = run_here(main, *given, '--keyframes')
+    assert done.returncode == 1 and 'room.keyframes.npz:' in done.stderr
+    assert run_here(main, *given).returncode == 0
+    assert json.loads((tmp_path / 'out/check.json').read_text())['keyframes'] is None
+    save_layer(layer_path(tmp_path / 'room.yaml'), layer_at(view(), view(1.0)))
+    done = run_here(main, *given)
+    assert done.returncode == 0 and 'keyframes: 2 with' in done.stdout
+    assert json.loads((tmp_path / 'out/check.json').read_text())['keyframes']['points'] == 10
+    assert '2 with 10 points' in (tmp_path / 'out/check.html').read_text()

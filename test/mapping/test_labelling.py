@@ -102,16 +102,6 @@ def test_medoids_stand_for_all_crops(static):
     assert embeddings.is_known.tolist() == [False, True]
 
 
-def test_five_medoids_at_most_and_one_of_equal_crops(static):
-    several = embed_landmarks(['it'], with_crops(static, np.eye(SIZE)[:12]),
-                              np.zeros(12, dtype=int))
-    assert several.medoid_offsets.tolist() == [0, 5]
-    equal = embed_landmarks(['it'], with_crops(static, np.eye(SIZE)[[3] * 12]),
-                            np.zeros(12, dtype=int))
-    assert equal.medoid_offsets.tolist() == [0, 1]
-    assert np.argmax(equal.means[0]) == np.argmax(equal.medoids[0]) == 3
-
-
 def test_crops_that_say_nothing_leave_the_class_name(static):
     """Zero rows, crops that cancel out, and a landmark that no box shows."""
     table = make_table(3)

@@ -116,21 +116,18 @@ def test_four_cameras_are_nearer_the_truth_than_one():
 
 @pytest.mark.parametrize('odometry', [False, True])
 def test_cameras_share_the_errors_of_the_robot(odometry):
-    def left(names, seed):
-        detections, true = drive(*names, move=wandering(seed))
+    left = {}
+    for names in (('front',), tuple(RIG)):
+        detections, true = drive(*names, move=wandering(0), seconds=30.0)
         if odometry:
             detections = replace(detections, odom_from_camera=true)
         built = build_map(detections, MappingOptions(pose_errors=ERRORS))
-        assert len(built.landmark_map) == len(ROOM)
-        offsets = built.map_from_camera[:, :3, 3] - true[:, :3, 3]
-        return offsets.std(axis=0).mean(), built
-    one, four = (np.mean([left(names, seed)[0] for seed in (0, 1)])
-                 for names in (('front',), tuple(RIG)))
-    built = left(tuple(RIG), 0)[1]
+        left[names] = (built.map_from_camera - true)[:, :3, 3].std(axis=0).mean()
+    one, four = left.values()
     print(f'\nposes off by: one camera {1e3 * one:.0f} mm, four {1e3 * four:.0f} mm')
     assert four < (1.0 if odometry else 0.6) * one
     if odometry:
-        assert any(' 399 of 399 ' in one for one in built.report.notes)
+        assert any(' 239 of 239 ' in one for one in built.report.notes)
 
 
 def test_a_rig_stays_rigid():

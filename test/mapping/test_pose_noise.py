@@ -1,18 +1,28 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of the poses, and of the mount, estimated from the boxes of a simulated walk."""
+"""Errors of poses and of the mount, and odometry between frames, in maps of a simulated walk."""
+
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from disturbed_poses import aligned_offsets_m, disturb, draw_errors, offsets_m
+from disturbed_poses import (
+    aligned_offsets_m,
+    disturb,
+    draw_errors,
+    offsets_m,
+    with_odometry,
+)
 from scipy.spatial.transform import Rotation
 from walk import look_at, make_table, nearest_errors, see, walk_around
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.offline.mapping.building import build_map
-from cliploc_ros.offline.mapping.joint import PosePrior
+from cliploc_ros.offline.mapping.joint import PosePrior, State
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
-from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
+from cliploc_ros.offline.mapping.odometry import link_frames
+from cliploc_ros.offline.mapping.options import MappingOptions, OdometryErrors, PoseErrors
 from cliploc_ros.offline.mapping.pose_noise import (
     _BENDING,
     estimate_pose_errors,
@@ -56,19 +66,6 @@ def test_errors_are_estimated(seen, kind, given):
     assert given.sigma_m / 2 < found.sigma_m < 2 * given.sigma_m
     assert given.sigma_deg / 2.5 < found.sigma_deg < 2 * given.sigma_deg
     assert (found.correlation_s < 0.3) == (kind == 'independent')
-
-
-@pytest.mark.full
-def test_estimated_errors_are_refined_and_reported(seen):
-    errors = draw_errors('correlated', seen.stamps_s, PoseErrors(0.05, 1.0, 3.0),
-                         np.random.default_rng(1))
-    disturbed, table = disturb(seen, errors), make_table()
-    plain, built = build_map(disturbed), build_map(disturbed, ESTIMATING)
-    assert len(built.landmark_map) == len(table)
-    assert (np.median(aligned_offsets_m(built.landmark_map, table))
-            < 0.5 * np.median(aligned_offsets_m(plain.landmark_map, table)))
-    assert any('off by about' in note for note in built.report.notes)
-    assert built.report.pose_change_m > 0.02
 
 
 def test_too_few_boxes_give_no_estimate():
@@ -157,3 +154,119 @@ def test_neighbours_are_what_some_frame_shows_together():
     np.testing.assert_allclose(found[:, 1], 20.0 * found[:, 0])
     # never seen: as far off as a single pose
     assert found[4, 0] == pytest.approx(_BENDING * 0.1)
+
+
+POSE_ERRORS = PoseErrors(0.05, 1.0, 3.0)
+NOISE = OdometryErrors(0.005, 0.2)
+OPTIONS = MappingOptions(pose_errors=POSE_ERRORS, odometry_errors=NOISE)
+
+
+@pytest.fixture(scope='module')
+def truth():
+    """Few objects and poor boxes: odometry tells more than they do."""
+    return see(make_table(4), walk_around(frames=120), noise_px=6.0, missed=0.3)
+
+
+@pytest.fixture(scope='module')
+def disturbed(truth):
+    return disturb(truth, draw_errors('correlated', truth.stamps_s, POSE_ERRORS,
+                                      np.random.default_rng(1)))
+
+
+@pytest.fixture(scope='module')
+def without(disturbed):
+    return build_map(disturbed, OPTIONS)
+
+
+@pytest.fixture(scope='module')
+def linked(truth, disturbed):
+    return with_odometry(disturbed, truth, np.random.default_rng(2), NOISE)
+
+
+def moved_odometry(detections, change):
+    """Return the detections with their odometry changed by a function of the poses."""
+    return replace(detections, odom_from_camera=change(detections.odom_from_camera.copy()))
+
+
+def slip(poses, way_m=(0.3, 0.2, 0.0)):
+    poses[60:, :3, 3] += way_m
+    return poses
+
+
+def lose(poses, frames=slice(None, None, 3)):
+    poses[frames] = np.nan
+    return poses
+
+
+def scaled(factor):
+    def change(poses):
+        poses[:, :3, 3] *= factor
+        return poses
+
+    return change
+
+
+def joined(built):
+    """Return how many pairs of frames odometry joins, or None where it is left out."""
+    note, = [one for one in built.report.notes if one.startswith('odometry')]
+    found = re.search(r' (\d+) of 119 pairs', note)
+    return int(found[1]) if found else None
+
+
+def pose_error_m(built, truth):
+    """Return how far the motions over 10 frames are off: root mean square [m]."""
+    one, other = (np.linalg.inv(poses[:-10]) @ poses[10:]
+                  for poses in (built.map_from_camera, truth.map_from_camera))
+    return float(np.sqrt(np.square(one - other)[:, :3, 3].sum(axis=1).mean()))
+
+
+def test_the_gradient_is_that_of_the_cost(linked):
+    few = moved_odometry(linked, slip).select_frames(range(56, 64))
+    views = make_views(few, MappingOptions())
+    steps, _ = link_frames(views, few.odom_from_camera, PoseErrors(0.5, 2.0), OdometryErrors())
+    assert steps.frames.tolist() == list(range(7))
+    landmarks = landmarks_of_map(make_table(4), few.class_names)
+    state = State(views, landmarks, np.zeros((8, 6)))
+
+    def cost(pose_steps):
+        return steps.linearize(state.moved(np.zeros((4, 9)), pose_steps.reshape(8, 6)).views)[0]
+
+    expected = [(cost(step) - cost(-step)) / 2e-5 for step in 1e-5 * np.eye(48)]
+    np.testing.assert_allclose(steps.linearize(views)[3].ravel(), expected, atol=1e-4)
+
+
+def test_odometry_betters_poses_and_map(truth, linked, without):
+    built = build_map(linked, OPTIONS)
+    assert joined(built) == 119
+    assert pose_error_m(built, truth) < 0.6 * pose_error_m(without, truth)
+    assert (np.median(aligned_offsets_m(built.landmark_map, make_table(4)))
+            < 0.8 * np.median(aligned_offsets_m(without.landmark_map, make_table(4))))
+
+
+@pytest.mark.parametrize(('way_m', 'pairs', 'share'), [
+    ((0.3, 0.2, 0.0), 118, 0.6), ((0.05, 0.05, 0.0), 119, 1.0)])
+def test_a_slip_is_left_out_and_one_that_the_poses_hide_does_little_harm(
+        truth, linked, without, way_m, pairs, share):
+    built = build_map(moved_odometry(linked, lambda poses: slip(poses, way_m)), OPTIONS)
+    assert joined(built) == pairs
+    assert any('jumps 1 times' in one for one in built.report.notes) == (pairs == 118)
+    assert pose_error_m(built, truth) < share * pose_error_m(without, truth)
+
+
+@pytest.mark.parametrize('change', [
+    scaled(1.25), scaled(1e300), lambda poses: np.concatenate([poses[:10], poses[:-10]]),
+    lambda poses: poses @ look_at(np.array([1.0, 0.0, 0.8])),
+    lambda poses: lose(poses, slice(None)),
+], ids=['a fourth too far', 'huge', 'two seconds late', 'another camera', 'none'])
+def test_odometry_that_contradicts_the_poses_is_left_out(linked, without, change):
+    built = build_map(moved_odometry(linked, change), OPTIONS)
+    assert any('is left out: ' in one for one in built.report.notes)
+    assert (built.landmark_map.centers == without.landmark_map.centers).all()
+
+
+def test_frames_without_odometry_are_not_joined(linked):
+    assert joined(build_map(moved_odometry(linked, lose), OPTIONS)) == 40
+
+
+def test_poses_that_are_taken_as_they_are_need_no_odometry(linked):
+    assert joined(build_map(linked)) is None

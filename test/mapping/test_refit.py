@@ -1,17 +1,26 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Given maps fitted to a simulated walk, whose landmarks are known."""
+"""Given maps fitted to a simulated walk, and landmarks that stand in one another."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from walk import join_maps, make_table, see, walk_around
+from walk import CLASSES, join_maps, make_table, see, see_rows, walk_around
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.mapping.check.checking import check_map
+from cliploc_ros.offline.mapping.check.landmark_faults import find_map_overlaps, hear_witness
+from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions
 from cliploc_ros.offline.mapping.refit import refit_map
+from cliploc_ros.offline.mapping.update.updating import update_map
+from cliploc_ros.offline.mapping.views import make_views
 
 
 @pytest.fixture(scope='module')
@@ -20,7 +29,7 @@ def table():
 
 
 @pytest.fixture(scope='module')
-def detections(table):
+def boxes(table):
     return see(table, walk_around(), noise_px=1.0, missed=0.2)
 
 
@@ -38,9 +47,9 @@ def errors_m(found, table):
     return np.linalg.norm(found.centers - table.centers, axis=1)
 
 
-def test_landmarks_move_to_where_the_boxes_are(table, detections):
+def test_landmarks_move_to_where_the_boxes_are(table, boxes):
     given = disturb(table)
-    refit = refit_map(detections, given)
+    refit = refit_map(boxes, given)
     assert refit.reasons == (None,) * len(table)
     assert np.median(errors_m(given, table)) > 0.05
     assert errors_m(refit.landmark_map, table).max() < 0.01
@@ -50,9 +59,9 @@ def test_landmarks_move_to_where_the_boxes_are(table, detections):
     assert refit.iou > 0.9 > 0.7 > refit.iou_before
 
 
-def test_what_the_map_says_of_its_landmarks_stays(table, detections):
+def test_what_the_map_says_of_its_landmarks_stays(table, boxes):
     given = disturb(table)
-    found = refit_map(detections, given).landmark_map
+    found = refit_map(boxes, given).landmark_map
     assert (found.landmark_ids, found.labels, found.class_ids) == (
         given.landmark_ids, given.labels, given.class_ids)
     for before, after in zip(given.details, found.details, strict=True):
@@ -64,35 +73,22 @@ def test_what_the_map_says_of_its_landmarks_stays(table, detections):
         assert after.last_seen > 9.0
 
 
-def test_only_chosen_landmarks_move(table, detections):
+def test_only_chosen_landmarks_move(table, boxes):
     given = disturb(table)
     chosen = np.arange(len(table)) == 4
-    found = refit_map(detections, given, chosen).landmark_map
+    found = refit_map(boxes, given, chosen).landmark_map
     assert (found.centers[~chosen] == given.centers[~chosen]).all()
     assert (found.quats_xyzw[~chosen] == given.quats_xyzw[~chosen]).all()
     assert [one.support is None for one in found.details] == (~chosen).tolist()
     assert errors_m(found, table)[4] < 0.01
 
 
-def test_a_duplicate_is_part_of_the_other(table, detections):
-    given = join_maps(disturb(table), disturb(table, seed=1).select([2, 5]))
-    refit = refit_map(detections, given)
-    assert len(set(refit.part_of)) == len(table)
-    for first, second in ((2, 9), (5, 10)):
-        assert refit.part_of[first] == refit.part_of[second]
-        gone = first if refit.part_of[first] != first else second
-        assert given.landmark_ids[first + second - gone] in refit.reasons[gone]
-    kept = np.unique(refit.part_of)
-    assert errors_m(refit.landmark_map.select(kept), table.select(
-        [row if row < 9 else {9: 2, 10: 5}[row] for row in kept])).max() < 0.01
-
-
-def test_a_landmark_without_boxes_stays_and_gets_a_reason(table, detections):
+def test_a_landmark_without_boxes_stays_and_gets_a_reason(table, boxes):
     given = disturb(table)
     ghosts = given.select([0, 1, 2])
     ghosts = replace(ghosts, class_ids=('book', 'book', 'lamp'), details=(LandmarkDetails(),) * 3,
                      centers=np.array([[0.2, -0.3, 1.2], [60.0, 0.0, 40.0], [0.0, 0.0, 2.0]]))
-    refit = refit_map(detections, join_maps(given, ghosts))
+    refit = refit_map(boxes, join_maps(given, ghosts))
     assert refit.reasons[:9] == (None,) * 9
     for reason, named in zip(refit.reasons[9:], ('no box', 'in no image', 'lamp'), strict=True):
         assert named in reason
@@ -101,38 +97,172 @@ def test_a_landmark_without_boxes_stays_and_gets_a_reason(table, detections):
 
 
 def test_one_side_is_not_enough(table):
-    detections = see(table, walk_around(frames=12, turn_deg=12.0))
+    boxes = see(table, walk_around(frames=12, turn_deg=12.0))
     with pytest.raises(MappingError, match='one side only'):
-        refit_map(detections, table)
-    refit = refit_map(detections, table, np.arange(len(table)) < 8)
+        refit_map(boxes, table)
+    refit = refit_map(boxes, table, np.arange(len(table)) < 8)
     assert ['one side' in str(reason) for reason in refit.reasons] == [True] * 8 + [False]
 
 
 @pytest.mark.parametrize(('turn_deg', 'shift_m', 'scale'), [
     (0, 0.8, 1), (45, 0, 1), (0, 0, 0.5), (0, 3.0, 1)])
-def test_a_map_in_another_coordinate_frame_is_refused(table, detections, turn_deg, shift_m, scale):
+def test_a_map_in_another_coordinate_frame_is_refused(table, boxes, turn_deg, shift_m, scale):
     turn = Rotation.from_euler('z', turn_deg, degrees=True)
     elsewhere = replace(
         table, centers=turn.apply(table.centers * scale) + np.array([shift_m, 0.0, 0.0]),
         semi_axes=table.semi_axes * scale,
         quats_xyzw=(turn * Rotation.from_quat(table.quats_xyzw)).as_quat())
     with pytest.raises(MappingError, match=r'boxes are|frame\?'):
-        refit_map(detections, elsewhere)
+        refit_map(boxes, elsewhere)
 
 
-def test_a_map_of_other_classes_is_refused(table, detections):
+def test_a_map_of_other_classes_is_refused(table, boxes):
     foreign = replace(table, class_ids=('tvmonitor',) * len(table))
     with pytest.raises(MappingError, match=r'tvmonitor; .*: book, bottle'):
-        refit_map(detections, foreign)
+        refit_map(boxes, foreign)
 
 
 def test_a_landmark_does_not_become_a_distant_object(table):
     """A landmark behind an object, seen from the front, overlaps the boxes of the object."""
     table = table.select([0, 2, 3, 4, 5, 6, 7, 8])
-    detections = see(table, walk_around(turn_deg=50.0))
+    boxes = see(table, walk_around(turn_deg=50.0))
     stray = replace(table.select([3]), centers=table.centers[[3]] + [-0.6, -0.25, -0.15],
                     semi_axes=np.full((1, 3), 0.2))
-    refit = refit_map(detections, join_maps(table.select([0, 1, 2, 4, 5, 6, 7]), stray))
+    refit = refit_map(boxes, join_maps(table.select([0, 1, 2, 4, 5, 6, 7]), stray))
     assert refit.reasons[:-1] == (None,) * 7
     assert 'another object' in refit.reasons[-1]
     assert (refit.landmark_map.centers[-1] == stray.centers[0]).all()
+
+
+POSES = walk_around()
+FRAMES = np.arange(len(POSES))
+BOOK, BOTTLE, CUP = CLASSES
+ALWAYS = FRAMES >= 0
+# Each: class, centre and semi-axes [m], and the frames that have its box.
+CHAIR = BOOK, (0.0, 0.0, 0.8), (0.25, 0.25, 0.4)
+BACK = BOTTLE, (0.0, 0.0, 1.0), (0.2, 0.2, 0.2)
+TABLE = BOOK, (0.0, 0.0, 0.6), (0.5, 0.4, 0.3)
+LEFT = BOOK, (-0.1, 0.0, 0.8), (0.1, 0.1, 0.3)
+RIGHT = BOOK, (0.1, 0.0, 0.8), (0.2, 0.1, 0.1)
+CUP_ON_TABLE = CUP, (0.1, 0.0, 0.85), (0.06, 0.06, 0.08)
+
+
+def make_map(*things):
+    """Return the map of some things: class, centre and semi-axes of each."""
+    classes, centers, axes = zip(*things, strict=True)
+    return LandmarkMap('map', tuple(f'thing_{row}' for row in range(len(things))), classes,
+                       classes, np.array(centers), np.array(axes),
+                       np.tile([0.0, 0.0, 0.0, 1.0], (len(things), 1)))
+
+
+def watch(*things, noise_px=1.0):
+    """Return what a detector sees of some things: class, centre, axes, frames with a box."""
+    parts = [see(make_map(one[:3]), POSES, noise_px, seed=row)
+             for row, one in enumerate(things)]
+    parts = [one.select_boxes(frames[one.frames])
+             for one, (*_, frames) in zip(parts, things, strict=True)]
+    frames = np.concatenate([one.frames for one in parts])
+    order = np.argsort(frames, kind='stable')
+    columns = {name: np.concatenate([getattr(one, name) for one in parts])[order]
+               for name in ('bboxes_xyxy', 'classes', 'scores')}
+    return replace(parts[0], frame_offsets=np.searchsorted(frames[order], np.arange(
+        len(POSES) + 1)), **columns)
+
+
+def under(name, thing):
+    """Return a thing under another name."""
+    return (name, *thing[1:])
+
+
+DOUBLES = {'thing_1', 'thing_1_b'}
+QUICK = CheckOptions(relocalizer=RelocalizerOptions(iterations=300), frames=6, max_positions=4,
+                     headings=2, spacing_m=2.0)
+# What the detector sees, and the class weights of the landmarks that it is.
+SCENES = {
+    'two names at once': ([(*CHAIR, ALWAYS), (*under(CUP, CHAIR), ALWAYS)],
+                          [{BOOK: 0.5, CUP: 0.5}]),
+    'two names in turn': ([(*CHAIR, FRAMES % 3 > 0), (*under(CUP, CHAIR), FRAMES % 3 == 0)],
+                          [{BOOK: 2 / 3, CUP: 1 / 3}]),
+    'a part, at times': ([(*CHAIR, ALWAYS), (*BACK, FRAMES % 5 == 0)], [{BOOK: 1.0}]),
+    'a part or the whole': ([(*CHAIR, FRAMES % 5 > 1), (*BACK, FRAMES % 5 <= 1)], [{BOOK: 1.0}]),
+    'a part of the same class': ([(*CHAIR, ALWAYS), (*under(BOOK, BACK), FRAMES % 5 == 0)],
+                                 [{BOOK: 1.0}]),
+    'a cup on a table': ([(*TABLE, ALWAYS), (*CUP_ON_TABLE, ALWAYS)], [{BOOK: 1.0}, {CUP: 1.0}]),
+    'side by side': ([(*LEFT, ALWAYS), (*RIGHT, ALWAYS)], [{BOOK: 1.0}, {BOOK: 1.0}]),
+    'side by side, two names': ([(*LEFT, ALWAYS), (*under(CUP, RIGHT), ALWAYS)],
+                                [{BOOK: 1.0}, {CUP: 1.0}]),
+}
+
+
+@pytest.mark.parametrize(('things', 'expected'), SCENES.values(), ids=SCENES)
+def test_what_the_images_show_at_once_is_two(things, expected):
+    """Of two things that stand in one another. A whole comes before its part."""
+    detections, pair = watch(*things), make_map(*(one[:3] for one in things))
+    (overlap,) = overlaps_of(pair, detections)
+    assert overlap.is_duplicate == (len(expected) == 1)
+    built = build_map(detections).landmark_map
+    assert len(built) == len(expected)
+    # the whole, not its part
+    for thing, weights in zip(things, expected, strict=False):
+        row = np.linalg.norm(built.centers - thing[1], axis=1).argmin()
+        assert np.sort(built.semi_axes[row]) == pytest.approx(np.sort(thing[2]), abs=0.02)
+        assert dict(built.details[row].class_weights or {built.class_ids[row]: 1.0}
+                    ) == pytest.approx(weights, abs=0.15)
+    assert not any(one.is_duplicate for one in overlaps_of(built, detections))
+
+
+def overlaps_of(landmark_map, detections=None):
+    """Return which landmarks stand in one another, with or without a recording."""
+    if detections is None:
+        return find_map_overlaps(landmark_map, None, None)
+    views = make_views(detections, MappingOptions())
+    return find_map_overlaps(landmark_map, hear_witness(
+        views, landmark_map, detections.class_names, MappingOptions()), views)
+
+
+def doubled_room():
+    """Return a room, and the map of it that has its bottle as a cup, too."""
+    room = make_table(6)
+    return room, join_maps(room, replace(room.select([1]), class_ids=(CUP,), labels=('mug',)))
+
+
+def test_the_check_counts_and_names_doubles_of_two_classes():
+    room, doubled = doubled_room()
+    report = check_map(doubled, see(room, POSES), options=QUICK)
+    assert report.duplicates == 1
+    first, second = report.landmarks[:2]
+    assert {first.landmark_id, second.landmark_id} == DOUBLES
+    assert first.overlaps == ((second.landmark_id, 0.0),)
+    assert any(set(re.findall(r'\w+', advice)) >= DOUBLES for advice in report.advice)
+
+
+def test_a_refit_and_an_update_join_doubles():
+    room, doubled = doubled_room()
+    seen, rows = see_rows(room, POSES, noise_px=1.0)
+    # the bottle is called a cup in every other image
+    classes = seen.classes.copy()
+    classes[(rows == 1) & (seen.frames % 2 == 0)] = CLASSES.index(CUP)
+    seen = replace(seen, classes=classes)
+    refit = refit_map(seen, doubled)
+    assert refit.part_of[1] == refit.part_of[6] and len(set(refit.part_of)) == 6
+    updated = update_map(doubled, seen)
+    assert updated.landmark_map.landmark_ids == room.landmark_ids
+    assert updated.shown.max() == 5 and updated.first_new == 6
+    for joined, row in ((refit.landmark_map, refit.part_of[1]), (updated.landmark_map, 1)):
+        assert dict(joined.details[row].class_weights) == {BOTTLE: 0.5, CUP: 0.5}
+        assert dict(joined.details[row].labels) == {BOTTLE: 0.5, 'mug': 0.5}
+        assert np.linalg.norm(joined.centers[row] - room.centers[1]) < 0.01
+
+
+def test_a_map_made_by_hand_is_judged_by_its_classes():
+    room, doubled = doubled_room()
+    assert overlaps_of(room) == []
+    assert [(one.first, one.second, one.is_duplicate) for one in overlaps_of(doubled)] == [
+        (1, 6, False)]
+    named = replace(doubled, class_ids=(*doubled.class_ids[:6], BOTTLE))
+    assert [one.is_duplicate for one in overlaps_of(named)] == [True]
+    assert check_map(named, options=QUICK).duplicates == 1
+    # boxes of other things tell nothing of it
+    elsewhere = see(room.select([0, 2, 3, 4, 5]), POSES)
+    assert [one.is_duplicate for one in overlaps_of(doubled, elsewhere)] == [False]
+    assert (refit_map(elsewhere, doubled).part_of == np.arange(7)).all()

@@ -1,21 +1,26 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Updates of a map from a simulated walk whose objects are known to have moved, or not."""
+"""Updates of a map: a simulated walk whose objects have moved, or not, and a rendered room."""
 
+import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from walk import CLASSES, join_maps, look_at, moved, see, see_rows, walk_around, without
 
+from cliploc_ros.cli import build_map
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.update.updating import update_map
+from demo import ASSETS
 
 ENCODER = 'test:0'
 POSES = walk_around(frames=60, turn_deg=320.0, radius=2.6)
@@ -273,6 +278,18 @@ def test_looks_tell_a_moved_object_from_a_new_one():
     assert other.embeddings.means[0] @ looks[0] > 0.99
 
 
+def test_what_is_left_out_has_its_reason():
+    things = make_things(12)
+    later = join_maps(things, replace(things.select([0]), centers=np.array([[1.9, 0.0, 0.8]])))
+    poses = np.array([look_at(np.array([-2.6, y, 1.1])) for y in np.linspace(-0.3, 0.3, 30)])
+    report = update_map(things, see(later, poses, noise_px=1.0)).report
+    assert report.new == ()
+    (one,) = [one for one in report.left_out if np.hypot(one.center[0] - 1.9, one.center[1]) < 0.6]
+    assert one.support >= 20
+    assert one.reason.startswith('seen from one side')
+    assert any(one.reason in line for line in report.lines())
+
+
 def test_an_object_that_could_be_either_of_two_says_so():
     things = make_things(12)
     alike = things.semi_axes.copy()
@@ -363,18 +380,6 @@ def test_a_landmark_that_is_never_seen_is_named():
     assert updated.landmark_map.details[0].seen_ratio < 0.1
 
 
-def test_what_is_left_out_has_its_reason():
-    things = make_things(12)
-    later = join_maps(things, replace(things.select([0]), centers=np.array([[1.9, 0.0, 0.8]])))
-    poses = np.array([look_at(np.array([-2.6, y, 1.1])) for y in np.linspace(-0.3, 0.3, 30)])
-    report = update_map(things, see(later, poses, noise_px=1.0)).report
-    assert report.new == ()
-    (one,) = [one for one in report.left_out if np.hypot(one.center[0] - 1.9, one.center[1]) < 0.6]
-    assert one.support >= 20
-    assert one.reason.startswith('seen from one side')
-    assert any(one.reason in line for line in report.lines())
-
-
 @pytest.mark.parametrize(('sigma_m', 'noise'), [(0.02, (0.0, 0.0)), (0.05, (0.0, 0.0)),
                                                 (0.05, (0.05, 1.0))])
 def test_an_exact_map_hardly_moves_and_errors_of_poses_are_estimated(sigma_m, noise):
@@ -392,3 +397,91 @@ def test_an_exact_map_hardly_moves_and_errors_of_poses_are_estimated(sigma_m, no
     assert (updated.report.pose_change_m > 0.04) == (noise[0] > 0.0)
     assert any('estimated from' in one for one in updated.report.notes) == (
         noise[0] > 0.0)
+
+
+ROOM = Path(__file__).parent / 'changed_room'
+CHANGES = json.loads((ROOM / 'changes.json').read_text())
+CLIP = ['--clip-model', ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'clip.safetensors']
+
+
+def update(folder, *options):
+    """Update the map of a folder by the executable's own function; return the exit code."""
+    return build_map.main([str(one) for one in (
+        '--observations', ROOM / 'after.npz', '--update', folder / 'map.yaml', '--no-check',
+        '--out', folder / 'map.yaml', '--report', folder / 'report.json', *CLIP, *options)])
+
+
+@pytest.fixture(scope='module')
+def updated(tmp_path_factory):
+    """The folder of a map that was updated in place."""
+    folder = tmp_path_factory.mktemp('changed')
+    for name in ('map.yaml', 'map.embeddings.npz'):
+        shutil.copyfile(ROOM / name, folder / name)
+    assert update(folder) == 0
+    return folder
+
+
+@pytest.fixture(scope='module')
+def report(updated):
+    return json.loads((updated / 'report.json').read_text())
+
+
+def test_all_nine_changes_are_reported_and_nothing_else(report):
+    def names(kind):
+        return {one['landmark_id'] for one in report[kind]}
+
+    assert names('moved') == set(CHANGES['moved'])
+    assert names('missing') == set(CHANGES['removed'])
+    assert len(report['new']) == len(CHANGES['new']) == 3
+    assert sorted(one['class_id'] for one in report['new']) == sorted(
+        name.split('_')[0] for name in CHANGES['new'])
+    assert len(report['confirmed']) == 60 - 4 - 2
+    assert report['not_observed'] == []
+    assert all('seen in 0' in one['evidence'] for one in report['missing'])
+    assert all(one['rivals'] == [] and one['distance_m'] > 1.0 for one in report['moved'])
+
+
+def test_the_map_holds_what_is_there_now(updated, report):
+    old, new = LandmarkMap.from_file(ROOM / 'map.yaml'), LandmarkMap.from_file(
+        updated / 'map.yaml')
+    kept = [name for name in old.landmark_ids if name not in CHANGES['removed']]
+    assert new.landmark_ids[:len(kept)] == tuple(kept)
+    labels = dict(zip(new.landmark_ids, new.labels, strict=True))
+    for name, label in zip(old.landmark_ids, old.labels, strict=True):
+        assert labels.get(name, label) == label
+    # pairs exchanged their places
+    places = dict(zip(old.landmark_ids, old.centers, strict=True))
+    for name in CHANGES['moved']:
+        here = new.centers[new.landmark_ids.index(name)]
+        way = min(np.linalg.norm((here - places[other])[:2])
+                  for other in CHANGES['moved'] if other != name)
+        assert way < 0.1
+    # a person's ellipsoids stay
+    stayed = [name for name in kept if name not in CHANGES['moved']]
+    for name in stayed:
+        np.testing.assert_array_equal(new.centers[new.landmark_ids.index(name)], places[name])
+    assert {one['landmark_id'] for one in report['new']} == set(new.landmark_ids[len(kept):])
+
+
+def test_new_landmarks_have_phrases_and_all_have_embeddings(updated, report):
+    new = LandmarkMap.from_file(updated / 'map.yaml')
+    embeddings = load_embeddings_of_map(updated / 'map.yaml', new.landmark_ids)
+    assert embeddings.is_known.all()
+    old = load_embeddings_of_map(ROOM / 'map.yaml', new.landmark_ids)
+    kept = old.is_known
+    np.testing.assert_array_equal(embeddings.means[kept], old.means[kept])
+    for one in report['new']:
+        row = new.landmark_ids.index(one['landmark_id'])
+        assert one['label'] == new.labels[row]
+        assert len(new.details[row].labels) == 6 or one['label'] == one['class_id']
+
+
+@pytest.mark.parametrize(('text', 'options', 'message'), [
+    (None, (), 'no such file'), ('', (), 'map'), ('a: [1', (), 'map.yaml'),
+    ((ROOM / 'map.yaml').read_text(), ('--refine-mount',), '--refine-mount')])
+def test_an_unusable_old_map_and_wrong_options_are_refused_before_the_work(
+        tmp_path, capsys, text, options, message):
+    if text is not None:
+        (tmp_path / 'map.yaml').write_text(text)
+    assert update(tmp_path, *options) == 1
+    assert message in capsys.readouterr().err.lower()

@@ -76,17 +76,6 @@ def test_what_contradicts_itself_is_named_until_it_is_gone(own_relocalizer, test
     status.wait(ERROR, '1280x960 px')
 
 
-def test_a_detector_of_other_classes_is_an_error(own_relocalizer, tester, status):
-    own_relocalizer()
-    frame = make_frame()
-    for detection in frame[2].detections:
-        detection.results[0].hypothesis.class_id = '62'
-    answer = tester.relocalize(frame)
-    assert not answer.success and 'wrong_detections' in answer.message
-    assert 'turn the camera' not in answer.message
-    status.wait(ERROR, '62, which are numbers; the map has a, b, c')
-
-
 def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):
     detector = start('nodes.detector', parameters={
         'model': PROJECT / 'demo/assets/yolo.pt', 'stale_after_s': 1.0})

@@ -163,18 +163,6 @@ def test_the_manager_hears_by_a_bond_whether_a_node_lives(manage, tester, room_m
 
 
 @pytest.mark.full
-def test_a_detector_mends_itself_when_its_weights_come(start, tester, tmp_path):
-    weights = tmp_path / 'yolo.pt'
-    process = start('nodes.detector', parameters={'model': weights})
-    process.wait_for_output('[ERROR]')
-    assert str(weights) in process.output()
-    weights.symlink_to(ASSETS / 'yolo.pt')
-    process.wait_for_output('ready after')
-    with tester.hearing_detections() as detected:
-        tester.feed_until(lambda: detected, [make_frame()[0]], 'detections')
-
-
-@pytest.mark.full
 def test_a_detector_looks_for_what_its_map_names_when_it_is_configured(manage, tester, tmp_path):
     from open_weights import write_open_yolo, write_tower  # needs PyTorch
 

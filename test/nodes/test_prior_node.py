@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a relocalizer knows before an image: the topic ~/prior, and its last pose."""
 
+
 import json
 
 import numpy as np

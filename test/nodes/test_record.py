@@ -5,7 +5,6 @@
 import hashlib
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
 from scene import make_room, see_room
 from tester import make_frame
 
@@ -51,25 +50,4 @@ def test_what_cannot_be_recorded_says_why(own_relocalizer, tester, tmp_path):
     assert not full.success and 'record_limit_mb' in full.message
     assert len(list(folder.iterdir())) == 1
     assert 'no fresh frame' in tester.answer(tester.ask()).message
-    assert not tester.trigger('record').success
-
-
-def test_a_fleet_collects_counters_and_the_hash(own_relocalizer, tester, room_map):
-    own_relocalizer()
-    heard = []
-    subscription = tester.create_subscription(DiagnosticArray, '/diagnostics', heard.append, 10)
-    for frame in (make_frame(), make_frame(see_room(make_room()).select(np.array([0, 1]))),
-                  four_of()):
-        tester.relocalize(frame)
-
-    def values():
-        return {value.key: value.value for value in heard[-1].status[0].values} if heard else {}
-    tester.wait(lambda: values().get('requests') == '3', 'the counters')
-    counted = values()
-    tester.destroy_subscription(subscription)
-    assert (counted['requests accepted'], counted['requests refused']) == ('1', '2')
-    assert counted['refused: too_few_objects'] == '1'
-    assert sum(int(value) for key, value in counted.items() if key.startswith('refused: ')) == 2
-    assert 0.0 < float(counted['requests longest [s]']) <= float(counted['requests total [s]'])
-    # by default no frame is kept
     assert not tester.trigger('record').success

@@ -90,25 +90,6 @@ def health(tester):
     tester.destroy_subscription(subscription)
 
 
-def test_continuous_mode_publishes_nothing_of_them(own_relocalizer, tester, health):
-    # first of all: those below share one process
-    own_relocalizer(mode='continuous')
-    for name in ('zero', 'constant', 'whole seconds'):
-        stamp, reason = UNUSABLE[name]
-        camera = Camera(lambda message: tester.publish([message]), stamp)
-        health.clear()
-
-        def work(camera=camera):
-            camera.step()
-            for _ in range(3):
-                tester.spin()
-        wait_for(lambda camera=camera: camera.number > 40, '40 images', work=work)
-        assert not tester.poses
-        assert any(reason in text for _, text in health)
-    camera = Camera(lambda message: tester.publish([message]), right)
-    wait_for(lambda: tester.poses, 'a pose', work=lambda: (camera.step(), tester.spin()))
-
-
 @pytest.mark.parametrize('name', UNUSABLE)
 def test_stamps_that_name_no_image_pair_nothing(relocalizer, tester, ask, health, name):
     stamp, reason = UNUSABLE[name]
@@ -137,10 +118,3 @@ def test_late_detections_with_the_stamp_of_their_image_are_right(relocalizer, te
         error_m, error_deg = pose_error(transform_of(tester.poses[-1].pose.pose),
                                         Camera.place(number))
         assert error_m < 0.01 and error_deg < 0.5
-
-
-def test_detections_alone_without_stamps_are_named(relocalizer, tester, ask):
-    answer = ask(Camera(lambda message: tester.publish([message]), right, zero), 2.0)
-    assert not answer.success
-    assert 'on /detections is ' in answer.message
-    assert 'of the images' not in answer.message

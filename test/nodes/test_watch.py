@@ -98,6 +98,7 @@ def watch(own_relocalizer, tester):
     tester.localizer.is_on = True
 
 
+@pytest.mark.full
 def test_a_right_localizer_stays_localized_and_a_kidnapped_robot_is_only_reported(watch):
     watched = watch()
     watched.until_state('localized')
@@ -115,6 +116,7 @@ def test_a_right_localizer_stays_localized_and_a_kidnapped_robot_is_only_reporte
     assert 'watch: lost' in watched.message
 
 
+@pytest.mark.full
 def test_a_lost_robot_is_relocalized_once_it_stands(watch):
     watched = watch(on_lost='relocalize')
     watched.until_state('localized')

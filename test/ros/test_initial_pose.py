@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -109,6 +110,24 @@ def test_who_hears_the_pose_but_shows_none_is_no_localizer(robot):
     with pytest.raises(NoLocalizerError, match='/amcl_pose'):
         robot.hand_over()
     assert not robot.localizer.poses
+    robot.handoff.close()
+
+
+@pytest.mark.parametrize(('off_m', 'named'), [(0.0, ''), (4.7, r'4\.70 m')])
+def test_a_localizer_has_taken_the_pose_once_it_shows_it(robot, off_m, named):
+    shows = robot.localizer.node.create_publisher(PoseWithCovarianceStamped, 'amcl_pose', 10)
+
+    def show(pose):
+        robot.localizer.poses.append(pose)
+        pose.pose.pose.position.x += off_m
+        pose.pose.pose.orientation.w = 1.0
+        shows.publish(pose)
+    robot.localizer.node.create_subscription(PoseWithCovarianceStamped, 'initialpose', show, 10)
+    robot.handoff.open('amcl_pose')
+    robot.wait(lambda: not robot.handoff.missing() and shows.get_subscription_count(), 'both')
+    with pytest.raises(NoLocalizerError, match=named) if named else nullcontext():
+        robot.hand_over(3.2)
+    assert len(robot.localizer.poses) == (3 if named else 1)
     robot.handoff.close()
 
 

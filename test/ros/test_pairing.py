@@ -69,18 +69,6 @@ def test_a_set_is_complete_if_and_only_if_nothing_of_it_was_evicted(additions):
         assert pairing.waiting_bytes() == sum(map(expected.size, TOPICS))
 
 
-@given(ADDITIONS)
-def test_memory_is_bounded_whatever_comes(additions):
-    pairing = ExactPairing(LIMITS, MAX_COUNT, 'image', 'detections')
-    largest = dict.fromkeys(TOPICS, 0)
-    for topic, stamp, size in additions:
-        pairing.add(topic, stamp, None, size)
-        largest[topic] = max(largest[topic], size)
-        # a single item may be as large as it is
-        assert 0 <= pairing.waiting_bytes() <= sum(
-            max(LIMITS[name], largest[name]) for name in TOPICS)
-
-
 def paired_by_a_slow_detector(behind, room, images, queue=False, begin=0):
     """Return the images that pair, of a camera whose detections come so many images later.
 

@@ -2,10 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 import array
 import math
-from pathlib import Path
 
 import pytest
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -23,7 +21,6 @@ SWITCH = ParameterRow('switch', False, 'On or off.')
 MOUNT = ParameterRow('mount', [0.0, 0.0], 'Two numbers.', unit='m')
 NAMES = ParameterRow('names', [''], 'Some texts.')
 
-PROJECT = Path(__file__).resolve().parents[2]
 TABLES = {'detector': DetectorParameters.rows(), 'relocalizer': RelocalizerParameters.rows()}
 
 
@@ -65,17 +62,6 @@ def test_whatever_comes_it_is_allowed_or_refused(value):
             assert row.validated(validated) == validated
             if row in (COUNT, LENGTH):
                 assert row.low <= validated <= row.high
-
-
-@pytest.mark.parametrize('name', TABLES)
-def test_the_page_holds_the_defaults(name):
-    _, _, page = (PROJECT / 'doc/parameters.md').read_text().partition(f'## {name}')
-    rows = [[cell.strip() for cell in line.strip('|').split('|')]
-            for line in page.partition('\n## ')[0].splitlines() if line.startswith('| `')]
-    assert all(len(cells) == 6 for cells in rows)
-    assert {cells[0].strip('`'): yaml.safe_load(cells[1].strip('`')) for cells in rows} == {
-        row.name: row.default for row in TABLES[name]}
-    assert [cells[4] == '' for cells in rows] == [row.read_only for row in TABLES[name]]
 
 
 @pytest.mark.parametrize('name', TABLES)

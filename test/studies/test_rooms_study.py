@@ -52,8 +52,3 @@ def test_nothing_is_accepted_elsewhere(asked):
     elsewhere = [one for one in outcomes if one['asked'] == 'elsewhere']
     assert len(elsewhere) == 4 * 2 * 3  # parts, images, ways
     assert not any(one['accepted'] for one in elsewhere)
-
-
-def test_the_tables_count_each_image(asked):
-    assert '| demo | in turn | objects | - | 6 |' in asked[1]
-    assert asked[1].count('## ') == 8

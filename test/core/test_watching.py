@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The watch in a room of forty objects, seen by a nearly perfect detector."""
+"""The watch: faults of images, and poses in a room of forty objects."""
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scene import boxes_of
@@ -13,21 +14,76 @@ from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.map.visibility import Expected, Missing, _Record, expect
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.watch.look import (
-    LookEvidence,
-    align,
-    by_vertical,
-    log_odds,
-    look_at,
-    measure,
-)
-from cliploc_ros.core.watch.watch import Belief, Watch, WatchState
+from cliploc_ros.core.watch.alignment import align, look_at
+from cliploc_ros.core.watch.belief import Belief
+from cliploc_ros.core.watch.evidence import LookEvidence, by_vertical, log_odds, measure
+from cliploc_ros.core.watch.expectation import Expected, expect
+from cliploc_ros.core.watch.image_faults import ImageFaults
+from cliploc_ros.core.watch.missing import Missing
+from cliploc_ros.core.watch.watch import Watch, WatchState
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
+
+
+def poses(count, step_m=0.2):
+    found = np.tile(np.eye(4), (count, 1, 1))
+    found[:, 0, 3] = step_m * np.arange(count)
+    return found
+
+
+@pytest.fixture
+def images():
+    """Six different images of boxes and lines."""
+    rng, found = np.random.default_rng(0), []
+    for _ in range(6):
+        image = np.full((240, 320, 3), 120, dtype=np.uint8)
+        for corner, size, color in zip(rng.integers(0, 300, (60, 2)), rng.integers(5, 60, (60, 2)),
+                                       rng.integers(0, 255, (60, 3)), strict=True):
+            cv2.rectangle(image, corner.tolist(), (corner + size).tolist(), color.tolist(), -1)
+        found.append(image)
+    return found
+
+
+def faults_of(images, where):
+    faults = ImageFaults()
+    return [faults.add(image, pose) for image, pose in zip(images, where, strict=True)]
+
+
+def test_good_images_have_no_fault(images):
+    assert faults_of(images, poses(6)) == [''] * 6
+
+
+@pytest.mark.parametrize(('change', 'word', 'looks'), [
+    (lambda one: one // 20, 'dark', 3),
+    (lambda one: np.full_like(one, 90), 'covered', 3),
+    (lambda one: cv2.GaussianBlur(one, (0, 0), 6.0), 'blurred', 5)])
+def test_a_fault_that_lasts_is_named(images, change, word, looks):
+    found = faults_of([change(one) for one in images], poses(6))
+    assert found[:looks - 1] == [''] * (looks - 1)
+    assert word in found[looks - 1]
+    # one good image ends it
+    again = faults_of([*map(change, images), images[0]], poses(7))
+    assert again[-1] == ''
+
+
+def test_the_same_image_is_frozen_only_for_a_robot_that_moves(images):
+    assert 'frozen' in faults_of([images[0]] * 6, poses(6))[-1]
+    assert faults_of([images[0]] * 6, poses(6, step_m=0.0)) == [''] * 6
+
+
+def test_a_standing_robot_before_a_smooth_wall_is_no_fault(images):
+    smooth = [cv2.GaussianBlur(images[0], (0, 0), 6.0) + np.uint8(row) for row in range(6)]
+    assert faults_of(smooth, poses(6, step_m=0.0)) == [''] * 6
+
+
+@pytest.mark.full
+@pytest.mark.parametrize('shape', [(1, 1, 3), (480, 3, 3), (1080, 1920, 3)])
+def test_images_of_any_shape(shape):
+    faults_of([np.zeros(shape, dtype=np.uint8)] * 4, poses(4))
+
 
 CAMERA = Camera(640, 480, 400.0, 400.0, 320.0, 240.0)
 SIDE_M, COUNT = 6.0, 40
@@ -366,12 +422,3 @@ def test_without_similarities_a_look_matches_by_class(room, similarities, matchi
     if similarities:
         seen = replace(seen, similarities=np.zeros((len(seen.detections), COUNT)))
     assert look_at(room, seen, RelocalizerOptions()).options.matching == matching
-
-
-@pytest.mark.parametrize(('record', 'gone'), [
-    (_Record(), 0.05), (_Record(misses=1.0), 1 / 6), (_Record(misses=2.0), 0.05 * 0.95 / (
-        0.05 * 0.95 + 0.25 * 1.75 / 4)), (_Record(found=1.0, misses=1.0), 0.05 / (
-            0.05 + 0.75 / 4)), (_Record(missed=1.0, misses=1.0), 0.05 / (0.05 + 1.75 / 4))])
-def test_each_miss_makes_a_landmark_less_likely_to_be_there(record, gone):
-    """In numbers: looks find three of four landmarks, 3 looks before any, 5 % are gone."""
-    assert record.gone(0.75) == pytest.approx(gone)

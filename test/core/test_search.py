@@ -1,0 +1,246 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which samples are drawn and tried, and the search kernel against the plain reference."""
+
+from math import comb, radians
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from reference import same_class, sample_pose, scene_of, score, verify
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+
+from cliploc_ros.core.geometry.ellipse import ellipse_iou, iou_bound
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
+from cliploc_ros.core.search.sampling import (
+    FARTHEST,
+    NEAREST,
+    _depths,
+    _distance_range,
+    compatible_pairs,
+    draw_prosac,
+    draw_ransac,
+    enumerate_compatible_triples,
+    prosac_growth,
+)
+from cliploc_ros.core.search.scene import Constraint, make_scene
+from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
+from cliploc_ros.core.search.strategies import Leaders, search_exhaustively, search_progressively
+
+
+def test_growth_of_chum_and_matas():
+    assert prosac_growth(33, 500)[:8].tolist() == [1, 2, 3, 4, 6, 8, 11, 15]
+
+
+@given(st.integers(3, 200), st.integers(1, 5000))
+def test_growth_is_monotone_and_ends_near_the_iterations(candidates, iterations):
+    growth = prosac_growth(candidates, iterations)
+    assert len(growth) == candidates - 2
+    assert growth[0] == 1
+    assert (np.diff(growth) >= 1).all()
+    # from T_3 to T_N, with every step rounded up
+    first = iterations / comb(candidates, 3)
+    assert iterations - first <= growth[-1] - 1 + 1e-6 <= iterations - first + candidates
+
+
+pairs = st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=0, max_size=30,
+                 unique=True).map(lambda rows: np.array(rows, dtype=np.int64).reshape(-1, 2))
+
+
+@given(pairs, st.integers(1, 200), st.integers(0, 2**32), st.sampled_from([draw_ransac,
+                                                                           draw_prosac]))
+def test_samples_are_valid_and_repeat(pairs, iterations, seed, draw):
+    samples = draw(pairs, iterations, np.random.default_rng(seed))
+    assert samples.shape == (iterations, 3)
+    assert (samples == draw(pairs, iterations, np.random.default_rng(seed))).all()
+    for sample in samples[samples[:, 0] >= 0]:
+        assert len(set(pairs[sample, 0])) == 3
+        assert len(set(pairs[sample, 1])) == 3
+
+
+def test_prosac_draws_the_newest_candidate_while_its_set_grows():
+    pairs = np.stack([np.arange(33)] * 2, axis=1)
+    samples = draw_prosac(pairs, 500, np.random.default_rng(0))
+    sizes = np.searchsorted(prosac_growth(33, 500), np.arange(1, 501)) + 3
+    for sample, size in zip(samples, np.minimum(sizes, 33), strict=True):
+        assert sample.max() == size - 1 if size < 33 else sample.max() < 33
+
+
+def test_ransac_draws_all_candidates_alike():
+    pairs = np.stack([np.arange(10)] * 2, axis=1)
+    counts = np.bincount(draw_ransac(pairs, 30_000, np.random.default_rng(0)).ravel())
+    # 9,000 each is expected, with a standard deviation of about 80
+    assert np.abs(counts - 9_000).max() < 400
+
+
+def test_the_range_holds_every_distance(rng):
+    for _ in range(200):
+        a, b = rng.uniform(1, 10, 2)
+        cosine = rng.uniform(0.3, 1.0)
+        low, high = _distance_range(a, b, cosine)
+        u, v = np.meshgrid(np.linspace(NEAREST, FARTHEST, 60) * a,
+                           np.linspace(NEAREST, FARTHEST, 60) * b)
+        distances = np.sqrt(np.maximum(0, u**2 + v**2 - 2 * u * v * cosine))
+        assert low <= distances.min() + 1e-9
+        assert high == pytest.approx(distances.max())
+        assert low == pytest.approx(distances.min(), abs=0.05 * max(a, b))
+
+
+def test_all_that_is_within_reach_is_found(room, rng):
+    """Landmarks along a corridor: the sweep leaves out only what no distance allows."""
+    seen = see_room(room)
+    centers = rng.uniform(-1.0, 1.0, (60, 3)) * [40.0, 3.0, 3.0]
+    pairs = np.column_stack([rng.integers(len(seen), size=200), rng.integers(60, size=200)])
+    scene = make_scene(CAMERA.normalize_bboxes(seen.bboxes_xyxy), centers,
+                       np.repeat(room.shapes, 5, axis=0), pairs, pairs, 0.2)
+    depths, bearings = _depths(scene), scene.bearings[pairs[:, 0]]
+    expected = np.zeros((200, 200), dtype=bool)
+    for i, j in np.argwhere((pairs[:, None] != pairs[None]).all(axis=2)):
+        low, high = _distance_range(depths[i], depths[j], bearings[i] @ bearings[j])
+        expected[i, j] = low <= np.linalg.norm(centers[pairs[i, 1]] - centers[pairs[j, 1]]) <= high
+    assert 100 < expected.sum() < 0.5 * expected.size
+    np.testing.assert_array_equal(compatible_pairs(scene), expected)
+
+
+@pytest.mark.parametrize('size', [1, 7, 1024])
+def test_every_compatible_triple_comes_once_and_in_order(rng, size):
+    compatible = np.triu(rng.random((25, 25)) < 0.4, 1)
+    compatible |= compatible.T
+    cursor, found = np.array([2, 0, 1]), []
+    while cursor[0] < len(compatible):
+        block = np.full((size, 3), -1)
+        count = enumerate_compatible_triples(compatible, cursor, block)
+        found += map(tuple, block[:count].tolist())
+    expected = [(a, b, newest) for newest in range(25) for a in range(newest)
+                for b in range(a + 1, newest)
+                if compatible[newest, a] and compatible[newest, b] and compatible[a, b]]
+    assert found == expected
+    assert len(found) > 50
+
+
+def test_it_ends_where_the_exhaustive_search_ends(room):
+    scene = scene_of(room)
+    whole, gated = Leaders.none_yet(), Leaders.none_yet()
+    *_, all_tried = search_exhaustively(scene, whole)
+    *_, progress = search_progressively(scene, compatible_pairs(scene), gated)
+    assert (progress.coverage, progress.reach) == (1.0, len(scene.pairs))
+    assert progress.tried < 0.8 * all_tried.tried
+    print(f'\n{progress.tried} of {all_tried.tried} samples tried')
+    best = [leaders.ranked()[0] for leaders in (whole, gated)]
+    assert gated.scores[best[1]] == pytest.approx(whole.scores[best[0]], rel=1e-6)
+    pose = invert_transform(make_transform(gated.rotations[best[1]], gated.translations[best[1]]))
+    assert pose_error(pose, MAP_FROM_CAMERA)[0] < 1e-2
+
+
+def test_the_first_candidates_are_done_before_the_next(room):
+    scene = scene_of(room, rows=slice(0, 9))
+    everything = np.ones((len(scene.pairs),) * 2, dtype=bool)
+    steps = list(search_progressively(scene, everything, Leaders.none_yet()))
+    reaches = [step.reach for step in steps]
+    assert reaches == sorted(reaches)
+    count = len(scene.pairs)
+    for step in steps[:-1]:
+        assert step.coverage == pytest.approx(comb(step.reach, 3) / comb(count, 3))
+    assert steps[-1].coverage == 1.0
+    assert steps[-1].tried == comb(count, 3)
+
+
+UP_IN_MAP = np.array([0.0, -1.0, 0.0])
+UP_IN_CAMERA = MAP_FROM_CAMERA[:3, :3].T @ UP_IN_MAP
+HEIGHT = float(MAP_FROM_CAMERA[:3, 3] @ UP_IN_MAP)
+
+
+def upright(**known):
+    return Constraint(tuple(UP_IN_CAMERA), tuple(UP_IN_MAP), **known)
+
+
+@pytest.fixture(scope='module')
+def scene():
+    return scene_of(make_room(), noise_px=4, rng=np.random.default_rng(3))
+
+
+def test_it_chooses_and_scores_as_the_reference(scene, room, rng):
+    (candidates, constraint, targets, memory, poses, overlaps), compared = set_up(scene), 0
+    samples = draw_ransac(scene.pairs, 2_000, rng)
+    for number, sample in enumerate(samples):
+        which = make_hypothesis(candidates, constraint, memory, poses, samples, number, 0.0)
+        expected, total = sample_pose(scene, sample)
+        assert (which >= 0) == (expected is not None)
+        if expected is None:
+            continue
+        compared += 1
+        assert total >= 0.0
+        assert (poses.rotations[which] == expected[0]).all()
+        assert (poses.translations[which] == expected[1]).all()
+        plain, landmarks = score(scene, same_class(room.class_ids, room.class_ids), expected)
+        verified = verify(scene, *expected)
+        assert verified.score == pytest.approx(plain, abs=1e-12)
+        assert (verified.landmarks == landmarks).all()
+        for floor in (-1.0, 0.5 * plain, plain - 1e-6, plain + 1e-6, plain + 1.0):
+            found = verify_beyond(targets, poses, which, overlaps, floor)
+            assert found == pytest.approx(max(plain, floor), abs=1e-9)
+    assert compared > 500
+
+
+def test_a_least_overlap_drops_what_overlaps_less(scene, rng):
+    (candidates, constraint, _, memory, poses, _), dropped = set_up(scene), 0
+    samples = draw_ransac(scene.pairs, 500, rng)
+    for number, sample in enumerate(samples):
+        which = make_hypothesis(candidates, constraint, memory, poses, samples, number, 1.0)
+        expected, total = sample_pose(scene, sample)
+        assert (which >= 0) == (total >= 1.0)
+        if which >= 0:
+            assert (poses.rotations[which] == expected[0]).all()
+        dropped += expected is not None and which < 0
+    assert dropped > 20
+
+
+sizes = st.floats(0.05, 20.0)
+offsets = st.floats(-3.0, 3.0)
+
+
+@given(sizes, sizes, sizes, sizes, offsets, offsets, st.floats(0.0, np.pi))
+def test_the_bound_is_never_below_the_iou(a, b, p, q, x, y, angle):
+    c, s = np.cos(angle), np.sin(angle)
+    exx, eyy, exy = (p * c)**2 + (q * s)**2, (p * s)**2 + (q * c)**2, (p * p - q * q) * c * s
+    iou = ellipse_iou(0.0, 0.0, a, b, x, y, exx, exy, eyy)
+    assert iou <= iou_bound(0.0, 0.0, a, b, x, y, np.sqrt(exx), np.sqrt(eyy), p * q)
+
+
+@pytest.mark.parametrize(('constraint', 'remains'), [
+    (upright(min_height=HEIGHT - 0.3, max_height=HEIGHT + 0.3), True),
+    (upright(max_tilt=radians(10)), True),
+    (upright(min_height=HEIGHT + 0.3), False),
+    (upright(max_height=HEIGHT - 0.3), False),
+    (Constraint(tuple(-UP_IN_CAMERA), tuple(UP_IN_MAP), max_tilt=radians(10)), False),
+])
+def test_a_constraint_rules_poses_out(scene, constraint, remains):
+    search = (search_exhaustively, lambda *given: search_progressively(
+        scene, compatible_pairs(scene), *given[1:]))
+    for one in search:
+        leaders = Leaders.none_yet()
+        *_, progress = one(scene, leaders, constraint)
+        assert progress.coverage == 1.0
+        near = False
+        for row in leaders.ranked():
+            pose = invert_transform(make_transform(leaders.rotations[row],
+                                                   leaders.translations[row]))
+            height = pose[:3, 3] @ UP_IN_MAP
+            assert constraint.min_height <= height <= constraint.max_height
+            tilt = (pose[:3, :3] @ np.array(constraint.up_in_camera)) @ UP_IN_MAP
+            assert tilt >= np.cos(constraint.max_tilt) - 1e-12
+            near |= pose_error(pose, MAP_FROM_CAMERA)[0] < 0.3
+        assert near == remains
+
+
+def test_pairs_and_a_vertical_find_the_pose(scene):
+    leaders = Leaders.none_yet()
+    steps = list(search_progressively(scene, compatible_pairs(scene), leaders, upright(), size=2))
+    best = leaders.ranked()[0]
+    pose = invert_transform(make_transform(leaders.rotations[best], leaders.translations[best]))
+    assert pose_error(pose, MAP_FROM_CAMERA)[0] < 0.2
+    assert leaders.samples[best, 2] == -1
+    assert (scene.pairs[leaders.samples[best, 0]] != scene.pairs[leaders.samples[best, 1]]).all()
+    assert steps[-1].tried == np.tril(compatible_pairs(scene)).sum()
+    assert (steps[-1].coverage, steps[-1].reach) == (1.0, len(scene.pairs))

@@ -1,0 +1,209 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings: written and read back, of several files, compressed, damaged."""
+
+import numpy as np
+import pytest
+import yaml
+from rosbags.interfaces import QosDurability
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import transform_from_pose
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.messages import detections_from_msg
+from cliploc_ros.offline.datasets import bag_messages
+from cliploc_ros.offline.datasets.bags import (
+    LATCHED_QOS,
+    RELIABLE_QOS,
+    STORAGES,
+    BagMessage,
+    BagReader,
+    BagWriter,
+    typestore,
+)
+from cliploc_ros.ros.conversions import pose_from_msg
+
+STRING = 'std_msgs/msg/String'
+# From ROS's own generator, not computed here.
+STRING_HASH = 'RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18'
+QOS = {'/chatter': RELIABLE_QOS, '/robot_description': LATCHED_QOS, '/status': RELIABLE_QOS}
+
+
+def make_messages(count):
+    """Three topics in turn, the third with the stamp of the second."""
+    text = typestore().types[STRING]
+    return [BagMessage([*QOS][number % 3], 10**18 + (number - (number % 3 == 2)) * 100_000_001,
+                       bytes(typestore().serialize_cdr(text(f'message {number}'), STRING)))
+            for number in range(count)]
+
+
+def write_bag(path, storage, parts, compression='NONE'):
+    """Write a recording of several files, as `ros2 bag record` splits it."""
+    for index, messages in enumerate(parts):
+        writer = Writer(path.parent / f'part_{index}', version=9, storage_plugin=STORAGES[storage])
+        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+        with writer:
+            topics = {name: writer.add_connection(name, STRING, typestore=typestore(),
+                                                  offered_qos_profiles=[qos])
+                      for name, qos in QOS.items()}
+            for one in messages:
+                writer.write(topics[one.topic], one.stamp_ns, one.data)
+    path.mkdir()
+    every = []
+    for index, _ in enumerate(parts):
+        part = path.parent / f'part_{index}'
+        every.append(yaml.safe_load((part / 'metadata.yaml').read_text()))
+        for file in every[-1]['rosbag2_bagfile_information']['relative_file_paths']:
+            (part / file).rename(path / file)
+    info = every[0]['rosbag2_bagfile_information']
+    for one in (each['rosbag2_bagfile_information'] for each in every[1:]):
+        info['relative_file_paths'] += one['relative_file_paths']
+        info['files'] += one['files']
+        info['message_count'] += one['message_count']
+        info['duration']['nanoseconds'] = (
+            one['starting_time']['nanoseconds_since_epoch'] + one['duration']['nanoseconds']
+            - info['starting_time']['nanoseconds_since_epoch'])
+        for topic, more in zip(info['topics_with_message_count'],
+                               one['topics_with_message_count'], strict=True):
+            topic['message_count'] += more['message_count']
+    (path / 'metadata.yaml').write_text(yaml.safe_dump(every[0]))
+    return path
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+@pytest.mark.parametrize('compression', ['NONE', 'FILE', 'MESSAGE'])
+def test_reads_what_jazzy_records(tmp_path, storage, compression):
+    messages = make_messages(18)
+    bag = write_bag(tmp_path / 'bag', storage, [messages[:6], messages[6:]], compression)
+    with BagReader(bag) as reader:
+        assert list(reader.messages()) == messages
+        assert reader.message_count == 18
+        assert (reader.start_ns, reader.end_ns) == (messages[0].stamp_ns, messages[-1].stamp_ns)
+        assert {(topic.msgtype, topic.type_hash, topic.message_count)
+                for topic in reader.topics.values()} == {(STRING, STRING_HASH, 6)}
+        (latched,) = reader.topic('/robot_description').offered_qos
+        assert latched.durability == QosDurability.TRANSIENT_LOCAL
+        assert reader.deserialize(messages[0]).data == 'message 0'
+        chosen = reader.messages(['/chatter', '/robot_description'], messages[3].stamp_ns,
+                                 messages[9].stamp_ns)
+        assert list(chosen) == [one for one in messages[3:9] if one.topic != '/status']
+
+
+def truncate(path, size):
+    path.write_bytes(path.read_bytes()[:size])
+
+
+@pytest.mark.parametrize(('damage', 'reason'), [
+    (lambda bag: (bag / 'metadata.yaml').unlink(), 'ros2 bag reindex'),
+    (lambda bag: (bag / 'metadata.yaml').write_text('version: 9'), 'rosbag2_bagfile_informa'),
+    (lambda bag: (bag / 'part_0.mcap').unlink(), 'part_0.mcap'),
+    (lambda bag: truncate(bag / 'part_0.mcap', -20), 'magic')])
+def test_broken_recordings_are_refused(tmp_path, damage, reason):
+    bag = write_bag(tmp_path / 'bag', 'mcap', [make_messages(30)])
+    damage(bag)
+    with pytest.raises(DatasetError, match=reason), BagReader(bag) as reader:
+        list(reader.messages())
+
+
+def test_missing_recording_and_topic_are_named(tmp_path):
+    with pytest.raises(DatasetError, match='no such recording'), BagReader(tmp_path / 'none'):
+        pass
+    (tmp_path / 'notes.txt').write_text('hello')
+    with pytest.raises(DatasetError, match='txt'), BagReader(tmp_path / 'notes.txt'):
+        pass
+    bag = write_bag(tmp_path / 'bag', 'mcap', [make_messages(3)])
+    with BagReader(bag) as reader, pytest.raises(DatasetError, match='/chatter'):
+        reader.topic('/image')
+
+
+STAMP_NS = 1341847980722988001
+CAMERA = Camera(64, 48, 53.5, 53.9, 32.0, 24.7, 'plumb_bob', (0.1, -0.2, 0.001, 0.002, 0.3))
+
+
+@pytest.fixture(params=['sqlite3', 'mcap'])
+def plugin(request):
+    return request.param
+
+
+def test_messages_come_back(tmp_path, plugin):
+    pixels_rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    detections = Detections(np.array([[1.5, 2.0, 30.25, 40.0], [0.0, 0.0, 63.0, 47.0]]),
+                            ('teddy bear', 'tv'), np.array([0.5, 0.25]))
+    map_from_camera = transform_from_pose(np.array([1.0, -2.0, 3.0]),
+                                          np.array([0.5, 0.5, -0.5, 0.5]))
+    written = {
+        bag_messages.IMAGE: bag_messages.image_message(STAMP_NS, 'camera', pixels_rgb),
+        bag_messages.CAMERA_INFO: bag_messages.camera_info_message(STAMP_NS, 'camera', CAMERA),
+        bag_messages.DETECTIONS: bag_messages.detections_message(STAMP_NS, 'camera', detections),
+        bag_messages.POSE: bag_messages.pose_message(STAMP_NS, 'world', map_from_camera)}
+    with BagWriter(tmp_path / 'bag', plugin) as bag:
+        for number, (msgtype, message) in enumerate(written.items()):
+            bag.add_topic(f'/topic_{number}', msgtype)
+            bag.write(f'/topic_{number}', STAMP_NS, message)
+    with BagReader(tmp_path / 'bag') as reader:
+        raws = sorted(reader.messages(), key=lambda one: one.topic)
+        image, info, array, pose = map(reader.deserialize, raws)
+    assert {raw.stamp_ns for raw in raws} == {bag_messages.stamp_ns(image)} == {STAMP_NS}
+    assert (image.encoding, image.height, image.width, image.step) == ('rgb8', 48, 64, 192)
+    assert image.header.frame_id == 'camera'
+    np.testing.assert_array_equal(image.data.reshape(48, 64, 3), pixels_rgb)
+    assert (info.width, info.height, info.distortion_model) == (64, 48, 'plumb_bob')
+    assert list(info.d) == [0.1, -0.2, 0.001, 0.002, 0.3]
+    assert list(info.k) == [53.5, 0, 32.0, 0, 53.9, 24.7, 0, 0, 1]
+    assert list(info.p) == [53.5, 0, 32.0, 0, 0, 53.9, 24.7, 0, 0, 0, 1, 0]
+    assert list(info.r) == [1, 0, 0, 0, 1, 0, 0, 0, 1]
+    assert [bag_messages.stamp_ns(one) for one in (array, *array.detections)] == [STAMP_NS] * 3
+    again = detections_from_msg(array)
+    np.testing.assert_array_equal(again.bboxes_xyxy, detections.bboxes_xyxy)
+    np.testing.assert_array_equal(again.scores, detections.scores)
+    assert again.class_ids == detections.class_ids
+    assert pose.header.frame_id == 'world'
+    np.testing.assert_allclose(pose_from_msg(pose.pose), map_from_camera, atol=1e-15)
+
+
+def test_metadata_is_as_jazzy_reads_it(tmp_path, plugin):
+    with BagWriter(tmp_path / 'office', plugin) as bag:
+        bag.add_topic('/pose', bag_messages.POSE, RELIABLE_QOS)
+        bag.add_topic('/map', bag_messages.DETECTIONS, LATCHED_QOS)
+        for index in range(3):
+            message = bag_messages.pose_message(STAMP_NS + index, 'world', np.eye(4))
+            bag.write('/pose', STAMP_NS + index, message)
+    content = yaml.safe_load((tmp_path / 'office' / 'metadata.yaml').read_text())
+    info = content['rosbag2_bagfile_information']
+    assert (info['version'], info['storage_identifier']) == (9, plugin)
+    assert info['message_count'] == 3
+    assert info['starting_time'] == {'nanoseconds_since_epoch': STAMP_NS}
+    assert info['duration'] == {'nanoseconds': 2}
+    (file,) = info['relative_file_paths']
+    assert (tmp_path / 'office' / file).exists()
+    infinite = {'sec': 9223372036, 'nsec': 854775807}
+    offered = {
+        'history': 'keep_last', 'depth': 10, 'reliability': 'reliable', 'durability': 'volatile',
+        'deadline': infinite, 'lifespan': infinite, 'liveliness': 'automatic',
+        'liveliness_lease_duration': infinite, 'avoid_ros_namespace_conventions': False,
+    }
+    latched = offered | {'depth': 1, 'durability': 'transient_local'}
+    topics = [one['topic_metadata'] for one in info['topics_with_message_count']]
+    assert [one['offered_qos_profiles'] for one in topics] == [[offered], [latched]]
+    assert [one['serialization_format'] for one in topics] == ['cdr', 'cdr']
+    assert topics[1]['type_description_hash'].startswith('RIHS01_2142741200')
+
+
+def test_existing_output_is_kept(tmp_path, plugin):
+    (tmp_path / 'bag').mkdir()
+    (tmp_path / 'bag' / 'precious').write_text('data')
+    with pytest.raises(DatasetError, match='exists already'), BagWriter(tmp_path / 'bag', plugin):
+        pass
+    assert [path.name for path in tmp_path.rglob('*')] == ['bag', 'precious']
+
+
+def test_failure_leaves_nothing(tmp_path, plugin):
+    with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'bag', plugin) as bag:
+        bag.add_topic('/pose', bag_messages.POSE)
+        bag.write('/pose', 1, bag_messages.pose_message(1, 'world', np.eye(4)))
+        assert not (tmp_path / 'bag').exists()  # built beside its final path
+        assert len(list(tmp_path.iterdir())) == 1
+        _ = 1 / 0
+    assert list(tmp_path.iterdir()) == []
