@@ -13,9 +13,9 @@ from scene import CAMERA, MAP_FROM_CAMERA, boxes_of
 from cliploc_ros.core.fit.verification import Verified, make_rig, verify_rig
 from cliploc_ros.core.geometry.ellipse import ellipse_iou
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
-from cliploc_ros.core.geometry.p3p import solve_p3p
+from cliploc_ros.core.geometry.minimal_solvers import solve_p3p
 from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.core.search.candidates import Candidates
+from cliploc_ros.core.search.frame_search import Candidates
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Scene, make_scene
 
 # A pose: rotation (3, 3) and translation (3,) of camera_from_map.

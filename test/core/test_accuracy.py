@@ -10,9 +10,13 @@ from scipy.stats import chi2
 
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.offline.evaluation.methods import Method
-from cliploc_ros.offline.evaluation.sensors import with_neighbours, with_vertical
 from cliploc_ros.offline.evaluation.summary import summarize
-from cliploc_ros.offline.evaluation.trials import make_queries, run_trial
+from cliploc_ros.offline.evaluation.trials import (
+    make_queries,
+    run_trial,
+    with_neighbours,
+    with_vertical,
+)
 
 pytestmark = pytest.mark.full
 

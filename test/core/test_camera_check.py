@@ -22,8 +22,7 @@ from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
-from cliploc_ros.core.relocalization import Relocalization
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN
 from cliploc_ros.offline.evaluation.trials import PosedQuery
 from studies import wrong_sensors

@@ -16,11 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
-from cliploc_ros.core.map.classes import ClassIndex
 from cliploc_ros.core.map.culling import FEW
 from cliploc_ros.core.map.landmark_details import LEAST_CLASS_SHARE, LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, with_images
-from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.landmark_map import ClassIndex, LandmarkMap
 from cliploc_ros.core.map.similarities import (
     CropSimilarities,
     LabelEmbeddings,
@@ -29,15 +28,14 @@ from cliploc_ros.core.map.similarities import (
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.search import candidates
-from cliploc_ros.core.search.candidates import (
+from cliploc_ros.core.search import frame_search
+from cliploc_ros.core.search.frame_search import (
     balanced_order,
     class_candidates,
     joined,
     match_frame,
     nearest_candidates,
     prosac_order,
-    rarest_class_candidates,
 )
 from cliploc_ros.core.search.scene import make_scene
 from cliploc_ros.errors import OptionsError
@@ -64,7 +62,7 @@ def test_balanced_order_takes_all_first_neighbours_first():
 
 def test_rare_classes_come_first_and_nothing_twice():
     index = ClassIndex.of(('a', 'a', 'a', 'b'))
-    rare = rarest_class_candidates(index, index.classes_of(('a', 'b', 'a')), 100)
+    rare = class_candidates(index, index.classes_of(('a', 'b', 'a')), 100)
     assert rare.pairs.tolist() == [[1, 3], [0, 0], [0, 1], [0, 2], [2, 0], [2, 1], [2, 2]]
     similarities = np.array([[0.1, 0.9, 0.2, 0.3]] * 3, dtype=np.float32)
     both = joined(nearest_candidates(similarities, 1), rare, 4)
@@ -83,9 +81,9 @@ def test_landmarks_of_several_classes_agree_with_their_mask(landmarks, others, d
         mask[[one == name for one in detections], row] = True
     classes = index.classes_of(detections)
     assert (class_candidates(index, classes).pairs == np.argwhere(mask)).all()
-    rarest = rarest_class_candidates(index, classes, 100).pairs
+    rarest = class_candidates(index, classes, 100).pairs
     assert sorted(rarest.tolist()) == np.argwhere(mask).tolist()
-    assert (rarest_class_candidates(index, classes, limit).pairs == rarest[:limit]).all()
+    assert (class_candidates(index, classes, limit).pairs == rarest[:limit]).all()
     rows, columns = np.indices(mask.shape).reshape(2, -1)
     assert (index.have(columns, classes[rows]) == mask.ravel()).all()
     assert (np.diff(index.members[:, 0]) >= 0).all()  # in the map's order
@@ -203,7 +201,7 @@ def test_a_box_that_no_lens_sees_changes_nothing(count, far):
 def test_too_many_candidates_are_cut_and_said(monkeypatch):
     landmark_map, observation = make_world(400)
     whole, _ = match_frame(landmark_map, observation, RelocalizerOptions())
-    monkeypatch.setattr(candidates, 'MAX_CANDIDATES', 60)
+    monkeypatch.setattr(frame_search, 'MAX_CANDIDATES', 60)
     cut, left_out = match_frame(landmark_map, observation, RelocalizerOptions())
     assert len(cut.pairs) < len(whole.pairs) <= len(cut.pairs) + left_out
     assert (cut.pairs == whole.pairs[:len(cut.pairs)]).all()

@@ -19,7 +19,7 @@ from cliploc_ros.core.geometry.ellipsoid import (
     project_ellipsoids,
     shape_matrices,
 )
-from cliploc_ros.core.geometry.p3p import largest_cubic_root
+from cliploc_ros.core.geometry.minimal_solvers import largest_cubic_root
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     make_transform,

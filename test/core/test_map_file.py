@@ -25,8 +25,7 @@ from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.core.map.parameter_file import parse_written_map, read_parameter_file
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalization import in_its_map
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalizer, in_its_map
 from cliploc_ros.errors import MapError
 
 CUP = {'class_id': 'cup', 'center': [1.0, 2.0, 3.0], 'semi_axes': [0.1, 0.2, 0.3],

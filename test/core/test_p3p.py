@@ -8,8 +8,7 @@ import pytest
 from reference import bearings_of, nearest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.p3p import solve_p3p
-from cliploc_ros.core.geometry.two_point import two_point
+from cliploc_ros.core.geometry.minimal_solvers import solve_p3p, two_point
 
 
 def random_problem(rng):

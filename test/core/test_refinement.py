@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from cliploc_ros.core.fit.covariance import EXACT, normalized_square, refined_covariance
-from cliploc_ros.core.fit.finalists import Finalist, first_of_each_place
 from cliploc_ros.core.fit.refinement import (
     LEAST_DEVIATION,
     LEAST_SHARE,
@@ -23,14 +22,19 @@ from cliploc_ros.core.fit.refinement import (
     refine_rig,
     residuals_of,
 )
-from cliploc_ros.core.fit.verification import choose_distinct, make_rig, scores_of, verify_rig
-from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
+from cliploc_ros.core.fit.verification import make_rig, scores_of, verify_rig
+from cliploc_ros.core.geometry.transforms import (
+    SAME_PLACE,
+    invert_transform,
+    make_transform,
+    pose_error,
+)
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.search.candidates import match_frame
+from cliploc_ros.core.search.frame_search import match_frame
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
 
 
@@ -193,11 +197,12 @@ def test_the_best_at_each_place_are_chosen(room, walk, rng):
     poses = [*near[:3], far, *near[3:]]
     rotations, translations = (np.array(part) for part in zip(*map(split, poses), strict=True))
     scores = scores_of(rig, rotations, translations)
-    rows = choose_distinct(scores, rotations, translations, 5)
+    order = np.argsort(-scores, kind='stable')
+    rows = order[SAME_PLACE.distinct(np.array(poses)[order], 5)]
     assert len(rows) == 2
     assert rows[1] == 3
     assert scores[rows[0]] == scores.max() > scores[3]
-    rows = choose_distinct(scores, rotations, translations, 1)
+    rows = order[SAME_PLACE.distinct(np.array(poses)[order], 1)]
     np.testing.assert_array_equal(rows, [int(np.argmax(scores))])
 
 
@@ -329,18 +334,22 @@ def test_a_map_states_what_its_landmarks_share():
 
 def pose_at(x_m, yaw_deg=0.0):
     rotation = Rotation.from_euler('z', yaw_deg, degrees=True).as_matrix()
-    return Finalist(rotation, -rotation @ np.array([x_m, 0.0, 0.0]), 1.0, 1, 0,
-                    np.arange(3))
+    return make_transform(rotation, np.array([x_m, 0.0, 0.0]))
 
 
-FOUND = [pose_at(0.0), pose_at(0.3), pose_at(2.0), pose_at(0.0, 30.0), pose_at(2.1, 5.0)]
+FOUND = np.array([pose_at(0.0), pose_at(0.3), pose_at(2.0), pose_at(0.0, 30.0),
+                  pose_at(2.1, 5.0)])
+
+
+def distinct(order, most=np.inf):
+    return [order[row] for row in SAME_PLACE.distinct(FOUND[np.array(order, dtype=int)], most)]
 
 
 def test_the_first_in_the_given_order_stands_for_its_place():
-    assert first_of_each_place([0, 1, 2, 3, 4], FOUND, 8) == [0, 2, 3]
-    assert first_of_each_place([4, 1, 3, 2, 0], FOUND, 8) == [4, 1, 3]
+    assert distinct([0, 1, 2, 3, 4]) == [0, 2, 3]
+    assert distinct([4, 1, 3, 2, 0]) == [4, 1, 3]
 
 
 def test_no_more_than_a_count():
-    assert first_of_each_place([2, 0, 3], FOUND, 2) == [2, 0]
-    assert first_of_each_place([], FOUND, 2) == []
+    assert distinct([2, 0, 3], 2) == [2, 0]
+    assert distinct([], 2) == []

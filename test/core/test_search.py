@@ -13,9 +13,12 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
 from cliploc_ros.core.geometry.ellipse import ellipse_iou, iou_bound
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
-from cliploc_ros.core.search.sampling import (
+from cliploc_ros.core.search.scene import Constraint, make_scene
+from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
+from cliploc_ros.core.search.strategies import (
     FARTHEST,
     NEAREST,
+    Leaders,
     _depths,
     _distance_range,
     compatible_pairs,
@@ -23,10 +26,9 @@ from cliploc_ros.core.search.sampling import (
     draw_ransac,
     enumerate_compatible_triples,
     prosac_growth,
+    search_exhaustively,
+    search_progressively,
 )
-from cliploc_ros.core.search.scene import Constraint, make_scene
-from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
-from cliploc_ros.core.search.strategies import Leaders, search_exhaustively, search_progressively
 
 
 def test_growth_of_chum_and_matas():

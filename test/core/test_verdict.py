@@ -18,27 +18,30 @@ from scipy.stats import chi2
 from cliploc_ros.core.acceptance.calibration import CALIBRATION, FILE
 from cliploc_ros.core.acceptance.confidence import (
     Setting,
+    Support,
+    compared_frame,
     confidences,
     none_right,
+    one_thing,
+    support,
     tilt_handicaps,
     utilities,
 )
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, chance_genuine
 from cliploc_ros.core.acceptance.look_alikes import lead_over_twin, turned_about_axis
-from cliploc_ros.core.acceptance.support import Support, compared_frame, one_thing, support
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, Rival, refusal
-from cliploc_ros.core.fit.covariance import pose_covariance, share_within
+from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import RIGHT_M, make_transform, pose_difference
 from cliploc_ros.core.keyframes.places import RecognizedPlace
+from cliploc_ros.core.localizer import succeed
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.scene import make_scene
-from cliploc_ros.core.succession import succeed
-from cliploc_ros.offline.datasets.queries import load_queries
+from cliploc_ros.offline.datasets.observations import load_queries
 from cliploc_ros.offline.evaluation.trials import make_queries
 from studies.acceptance.troubles import exchange_landmarks
 
@@ -409,36 +412,6 @@ def test_garbage_is_never_accepted(kind, office_map, rng):
             Camera(640, 480, 535.4, 539.2, 320.1, 247.6), detections)]).accepted
     print(f'\n{kind}: {accepted} of 200 garbage frames accepted')
     assert accepted == 0
-
-
-def test_covariance_is_that_of_simulated_boxes(rng):
-    """The linearized covariance against the scatter of poses solved from noisy boxes."""
-    from cliploc_ros.core.fit.covariance import _VARIANCE_INFLATION
-    from cliploc_ros.core.geometry.p3p import solve_p3p
-    centers = np.array([[-1.0, 0.2, 4.0], [1.2, -0.3, 5.0], [0.1, 0.9, 3.0]])
-    seen = centers[:, :2] / centers[:, 2:]
-    sizes, scatter = np.full((3, 2), 0.1), 0.01
-    poses = []
-    for _ in range(2_000):
-        noisy = np.c_[seen + rng.normal(size=(3, 2)) * sizes * scatter, np.ones(3)]
-        rotations, translations = solve_p3p(
-            noisy / np.linalg.norm(noisy, axis=1, keepdims=True), centers)
-        best = np.argmin(np.linalg.norm(translations, axis=1))
-        pose = np.eye(4)
-        pose[:3, :3] = rotations[best].T
-        pose[:3, 3] = -rotations[best].T @ translations[best]
-        poses.append(pose_difference(np.eye(4), pose))
-    covariance = pose_covariance(np.eye(4), centers, sizes, scatter) / _VARIANCE_INFLATION
-    expected = np.sqrt(np.diag(covariance))
-    assert np.std(poses, axis=0) == pytest.approx(expected, rel=0.1)
-
-
-def test_covariance_of_an_undetermined_pose_is_large_not_infinite():
-    centers = np.array([[0.0, 0.0, 4.0]] * 3)
-    covariance = pose_covariance(np.eye(4), centers, np.full((3, 2), 0.1), 0.1)
-    assert np.isfinite(covariance).all()
-    assert np.linalg.eigvalsh(covariance).min() > 0
-    assert covariance.max() > 1
 
 
 OWN = np.diag([0.04, 0.01, 0.02, 0.001, 0.002, 0.003])

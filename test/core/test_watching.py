@@ -14,16 +14,20 @@ from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.visibility import Expected, Missing, expect
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.watch.alignment import align, look_at
-from cliploc_ros.core.watch.belief import Belief
-from cliploc_ros.core.watch.evidence import LookEvidence, by_vertical, log_odds, measure
-from cliploc_ros.core.watch.expectation import Expected, expect
-from cliploc_ros.core.watch.image_faults import ImageFaults
-from cliploc_ros.core.watch.missing import Missing
-from cliploc_ros.core.watch.watch import Watch, WatchState
+from cliploc_ros.core.watch.camera import ImageFaults
+from cliploc_ros.core.watch.look import (
+    LookEvidence,
+    align,
+    by_vertical,
+    log_odds,
+    look_at,
+    measure,
+)
+from cliploc_ros.core.watch.watch import Belief, Watch, WatchState
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 

@@ -16,8 +16,12 @@ from cliploc_ros.offline.datasets.map_recording import (
     recording_path,
     save_recording,
 )
-from cliploc_ros.offline.datasets.observations import load_observations, save_observations
-from cliploc_ros.offline.datasets.queries import load_queries, save_queries
+from cliploc_ros.offline.datasets.observations import (
+    load_observations,
+    load_queries,
+    save_observations,
+    save_queries,
+)
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
 

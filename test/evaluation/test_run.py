@@ -18,10 +18,12 @@ from scene import make_room
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.files.log import Log
-from cliploc_ros.offline.datasets.queries import Queries
-from cliploc_ros.offline.evaluation.drawing import draw_map, png_of, spread_names
+from cliploc_ros.offline.datasets.observations import Queries
 from cliploc_ros.offline.evaluation.figures import (
+    draw_map,
+    png_of,
     precision_recall,
+    spread_names,
 )
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS, parse_methods
 from cliploc_ros.offline.evaluation.run import count_trials, read_results, run_methods

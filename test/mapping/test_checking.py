@@ -37,21 +37,20 @@ from cliploc_ros.offline.mapping.check.relocalization import (
     try_recording,
 )
 from cliploc_ros.offline.mapping.check.report import check_keyframes, in_reach
-from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions, Thresholds
+from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.offline.mapping.systematic import find_corrections
 from cliploc_ros.offline.mapping.views import make_views
-from cliploc_ros.offline.simulation.labels import LabelModel
+from cliploc_ros.offline.simulation import LabelModel
 
 NOUNS = ('apple', 'brick', 'candle', 'drum', 'engine', 'flag', 'globe', 'hammer', 'iron')
 TABLE = replace(make_table(), labels=NOUNS)
 QUICK = CheckOptions(relocalizer=RelocalizerOptions(iterations=300), frames=12, max_positions=9,
                      headings=4, spacing_m=2.0)
-MAPPING = MappingOptions()
 
 
 def witness_of(table, detections):
-    views = make_views(detections, MAPPING)
-    return views, hear_witness(views, table, detections.class_names, MAPPING)
+    views = make_views(detections)
+    return views, hear_witness(views, table, detections.class_names)
 
 
 @pytest.fixture(scope='module')
@@ -112,7 +111,7 @@ def test_a_misspelt_class_is_named_with_the_right_one(detections, is_recorded):
     right = TABLE.class_ids[4]
     wrong = replace(TABLE, class_ids=(*TABLE.class_ids[:4], f'{right}k', *TABLE.class_ids[5:]))
     _, witness = witness_of(wrong, detections) if is_recorded else (None, None)
-    worst, *others = check_landmarks(wrong, witness, [], MAPPING)
+    worst, *others = check_landmarks(wrong, witness, [])
     assert worst.landmark_id == 'thing_4'
     (fault,) = worst.faults
     assert f"'{right}k'" in fault and f"mean '{right}'?" in fault
@@ -126,7 +125,7 @@ def test_a_misspelt_class_is_named_with_the_right_one(detections, is_recorded):
 def test_a_label_of_another_class_is_a_fault(label, class_id, other):
     ids = ('cup', class_id, 'book', *TABLE.class_ids[3:])
     named = replace(TABLE, class_ids=ids, labels=('a cup', label, 'a book', *TABLE.labels[3:]))
-    faults = {one.landmark_id: one.faults for one in check_landmarks(named, None, [], MAPPING)}
+    faults = {one.landmark_id: one.faults for one in check_landmarks(named, None, [])}
     assert [f"'{label}', a {other} by" in fault for fault in faults.pop(TABLE.landmark_ids[1])
             ] == [True] * (other is not None)
     assert not any(faults.values())
@@ -139,7 +138,7 @@ def test_boxes_that_leave_a_place_open_do_not_say_that_a_landmark_moved(detectio
     boxes = detections.bboxes_xyxy.copy()
     boxes[own, 0], boxes[own, 1], boxes[own, 2] = 0.0, 0.0, 640.0
     _, witness = witness_of(TABLE, replace(detections, bboxes_xyxy=boxes))
-    (one,) = [one for one in check_landmarks(TABLE, witness, [], MAPPING)
+    (one,) = [one for one in check_landmarks(TABLE, witness, [])
               if one.landmark_id == 'thing_4']
     assert not any(' cm away' in fault for fault in one.faults)
 
@@ -148,7 +147,7 @@ def test_a_shifted_landmark_is_told_its_offset(detections):
     shifted = moved(TABLE, {4: TABLE.centers[4] + (0.12, 0.0, 0.0)})
     _, witness = witness_of(shifted, detections)
     assert np.linalg.norm(witness.fitted.centers[4] - TABLE.centers[4]) < 0.01
-    worst, *_ = check_landmarks(shifted, witness, [], MAPPING)
+    worst, *_ = check_landmarks(shifted, witness, [])
     assert worst.landmark_id == 'thing_4'
     assert worst.offset_m == pytest.approx(0.12, abs=0.01)
     assert any('is 12 cm away' in fault for fault in worst.faults)
@@ -289,20 +288,20 @@ def test_too_few_views_are_named_as_the_cause(detections):
 def test_detector_has_the_misses_and_noise_of_the_recording():
     detections = see(TABLE, walk_around(frames=200), noise_px=4.0, missed=0.4)
     views, witness = witness_of(TABLE, detections)
-    model = measure_detector(TABLE, detections, views, witness, MAPPING)
+    model = measure_detector(TABLE, detections, views, witness)
     rng, poses = np.random.default_rng(0), detections.map_from_camera
     counts = [len(model.detect(pose, rng)[1]) for pose in poses]
     assert np.mean(counts) == pytest.approx(len(detections.classes) / 200, rel=0.1)
     assert np.mean([model.expected_detections(pose) for pose in poses[::10]]) == pytest.approx(
         np.mean(counts), rel=0.1)
-    small = np.hypot(MAPPING.edge_sigma_px, MAPPING.edge_sigma_share * 50.0)
+    small = np.hypot(EDGE_SIGMA_PX, EDGE_SIGMA_SHARE * 50.0)
     assert model.edge_scale * small == pytest.approx(4.0, rel=0.25)
 
 
 def test_what_was_never_detected_is_never_simulated(detections):
     false = moved(TABLE, {4: TABLE.centers[4] + (0.0, 0.0, 1.0)})
     views, witness = witness_of(false, detections)
-    model = measure_detector(false, detections, views, witness, MAPPING)
+    model = measure_detector(false, detections, views, witness)
     assert all(4 not in model.in_view(pose)[0] for pose in detections.map_from_camera)
 
 

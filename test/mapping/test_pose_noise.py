@@ -222,7 +222,7 @@ def pose_error_m(built, truth):
 
 def test_the_gradient_is_that_of_the_cost(linked):
     few = moved_odometry(linked, slip).select_frames(range(56, 64))
-    views = make_views(few, MappingOptions())
+    views = make_views(few)
     steps, _ = link_frames(views, few.odom_from_camera, PoseErrors(0.5, 2.0), OdometryErrors())
     assert steps.frames.tolist() == list(range(7))
     landmarks = landmarks_of_map(make_table(4), few.class_names)

@@ -17,7 +17,7 @@ from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.landmark_faults import find_map_overlaps, hear_witness
-from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions
+from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.refit import refit_map
 from cliploc_ros.offline.mapping.update.updating import update_map
 from cliploc_ros.offline.mapping.views import make_views
@@ -215,9 +215,9 @@ def overlaps_of(landmark_map, detections=None):
     """Return which landmarks stand in one another, with or without a recording."""
     if detections is None:
         return find_map_overlaps(landmark_map, None, None)
-    views = make_views(detections, MappingOptions())
+    views = make_views(detections)
     return find_map_overlaps(landmark_map, hear_witness(
-        views, landmark_map, detections.class_names, MappingOptions()), views)
+        views, landmark_map, detections.class_names), views)
 
 
 def doubled_room():
