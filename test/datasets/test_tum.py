@@ -20,11 +20,11 @@ from cliploc_ros.core.depth_image import (
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions, pose_of
+from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import rgbd_frames
 from cliploc_ros.offline.datasets.frames import DepthFormat
 from cliploc_ros.offline.datasets.intrinsics import PRESETS, find_camera, read_camera
-from cliploc_ros.offline.datasets.parsing import parse_stamp_ns
+from cliploc_ros.offline.datasets.parsing import parse_stamp_ns, pose_of
 from cliploc_ros.offline.datasets.poses import TimedPoses, mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum, read_tum_trajectory
 from cliploc_ros.offline.datasets.tum_conversion import read_recorded_detections

@@ -40,7 +40,7 @@ from cliploc_ros.offline.mapping.check.report import check_keyframes, in_reach
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.offline.mapping.systematic import find_corrections
 from cliploc_ros.offline.mapping.views import make_views
-from cliploc_ros.offline.simulation import LabelModel
+from cliploc_ros.offline.simulation import EDGE_SIGMA_PX, EDGE_SIGMA_SHARE, LabelModel
 
 NOUNS = ('apple', 'brick', 'candle', 'drum', 'engine', 'flag', 'globe', 'hammer', 'iron')
 TABLE = replace(make_table(), labels=NOUNS)
