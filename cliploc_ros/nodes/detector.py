@@ -23,8 +23,7 @@ from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector, Prompt
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg, of_camera, stamp_ns
 from cliploc_ros.ros.node.diagnostics import Health, Rates, StageTimes
-from cliploc_ros.ros.node.lifecycle import ManagedNode
-from cliploc_ros.ros.node.process import run_node
+from cliploc_ros.ros.node.lifecycle import ManagedNode, run_node
 from cliploc_ros.ros.node.threads import LatestOnly, Worker
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters, path_of
 

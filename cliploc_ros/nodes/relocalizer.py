@@ -28,8 +28,7 @@ from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.stamps import TimeJumps
 from cliploc_ros.ros.node.diagnostics import Health
-from cliploc_ros.ros.node.lifecycle import ManagedNode
-from cliploc_ros.ros.node.process import run_node
+from cliploc_ros.ros.node.lifecycle import ManagedNode, run_node
 from cliploc_ros.ros.node.threads import MAX_REQUESTS, BoundedCallbackGroup, LatestOnly
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters, path_of
 from cliploc_ros.ros.request import Pipeline, Requests
