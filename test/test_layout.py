@@ -3,8 +3,12 @@
 """The layout of the package: imports point downwards."""
 
 import ast
+import subprocess
+import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
+
+import pytest
 
 PROJECT = Path(__file__).resolve().parents[1]
 ROOT = 'cliploc_ros'
@@ -90,6 +94,19 @@ def test_each_folder_stands_in_one_layer():
     folders = [prefix.partition('.')[0] for prefixes in LAYERS for prefix in prefixes]
     twice = {name for name in folders if folders.count(name) > 1}
     assert twice == {'core', 'ros', 'offline'}
+
+
+#: Modules of the package that the import of a node loads, at most: a reader meets no others.
+MOST_LOADED = 99
+
+
+@pytest.mark.parametrize('node', ['detector', 'relocalizer'])
+def test_a_node_loads_few_modules(node):
+    program = (f'import sys, cliploc_ros.nodes.{node}\n'
+               f'print(sum(name.startswith({ROOT!r}) for name in sys.modules))')
+    loaded = subprocess.run([sys.executable, '-c', program], cwd=PROJECT, check=True,
+                            capture_output=True, text=True).stdout
+    assert int(loaded) <= MOST_LOADED
 
 
 #: Names of several classes that are still to be told apart.
