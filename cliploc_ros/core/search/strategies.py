@@ -170,7 +170,7 @@ def enumerate_compatible_triples(compatible, cursor, samples):
     Parameters
     ----------
     compatible : ndarray (c, c) of bool
-        See cliploc_ros.core.search.compatibility.
+        See compatible_pairs.
     cursor : ndarray (3,)
         Newest, first and second candidate, at first 2, 0, 1; updated. The newest is c at the end.
     samples : ndarray (t, 3)
