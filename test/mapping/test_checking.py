@@ -30,7 +30,7 @@ from cliploc_ros.offline.mapping.check.landmark_faults import (
     check_landmarks,
     hear_witness,
 )
-from cliploc_ros.offline.mapping.check.places import find_look_alikes, make_grid
+from cliploc_ros.offline.mapping.check.places import LookAlike, find_look_alikes, make_grid
 from cliploc_ros.offline.mapping.check.relocalization import (
     make_folds,
     measure_detector,
@@ -178,6 +178,12 @@ def test_identical_rooms_fail_the_check(rooms_report):
     # more objects would not help
     assert not any('map more objects' in text for text in rooms_report.advice)
     assert sum(one.verdict == 'accepted' for one in rooms_report.grid.trials) == 0
+
+
+def test_a_symmetric_place_is_one_place(report):
+    pair = LookAlike((5.7, 3.5, 0.8), (5.8, 3.5, 0.8), (), 6, 1.0, 0, 180.0)
+    advice = give_advice(replace(report, look_alikes=(pair,)))
+    assert any('x 5.7, y 3.5' in one.text and '180 degrees' in one.text for one in advice)
 
 
 def test_a_robot_that_is_misled_into_the_double_is_advice_on_the_double(rooms_report):
