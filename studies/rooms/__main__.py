@@ -4,11 +4,11 @@
 
 Each room is mapped by a part of its images, and asked with the rest: split by time (images in
 turn, and halves), by where the camera looks, and by its height, the latter also with another
-camera (a part of the image, coarser); by objects, keyframes and both, and, with depth, by SIFT
-with PnP. Its maps are asked with images of all other rooms, too, where
-each accepted pose is false; a folder of ``images`` without poses serves for that alone. Objects
-are matched by classes. The vertical is that of accelerometer.txt where a folder has one, else the
-true one with an error of 1 degree.
+camera (a part of the image, coarser); by objects, keyframes and both, and, with --baseline, by
+RootSIFT, tracks and pycolmap. Its maps are asked with images of all other rooms, too, where each
+accepted pose is false; a folder of ``images`` without poses serves for that alone. Objects are
+matched by classes. The vertical is that of accelerometer.txt where a folder has one, else the true
+one with an error of 1 degree.
 
 Prints tables, and writes outcomes.json.
 """
@@ -55,7 +55,8 @@ def run() -> int:
                         metavar='WHAT', help=f'besides the image: {", ".join(asking.KNOWN)} (all)')
     parser.add_argument('--elsewhere', type=int, default=20, metavar='N',
                         help="images of each other room that a part's map is asked (%(default)s)")
-    parser.add_argument('--baseline', action='store_true', help='SIFT with PnP, too')
+    parser.add_argument('--baseline', action='store_true',
+                        help='by RootSIFT, tracks and pycolmap, too')
     parser.add_argument('--out', type=Path, default=Path('rooms'), metavar='DIR',
                         help='also keeps what networks say of the images (%(default)s)')
     parser.add_argument('--workers', type=positive_int, default=1, metavar='N')
@@ -97,7 +98,7 @@ def _tables(answers: Sequence[asking.Answers], rooms: Sequence[Room]) -> Iterato
     yield 'Rooms', _room_table(answers, rooms)
     yield 'Success and acceptance', answer_table(here, ['room', 'kind', 'way', 'known'])
     yield 'All splits of a room', answer_table(here, ['room', 'way', 'known'])
-    posed = [one for one in here if one.error_m < inf and one.way != asking.SIFT]
+    posed = [one for one in here if one.error_m < inf and one.way != asking.BASELINE]
     for by in (['source'], ['source', 'room']):
         yield f'Poses by {" and ".join(by)}; of each confidence those that are right', \
             answer_table(posed, by, **{f'from_{low:g}_on': _share_right(low, high)

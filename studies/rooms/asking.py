@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -22,7 +22,6 @@ from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from studies.blame import blame
 from studies.reports import Answer, judged
-from studies.rooms.baseline import SiftMap
 from studies.rooms.rooms import (
     ROBOT,
     Room,
@@ -32,8 +31,11 @@ from studies.rooms.rooms import (
     without_boxes,
 )
 
+if TYPE_CHECKING:
+    from studies.rooms.baseline import SiftMap
+
 #: What answers.
-WAYS = OBJECTS, KEYFRAMES, BOTH, SIFT = 'objects', 'keyframes', 'both', 'SIFT with PnP'
+WAYS = OBJECTS, KEYFRAMES, BOTH, BASELINE = 'objects', 'keyframes', 'both', 'baseline'
 #: What is known besides the image. Keyframes do not use depth.
 KNOWN = NOTHING, VERTICAL, DEPTH, ALL = '-', 'vertical', 'depth', 'vertical, depth'
 # Numbers of boxes that are counted together, from each on.
@@ -56,7 +58,7 @@ class AskOptions(NamedTuple):
     images: int  # of the rest of the room
     elsewhere: int  # of each other room
     known: Sequence[str]  # in turn
-    with_sift: bool
+    with_baseline: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,14 +118,15 @@ def make_ask(folders: Sequence[str], reading: RoomOptions, options: AskOptions
             layer = build_layer(room.frames.select(mapped.tolist()), landmark_map, LayerOptions())
         except MappingError as error:
             return [Answers(task, failure=str(error))]
-        keyframes, sift = KeyframeLocalizer(layer), None
-        if options.with_sift and room.has_depth:
-            sift = SiftMap(room.raws[row].decode() for row in mapped)
+        keyframes, baseline = KeyframeLocalizer(layer), None
+        if options.with_baseline:
+            from studies.rooms.baseline import SiftMap  # needs pycolmap
+            baseline = SiftMap(room.raws[row].decode() for row in mapped)
         asking = room.by_robot if task.kind == ROBOT else room
         if len(asked) > options.images:  # evenly spread over the time
             asked = asked[np.linspace(0, len(asked) - 1, options.images).astype(np.int64)]
         found = [one for row in asked for one in _ask_here(
-            task, options.known, asking, landmark_map, keyframes, sift, asking.queries[row])]
+            task, options.known, asking, landmark_map, keyframes, baseline, asking.queries[row])]
         rng = np.random.default_rng(len(task.part))
         for other in rooms().values():
             if other.name != room.name:
@@ -138,21 +141,21 @@ def make_ask(folders: Sequence[str], reading: RoomOptions, options: AskOptions
 
 
 def _ask_here(task: Task, names: Sequence[str], room: Room, landmark_map: LandmarkMap,
-              keyframes: KeyframeLocalizer, sift: SiftMap | None, query: PosedQuery
+              keyframes: KeyframeLocalizer, baseline: 'SiftMap | None', query: PosedQuery
               ) -> Iterator[Outcome]:
     """Yield the answers to an image of the mapped room."""
     for way, known in product((OBJECTS, BOTH, KEYFRAMES), names):
         if known not in (NOTHING, VERTICAL) and (way == KEYFRAMES or not room.has_depth):
             continue
         yield _outcome(task, room.name, query, way, known, landmark_map, keyframes)
-    if sift is not None:
+    if baseline is not None:
         image_rgb, camera = room.raws[query.number].color()
-        pose = sift.locate(image_rgb, camera)
+        pose = baseline.locate(image_rgb, camera)
         errors: dict[str, Any] = {} if pose is None else dict(zip(
             ('error_m', 'error_deg'), pose_error(pose, query.map_from_camera), strict=True))
         yield Outcome(room=task.room, kind=task.kind, part=task.part, asked=room.name,
-                      number=query.number, way=SIFT, known=NOTHING, accepted=False,
-                      confidence=0.0, source=SIFT, reason='', boxes=0, inliers=0, **errors)
+                      number=query.number, way=BASELINE, known=NOTHING, accepted=False,
+                      confidence=0.0, source=BASELINE, reason='', boxes=0, inliers=0, **errors)
 
 
 def _outcome(task: Task, asked: str, query: PosedQuery, way: str, known: str,

@@ -1,81 +1,161 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What users have without this package: SIFT (Lowe 2004), points by depth, PnP with RANSAC."""
+"""What anybody can build in an afternoon: RootSIFT, tracks at the known poses, PnP of pycolmap.
+
+RootSIFT (Lowe 2004; Arandjelovic and Zisserman 2012) of all map images, matched pair by pair; the
+tracks of the matches are triangulated with the known poses; an image is matched with all map
+images, and LO-RANSAC (Chum et al. 2003) of pycolmap finds its pose and refines it.
+"""
 
 from collections.abc import Iterable
+from itertools import combinations, pairwise
 
 import cv2
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.offline.datasets.frames import PosedImage
-from cliploc_ros.offline.recording.keyframe_layer import depths_of_points
 
-_MOST_FEATURES, _RATIO = 2000, 0.8
-# Nearest features vote for images; those with most votes are matched one by one.
-_NEIGHBOURS, _BEST_IMAGES = 4, 5
-_LEAST_INLIERS, _REPROJECTION_PX, _ITERATIONS = 12, 4.0, 2000
+Floats = NDArray[np.float64]
+Rows = NDArray[np.int64]
+_FEATURES, _CONTRAST, _RATIO = 1500, 0.02, 0.85
+# Images that look in directions further apart show no common points.
+_MOST_DEG = 70.0
+# Rays of a match, and those of a track, pass their point this near [px at f = 525 px]; the widest
+# angle between two rays of a track is at least this.
+_NEAR, _LEAST_ANGLE = 3.0 / 525.0, np.radians(1.5)
+_LEAST_INLIERS = 12
 
 
 class SiftMap:
-    """The SIFT features of posed images with depth; those without depth are left out."""
+    """The points of posed images, and the features that show them."""
 
     def __init__(self, frames: Iterable[PosedImage]) -> None:
-        self._sift = cv2.SIFT.create(_MOST_FEATURES)
-        self._points: list[NDArray[np.float64]] = []
-        self._descriptors: list[NDArray[np.float32]] = []
-        for frame in frames:
-            if frame.depth is None or frame.map_from_camera is None:
+        seen = [(frame, *_features(frame.image_rgb, frame.camera)) for frame in frames
+                if frame.map_from_camera is not None]
+        self._descriptors = [descriptors for _, _, descriptors in seen]
+        poses = np.array([frame.map_from_camera for frame, _, _ in seen])
+        rays = [np.column_stack([bearings, np.ones(len(bearings))]) for _, bearings, _ in seen]
+        starts = np.cumsum([0, *map(len, rays)])
+        matches = [np.empty((0, 2), dtype=np.int64)]
+        for one, other in combinations(range(len(seen)), 2):
+            if poses[one, :3, 2] @ poses[other, :3, 2] < np.cos(np.radians(_MOST_DEG)):
                 continue
-            pixels, descriptors = self._features(frame.image_rgb)
-            depths = depths_of_points(frame.depth, frame.camera, pixels)
-            kept = np.isfinite(depths)
-            rays = np.column_stack([frame.camera.normalize_points(pixels[kept]),
-                                    np.ones(kept.sum())])
-            points = rays * depths[kept, None].astype(np.float64)
-            pose = frame.map_from_camera
-            self._points.append(points @ pose[:3, :3].T + pose[:3, 3])
-            self._descriptors.append(descriptors[kept])
-        self._matcher = cv2.FlannBasedMatcher({'algorithm': 1, 'trees': 4}, {'checks': 64})
-        self._matcher.add(self._descriptors)
-        self._matcher.train()
+            pairs = _match(self._descriptors[one], self._descriptors[other])
+            near = _is_epipolar(rays[one][pairs[:, 0]], rays[other][pairs[:, 1]],
+                                invert_transform(poses[other]) @ poses[one])
+            matches.append(pairs[near] + (starts[one], starts[other]))
+        images = np.repeat(np.arange(len(seen)), np.diff(starts))
+        #: (n, 3): the point of each feature of all images, NaN without one
+        points = _triangulate(np.concatenate(matches), images, np.concatenate(rays), poses)
+        self._points = [points[first:last] for first, last in pairwise(starts)]
 
-    def locate(self, image_rgb: NDArray[np.uint8], camera: Camera) -> NDArray[np.float64] | None:
+    def locate(self, image_rgb: NDArray[np.uint8], camera: Camera) -> Floats | None:
         """Return map_from_camera (4, 4); None where too few features agree on a pose."""
-        pixels, descriptors = self._features(image_rgb)
-        if len(pixels) < _LEAST_INLIERS:
+        bearings, descriptors = _features(image_rgb, camera)
+        found = set[tuple[int, float, float, float]]()
+        for theirs, points in zip(self._descriptors, self._points, strict=True):
+            known = np.nonzero(np.isfinite(points[:, 0]))[0]
+            pairs = _match(descriptors, theirs)
+            pairs = pairs[np.isin(pairs[:, 1], known)]
+            found |= {(one, *points[other]) for one, other in pairs.tolist()}
+        if len(found) < _LEAST_INLIERS:
             return None
-        votes = np.bincount([near.imgIdx for nearest in self._matcher.knnMatch(
-            descriptors, _NEIGHBOURS) for near in nearest], minlength=len(self._points))
-        seen, points = [], []
-        for image in np.argsort(-votes)[:_BEST_IMAGES]:
-            if len(self._descriptors[image]) < 2:
-                continue
-            for one, other in cv2.BFMatcher().knnMatch(descriptors, self._descriptors[image], 2):
-                if one.distance < _RATIO * other.distance:
-                    seen.append(pixels[one.queryIdx])
-                    points.append(self._points[image][one.trainIdx])
-        if len(seen) < _LEAST_INLIERS:
+        matched = np.array(sorted(found))
+        focal = 0.5 * (camera.fx + camera.fy)
+        pinhole = pycolmap.Camera(model='PINHOLE', width=camera.width, height=camera.height,
+                                  params=[focal, focal, 0.5 * camera.width, 0.5 * camera.height])
+        pixels = bearings[matched[:, 0].astype(np.int64)] * focal + (
+            0.5 * camera.width, 0.5 * camera.height)
+        answer = pycolmap.estimate_and_refine_absolute_pose(pixels, matched[:, 1:], pinhole)
+        if answer is None or answer['num_inliers'] < _LEAST_INLIERS:
             return None
-        rays = camera.normalize_points(np.array(seen))
-        is_found, turn, shift, inliers = cv2.solvePnPRansac(
-            np.array(points), rays, np.eye(3), None, iterationsCount=_ITERATIONS,
-            reprojectionError=_REPROJECTION_PX / camera.fx, flags=cv2.SOLVEPNP_AP3P)
-        if not is_found or inliers is None or len(inliers) < _LEAST_INLIERS:
-            return None
-        rows = inliers.ravel()
-        turn, shift = cv2.solvePnPRefineLM(np.array(points)[rows], rays[rows], np.eye(3), None,
-                                           turn, shift)
-        return invert_transform(make_transform(np.asarray(cv2.Rodrigues(turn)[0], dtype=float),
-                                               np.asarray(shift, dtype=float).ravel()))
+        camera_from_map = np.eye(4)
+        camera_from_map[:3] = answer['cam_from_world'].matrix()
+        return invert_transform(camera_from_map)
 
-    def _features(self, image_rgb: NDArray[np.uint8]
-                  ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        keypoints, descriptors = self._sift.detectAndCompute(
-            cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY), None)
-        if descriptors is None:
-            return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32)
-        return (np.array([one.pt for one in keypoints], dtype=np.float64),
-                np.asarray(descriptors, dtype=np.float32))
+
+def _features(image_rgb: NDArray[np.uint8], camera: Camera) -> tuple[Floats, NDArray[np.float32]]:
+    """Return bearings (n, 2) and unit descriptors (n, 128)."""
+    points, descriptors = cv2.SIFT.create(_FEATURES, contrastThreshold=_CONTRAST).detectAndCompute(
+        cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY), None)
+    if descriptors is None:
+        return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32)
+    bearings = camera.normalize_points(np.array([one.pt for one in points], dtype=np.float64))
+    known = np.isfinite(bearings).all(axis=1)
+    roots = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
+    return bearings[known], roots[known]
+
+
+def _match(ours: NDArray[np.float32], theirs: NDArray[np.float32]) -> Rows:
+    """Return pairs (k, 2): mutual nearest ones, clearly nearer than the second of theirs."""
+    if len(ours) == 0 or len(theirs) < 2:
+        return np.empty((0, 2), dtype=np.int64)
+    cosines = ours @ theirs.T
+    rows, best = np.arange(len(ours)), cosines.argmax(axis=1)
+    mutual = cosines.argmax(axis=0)[best] == rows
+    first = cosines[rows, best]
+    cosines[rows, best] = -1.0
+    clear = 1.0 - first < _RATIO**2 * (1.0 - cosines.max(axis=1))
+    kept = np.nonzero(mutual & clear)[0]
+    return np.stack([kept, best[kept]], axis=1)
+
+
+def _is_epipolar(ours: Floats, theirs: Floats, theirs_from_ours: Floats) -> NDArray[np.bool_]:
+    """Return which rays (k, 3) of a match can meet."""
+    x, y, z = theirs_from_ours[:3, 3]
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ theirs_from_ours[:3, :3]
+    lines = ours @ essential.T
+    lengths = np.maximum(np.linalg.norm(lines[:, :2], axis=1), 1e-12)
+    return np.asarray(np.abs(np.sum(lines * theirs, axis=1)) / lengths < _NEAR)
+
+
+def _triangulate(matches: Rows, images: Rows, rays: Floats, poses: Floats) -> Floats:
+    """Return the point (n, 3) of each feature, by the track of its matches; NaN without one."""
+    count = len(images)
+    graph = coo_matrix((np.ones(len(matches)), matches.T), shape=(count, count))
+    _, tracks = connected_components(graph, directed=False)
+    # a track that shows one image twice is wrong
+    pairs, repeats = np.unique(np.stack([tracks, images]), axis=1, return_counts=True)
+    is_wrong = np.zeros(tracks.max() + 1, dtype=bool)
+    is_wrong[pairs[0, repeats > 1]] = True
+    used = np.bincount(tracks)[tracks] > 1
+    used &= ~is_wrong[tracks]
+    points = np.full((count, 3), np.nan)
+    for _ in range(2):  # again without the features that miss their point
+        found = _nearest_points(tracks[used], images[used], rays[used], poses)
+        points[used] = found[tracks[used]]
+        inside = np.einsum('nji,nj->ni', poses[images, :3, :3], points - poses[images, :3, 3])
+        with np.errstate(divide='ignore', invalid='ignore'):
+            errors = np.linalg.norm(inside[:, :2] / inside[:, 2:] - rays[:, :2], axis=1)
+            used &= (errors < _NEAR) & (inside[:, 2] > 0.0)
+        points[~used] = np.nan
+        used &= np.bincount(tracks[used], minlength=len(is_wrong))[tracks] > 1
+    turned = np.einsum('nij,nj->ni', poses[images, :3, :3], rays)
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    order = np.nonzero(used)[0][np.argsort(tracks[used], kind='stable')]
+    for rows in np.split(order, np.nonzero(np.diff(tracks[order]))[0] + 1):
+        if len(rows) < 2 or (turned[rows] @ turned[rows].T).min() > np.cos(_LEAST_ANGLE):
+            points[rows] = np.nan
+    points[~used] = np.nan
+    return points
+
+
+def _nearest_points(tracks: Rows, images: Rows, rays: Floats, poses: Floats) -> Floats:
+    """Return the point (t, 3) that is nearest to all rays of each track; NaN where none is."""
+    turned = np.einsum('nij,nj->ni', poses[images, :3, :3], rays)
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    across = np.eye(3) - turned[:, :, None] * turned[:, None, :]
+    size = int(tracks.max(initial=-1)) + 1
+    normal, right = np.zeros((size, 3, 3)), np.zeros((size, 3))
+    np.add.at(normal, tracks, across)
+    np.add.at(right, tracks, np.einsum('nij,nj->ni', across, poses[images, :3, 3]))
+    sound = np.abs(np.linalg.det(normal)) > 1e-9
+    found = np.full((size, 3), np.nan)
+    found[sound] = np.linalg.solve(normal[sound], right[sound, :, None])[..., 0]
+    return found
