@@ -97,7 +97,7 @@ def printable(text: str) -> str:
 
 def number[Number: (int, float)](kind: type[Number], allows: Callable[[Number], bool], what: str
                                  ) -> Callable[[str], Number]:
-    """Return a type for argparse: numbers of a kind that a condition allows.
+    """Return an argparse type that accepts the numbers for which `allows` holds.
 
     `what` names them, as in "2 is not a number above 3".
     """
@@ -128,7 +128,7 @@ def within[Number: (int, float)](low: Number, high: Number) -> Callable[[str], N
                   f'within {low:g} and {high:g}')
 
 
-# Values that are paths.
+# Placeholders in the help that stand for paths.
 _PATHS = ('DIR', 'NPZ', 'YAML', 'FILE', 'JSON', 'MAP', 'BAG|DIR', 'IN')
 
 

@@ -4,8 +4,10 @@
 
 Imports point downwards only, in this order (test/test_layout.py checks it):
 
-localizer, relocalizer, warm_up
+localizer, succession, relocalizer, warm_up, detector_check
     Frame after frame of a moving camera; frames to a result.
+watch
+    Whether a localizer's pose is right, look by look.
 acceptance
     Confidence, and the decision to accept or refuse.
 fit

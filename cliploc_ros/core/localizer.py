@@ -10,13 +10,6 @@ frame is first localized by classes alone, then with more and more of its crops,
 informative ones first, until the pose is accepted or no crop is left. Each of these searches is
 another chance of a false accept. So a pose from a part of the crops needs a greater confidence,
 see cliploc_ros.core.acceptance.verdict.
-
-A filter that fuses the answers gets a covariance of its own. Answers share images, landmarks and
-their errors. A filter that fuses ten of them as independent measurements is three times more
-certain of the pose than of one answer, and wrongly so. So a filter is given as much information as
-the answers before, carried on by odometry, did not give: in each direction it ends up as certain
-as the better of both, never more. That is safe fusion (Gustafsson, "Statistical Sensor Fusion",
-2010), seen from the sensor.
 """
 
 import math
@@ -28,21 +21,12 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.acceptance.looks import Look, Looks
-from cliploc_ros.core.fit.covariance import moved_pose
 from cliploc_ros.core.fit.verification import MAX_FRAMES
-from cliploc_ros.core.geometry.transforms import (
-    SAME_VIEW,
-    invert_transform,
-    move_covariance,
-    pose_difference,
-    pose_error,
-)
+from cliploc_ros.core.geometry.transforms import SAME_VIEW, pose_error
 from cliploc_ros.core.keyframes.localization import (
     ImageRecognizer,
     KeyframeLocalizer,
@@ -55,17 +39,9 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Case, Query
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, TimeBudget
 from cliploc_ros.core.search.frame_search import SearchedFrame
+from cliploc_ros.core.succession import FilterState, succeed
 from cliploc_ros.units import NS_PER_S
 
-# Odometry as a random walk: deviation on each axis after a metre and after a radian, the share of
-# cliploc_ros.core.fit.covariance. A filter that trusts its odometry less is less certain, not
-# wrong.
-_DRIFT = 0.03
-# Answers further apart than this quantile contradict each other.
-_CONTRADICTION = float(chi2.ppf(0.99, 6))
-# An answer keeps this share of its information in directions in which it says nothing new: a
-# covariance must be finite.
-_LEAST_SHARE = 1e-4
 #: Crops between two searches. A search takes less time than one crop of most networks on a CPU.
 BATCH = 4
 # Time that a request needs after its last crops [s]: for a search, which may take most of a fifth
@@ -75,55 +51,6 @@ _SEARCHES, _MOST_SHARE, _ANSWER_S = 2.0, 0.2, 0.1
 _LEAST_S = 0.5
 _NO_LOOKS = Looks()
 _NO_ROWS = np.empty(0, dtype=np.int64)
-
-
-class FilterState(NamedTuple):
-    """The state of a filter that fused all answers of one run of odometry."""
-
-    #: (4, 4): at the last answer
-    odom_from_camera: NDArray[np.float64]
-    map_from_camera: NDArray[np.float64]
-    covariance: NDArray[np.float64]  #: (6, 6): as of Relocalization
-
-
-def succeed(known: FilterState | None, odom_from_camera: NDArray[np.float64],
-            map_from_camera: NDArray[np.float64], covariance: NDArray[np.float64]
-            ) -> tuple[NDArray[np.float64], FilterState]:
-    """Return the covariance of an answer to a filter, and the state of the filter after it.
-
-    An answer that contradicts its predecessors makes both less certain: one of them is wrong. So
-    an outlier hardly moves the filter, and a filter that it misled recovers. Poses (4, 4) and
-    covariance (6, 6) are of the answer alone; known is None for the first one.
-    """
-    if known is None:
-        return covariance, FilterState(odom_from_camera, map_from_camera, covariance)
-    before = _carried(known, odom_from_camera)
-    innovation = pose_difference(before.map_from_camera, map_from_camera)
-    square = float(innovation @ np.linalg.solve(before.covariance + covariance, innovation))
-    doubt = max(1.0, square / _CONTRADICTION)
-    prior, own = doubt * before.covariance, doubt * covariance
-    # The covariance that makes a filter of a prior as certain as the better of both.
-    root = np.linalg.cholesky(prior)
-    whitened = np.linalg.solve(root, np.linalg.solve(root, own).T)
-    ratios, axes = np.linalg.eigh((whitened + whitened.T) / 2)
-    information = np.maximum(1.0 / ratios - 1.0, _LEAST_SHARE / ratios)
-    axes = root @ axes
-    given = np.asarray((axes / information) @ axes.T)
-    gain = np.linalg.solve(prior + given, prior).T
-    step, after = gain @ innovation, prior - gain @ prior
-    return given, FilterState(odom_from_camera, moved_pose(before.map_from_camera, step),
-                              (after + after.T) / 2)
-
-
-def _carried(known: FilterState, odom_from_camera: NDArray[np.float64]) -> FilterState:
-    """Return the state after the camera moved on by odometry."""
-    motion = invert_transform(known.odom_from_camera) @ odom_from_camera
-    pose = known.map_from_camera @ motion
-    covariance = move_covariance(known.covariance, pose[:3, 3] - known.map_from_camera[:3, 3])
-    ways = [float(np.linalg.norm(motion[:3, 3])),
-            float(Rotation.from_matrix(motion[:3, :3]).magnitude())]
-    return FilterState(odom_from_camera, pose,
-                 covariance + np.diag(np.repeat(_DRIFT ** 2 * np.array(ways), 3)))
 
 
 class ImageCrops(Protocol):

@@ -52,7 +52,7 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / f'.{os.getpid()}.probe'
         probe.touch()
-        probe.unlink()
+        probe.unlink(missing_ok=True)
     except OSError as error:
         raise OptionsError(f'{folder}: cannot be written to: {error.strerror}') from error
 

@@ -4,13 +4,13 @@
 
 import importlib
 import math
+import os
 import threading
 import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NoReturn
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -82,7 +82,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._answers = self.create_publisher(DiagnosticArray, '~/answer', qos.LATCHED)
         self._last_verdict = 'none yet'
         self._verdicts: dict[str, int] = dict.fromkeys(Verdict, 0)
-        # Between the parameters of a map and its reading, nobody else may set them.
+        # Held from setting the map parameters until the map is read.
         self._map_lock = threading.Lock()
         services: list[tuple[Any, str, Callable[[Any, Any], Any]]] = [
             (Trigger, '~/relocalize', self._on_relocalize),
@@ -233,7 +233,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                 self.get_logger().error(f'map not loaded: {error}')
                 response.result = response.RESULT_MAP_DOES_NOT_EXIST
                 with suppress(MapError):
-                    if Path(path_of(request.map_url)).exists():
+                    if os.path.exists(path_of(request.map_url)):  # noqa: PTH110 - never raises
                         response.result = response.RESULT_INVALID_MAP_DATA
         return response
 

@@ -204,9 +204,10 @@ class CaseRecorder:
             'versions': versions}))
         size, limit_mb, used = sum(one.nbytes for one in arrays.values()), \
             parameters.record_limit_mb, 0
-        for file in folder.rglob('*'):
-            with suppress(FileNotFoundError):  # moved away meanwhile
-                used += file.stat().st_size if file.is_file() else 0
+        for parent, _, names in folder.walk():
+            for name in names:
+                with suppress(FileNotFoundError):  # moved away meanwhile
+                    used += (parent / name).stat().st_size
         if used + size > limit_mb * _MIB:
             raise DatasetError(f'{folder} holds {used // _MIB} MiB, this case would take '
                                f'{max(1, size // _MIB)} MiB more, record_limit_mb is {limit_mb}: '

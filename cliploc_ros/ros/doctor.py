@@ -194,6 +194,7 @@ def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
                      f'publishes {parameters.localizer_pose or "nothing that is checked"}')
     else:
         report.skip('localizer', 'require_localizer is false')
+    node.frames.close('all frames are checked')  # a detector at work would take time from this
     _check_request(node, parameters, localizer, frame, report)
 
 
@@ -234,8 +235,8 @@ def _check_camera(node: Doctor, parameters: RelocalizerParameters, name: str,
                                            f"'{image.header.frame_id}'")
         why = stamp_problem(image.header.stamp)
         report.judge(clock, f"the images' stamp {why}: their driver must stamp each"
-                     if why else _doubt_of_clock(node, source.least_lag_s),
-                     f'images come {1e3 * source.least_lag_s:.0f} ms after their stamps')
+                     if why else _doubt_of_clock(node, source.nearest_lag_s),
+                     f'images come {1e3 * source.nearest_lag_s:.0f} ms after their stamps')
     if info is None:
         return report.add(calibration, State.FAIL,
                           silent.get('camera_info', 'no camera_info in time'))
@@ -393,9 +394,9 @@ def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) 
             status, given = ask(asking, name, patience_s)
             values = status.values
             if any(values.get(one, '0') != '0' for one in (
-                    Verdict.ACCEPTED, Verdict.WITHHELD)):  # its last pose is of no more use
+                    Verdict.ACCEPTED, Verdict.WITHHELD)):  # it no longer uses its last pose
                 given = [one for one in given if one.name != 'last_pose_file']
-            # what an active one misses has lines of its own
+            # what an active one lacks is reported by the checks below
             report.judge('relocalizer', '' if values['state'] == 'active' else status.problem(),
                          f'{name} is active')
     except NotRunningError as error:

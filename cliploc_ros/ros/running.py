@@ -100,7 +100,7 @@ def ask(node: Node, name: str, patience_s: float) -> tuple[RelocalizerStatus, li
     Parameters
     ----------
     node : Node
-        Asks; nobody else spins it.
+        Used to ask; nobody else may spin it.
     name : str
         The relocalizer's name with its namespace.
 

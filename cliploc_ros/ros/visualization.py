@@ -168,8 +168,6 @@ def beside_keyframe(canvas: NDArray[np.uint8], seen: RecognizedPlace, layer: Key
     panel = np.full((*size[::-1], 3), _BLANK, dtype=np.uint8) if image is None else \
         cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
     own = np.nonzero((seen.rows >= rows.start) & (seen.rows < rows.stop))[0]
-    _write(panel, f'keyframe {keyframe}: {len(own)} of {seen.inliers} inliers',
-           np.array([6, height - 8], dtype=np.int32), _TEXT)
     both = np.concatenate([canvas, panel], axis=1)
     pixels = np.asarray(layer.pixels[rows]) / PIXEL_SCALE * scale + np.array([width, 0])
     if image is None:
@@ -189,6 +187,8 @@ def beside_keyframe(canvas: NDArray[np.uint8], seen: RecognizedPlace, layer: Key
             cv2.line(both, here, there, color, 1, cv2.LINE_AA)
         for point in (here, there):
             cv2.circle(both, point, _RADIUS_PX, color, cv2.FILLED, cv2.LINE_AA)
+    _write(both, f'keyframe {keyframe}: {len(own)} of {seen.inliers} inliers',
+           np.array([width + 6, height - 8], dtype=np.int32), _TEXT)
     return both
 
 

@@ -63,9 +63,10 @@ class Turning:
         self._wait = wait
         self._step_rad = step_rad
         self._client: ActionClient | None = None
-        with suppress(ImportError):
-            self._action = importlib.import_module('nav2_msgs.action').Spin
-            self._client = ActionClient(node, self._action, 'spin')
+        if step_rad:
+            with suppress(ImportError):
+                self._action = importlib.import_module('nav2_msgs.action').Spin
+                self._client = ActionClient(node, self._action, 'spin')
         self._name = node.resolve_topic_name('spin')
         self._goal: Any = None
 

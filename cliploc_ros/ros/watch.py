@@ -198,7 +198,8 @@ class Watcher:
     def _look(self, stopped: threading.Event) -> Time | None:
         """Compare one frame with the localizer's pose; return its stamp, None without a look."""
         begun_at, age = time.monotonic(), self._age
-        frame = self._frames.next_frame(begun_at, begun_at + _FRAME_PATIENCE_S, 0.0, 1)
+        frame = self._frames.next_frame(begun_at, begun_at + _FRAME_PATIENCE_S, 0.0,
+                                        cameras=1)
         localizer = self._pipeline.localizer
         if localizer is None:
             raise StoppedError('the node was deactivated')

@@ -19,11 +19,12 @@ from scipy.sparse.csgraph import connected_components
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.keyframes.features import match
 from cliploc_ros.offline.datasets.frames import PosedImage
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
-_FEATURES, _CONTRAST, _RATIO = 1500, 0.02, 0.85
+_FEATURES, _CONTRAST = 1500, 0.02
 # Images that look in directions further apart show no common points.
 _MOST_DEG = 70.0
 # Rays of a match, and those of a track, pass their point this near [px at f = 525 px]; the widest
@@ -46,7 +47,7 @@ class SiftMap:
         for one, other in combinations(range(len(seen)), 2):
             if poses[one, :3, 2] @ poses[other, :3, 2] < np.cos(np.radians(_MOST_DEG)):
                 continue
-            pairs = _match(self._descriptors[one], self._descriptors[other])
+            pairs = match(self._descriptors[one], self._descriptors[other])
             near = _is_epipolar(rays[one][pairs[:, 0]], rays[other][pairs[:, 1]],
                                 invert_transform(poses[other]) @ poses[one])
             matches.append(pairs[near] + (starts[one], starts[other]))
@@ -61,7 +62,7 @@ class SiftMap:
         found = set[tuple[int, float, float, float]]()
         for theirs, points in zip(self._descriptors, self._points, strict=True):
             known = np.nonzero(np.isfinite(points[:, 0]))[0]
-            pairs = _match(descriptors, theirs)
+            pairs = match(descriptors, theirs)
             pairs = pairs[np.isin(pairs[:, 1], known)]
             found |= {(one, *points[other]) for one, other in pairs.tolist()}
         if len(found) < _LEAST_INLIERS:
@@ -90,20 +91,6 @@ def _features(image_rgb: NDArray[np.uint8], camera: Camera) -> tuple[Floats, NDA
     known = np.isfinite(bearings).all(axis=1)
     roots = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
     return bearings[known], roots[known]
-
-
-def _match(ours: NDArray[np.float32], theirs: NDArray[np.float32]) -> Rows:
-    """Return pairs (k, 2): mutual nearest ones, clearly nearer than the second of theirs."""
-    if len(ours) == 0 or len(theirs) < 2:
-        return np.empty((0, 2), dtype=np.int64)
-    cosines = ours @ theirs.T
-    rows, best = np.arange(len(ours)), cosines.argmax(axis=1)
-    mutual = cosines.argmax(axis=0)[best] == rows
-    first = cosines[rows, best]
-    cosines[rows, best] = -1.0
-    clear = 1.0 - first < _RATIO**2 * (1.0 - cosines.max(axis=1))
-    kept = np.nonzero(mutual & clear)[0]
-    return np.stack([kept, best[kept]], axis=1)
 
 
 def _is_epipolar(ours: Floats, theirs: Floats, theirs_from_ours: Floats) -> NDArray[np.bool_]:

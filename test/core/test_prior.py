@@ -85,6 +85,11 @@ def test_the_yaw_counts_across_the_seam():
     assert odds == pytest.approx([0.0, -TERMS.most])
 
 
+def test_a_camera_that_looks_up_has_no_yaw():
+    ahead = region(yaw=2.0, yaw_deviation=0.01)
+    assert region_odds(TWINS, ahead, np.eye(4)[None]) == [0.0]
+
+
 def test_a_region_decides_between_rooms_that_nearly_look_the_same():
     """The second room lacks three objects: more than by chance, too little to be sure."""
     alone = ask(LACKING)

@@ -341,7 +341,7 @@ FOUND = np.array([pose_at(0.0), pose_at(0.3), pose_at(2.0), pose_at(0.0, 30.0),
                   pose_at(2.1, 5.0)])
 
 
-def distinct(order, most=np.inf):
+def distinct(order, most=None):
     return [order[row] for row in SAME_PLACE.distinct(FOUND[np.array(order, dtype=int)], most)]
 
 

@@ -7,6 +7,7 @@ import math
 import re
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,12 +36,12 @@ from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import RIGHT_M, make_transform, pose_difference
 from cliploc_ros.core.keyframes.places import RecognizedPlace
-from cliploc_ros.core.localizer import succeed
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.scene import make_scene
+from cliploc_ros.core.succession import succeed
 from cliploc_ros.offline.datasets.observations import load_queries
 from cliploc_ros.offline.evaluation.trials import make_queries
 from studies.acceptance.troubles import exchange_landmarks
@@ -148,8 +149,15 @@ def test_mirror_images_are_refused(office_queries):
 def test_each_number_states_its_unit_and_meaning_and_the_command_that_fits_it():
     for section in yaml.safe_load(FILE.read_text()).values():
         if section['command'] != 'by definition':
-            module = re.fullmatch(r'python -m ([\w.]+)( \w+)?', section['command'])[1]
-            assert importlib.util.find_spec(module)
+            module, study = re.fullmatch(r'python -m ([\w.]+)(?: (\w+))?',
+                                         section['command']).groups()
+            spec = importlib.util.find_spec(module)
+            if spec.submodule_search_locations:
+                spec = importlib.util.find_spec(f'{module}.__main__')
+            program = Path(spec.origin).read_text()
+            assert "__name__ == '__main__'" in program
+            assert study is None or re.search(rf"'{study}'", program), section['command']
+            assert bool(study) == ('add_subparsers' in program or "'study'" in program), module
         assert all({*entry} == {'value', 'unit', 'meaning'} for entry in section['terms'].values())
 
 

@@ -388,14 +388,7 @@ class CameraCheck:
         """Take in the boxes of a frame, accepted or not; another camera_info forgets all looks."""
         name, camera = observation.camera_name, observation.camera
         record = self._records.get(name)
-        if record is not None and record.camera != camera:
-            before, most_px = record.camera, _SAME_CAMERA * record.camera.fx
-            changes = np.array([before.fx - camera.fx, before.fy - camera.fy,
-                                before.cx - camera.cx, before.cy - camera.cy])
-            if np.abs(changes).max() > most_px or before != replace(
-                    camera, fx=before.fx, fy=before.fy, cx=before.cx, cy=before.cy):
-                record = None
-        if record is None:
+        if record is None or not _is_same(record.camera, camera):
             record = self._records[name] = _Record(name, camera)
         record.see(observation)
 
@@ -458,3 +451,12 @@ class CameraCheck:
                     and matched / known < 0.5 * others_matched / others_known):
                 found.append(name)
         return found
+
+
+def _is_same(one: Camera, other: Camera) -> bool:
+    """Return whether intrinsics differ by little, as those of an autofocus do."""
+    if one == other:
+        return True
+    changes = np.array([one.fx, one.fy, one.cx, one.cy]) - [other.fx, other.fy, other.cx, other.cy]
+    return bool(np.abs(changes).max() <= _SAME_CAMERA * one.fx) and one == replace(
+        other, fx=one.fx, fy=one.fy, cx=one.cx, cy=one.cy)

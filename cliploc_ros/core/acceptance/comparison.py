@@ -202,7 +202,7 @@ class Comparison:
             rival=self._rival(), distinct=distinct,
             place=place_of(self._joined.landmark_map, self.poses[0]).position,
             twin=twin and twin.position, twin_map=twin.name if twin else '',
-            # the covariance of a pose that was not refined is too rough to decide
+            # as in the paper, the position's deviation refuses no pose that was not refined
             near=1.0 if self.place is None and best.finalist.information is None
             else share_within(RIGHT_M, CALIBRATION.covariance.caution * covariance),
             deviation_m=math.sqrt(np.trace(covariance[:3, :3])), coverage=coverage,

@@ -54,7 +54,7 @@ class RefusalKind(StrEnum):
 # Factors of the confidence besides likely and found, in the order in which equal ones are named.
 _FACTORS = ('distinct', 'near', 'camera', 'genuine', 'not_mirrored', 'uncontradicted')
 # What a refusal says of an Evidence whose weakest factor names its cause.
-_WEAK = {
+_ADVICE = {
     'near': (RefusalKind.UNCERTAIN_POSITION, 'position uncertain by {0.deviation_m:.2g} m; turn '
                                              'the camera to more or nearer objects'),
     'camera': (RefusalKind.WRONG_CAMERA,
@@ -249,8 +249,8 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
             f' (the second in {evidence.twin_map})')
         said = (f'{_point(evidence.place)} and {_point(evidence.twin)} m look alike{second}; '
                 'turn the camera to objects that differ')
-    elif weakest in _WEAK:
-        kind, sentence = _WEAK[weakest]
+    elif weakest in _ADVICE and (weakest != 'genuine' or evidence.recognized is not None):
+        kind, sentence = _ADVICE[weakest]
         said = sentence.format(evidence)
     elif rival is None or not (weakest == 'uncontradicted' or ambiguous):
         kind = RefusalKind.UNEXPLAINED

@@ -182,5 +182,3 @@ def _instants(frames: Sequence[SearchedFrame]) -> NDArray[np.int64]:
         seen[one.stamp_ns, one.camera_name] += 1
     order = sorted(set(keys))
     return np.array([order.index(key) for key in keys])
-
-

@@ -96,11 +96,13 @@ def move_covariance(covariance: NDArray[np.float64], lever: NDArray[np.float64]
     return jacobian @ covariance @ jacobian.T
 
 
-def first_of_each(same: NDArray[np.bool_], most: float = np.inf) -> list[int]:
+def first_of_each(same: NDArray[np.bool_], most: int | None = None) -> list[int]:
     """Return the first of m rows that are not the same (m, m) as one before, up to a number."""
     rows = list[int]()
     for row in range(len(same)):
-        if len(rows) < most and not same[row, rows].any():
+        if len(rows) == most:
+            break
+        if not same[row, rows].any():
             rows.append(row)
     return rows
 
@@ -128,7 +130,7 @@ class Tolerance(NamedTuple):
         traces = np.einsum('iab,jab->ij', poses[:, :3, :3], others[:, :3, :3])
         return np.asarray(near & (traces > self.least_trace))
 
-    def distinct(self, poses: NDArray[np.float64], most: float = np.inf) -> list[int]:
+    def distinct(self, poses: NDArray[np.float64], most: int | None = None) -> list[int]:
         """Return the row of the first of m poses (m, 4, 4) at each place, up to a number."""
         return first_of_each(self.agreeing(poses), most)
 

@@ -367,7 +367,7 @@ class LandmarkMap:
 
 
 def find_map_node(tree: Mapping[str, Any], path: str | os.PathLike[str]) -> str:
-    """Return the key of a parameter file whose parameters hold the map; MapError: not one does."""
+    """Return the node of a parameter file that has the map; MapError: none has, or several."""
     found = [name for name, node in tree.items()
              if isinstance(node, dict) and isinstance(node.get('ros__parameters'), dict)
              and 'map' in node['ros__parameters']]

@@ -3,8 +3,8 @@
 """Which landmarks an image should show at a pose, and which are no longer there.
 
 An image should show the landmarks that are near, large, wholly in view and not hidden. Walls are
-in no map, so an expected landmark may be hidden. That a landmark is beside one that the image
-shows tells that it is not, see mapping.evidence, which judges whole recordings.
+in no map, so an expected landmark may be hidden. If the image shows a landmark beside it, it is
+not hidden. cliploc_ros.offline.mapping.evidence judges whole recordings.
 
 A detector finds some landmarks in each image and others hardly ever. The share of looks that find
 a landmark has a beta distribution, which each look narrows down. Then the probability of k misses

@@ -8,10 +8,9 @@ The size of a box gives the distance of its landmark, roughly. So two boxes and 
 them bound the distance between their landmarks, which the map knows: two candidates that cannot be
 right at once never form a sample.
 
-Leaders take the best hypotheses; poses that contradict the constraint are not verified. Each
-search yields its progress after each block of samples, and the caller may stop there.
-
-Leaders are the best hypotheses of a search, each at a place of its own.
+Leaders are the best hypotheses of a search, each at a place of its own. Poses that contradict the
+constraint are not verified. Each search yields its progress after each block of samples, where the
+caller may stop it.
 """
 
 import time
@@ -375,7 +374,7 @@ def remember(leaders, score, iteration, sample, rotation, translation):
 
 @compiled
 def same_place(rotation_a, translation_a, rotation_b, translation_b):
-    """Return whether two camera_from_map poses are at one place, as Tolerance does.
+    """Return whether two camera_from_map poses are within SAME_PLACE of each other.
 
     The trace of the rotation between them is 1 + 2 cos(angle).
     """
@@ -445,7 +444,7 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
     Parameters
     ----------
     compatible : ndarray (c, c) of bool
-        See cliploc_ros.core.search.strategies.
+        See compatible_pairs.
     size : int, optional
         Candidates in a sample: three, or two where the constraint's vertical is known (see
         cliploc_ros.core.geometry.minimal_solvers). With two, the third column of the leaders'

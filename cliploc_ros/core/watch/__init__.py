@@ -3,8 +3,8 @@
 """Whether a localizer's pose is right, look by look.
 
 look
-    The pose near the given one that fits the detections best, and both as log odds that the given
-    pose is right.
+    The pose near the given one that fits the detections best, and the log odds that the given pose
+    is right.
 camera
     Faults of the images, and how the camera is turned against its stated mount.
 watch

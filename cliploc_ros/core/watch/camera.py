@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What looks tell of the camera: faults of its images, and how it is turned against its mount.
+"""Faults of a camera over several looks: in its images, and in the orientation of its mount.
 
 Each sign of a fault has to last for some looks. A wall before a standing robot is as bare as a
 cloth over its lens, and its image as smooth as one that is out of focus, so what is blurred or
 dirty shows in different views only. An image that stays the same to the last bit is frozen once
 the robot moves.
 
-A camera that is turned against its stated mount is so by a constant angle over looks at right
+If the stated orientation of the mount is wrong, it is off by the same angle in all looks at right
 poses. Each look gives the turn from the given pose to the fitted pose, with its information. The
 given pose is off by decimetres and its yaw by degrees, which changes along the way, while the turn
 of the camera stays. So looks are averaged by their information and by how much they scatter, far

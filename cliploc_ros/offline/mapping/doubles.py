@@ -26,8 +26,9 @@ from cliploc_ros.offline.mapping.views import Views
 # other if it shares more than the second number of its area. Below the third number of the other's
 # area it is a part, or a thing on it; below the fourth it is a thing.
 _ONE_BOX_IOU, _WITHIN_SHARE, _PART_SHARE, _THING_SHARE = 0.5, 0.8, 0.3, 1 / 16
-# Names of one thing exclude each other. Two things appear side by side in at least the first share
-# of the images that chance predicts, or in the second share of the images of the rarer thing.
+# Two classes of one thing are hardly ever detected in the same image. Two things are: in at least
+# the first share of the number of images that independent detections predict, or in at least the
+# second share of the images that show the less frequent of the two.
 _LEAST_LIFT, _LEAST_SHARE = 1 / 3, 0.15
 # A part has a box of its own at times, a thing on another one in this share of the images of both.
 # All are guesses, between the doubles and the neighbours of four rooms and TUM fr3.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Does what the messages of a page say, and keeps the log of what came of it.
+"""Runs the actions that the messages of a page name, and logs their results.
 
 A message names an action and its values. An action is a method of the desk, the studio, its
 document, its review or its new landmark, and stands in the ACTIONS of its class. Each change wakes

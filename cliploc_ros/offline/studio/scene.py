@@ -94,9 +94,9 @@ class Ellipsoids:
 
 
 class Labels:
-    """The landmarks' labels in the scene, as many as have room there, the nearest first.
+    """The labels of the landmarks in the scene: the nearest ones, as many as fit.
 
-    The room is that of the browser whose camera moved last.
+    They fit the window of the browser whose camera moved last.
     """
 
     def __init__(self, server: viser.ViserServer, up: NDArray[np.float64]):

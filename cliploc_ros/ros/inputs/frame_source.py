@@ -83,8 +83,8 @@ class FrameSource:
     Parameters
     ----------
     linger_s : float
-        How long the subscriptions outlive the wish for a frame [s]; inf keeps them for as long as
-        the source is open.
+        How long to stay subscribed after the last frame was wanted [s]; inf: for as long as the
+        source is open.
     on_frame : callable
         Called with each complete frame in the executor's thread.
     camera : str
@@ -111,8 +111,8 @@ class FrameSource:
         self.topics = {name: of_camera(camera, topic) for name, topic in topics.items()}
         #: Of each topic the newest message, and when it arrived (monotonic clock) [s]
         self.heard: dict[str, tuple[Any, float]] = {}
-        #: How long after its stamp the newest image came, and the one that came soonest [s]
-        self.lag_s, self.least_lag_s = math.nan, math.inf
+        #: Delay of the newest image after its stamp, and the delay nearest to 0 so far [s]
+        self.lag_s, self.nearest_lag_s = math.nan, math.inf
         self._depth_tolerance_ns = round(parameters.depth_tolerance_s * NS_PER_S)
         self._depths: deque[Image | CompressedImage] = deque()
         self._pairing = ExactPairing({'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20,
@@ -138,7 +138,7 @@ class FrameSource:
         return self._resolved('image')
 
     def open(self) -> None:
-        """Allow frames to be wanted.
+        """Accept calls of `want`.
 
         OptionsError: the type of the detections is not installed.
         """
@@ -150,7 +150,7 @@ class FrameSource:
                 self._subscribe()
 
     def close(self, reason: str) -> None:
-        """Unsubscribe; to want a frame raises StoppedError with a reason from now on."""
+        """Unsubscribe; from now on `want` raises StoppedError with this reason."""
         with self._changed:
             self._closed = reason
             self._deadlines.clear()
@@ -330,7 +330,7 @@ class FrameSource:
         if name == 'image':
             self.lag_s = (self._node.get_clock().now().nanoseconds
                           - stamp_ns(msg.header.stamp)) / NS_PER_S
-            self.least_lag_s = min(self.lag_s, self.least_lag_s, key=abs)
+            self.nearest_lag_s = min(self.lag_s, self.nearest_lag_s, key=abs)
             return self._stamps[name].add(msg.header.stamp, (
                 msg.header.frame_id, len(msg.data), bytes(
                     memoryview(msg.data)[::1 + len(msg.data) // _SAMPLE])), received_at)

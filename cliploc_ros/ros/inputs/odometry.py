@@ -341,7 +341,7 @@ class OdometryPlace(NamedTuple):
     #: Places of one run share their odometry frame; those of different runs do not compare.
     run: int
     way_m: float  #: Driven since the run began
-    frame: str = ''  #: The coordinate frame that odometry tracks (child_frame_id)
+    frame: str = ''  #: The coordinate frame whose pose this is
 
 
 class OdometrySource(qos.Listener):

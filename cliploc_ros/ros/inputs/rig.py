@@ -85,12 +85,13 @@ class CameraRig:
                                           self._changed)
                         for name in parameters.camera_names or ('',)}
         self._pending: deque[_Instant] = deque()
-        self._passed: deque[Mapping[str, Frame]] = deque(maxlen=_MOST_PENDING)
+        self._passed: deque[Mapping[str, Frame]] = deque(
+            maxlen=_MOST_PENDING if len(self.sources) > 1 else 1)
         self._passed_ns = -_LATE_NS
-        # Several cameras that run on: one that is late, or silent, completes no instant.
-        self._runs_on = linger_s == math.inf and len(self.sources) > 1
+        # With several cameras in continuous mode, one that is late or silent delays no other.
+        self._is_continuous = linger_s == math.inf and len(self.sources) > 1
         # Simulated time may stand still.
-        node.create_timer(_CHECK_PERIOD_S if self._runs_on else _REST_PERIOD_S, self._rest,
+        node.create_timer(_CHECK_PERIOD_S if self._is_continuous else _REST_PERIOD_S, self._tick,
                           MutuallyExclusiveCallbackGroup(),
                           Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -114,11 +115,11 @@ class CameraRig:
             self._passed_ns = -_LATE_NS
 
     def next_frame(self, after: float, deadline: float, linger_s: float | None = None,
-                   most: int | None = None) -> Frame:
+                   cameras: int | None = None) -> Frame:
         """Return the first instant whose images arrived after a moment.
 
         Both times are of the monotonic clock [s]. `linger_s` takes the place of the rig's own.
-        The instant is that of `most` cameras, the first ones; None: of all.
+        Only the first `cameras` cameras count; None: all of them.
 
         Raises
         ------
@@ -127,7 +128,7 @@ class CameraRig:
         StoppedError
             The rig was closed; the message gives the reason.
         """
-        sources = dict(islice(self.sources.items(), most))
+        sources = dict(islice(self.sources.items(), cameras))
         with self._changed:  # subscribed until the last camera's frame is there
             for source in sources.values():
                 source.want(deadline)
@@ -162,7 +163,10 @@ class CameraRig:
     def _take(self, frame: Frame) -> None:
         """Take in a frame, and pass on the instants that are complete."""
         with self._changed:
-            if self._runs_on and 0 <= self._passed_ns - frame.stamp_ns < _LATE_NS:
+            if self._is_continuous and 0 <= self._passed_ns - frame.stamp_ns < _LATE_NS:
+                # too late for its instant; those who wait for a frame may have it
+                self._passed.append({frame.camera: frame})
+                self._changed.notify_all()
                 return
             if not any(one.take(frame, self._tolerance_s * NS_PER_S) for one in self._pending):
                 self._pending.append(_Instant(frame, len(self.sources)))
@@ -187,8 +191,8 @@ class CameraRig:
             now < instant.image_until or source.awaits_detections(at_ns, self._tolerance_s)
             for name, source in self.sources.items() if name not in instant.frames)
 
-    def _rest(self) -> None:
-        """Pass on what waited long enough, and unsubscribe once no frame has been wanted."""
+    def _tick(self) -> None:
+        """Pass on instants that waited long enough; unsubscribe once no frame is wanted."""
         self._pass_on()
         with self._changed:
             subscribed = [one.rest() for one in self.sources.values()]
@@ -198,9 +202,13 @@ class CameraRig:
 
     def _fullest(self, instants: Iterable[Mapping[str, Frame]], after: float,
                  names: Collection[str]) -> Frame | None:
-        """Return the instant of the most of some cameras whose images arrived after a moment."""
+        """Return the instant of the most of some cameras whose images arrived after a moment.
+
+        Of several with as many cameras the newest one: the last of `instants`.
+        """
         fullest = max(({name: one for name, one in frames.items()
-                        if name in names and one.received_at >= after} for frames in instants),
+                        if name in names and one.received_at >= after}
+                       for frames in reversed([*instants])),
                       key=len, default={})
         return self._joined(fullest, names) if fullest else None
 

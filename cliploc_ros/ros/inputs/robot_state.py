@@ -385,7 +385,8 @@ class RobotStateSource:
             self._warn(f'one frame alone: {error}')
             return None
         return body._replace(
-            odom_from_frame=body.odom_from_frame @ invert_transform(camera_from_body))
+            odom_from_frame=body.odom_from_frame @ invert_transform(camera_from_body),
+            frame=image.frame_id)
 
     def _lookup(self, image: Header, frame: str, parameters: RelocalizerParameters
                 ) -> NDArray[np.float64]:

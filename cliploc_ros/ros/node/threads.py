@@ -197,7 +197,7 @@ class LatestOnly[T]:
             return self._items[0] if self._items else None
 
     def offer(self, item: T) -> None:
-        """Queue an item in place of the one that still waits."""
+        """Queue an item; it replaces an item that still waits."""
         with self._lock:
             waiting = bool(self._items)
             self.dropped += waiting
