@@ -324,7 +324,7 @@ def path_of(name: str) -> str:
         raise MapError(f'{name}: no package://PACKAGE/PATH, such as package://my_maps/office.yaml')
     try:
         return str(Path(get_package_share_directory(package)) / path)
-    except (LookupError, ValueError) as error:
+    except (OSError, LookupError, ValueError) as error:  # OSError: no workspace is sourced
         raise MapError(f"{name}: there is no package '{package}' here: install it, or source "
                        'the workspace that has it') from error
 
