@@ -107,16 +107,20 @@ def _draw_image(axes: Axes, review: Review, landmark_map: LandmarkMap, numbers: 
 
 
 def _draw_outlines(axes: Axes, camera: Camera, landmark_map: LandmarkMap,
-                   pose: NDArray[np.float64], matched: Set[int]) -> None:
-    """Draw the outlines of all landmarks as seen from a pose, those of the matched ones bold."""
+                   pose: NDArray[np.float64], matched: Set[int], width: float = 0.9,
+                   is_edged: bool = False) -> None:
+    """Draw the outlines of all landmarks as seen from a pose, those of the matched ones bold.
+
+    The others are dotted, of a width, with or without an edge.
+    """
     for landmark, outline in enumerate(project_ellipsoids(
             invert_transform(pose), landmark_map.centers, landmark_map.shapes)):
         if np.isfinite(outline).all():
             own = landmark in matched
             axes.add_patch(Polygon(
                 camera.project_normalized(outline_points(outline)), closed=True, fill=False,
-                edgecolor=_ELLIPSE if own else _EXPECTED, linewidth=1.8 if own else 0.9,
-                linestyle='-' if own else ':', path_effects=_EDGED if own else None))
+                edgecolor=_ELLIPSE if own else _EXPECTED, linewidth=1.8 if own else width,
+                linestyle='-' if own else ':', path_effects=_EDGED if own or is_edged else None))
 
 
 def _list_matches(panel: Axes, review: Review, landmark_map: LandmarkMap, numbers: dict[int, int]
@@ -289,7 +293,7 @@ def _draw_expected(axes: Axes, file: Path, camera: Camera, detections: Detection
     for left, top, right, bottom in detections.bboxes_xyxy:
         axes.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False,
                                  edgecolor=_BOX, linewidth=1.5, path_effects=_EDGED))
-    _draw_outlines(axes, camera, landmark_map, pose, frozenset())
+    _draw_outlines(axes, camera, landmark_map, pose, frozenset(), width=1.5, is_edged=True)
 
 
 def _draw_ways(axes: Axes, landmark_map: LandmarkMap, moments: Sequence[Moment]) -> None:

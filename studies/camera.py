@@ -19,6 +19,7 @@ from cliploc_ros.command import positive_int, run_command
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.evaluation.trials import PosedQuery, with_vertical
 from studies import wrong_sensors
 from studies.acceptance.places import (
@@ -119,8 +120,14 @@ def run(arguments: Sequence[str]) -> int:
                         metavar='WHAT', help=f'{", ".join(CAMERAS)} (all)')
     parser.add_argument('--vertical', action='store_true', help='it is known to a degree')
     options = parser.parse_args(arguments)
+    places = chosen_places(options)
+    if options.cameras > 1 or options.workers > 1:
+        raise OptionsError('--cameras and --workers: one camera looks in order, in one process')
+    if options.depth and any(isinstance(one, Simulated) for one in places):
+        raise OptionsError('--depth: the simulated drives have none; it is for --queries and '
+                           '--observations')
     looks: list[Look] = []
-    for number, place in enumerate(tqdm(chosen_places(options), 'drives', disable=None)):
+    for number, place in enumerate(tqdm(places, 'drives', disable=None)):
         landmark_map, queries = _drive(place, options)
         if options.vertical:
             queries = with_vertical(queries, VERTICAL_DEG)

@@ -104,8 +104,8 @@ def answer_table[One: Answer](answers: Iterable[One], by: Sequence[str],
                               **more: Callable[[list[One]], object]) -> str:
     """Return what became of requests, as Markdown: a row for each group of equal fields.
 
-    The intervals are of the share of false accepts. The last column but those of ``more`` is the
-    share of accepted poses within their 95 % ellipsoid.
+    The intervals are of the share of false accepts. Before the columns of ``more`` comes the share
+    of accepted poses within their 95 % ellipsoid.
     """
     rows = []
     for key, its in grouped(answers, by).items():
@@ -129,9 +129,9 @@ def answer_table[One: Answer](answers: Iterable[One], by: Sequence[str],
 
 def confidence_table(answers: Iterable[Answer], by: Sequence[str], thresholds: Sequence[float]
                      ) -> str:
-    """Return what several values of min_confidence accept, and the best recall that any reaches.
+    """Return what several values of min_confidence accept, and the best recall at .99 precision.
 
-    At a precision of .99.
+    The recall is that of any threshold, see best_recall.
     """
     return answer_table(
         [replace(one, min_confidence=least, accepted=one.confidence >= least) for one in answers

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from cliploc_ros.command import run_command
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.files.parallel import run_tasks
+from cliploc_ros.files.parallel import WorkersError, run_tasks
 from cliploc_ros.files.storage import make_folder
 from cliploc_ros.offline.evaluation.methods import parse_methods
 from cliploc_ros.offline.evaluation.run import run_methods
@@ -53,8 +53,12 @@ def render(folder: Path, count: int, images: int, seed: int) -> None:
     write_true_map(folder / 'map.yaml', room)
 
 
-def _make_work(folder: Path, images: int, seed: int) -> Callable[[int], None]:
-    return lambda count: render(folder / str(count), count, images, seed)
+def _make_work(folder: Path, images: int, seed: int) -> Callable[[int], bool]:
+    def work(count: int) -> bool:
+        render(folder / str(count), count, images, seed)
+        return True
+
+    return work
 
 
 def _whole_search_s(one: Summary) -> float:
@@ -104,9 +108,12 @@ def run(arguments: list[str]) -> int:
     summaries: dict[int, list[Summary]] = {}
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_growth_') as name:
         # In other processes: Mesa and PyTorch each load an LLVM, and the two conflict.
-        for _ in tqdm(run_tasks(partial(_make_work, Path(name), options.images, options.seed),
-                                COUNTS, workers=2), 'rendering', len(COUNTS), unit='room'):
-            pass
+        for count, is_made in tqdm(run_tasks(
+                partial(_make_work, Path(name), options.images, options.seed), COUNTS, workers=2),
+                'rendering', len(COUNTS), unit='room'):
+            if not is_made:
+                raise WorkersError(f'workers died again and again at the room with {count} '
+                                   'objects of each class')
         for count in COUNTS:
             folder = Path(name, str(count))
             landmark_map = LandmarkMap.from_file(folder / 'map.yaml')

@@ -300,7 +300,7 @@ def _of_sensor(change: wrong_sensors.Change, levels: tuple[float, ...], modes: t
         landmark_map, change(queries, level)), levels, modes, in_order=in_order)
 
 
-_DEPTH = partial(_of_sensor, modes=(ONE, LEVEL))
+_of_depth = partial(_of_sensor, modes=(ONE, LEVEL))
 #: What is wrong, and the robot does not know.
 TROUBLES = {
     'none': Trouble(unchanged, modes=(ONE, LEVEL, FIVE, ALL)),
@@ -312,15 +312,15 @@ TROUBLES = {
     'share of the objects moved by .3 to 3 m': Trouble(move_objects, (0.4,)),
     'mount off by [degrees]': _of_sensor(wrong_sensors.wrong_mount, (5.0,), (LEVEL, FIVE, ALL)),
     'vertical off by [degrees]': _of_sensor(wrong_sensors.tilted_vertical, (10.0,), (LEVEL, ALL)),
-    'depth too large by a factor': _DEPTH(wrong_sensors.scaled_depth,
-                                          (1000.0, 1.15, 1.0 / 1.15)),
-    'share of the depths that are random': _DEPTH(wrong_sensors.random_depth, (1.0,)),
-    'share of the depths of something else': _DEPTH(wrong_sensors.depth_elsewhere, (1.0,)),
-    'share of the depths that are missing': _DEPTH(wrong_sensors.missing_depth, (0.5, 1.0)),
+    'depth too large by a factor': _of_depth(wrong_sensors.scaled_depth,
+                                             (1000.0, 1.15, 1.0 / 1.15)),
+    'share of the depths that are random': _of_depth(wrong_sensors.random_depth, (1.0,)),
+    'share of the depths of something else': _of_depth(wrong_sensors.depth_elsewhere, (1.0,)),
+    'share of the depths that are missing': _of_depth(wrong_sensors.missing_depth, (0.5, 1.0)),
     'odometry too long by a factor': _of_sensor(
         wrong_sensors.scaled_odometry, (1.2, 0.8), (FIVE, ALL))}
 _BOTH = (ONE, VERTICAL)
-_CAMERA = partial(_of_sensor, modes=_BOTH, in_order=True)
+_of_camera = partial(_of_sensor, modes=_BOTH, in_order=True)
 #: Errors that many objects share, by their kind: A in the map of one thing, B in the input, C in
 #: the whole map.
 FAMILIES = {
@@ -332,19 +332,20 @@ FAMILIES = {
     'A things on one line': Trouble(unchanged, (0.0,), _BOTH, ('row',)),
     'A landmarks under other classes, copies': Trouble(confuse_landmarks, (1, 2, 3), _BOTH),
     'A unmapped desk': Trouble(unmapped_desk, (0.0,), _BOTH, ('one desk', 'office', 'room')),
-    'B boxes in pixels of a middle crop of [px]': _CAMERA(wrong_sensors.middle_crop,
-                                                          (300.0, 416.0)),
-    'B boxes scaled by': _CAMERA(wrong_sensors.scaled_boxes, (0.5, 1.5, 2.0)),
-    'B boxes shifted by a share of the width': _CAMERA(wrong_sensors.shifted_boxes, (0.05, 0.15)),
-    'B boxes turned by [degrees]': _CAMERA(wrong_sensors.turned_boxes, (90.0, 180.0)),
-    'B boxes mirrored': _CAMERA(wrong_sensors.mirrored_boxes, (0.0, 1.0)),
-    'B boxes of convention': _CAMERA(wrong_sensors.of_convention, tuple(
+    'B boxes in pixels of a middle crop of [px]': _of_camera(wrong_sensors.middle_crop,
+                                                             (300.0, 416.0)),
+    'B boxes scaled by': _of_camera(wrong_sensors.scaled_boxes, (0.5, 1.5, 2.0)),
+    'B boxes shifted by a share of the width': _of_camera(wrong_sensors.shifted_boxes,
+                                                          (0.05, 0.15)),
+    'B boxes turned by [degrees]': _of_camera(wrong_sensors.turned_boxes, (90.0, 180.0)),
+    'B boxes mirrored': _of_camera(wrong_sensors.mirrored_boxes, (0.0, 1.0)),
+    'B boxes of convention': _of_camera(wrong_sensors.of_convention, tuple(
         map(float, range(len(wrong_sensors.CONVENTIONS))))),
-    'B K scaled by': _CAMERA(wrong_sensors.scaled_camera, (2.0, 0.5)),
-    'B focal length off by a factor': _CAMERA(wrong_sensors.scaled_focal, (1.5, 0.7)),
-    'B principal point off by a share of the width': _CAMERA(wrong_sensors.shifted_center,
-                                                             (0.2, -0.2)),
-    'B fisheye taken for a pinhole': _CAMERA(wrong_sensors.fisheye_boxes, (0.0,)),
+    'B K scaled by': _of_camera(wrong_sensors.scaled_camera, (2.0, 0.5)),
+    'B focal length off by a factor': _of_camera(wrong_sensors.scaled_focal, (1.5, 0.7)),
+    'B principal point off by a share of the width': _of_camera(wrong_sensors.shifted_center,
+                                                                (0.2, -0.2)),
+    'B fisheye taken for a pinhole': _of_camera(wrong_sensors.fisheye_boxes, (0.0,)),
     'B odometry too long by a factor': _of_sensor(
         wrong_sensors.scaled_odometry, (1.2, 0.8), (FIVE,)),
     'B mount off by [degrees]': _of_sensor(wrong_sensors.wrong_mount, (5.0,), (VERTICAL, FIVE)),

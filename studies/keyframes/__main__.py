@@ -50,7 +50,7 @@ def _stored(options: argparse.Namespace) -> list[Path]:
     order = list(cases())
     paths = [path for path in options.out.glob('cases/*/*.pickle')
              if path.stem.partition(':')[0] in options.families
-             and any(text in path.parent.name for text in options.places)]
+             and any(text.replace('/', '.') in path.parent.name for text in options.places)]
     if not paths:
         raise OptionsError(f'{options.out}: no such records here; collect them first')
     return sorted(paths, key=lambda path: (order.index(path.stem), path.parent.name))

@@ -4,7 +4,7 @@
 
 The detector misses, invents, jitters, splits and confuses. To the encoder, weak or strong, objects
 are vectors: a part of their class, and a part of their model, which is how they look. A crop is
-the vector of its object and noise, see cliploc_ros.offline.simulation.labels.
+the vector of its object and noise, see cliploc_ros.offline.simulation.
 """
 
 from typing import NamedTuple

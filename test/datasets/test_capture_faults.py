@@ -16,6 +16,7 @@ from capture_folders import (
     shots_of,
     write_colmap,
     write_nerf,
+    write_stray,
 )
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -123,6 +124,15 @@ def test_files_cut_short_and_false_counts_cost_nothing(shots, tmp_path):
      'of shape')])
 def test_faults_of_transforms_json(edit, expected, shots, tmp_path):
     refuses(edited(write_nerf(tmp_path, shots), edit), expected)
+
+
+@pytest.mark.parametrize('header', [
+    '# timestamp, frame, x, y, z, qx, qy, qz, qw', 'time,frame', ''])
+def test_the_first_line_of_stray_scanner_is_its_header(header, shots, tmp_path):
+    table = write_stray(tmp_path / 'scan', shots) / 'odometry.csv'
+    _, *rows = table.read_text().splitlines()
+    table.write_text('\n'.join([header, *rows]))
+    assert read_folder(tmp_path / 'scan').count == len(shots)
 
 
 def test_the_memory_of_large_photos(tmp_path):

@@ -179,6 +179,7 @@ def test_what_no_map_can_hold_is_left_out_with_the_reason(tmp_path):
     (read_msgloc, json.dumps({'nodes': [msgloc_node(0, [0] * 3, [1] * 3, [0, 0, 0, 1],
                                                     baseline_label={'812.0': [1.0]})]}).encode(),
      '812.* `class_names`'),
+    (read_msgloc, b'{"edges": []}', 'is no map of MSG-Loc'),
     (read_goreloc, goreloc_object(0, SPHERE, [(CUP, 1)])[:-1],
      r'byte \d+'),
     (read_goreloc, b'\xff' * 11, 'more than 10 bytes'),

@@ -20,11 +20,13 @@ from cliploc_ros.core.depth_image import (
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.bag_frames import BagTopics
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
-from cliploc_ros.offline.datasets.folders import rgbd_frames
+from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames, tum_frames
 from cliploc_ros.offline.datasets.frames import DepthFormat
+from cliploc_ros.offline.datasets.images import open_images
 from cliploc_ros.offline.datasets.intrinsics import PRESETS, find_camera, read_camera
-from cliploc_ros.offline.datasets.parsing import parse_stamp_ns, pose_of
+from cliploc_ros.offline.datasets.parsing import Fields, parse_stamp_ns, pose_of, read_numbers
 from cliploc_ros.offline.datasets.poses import TimedPoses, mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum, read_tum_trajectory
 from cliploc_ros.offline.datasets.tum_conversion import read_recorded_detections
@@ -98,6 +100,36 @@ def test_malformed_files_are_named(sequence_folder, name, text, message):
         read_tum(sequence_folder)
 
 
+@pytest.mark.parametrize(('truth', 'message'), [
+    (None, 'no groundtruth.txt here; give a `trajectory`'),
+    ('9000 0 0 0 0 0 0 1\n', 'another clock')])
+def test_images_alone_need_no_poses(sequence_folder, truth, message):
+    """The studio shows the images of a map that was made with a trajectory of its own."""
+    for path in (sequence_folder / 'rgb').iterdir():
+        cv2.imwrite(str(path), np.full((480, 640, 3), 7, dtype=np.uint8))
+    poses = sequence_folder / 'groundtruth.txt'
+    poses.unlink() if truth is None else poses.write_text(truth)
+    assert (open_images(sequence_folder, BagTopics()).near(1.033)[200:300, 300:400] == 7).all()
+    with pytest.raises(DatasetError, match=message):
+        read_folder(sequence_folder)
+    with pytest.raises(DatasetError, match=message):
+        tum_frames(read_tum(sequence_folder), find_camera(None, sequence_folder)[0])
+
+
+def test_an_empty_cell_is_no_cell_of_another_column(tmp_path):
+    path = tmp_path / 'table.csv'
+    for line in ('1.0, 2,3 ,4', '1.0,2,3,4,', '1.0 2 3 4', '1.0\t2,3 4'):
+        path.write_text(f'# comment\n{line}\n')
+        assert read_numbers(path, 'a b c d') == [[1.0, 2.0, 3.0, 4.0]]
+    for line in ('1.0,2,,4,5', ',1.0,2,3,4', '1.0,2, ,3,4', '1.0,2,3,4,,', ','):
+        path.write_text(f'# comment\n{line}\n')
+        with pytest.raises(DatasetError, match=r'table\.csv:2: a cell between its'):
+            read_numbers(path, 'a b c d')
+    path.write_text('1.0,2,three,4\n')
+    with pytest.raises(DatasetError, match=r"table\.csv:1: 'three' is no number"):
+        read_numbers(path, 'a b c d')
+
+
 # --- cameras -------------------------------------------------------------------------------
 def camera_json(path, **changes):
     values = {'width': 640, 'height': 480, 'fx': 500, 'fy': 501.5, 'cx': 320, 'cy': 240}
@@ -143,6 +175,25 @@ def test_recorded_detections(tmp_path):
     assert second.bboxes_xyxy.shape == (0, 4)
 
 
+@pytest.mark.parametrize(('frame', 'message'), [
+    ({}, "frame 0: field 'timestamp' is missing"),
+    ({'timestamp': True}, "field 'timestamp' is 'True', neither"),
+    ({'timestamp': [1.0]}, "field 'timestamp' is .* neither"),
+    ({'timestamp': 1, 'detections': [{**BOOK, 'bbox_xyxy': [True, 0, 5, 6]}]}, 'bbox_xyxy is'),
+    ({'timestamp': 1, 'detections': [{**BOOK, 'score': True}]}, 'score is True')])
+def test_booleans_and_missing_fields_are_refused(tmp_path, frame, message):
+    path = detections_json(tmp_path / 'd.json', [{'detections': [], **frame}])
+    with pytest.raises(DatasetError, match=message):
+        read_recorded_detections(path)
+
+
+def test_numbers_of_a_mapping():
+    values = Fields({'K': [[1, 0.5], [2, 3]], 'flags': [[1.0, 2.0], [False, 3.0]]}, 'here')
+    np.testing.assert_array_equal(values.numbers('K', (-1, 2)), [[1.0, 0.5], [2.0, 3.0]])
+    with pytest.raises(DatasetError, match='here: flags is'):
+        values.numbers('flags', (-1, 2))
+
+
 @pytest.mark.parametrize('number', [1e200, 1e308, 1e-320, 2.0])
 def test_quaternions_of_any_numbers_are_refused(number, tmp_path):
     """Squares of the largest overflow: no warning says so, and no pose is made of them."""
@@ -184,6 +235,16 @@ def test_seven_scenes(tmp_path):
     assert second.stamp_ns == 333_333_333
     assert np.nanmax(first.depth.depths_m) == pytest.approx(2.0)
     assert first.camera.fx == 525.0
+
+
+def test_what_is_no_pose_of_seven_scenes(tmp_path):
+    write_scene(tmp_path, [np.eye(4)])
+    path = tmp_path / 'frame-000000.pose.txt'
+    path.write_text('# of the depth camera\n1 0 0 0 # x\n0 1 0 0\n0 0 1 0\n0 0 0 1\n')
+    assert next(rgbd_frames(tmp_path, NO_OPTIONS).read()).map_from_camera is not None
+    path.write_text('1 0 0 0\n0 1 0\n')
+    with pytest.raises(DatasetError, match=r'pose\.txt:2: is no 4x4 matrix'):
+        rgbd_frames(tmp_path, NO_OPTIONS)
 
 
 def test_tum_rgbd(tmp_path):

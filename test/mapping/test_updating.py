@@ -18,6 +18,7 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.mapping import evidence
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.update.updating import update_map
 from demo import ASSETS
@@ -83,6 +84,19 @@ def test_each_change_is_reported_and_nothing_else():
     assert set(np.unique(updated.shown)) <= set(range(-1, len(found)))
     assert len(set(found.landmark_ids)) == len(found) == len(later)
     assert report.as_dict()['missing'][0]['last_seen'] == 1.0
+
+
+def test_windows_of_frames_do_not_matter(monkeypatch):
+    """Also where they part the frames of one viewpoint."""
+    things = make_things()
+    walk = see(without(moved(things, {12: (1.6, 0.1, 0.8)}), 7), np.repeat(POSES, 3, axis=0),
+               noise_px=2.0, missed=0.2)
+    whole = update_map(things, walk)
+    monkeypatch.setattr(evidence, '_WINDOW', 7)
+    parted = update_map(things, walk)
+    assert parted.report.as_dict() == whole.report.as_dict()
+    np.testing.assert_array_equal(parted.landmark_map.centers, whole.landmark_map.centers)
+    np.testing.assert_array_equal(parted.shown, whole.shown)
 
 
 def test_what_is_kept_of_a_landmark():

@@ -323,7 +323,7 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
         with BagReader(bag) as reader:
             msgtype = reader.topic(topics.image).msgtype
             for place, stamp_ns, pose, data, depth_data in _paired(reader, topics, poses,
-                                                                                is_wanted):
+                                                                   is_wanted):
                 yield RawFrame(place, stamp_ns, pose, partial(decode, msgtype, data),
                                None if depth_data is None else partial(decode_depth, depth_data))
     return Frames(bag, count, read_raw, notes=notes)

@@ -7,7 +7,7 @@ TUM RGB-D, with or without depth, and 7-Scenes are read here, the others in ``ca
 
 import hashlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from cliploc_ros.offline.datasets.captures import colmap, devices, placing
 from cliploc_ros.offline.datasets.captures.capture import Capture, FolderOptions
 from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, ImageFile, folder_frames
 from cliploc_ros.offline.datasets.intrinsics import find_camera, read_camera
-from cliploc_ros.offline.datasets.parsing import naming, read_numbers
+from cliploc_ros.offline.datasets.parsing import naming, parse_all, read_lines
 from cliploc_ros.offline.datasets.poses import TimedPoses, check_clock
 from cliploc_ros.offline.datasets.tum import TumSequence, read_image_list, read_tum
 from cliploc_ros.offline.mapping.tilt import NO_VERTICAL, find_tilt, tilt_note
@@ -120,6 +120,8 @@ def find_layout(folder: Path, key: str = '') -> Layout | None:
 
 def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptions) -> Frames:
     """Return the frames of a capture, in the map's coordinate frame."""
+    if capture.trajectory is not None:
+        _check_trajectory(folder, capture.files, capture.trajectory)
     axes, scale, turn = options.axes or capture.axes, options.scale, placing.UP[capture.up or 'z']
     files = placing.place_images(capture.files, axes)
     notes = [f'read as {layout.name}: {sum(one.pose is not None for one in files)} of '
@@ -156,7 +158,9 @@ def tum_frames(sequence: TumSequence, camera: Camera) -> Frames:
 
     DatasetError: there are no poses, or they are of another time.
     """
-    return folder_frames(sequence.folder, _tum_files(sequence, camera, sequence.trajectory, {}))
+    files = _tum_files(sequence, camera, sequence.trajectory, {})
+    _check_trajectory(sequence.folder, files, sequence.trajectory)
+    return folder_frames(sequence.folder, files)
 
 
 def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
@@ -181,22 +185,26 @@ def _tum(folder: Path, options: FolderOptions, with_depth: bool = True) -> Captu
             nearest = int(np.argmin(np.abs(times - stamp)))
             if abs(stamps[nearest] - stamp) <= _MAX_DEPTH_DELAY_NS:
                 depths[stamp] = paths[nearest]
-    trajectory = sequence.trajectory if options.trajectory is None else options.trajectory
-    return Capture(_tum_files(sequence, camera, replace(
-        trajectory, max_gap_ns=options.max_gap_ns, body_from_camera=options.body_from_camera),
-        depths), depth=DepthFormat(TUM_UNIT))
+    trajectory = replace(
+        sequence.trajectory if options.trajectory is None else options.trajectory,
+        max_gap_ns=options.max_gap_ns, body_from_camera=options.body_from_camera)
+    return Capture(_tum_files(sequence, camera, trajectory, depths), depth=DepthFormat(TUM_UNIT),
+                   trajectory=trajectory)
 
 
 def _tum_files(sequence: TumSequence, camera: Camera, trajectory: TimedPoses,
                depths: Mapping[int, Path]) -> tuple[ImageFile, ...]:
-    """Return the images of a folder, each with the pose at its stamp."""
-    if not len(trajectory):
-        raise DatasetError(f'{sequence.folder}: there are no poses: no groundtruth.txt here; give '
-                           'a `trajectory`')
-    stamps_ns = sequence.stamps_ns
-    check_clock(trajectory, stamps_ns[0], stamps_ns[-1], str(sequence.folder))
+    """Return the images of a folder, each with the pose at its stamp, if there is one."""
     return tuple(ImageFile(stamp, path, camera, trajectory.pose_at(stamp), depths.get(stamp))
-                 for stamp, path in zip(stamps_ns, sequence.image_paths, strict=True))
+                 for stamp, path in zip(sequence.stamps_ns, sequence.image_paths, strict=True))
+
+
+def _check_trajectory(folder: Path, files: Sequence[ImageFile], trajectory: TimedPoses) -> None:
+    """Refuse a trajectory without poses, or of another time than the images."""
+    if not len(trajectory):
+        raise DatasetError(f'{folder}: there are no poses: no groundtruth.txt here; give '
+                           'a `trajectory`')
+    check_clock(trajectory, files[0].stamp_ns, files[-1].stamp_ns, str(folder))
 
 
 def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
@@ -228,7 +236,13 @@ def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
 
 def _read_pose(path: Path) -> NDArray[np.float64] | None:
     """Return a pose (4, 4); None where tracking was lost, which is written as NaN or infinite."""
-    pose = np.array([row[:4] for row in read_numbers(path, '0 1 2 3')])
+    rows = []
+    for where, line in read_lines(path):
+        cells = line.partition('#')[0].split()
+        if len(cells) != 4:
+            raise DatasetError(f'{where}: is no 4x4 matrix: {line[:60]!r}')
+        rows.append(parse_all(cells, float, where))
+    pose = np.array(rows)
     if pose.shape != (4, 4):
         raise DatasetError(f'{path}: is no 4x4 matrix, its shape is {pose.shape}')
     if not np.isfinite(pose).all():

@@ -45,23 +45,29 @@ def read_text(path: Path) -> str:
         return path.read_text(encoding='utf-8')
 
 
-def read_lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Yield 'file:line' and the text of each line that is neither blank nor a comment."""
+def read_lines(path: Path, header: int = 0) -> Iterator[tuple[str, str]]:
+    """Yield 'file:line' and the text of each line that is neither blank nor a comment.
+
+    The first lines may be a header, whatever they hold.
+    """
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         stripped = line.strip()
-        if stripped and not stripped.startswith('#'):
+        if number > header and stripped and not stripped.startswith('#'):
             yield f'{path}:{number}', stripped
 
 
-def read_cells(path: Path, expected: str) -> Iterator[tuple[str, list[str]]]:
-    """Yield 'file:line' and the cells of each line, between spaces or commas.
+def read_cells(path: Path, expected: str, header: int = 0) -> Iterator[tuple[str, list[str]]]:
+    """Yield 'file:line' and the cells of each line after a header, between spaces or commas.
 
-    DatasetError: the file cannot be read, or a line has other cells than the expected names, of
-    which '...' stands for any number.
+    DatasetError: the file cannot be read, or a line has an empty cell before its last comma, or
+    other cells than the expected names, of which '...' stands for any number.
     """
     names = expected.split()
-    for where, line in read_lines(path):
-        cells = line.replace(',', ' ').split()
+    for where, line in read_lines(path, header):
+        between_commas = line.removesuffix(',').split(',')
+        if not all(map(str.strip, between_commas)):
+            raise DatasetError(f'{where}: a cell between its commas is empty: {line[:60]!r}')
+        cells = ' '.join(between_commas).split()
         if len(cells) < len(names) - 1 or (names[-1] != '...' and len(cells) != len(names)):
             raise DatasetError(f'{where}: expected {expected}, got {len(cells)} fields: '
                                f'{line[:60]!r}')
@@ -75,10 +81,13 @@ def read_numbers(path: Path, expected: str) -> list[list[float]]:
 
 def parse_all[T](cells: Sequence[str], kind: Callable[[str], T], where: str) -> list[T]:
     """Return cells as numbers of a kind; DatasetError: a cell is none."""
-    try:
-        return [kind(cell) for cell in cells]
-    except ValueError:
-        raise DatasetError(f'{where}: {" ".join(cells)[:60]!r} are no numbers') from None
+    numbers = []
+    for cell in cells:
+        try:
+            numbers.append(kind(cell))
+        except ValueError:
+            raise DatasetError(f'{where}: {cell[:40]!r} is no number') from None
+    return numbers
 
 
 def parse_stamp_ns(text: str, where: str) -> int:
@@ -178,7 +187,9 @@ class Fields:
         value = self._value(name, default)
         try:
             found = np.array(value)
-            if found.size and found.dtype.kind not in 'iuf':
+            # NumPy takes a boolean beside numbers for one of them
+            if found.size and (found.dtype.kind not in 'iuf' or any(
+                    isinstance(one, bool) for one in np.array(value, dtype=object).flat)):
                 raise ValueError
             found = found.astype(np.float64)
         except (ValueError, OverflowError, TypeError):
@@ -189,6 +200,14 @@ class Fields:
             raise FieldError(f'{self.where}: {name} is {str(value)[:60]}, not ' + (
                 f'numbers of shape {shape}' if shape else 'a finite number'))
         return found
+
+    def written(self, name: str) -> str:
+        """Return a number or a text as the file writes it."""
+        value = self._value(name, None)
+        if isinstance(value, bool) or not isinstance(value, str | int | float):
+            raise FieldError(f'{self.where}: field {name!r} is {str(value)[:40]!r}, neither a '
+                             'number nor a text')
+        return str(value)
 
     def text(self, name: str, default: str | None = None) -> str:
         """Return a text."""

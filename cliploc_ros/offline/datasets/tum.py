@@ -113,7 +113,7 @@ def read_image_list(path: Path) -> tuple[tuple[int, ...], tuple[Path, ...]]:
             raise DatasetError(f'{where}: expected timestamp and file name, got {line!r}')
         image_path = path.parent / name[0]
         stamps_ns.append(parsing.parse_stamp_ns(stamp, where))
-        if stamps_ns[:-1] and stamps_ns[-1] <= stamps_ns[-2]:
+        if len(stamps_ns) > 1 and stamps_ns[-1] <= stamps_ns[-2]:
             raise DatasetError(f'{where}: timestamp {stamp} does not exceed the one before')
         if not image_path.is_file():
             raise DatasetError(f'{where}: image {image_path} does not exist')

@@ -172,7 +172,7 @@ def read_recorded_detections(path: str | Path, image_size: tuple[int, int] | Non
     detections: dict[int, Detections] = {}
     for index, entry in enumerate(content.entries('frames')):
         frame = Fields(entry, f'{path}: frame {index}')
-        timestamp = str(frame.values.get('timestamp'))
+        timestamp = frame.written('timestamp')
         stamp_ns = parse_stamp_ns(timestamp, frame.where)
         if stamp_ns in detections:
             raise DatasetError(f'{frame.where}: timestamp {timestamp} is a repetition')

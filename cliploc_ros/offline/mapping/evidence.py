@@ -47,6 +47,8 @@ _BESIDE_SHARE = 0.8
 # A class with fewer boxes is taken to be seen at the sizes of its boxes and of all classes only.
 _FEW_BOXES = 20
 _LEAST_QUANTILE = 0.1
+# So many frames are looked at together: a table of all frames and places would be large.
+_WINDOW = 1000
 # Points in a box at which the kernel asks whether something hides it: a 5 x 5 grid in the ellipse.
 _GRID = np.array([(x, y) for x in (-0.8, -0.4, 0.0, 0.4, 0.8) for y in (-0.8, -0.4, 0.0, 0.4, 0.8)
                   if x * x + y * y < 1.0])
@@ -240,21 +242,25 @@ def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
     extents = _least_extents(views, int(places.classes.max(initial=0)))
     least = np.where(places.classes < 0, extents[-1], extents[places.classes])
     radii = np.linalg.norm(places.bases, axis=1).max(axis=1, initial=0.0)
-    in_view = _in_view(
-        views, places.centers, places.bases, radii, 2.0 * radii / np.maximum(least, 1e-6), least,
-        is_solid, shown, np.cos(np.radians(_BESIDE_DEG)), _HIDDEN_SHARE)
-    rows, was_seen = np.nonzero(shown >= 0)[0], np.zeros_like(in_view)
-    was_seen[views.frames[rows], shown[rows]] = True
-
-    def viewpoints(of_frames: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Return the number of viewpoints (L,) that have one of some frames (F, L)."""
-        frames, rows = np.nonzero(of_frames)
-        distinct = np.unique(views.viewpoints[frames] * count + rows) % max(count, 1)
-        return np.bincount(distinct, minlength=count)
-
-    in_view |= was_seen
-    return Sight(viewpoints(in_view), viewpoints(was_seen), in_view.sum(axis=0),
-                 was_seen.sum(axis=0))
+    # by whether a place was in view or seen: (L,) frames, and keys of viewpoints and places
+    frames = np.zeros((2, count), dtype=np.int64)
+    keys: tuple[list[NDArray[np.int64]], ...] = [], []
+    for first in range(0, max(1, len(views.rotations)), _WINDOW):
+        window = views.between(first, min(first + _WINDOW, len(views.rotations)))
+        own = shown[views.offsets[first]:][:len(window.frames)]
+        in_view = _in_view(
+            window, places.centers, places.bases, radii, 2.0 * radii / np.maximum(least, 1e-6),
+            least, is_solid, own, np.cos(np.radians(_BESIDE_DEG)), _HIDDEN_SHARE)
+        rows, was_seen = np.nonzero(own >= 0)[0], np.zeros_like(in_view)
+        was_seen[window.frames[rows], own[rows]] = True
+        for number, of_frames in enumerate((in_view | was_seen, was_seen)):
+            frames[number] += of_frames.sum(axis=0)
+            in_frames, its = np.nonzero(of_frames)
+            keys[number].append(np.unique(window.viewpoints[in_frames] * count + its))
+    # frames of one viewpoint may lie in several windows
+    expected, seen = (np.bincount(np.unique(np.concatenate(own)) % max(count, 1), minlength=count)
+                      for own in keys)
+    return Sight(expected, seen, *frames)
 
 
 def _least_extents(views: Views, last_class: int) -> NDArray[np.float64]:

@@ -82,12 +82,13 @@ class _Cause(NamedTuple):
             return np.einsum('mep,mpg->meg', linear.by_pose,
                              self.motions[views.frames[linear.rows]])
         # a measured edge e = (px - c) / f gets smaller with f and c, its residual greater
-        by_number = np.zeros((len(views.edges), 4, 4))
+        edges, stiffness = views.edges[linear.rows], views.stiffness[linear.rows]
+        by_number = np.zeros((len(edges), 4, 4))
         for axis, focal in enumerate((self.camera.fx, self.camera.fy)):
             sides = [axis, axis + 2]
-            by_number[:, sides, axis] = (views.edges * views.stiffness)[:, sides]
-            by_number[:, sides, 2 + axis] = (views.stiffness / focal)[:, sides]
-        return by_number[linear.rows] * self.boxes[linear.rows, None, None]
+            by_number[:, sides, axis] = (edges * stiffness)[:, sides]
+            by_number[:, sides, 2 + axis] = (stiffness / focal)[:, sides]
+        return by_number * self.boxes[linear.rows, None, None]
 
     def apply(self, views: Views, values: NDArray[np.float64]) -> Views:
         """Return views with the numbers (G,) applied."""

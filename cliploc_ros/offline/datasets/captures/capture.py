@@ -62,6 +62,9 @@ class Capture:
     is_metric: bool = True  #: Whether the unit is the metre by the definition of the layout
     notes: tuple[str, ...] = ()
     images: int = 0  #: How many there are, where more than the files have no pose
+    #: What the poses were looked up in: it must have some, of the time of the images. Images
+    #: alone may do without
+    trajectory: TimedPoses | None = None
 
 
 def arrange(files: Sequence[ImageFile], where: object) -> tuple[ImageFile, ...]:

@@ -81,7 +81,7 @@ def read_colmap(folder: Path, options: capture.FolderOptions) -> capture.Capture
         notes.append(f'the model is in {len(models)} pieces: {model.name} with '
                      f'{len(found[model])} images is used, {rest} images of the others are not')
     root = options.images or next((one / 'images' for one in (folder, *model.resolve().parents[:3])
-                           if (one / 'images').is_dir()), folder)
+                                   if (one / 'images').is_dir()), folder)
     files = []
     for one in found[model]:
         if one.camera_id not in cameras:

@@ -9,7 +9,6 @@ right, y up, z back. Fields that are not used here are ignored.
 
 import math
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path, PurePosixPath
 
 import cv2
@@ -106,7 +105,7 @@ def read_stray(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     Its quaternions are of OpenCV's camera axes.
     """
     path, lens = folder / 'odometry.csv', folder / 'camera_matrix.csv'
-    table = parsing.read_cells(path, 'timestamp frame x y z qx qy qz qw ...')
+    table = parsing.read_cells(path, 'timestamp frame x y z qx qy qz qw ...', header=1)
     matrix = parsing.read_numbers(lens, 'fx 0 cx ...')
     if len(matrix) != 3:
         raise DatasetError(f'{lens} has {len(matrix)} rows, expected 3')
@@ -114,7 +113,7 @@ def read_stray(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     camera = parsing.camera_of(str(lens), *_size_of(folder, video), matrix[0][0], matrix[1][1],
                                matrix[0][2], matrix[1][2])
     files = []
-    for place, (where, cells) in enumerate(islice(table, 1, None)):
+    for place, (where, cells) in enumerate(table):
         time_s, frame, *numbers = parsing.parse_all(cells, float, where)
         stem = f'{frame:06.0f}'
         image = capture.first_image(folder / 'rgb', stem)

@@ -67,7 +67,8 @@ def find_scale(files: Sequence[ImageFile], first: str, second: str, metres: floa
         found = [one.pose[:3, 3] for one in files
                  if one.pose is not None and str(one.color).endswith(f'/{name}')]
         if len(found) != 1:
-            shown = ', '.join(one.color.name for one in files[:3])
+            posed = [one for one in files if one.pose is not None]
+            shown = ', '.join(one.color.name for one in posed[:3])
             raise DatasetError(f'{where}: {len(found) or "no"} images with a pose are named {name}'
                                f'; there are {shown} and so on')
         places.append(found[0])

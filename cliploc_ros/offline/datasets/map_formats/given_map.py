@@ -259,13 +259,17 @@ def read_msgloc(path: Path, class_names: Sequence[str]) -> GivenMap:
     """
     given = GivenMap([], [], [])
     negative = 0
-    for place, values in enumerate(Fields.of_file(path, read_bytes).entries('nodes')):
+    content = Fields.of_file(path, read_bytes)
+    if not isinstance(content.values.get('nodes'), list):
+        raise DatasetError(f"{path}: is no map of MSG-Loc: it has no list 'nodes'")
+    for place, values in enumerate(content.entries('nodes')):
         try:
             node = Fields(values, f'node {place}')
             given.landmarks.append(_landmark_of_node(node, place, class_names))
             negative += any(radius < 0.0 for radius in node.values['radii'])
         except FieldError as error:
-            given.left_out.append(Skipped(f'node {place}', str(error)))
+            reason = str(error).removeprefix(f'node {place}: ')
+            given.left_out.append(Skipped(f'node {place}', reason))
     if negative:
         given.notes.append(f'{negative} landmarks have negative radii; their signs are ignored')
     return given

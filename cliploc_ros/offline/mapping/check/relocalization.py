@@ -213,6 +213,9 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
     taken_at = None if keyframes is None else _frames_of(keyframes.layer, detections)
     trials: list[Trial] = []
     for fold in folds:
+        frames = [frame for frame in fold.frames.tolist() if frame in chosen]
+        if not frames:
+            continue
         relocalizer = localizer = None
         if len(fold.rows):
             semi_axes, quats_xyzw = fold.landmarks.axes_and_quats()
@@ -221,7 +224,7 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
                 semi_axes=semi_axes, quats_xyzw=quats_xyzw), options)
         if keyframes is not None and fold.training[taken_at].any():
             localizer = KeyframeLocalizer(keyframes.layer.select(fold.training[taken_at]))
-        for frame in filter(chosen.__contains__, fold.frames.tolist()):
+        for frame in frames:
             tell((len(trials) + 1) / len(chosen))
             seen = shown[slice(*detections.frame_offsets[frame:frame + 2])]
             count, known = int((seen >= 0).sum()), int(np.isin(seen, fold.rows).sum())

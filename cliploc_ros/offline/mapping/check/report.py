@@ -293,7 +293,7 @@ def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
                                  limits.min_explained, False),
                          Measure('held-out median IoU', recording.held_out.median_iou,
                                  limits.min_iou, False, 'number')]
-        # the second one: a map of a walk that passes each object once
+        # without enough judged frames (each object passed only once), simulated boxes stand in
         how, trials = ((report.evidence, recording.judged) if recording.can_judge_frames else
                        ('with simulated boxes', recording.simulated))
         measures.append(Measure(f'recorded frames accepted {how}', share(trials, 'accepted'),
