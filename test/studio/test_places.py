@@ -69,6 +69,7 @@ def test_a_search_is_stopped_and_grows_old(studio):
     studio.stop_search()
     thread.join()
     assert studio.places is None
+    studio.allow_search()
     studio.search_places()
     assert not studio.is_stale and studio.share == 1.0
     document.edit(edits.delete, ['cup_0'])

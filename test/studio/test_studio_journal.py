@@ -87,7 +87,7 @@ def test_edits_of_another_content_are_set_aside(path):
     document = Document(path)
     assert document.landmarks['cup_1'].label == 'theirs'
     (note,) = document.notes
-    aside = path.with_name(re.search(r'lie in (\S+)', note)[1])
+    aside = path.with_name(re.search(r'kept in (\S+)', note)[1])
     assert '"mine"' in aside.read_text()
 
 

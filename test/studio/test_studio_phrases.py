@@ -89,7 +89,7 @@ def test_a_new_landmark_has_the_mean_of_its_boxes(path, tmp_path):
     file, embeddings = observed(tmp_path, 'bowl_1')
     new = tmp_path / 'new.yaml'
     studio = opened(new, '--observations', file, *CLIP)
-    for view in np.flatnonzero(np.diff(studio.recording.detections.frame_offsets)):
+    for view in np.flatnonzero(np.diff(studio.recording.detections.frame_offsets)).tolist():
         studio.show_view(view)
         box = studio.recording.detections.detections_of(view).bboxes_xyxy[0]
         studio.new.draw(view, box[:2], box[2:])

@@ -20,14 +20,15 @@ class Background[Answer]:
         self._wanted: tuple[Hashable, Callable[[], Answer]] | None = None
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
+        self._is_stopped = False
 
     def ask(self, key: Hashable, find: Callable[[], Answer]) -> Answer | None:
         """Return the answer to a question that a key tells from others; None until it is found.
 
-        ``find`` returns the answer, and raises nothing.
+        ``find`` returns the answer, and raises nothing. After a stop, no answer is looked for.
         """
         with self._lock:
-            if key not in self._answers:
+            if key not in self._answers and not self._is_stopped:
                 self._wanted = key, find
                 if self._thread is None:
                     self._thread = threading.Thread(target=self._work, daemon=True)
@@ -35,9 +36,9 @@ class Background[Answer]:
             return self._answers.get(key)
 
     def stop(self) -> None:
-        """Forget the question, and wait for the thread."""
+        """Forget the question, take no others, and wait for the thread."""
         with self._lock:
-            self._wanted, thread = None, self._thread
+            self._is_stopped, self._wanted, thread = True, None, self._thread
         if thread is not None:
             thread.join()
 

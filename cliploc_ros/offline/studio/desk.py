@@ -22,7 +22,8 @@ from cliploc_ros.offline.studio.edits import EditError
 from cliploc_ros.offline.studio.studio import Studio
 from cliploc_ros.offline.studio.viewpoint import Bounds, extent_of
 
-_MAX_LINES = 60
+# Lines of the log, and characters of each.
+_MAX_LINES, _MAX_TEXT = 60, 600
 # How long stopping waits for an action that takes long.
 _GRACE_S = 2.0
 # After these, the camera of the person flies to the selection.
@@ -46,7 +47,7 @@ class Desk:
         The mode of each person's page.
     """
 
-    ACTIONS = ('mode', 'show_layer', 'export')
+    ACTIONS = ('show_layer', 'export')
     LOOKS = ('fly', 'overview', 'from_above', 'look_through', 'look_at_robot', 'flatten')
 
     def __init__(self, studio: Studio, server: viser.ViserServer):
@@ -70,7 +71,7 @@ class Desk:
         values = dict(message)
         name = str(values.pop('do', ''))
         if name in self.LOOKS:
-            self.look(self._client_of(person), name, **values)
+            self.look(self._client_of(person), name, values.get('is_flat') is True)
         elif name == 'mode':
             self.show_mode(person, str(values.get('mode')))
         else:
@@ -101,7 +102,9 @@ class Desk:
             if not is_slow:
                 return action(**values)
             if name in self.running:
-                raise EditError(f'{name.replace("_", " ")}: this goes on; wait for it, or stop it')
+                raise EditError(f"'{name.replace('_', ' ')}' is already running")
+            if name == 'search_places':
+                studio.allow_search()  # before the thread begins: it may be stopped at once
             thread = threading.Thread(target=self._run, args=(name, action), daemon=True)
             with self._lock:
                 self.running = {**self.running, name: thread}
@@ -139,14 +142,17 @@ class Desk:
     def log(self, kind: str, text: str) -> None:
         """Add a line to the log."""
         with self._lock:
-            self.lines = (*self.lines, (kind, text))[-_MAX_LINES:]
+            self.lines = (*self.lines, (kind, text[:_MAX_TEXT]))[-_MAX_LINES:]
         self.studio.changed.set()
 
     # ---- the scene ------------------------------------------------------------------------------
 
     def show_layer(self, name: str, is_shown: bool) -> None:
         """Show or hide a layer of the scene."""
-        self.layers = {**self.layers, name: is_shown}
+        name = str(name)
+        if name not in self.layers:
+            raise EditError(f"the scene has no layer '{name:.60}'")
+        self.layers = {**self.layers, name: is_shown is True}
 
     def export(self) -> str:
         """Write the scene as one page that opens without a server."""

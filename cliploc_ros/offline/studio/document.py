@@ -217,7 +217,7 @@ class Document:
     # ---- the files ------------------------------------------------------------------------------
 
     def save(self) -> str:
-        """Write the map file in one step, and what it did; not over a foreign content.
+        """Write the map file in one step, and report it; refuse to overwrite others' changes.
 
         CliplocError: another program changed the file, the map is empty, or a file cannot be
         written; that one is as it was.
@@ -244,15 +244,19 @@ class Document:
             self._file = file
             self._saved = self.landmarks
             self._gesture = None
-            self.foreign = self._accepted = ''
+            self.foreign = ''
             self._journal.restart([self._header()])
             self.changed.set()
             return f'saved {self.path.name}'
 
     def overwrite(self) -> str:
         """Save the map over the foreign content that saving found."""
-        self._accepted = self.foreign
-        return self.save()
+        with self.lock:
+            self._accepted = self.foreign
+            try:
+                return self.save()
+            finally:
+                self._accepted = ''
 
     def reload(self) -> str:
         """Take the map from the file; this is an edit that undo takes back.
@@ -322,8 +326,8 @@ class Document:
                 done.append(entry)
         except (LookupError, TypeError, AttributeError, ValueError, CliplocError) as error:
             aside = self._journal.set_aside()
-            self.notes += (f'the last {len(edits) - len(done)} edits of an earlier session cannot '
-                           f'be restored ({error}); they lie in {aside.name}',)
+            self.notes += (f'could not restore the last {len(edits) - len(done)} edits of an '
+                           f'earlier session ({error}); they are kept in {aside.name}',)
             self._journal.restart([header, *done])
         if not starts:
             self._journal.restart([header])
@@ -335,7 +339,8 @@ class Document:
         """Restore the marks and looks that belong to the file's content.
 
         Marks come from the header and, where a content was written since, the edits before it.
-        Looks that a save replaced before it was cut off come from the last entry.
+        Looks that a save replaced before it was cut off come from the last entry, unless an
+        earlier version wrote it: it named them only.
         """
         marks: dict[str, Any] = {}
         for entry in entries:
@@ -344,5 +349,6 @@ class Document:
         looks = {} if last == entries[-1:] else last[0].get('looks', {})
         self.landmarks = self._saved = {
             key: replace(one, marks=Marks(**marks.get(key, {})),
-                         look=Encoded.from_json(looks[key]) if key in looks else one.look)
+                         look=(Encoded.from_json(looks[key]) if isinstance(looks.get(key), dict)
+                               else one.look))
             for key, one in self.landmarks.items()}

@@ -71,10 +71,15 @@ def change_from_json(tree: Mapping[str, Any], landmarks: Landmarks) -> Change:
     LookupError, TypeError, AttributeError, ValueError or MapError: it is none, or a landmark is
     invalid.
     """
-    after = {key: one and Landmark(
-        one['fields'], Marks(**one['marks']),
-        one['look'] and Encoded.from_json(one['look']) if 'look' in one else landmarks[key].look)
-        for key, one in tree['after'].items()}
+    def look_of(key: str, look: Any) -> Encoded | None:
+        if isinstance(look, str):
+            return landmarks[key].look if key in landmarks else None
+        return look and Encoded.from_json(look)
+
+    # earlier versions wrote a key of the look, or nothing: the present look stays
+    after = {key: one and Landmark(one['fields'], Marks(**one['marks']),
+                                   look_of(key, one.get('look', '')))
+             for key, one in tree['after'].items()}
     if valid := {key: one for key, one in after.items() if one is not None}:
         map_of(valid)
     return Change(str(tree['what']), after)
@@ -91,6 +96,20 @@ def _change_of(what: str, landmarks: Landmarks, after: Mapping[str, Landmark | N
         if landmark is not None:
             map_of({landmark_id: landmark}, source=what)
     return Change(what[:80], changed)
+
+
+def numbers(value: Any, count: int, what: str) -> list[float]:
+    """Return the numbers of a page's message; EditError: it has others than finite numbers.
+
+    ``what`` names the value in the error.
+    """
+    try:
+        found = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        found = np.empty(0)
+    if found.shape != (count,) or not np.isfinite(found).all():
+        raise EditError(f'{what}: expected {count} finite numbers, not {value!r:.60}')
+    return list(found.tolist())
 
 
 # ---- edits; EditError: a landmark is unknown or locked; MapError: a value is invalid ------------

@@ -7,6 +7,7 @@ box, or where the ellipsoid that fits two or more projects to.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,10 +53,13 @@ class NewLandmark:
         # the next views since the last box
         self._offered: list[int] = []
 
-    def draw(self, view: int, corner: Sequence[float], other: Sequence[float]) -> str:
+    def draw(self, view: int, corner: Any, other: Any) -> str:
         """Put a box into a view, between two opposite corners (2,) [px]."""
+        if type(view) is not int or not 0 <= view < len(self._recording.detections):
+            raise EditError(f'there is no view {view!r:.60}')
+        corners = [edits.numbers(one, 2, 'corner') for one in (corner, other)]
         camera = self._recording.detections.camera_of(view)
-        low, high = np.clip(np.sort([corner, other], axis=0), 0.0, (camera.width, camera.height))
+        low, high = np.clip(np.sort(corners, axis=0), 0.0, (camera.width, camera.height))
         if not (high - low).min() >= MIN_BOX_PX:
             raise EditError(f'the box is smaller than {MIN_BOX_PX:g} pixels; drag from corner to '
                             'corner')
@@ -98,7 +102,7 @@ class NewLandmark:
         """Create a landmark from the boxes, and select it."""
         document, recording = self._document, self._recording
         fit, warning = self._fit()
-        of = label, class_id, fit.center, fit.basis
+        of = str(label), str(class_id), fit.center, fit.basis
         change = edits.create(document.landmarks, *of)
         (landmark_id,) = change.after
         rows = recording.boxes_of(change.apply(document.landmarks))[landmark_id]

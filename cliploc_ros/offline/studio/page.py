@@ -10,6 +10,7 @@ So all browsers show the same state, and a slow one delays no edit.
 """
 
 import io
+import logging
 import threading
 import time
 from collections.abc import Iterator
@@ -51,6 +52,8 @@ _MISSING_SCALE = 1.3
 # Between the clicks of a double click [s].
 _DOUBLE_CLICK_S = 0.6
 
+logger = logging.getLogger(__name__)
+
 
 class Page:
     """The studio in the browser."""
@@ -89,11 +92,11 @@ class Page:
         threading.Thread(target=self._load_cloud, args=(extent,), daemon=True).start()
 
     def stop(self) -> None:
-        """Stop the searches and redrawing."""
-        self.desk.stop()
+        """Stop redrawing, which asks for answers, and then the searches."""
         self._stopped.set()
         self._studio.changed.set()
         self._redrawer.join()
+        self.desk.stop()
 
     def _load_cloud(self, extent: viewpoint.Bounds) -> None:
         """Read the surfaces, which takes seconds, while people use the page."""
@@ -103,7 +106,8 @@ class Page:
         except CliplocError as error:
             self.desk.log('refused', f'no surfaces: {error}')
         if self._cloud is not None:
-            self.desk.show_layer('Surfaces', True)
+            with studio.document.lock:
+                self.desk.layers = {**self.desk.layers, 'Surfaces': True}
             studio.changed.set()
 
     # ---- what a person does in the scene --------------------------------------------------------
@@ -138,8 +142,11 @@ class Page:
 
     def _redraw_always(self) -> None:
         while not self._stopped.is_set():
-            with self._studio.document.lock, self._server.atomic():
-                self._redraw()
+            try:
+                with self._studio.document.lock, self._server.atomic():
+                    self._redraw()
+            except Exception:
+                logger.exception('the page was not redrawn')  # the next change redraws it
             self._stopped.wait(_REDRAW_INTERVAL_S)
             self._studio.changed.wait()
             self._studio.changed.clear()
@@ -172,9 +179,10 @@ class Page:
                                 if key in document.landmarks}, lambda class_id: _MISSING_RGB)
             is_here = state.pose is not None and state.pose.frame_id == document.frame_id
             show('Robot', state if is_here else None, draw_robot)
+        # the pages need not wait for the image of the scene
+        self.board.show(parts_of(self.desk))
         if recording is not None:
             show('Image', studio.view, self._draw_image)
-        self.board.show(parts_of(self.desk))
 
     def _draw_image(self, scene: viser.SceneApi, view: int) -> list[Any]:
         camera, image = self._studio.camera, None

@@ -20,8 +20,6 @@ _MAX_OUTLINES = 200
 _CROP_PX, _QUALITY = 160, 88
 # Answers that are listed after a run over the recording.
 _MAX_ANSWERS = 100
-# Between the pictures of the film [s].
-_PICTURE_S = 0.2
 
 
 def parts_of(desk: Desk) -> dict[str, Any]:
@@ -32,7 +30,8 @@ def parts_of(desk: Desk) -> dict[str, Any]:
         'file': {
             'name': document.path.name, 'frame': document.frame_id, 'is_saved': document.is_saved,
             'notes': document.notes, 'undo': document.to_undo, 'redo': document.to_redo,
-            'conflict': bool(document.foreign), 'views': studio.views, 'step': _film_step(studio),
+            'conflict': bool(document.foreign), 'views': studio.views,
+            'step': 1 if studio.recording is None else studio.recording.film_step,
             'has_boxes': review.has_boxes, 'images': studio.recording is not None
             and studio.recording.images is not None,
             'classes': sorted({one.class_id for one in document.landmarks.values()})},
@@ -55,14 +54,6 @@ def parts_of(desk: Desk) -> dict[str, Any]:
     if studio.recording is not None:
         found |= _view_parts(studio)
     return found
-
-
-def _film_step(studio: Studio) -> int:
-    """Return how many views the film goes on with each picture."""
-    if studio.recording is None or studio.views < 2:
-        return 1
-    interval_s = np.median(np.diff(np.unique(studio.recording.detections.stamps_s)))
-    return max(1, round(_PICTURE_S / max(float(interval_s), 1e-3)))
 
 
 def _selected_part(studio: Studio) -> dict[str, Any] | None:
@@ -131,8 +122,8 @@ def picture_of(studio: Studio, path: str) -> Content | None:
     if image is None:
         return None
     if kind == 'crop' and (large := max(image.shape) / _CROP_PX) > 1.0:
-        image = cv2.resize(image, None, fx=1.0 / large, fy=1.0 / large,
-                           interpolation=cv2.INTER_AREA)
+        height, width = (max(1, round(side / large)) for side in image.shape[:2])
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     done, content = cv2.imencode('.jpg', image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     assert done
     return Content(content.tobytes(), '.jpg', True)

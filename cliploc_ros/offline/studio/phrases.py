@@ -44,16 +44,25 @@ class PhraseFinder:
 
     def __init__(self, clip: ClipOptions, vocabulary: Vocabulary, recording: Recording | None):
         self._clip, self._vocabulary, self._recording = clip, vocabulary, recording
+        self._fault: FoundPhrases | None = None
 
     def find(self, landmarks: Landmarks, landmark_id: str) -> FoundPhrases:
-        """Return the phrases for a landmark, or why there are none."""
+        """Return the phrases for a landmark, or why there are none.
+
+        Weights that cannot be loaded are not tried again: the fault answers for all landmarks.
+        """
+        if self._fault is not None:
+            return self._fault
         try:
             return self._find(landmarks, landmark_id)
         except CliplocError as error:
-            return FoundPhrases((), f'CLIP offers no phrases: {error}')
+            found = FoundPhrases((), f'CLIP offers no phrases: {error}')
         except Exception as error:  # of torch, open_clip: the page shows it and goes on
             logger.exception('CLIP finds no phrases for %s', landmark_id)
-            return FoundPhrases((), f'CLIP offers no phrases: {type(error).__name__}: {error}')
+            found = FoundPhrases((), f'CLIP offers no phrases: {type(error).__name__}: {error}')
+        if '_weights' not in vars(self):
+            self._fault = found
+        return found
 
     @cached_property
     def _weights(self) -> ClipWeights:

@@ -45,6 +45,8 @@ from cliploc_ros.offline.studio.landmark import Encoded, Landmarks, looks_of, ma
 LEAST_BOXES = 3
 # What is looked at around a box, as a share of its size.
 _MARGIN = 0.25
+# Between the pictures of the film [s].
+_PICTURE_S = 0.2
 
 
 class Outline(NamedTuple):
@@ -66,6 +68,14 @@ class Recording:
     def views(self) -> Views:
         """The arrays that the kernels of mapping read."""
         return make_views(self.detections)
+
+    @cached_property
+    def film_step(self) -> int:
+        """How many views the film goes on with each picture."""
+        gaps_s = np.diff(np.unique(self.detections.stamps_s))
+        if not len(gaps_s):
+            return 1
+        return max(1, round(_PICTURE_S / max(float(np.median(gaps_s)), 1e-3)))
 
     def witness(self, landmark_map: LandmarkMap) -> Witness:
         """Return what the boxes say of a map."""
@@ -119,9 +129,12 @@ class Recording:
         return self.images.of(self.detections, view)
 
     def crop(self, view: int, box: NDArray[np.float64]) -> NDArray[np.uint8] | None:
-        """Return what a box (4,) [px] and a margin around it show; None without the image."""
+        """Return what a box (4,) [px] and a margin around it show.
+
+        None without the image, or for a box that is not finite.
+        """
         image = self.image(view)
-        if image is None:
+        if image is None or not np.isfinite(box).all():
             return None
         around = _MARGIN * (box[2:] - box[:2]).max()
         height, width = image.shape[:2]

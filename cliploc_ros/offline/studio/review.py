@@ -130,6 +130,8 @@ class ReviewQueue:
 
     def step(self, count: int) -> None:
         """Select the landmark that lies some places farther in the queue."""
+        if type(count) is not int:
+            raise EditError(f'step: expected a whole number, not {count!r:.60}')
         ids = [key for key in self.order if key in self._document.landmarks]
         if not ids:
             raise EditError('there are no landmarks')

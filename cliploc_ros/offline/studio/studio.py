@@ -130,7 +130,8 @@ class Studio:
 
     def show_view(self, view: int) -> None:
         """Select a view; a number beyond the last one selects the last one."""
-        self.view = max(0, min(int(view), self.views - 1))
+        view = int(edits.numbers([view], 1, 'view')[0])
+        self.view = max(0, min(view, self.views - 1))
         self.changed.set()
 
     def next_view(self) -> None:
@@ -142,9 +143,9 @@ class Studio:
     def sightings(self, landmark_id: str) -> list[Sighting] | None:
         """Return the best views of a landmark; None until they are found."""
         recording, landmarks = self.recording, self.document.landmarks
+        known = self._sightings[1] if landmark_id == self._sightings[0] else None
         # a landmark that is being dragged keeps those that it had
-        if recording is not None and not (
-                self.document.is_in_gesture and landmark_id == self._sightings[0]):
+        if recording is not None and (known is None or not self.document.is_in_gesture):
 
             def find() -> list[Sighting]:
                 try:
@@ -152,9 +153,11 @@ class Studio:
                 except CliplocError:  # an image that cannot be read; the view says so
                     return []
 
-            self._sightings = landmark_id, self._found_sightings.ask(
+            found = self._found_sightings.ask(
                 (landmark_id, str(landmarks[landmark_id].fields)), find)
-        return self._sightings[1]
+            known = known if found is None else found
+            self._sightings = landmark_id, known
+        return known
 
     def color_of(self, class_id: str) -> Rgb:
         """Return the colour of a class; the first twenty classes of a map differ."""
@@ -168,15 +171,19 @@ class Studio:
                 if not one.marks.is_hidden}
 
     def select(self, id: str, joins: bool = False) -> None:
-        """Select a landmark; or add it to the selection, or take it out."""
+        """Select a landmark, or toggle it in the selection."""
+        id = str(id)
         others = [key for key in self.document.selection if key != id] if joins else []
         is_chosen = joins and id in self.document.selection
         self.document.select(others if is_chosen else [*others, id])
 
-    def edit(self, field: str, value: str | Sequence[float], gesture: object = None
-             ) -> str | None:
+    def edit(self, field: str, value: Any, gesture: object = None) -> str | None:
         """Set a field of the selected landmark, its angles [deg], or move it by some metres."""
         key, one = self.document.only_chosen()
+        is_text = field in ('label', 'class_id')
+        if not is_text and field not in ('center', 'by', 'angles', 'semi_axes'):
+            raise EditError(f"a landmark has no field '{field!s:.60}'")
+        value = str(value) if is_text else edits.numbers(value, 3, field)
         values: dict[str, Any] = {field: value}
         if field == 'angles':
             values = {'orientation': Rotation.from_euler('xyz', value, degrees=True).as_quat()}
@@ -184,7 +191,7 @@ class Studio:
             values = {'center': np.add(one.center, value)}
         change = self.document.edit(edits.set_fields, [key], **values,
                                     gesture=(field, key, gesture))
-        return f'{key}: {change.what}' if isinstance(value, str) and change.after else None
+        return f'{key}: {change.what}' if is_text and change.after else None
 
     def delete(self) -> str:
         """Delete the selection."""
@@ -194,19 +201,23 @@ class Studio:
 
     def lock(self, ids: Sequence[str] | None = None) -> str:
         """Lock landmarks, by default the selection; unlock them if all are locked."""
-        return self._toggle(ids, 'is_locked', 'lock', 'unlock')
+        return self._toggle(ids, 'is_locked', ('lock', 'locked'), ('unlock', 'unlocked'))
 
     def hide(self, ids: Sequence[str] | None = None) -> str:
         """Hide landmarks, by default the selection; show them if all are hidden."""
-        return self._toggle(ids, 'is_hidden', 'hide', 'show')
+        return self._toggle(ids, 'is_hidden', ('hide', 'hid'), ('show', 'showed'))
 
-    def _toggle(self, ids: Sequence[str] | None, name: str, on: str, off: str) -> str:
-        """Set a mark, or clear it where all have it."""
+    def _toggle(self, ids: Sequence[str] | None, name: str, on: tuple[str, str],
+                off: tuple[str, str]) -> str:
+        """Set a mark, or clear it where all have it; a verb and its past tell of each."""
+        if ids is not None and not (isinstance(ids, list)
+                                    and all(isinstance(key, str) for key in ids)):
+            raise EditError(f'{on[0]}: expected a list of ids, not {ids!r:.60}')
         ids, landmarks = ids or self.document.chosen(), self.document.landmarks
         have_it = all(getattr(landmarks[key].marks, name) for key in ids if key in landmarks)
-        what = off if have_it else on
+        what, past = off if have_it else on
         self.document.edit(edits.mark, ids, what, **{name: not have_it})
-        return f'{what} {", ".join(ids)}'
+        return f'{past} {", ".join(ids)}'
 
     def split(self) -> str:
         """Split the selected landmark along its longest axis, and select both halves."""
@@ -245,8 +256,9 @@ class Studio:
     def relocalize_here(self) -> str:
         """Relocalize in the selected view."""
         view, landmarks = self.view, self.document.landmarks
-        self.answers = self.seen().relocalize(landmarks, [view], self.layer)
-        ids, trial, result = list(landmarks), self.answers[view], self.answers[view].result
+        answers = self.seen().relocalize(landmarks, [view], self.layer)
+        self.answers = answers
+        ids, trial, result = list(landmarks), answers[view], answers[view].result
         assert result is not None
         found = ', '.join(ids[match.landmark] for match in result.matches)
         return '; '.join(filter(None, [
@@ -260,18 +272,19 @@ class Studio:
     def relocalize_all(self) -> str:
         """Relocalize in views along the trajectory, and compare with the time before."""
         views = sample_frames(self.seen().detections, _MAX_TRIALS).tolist()
-        self.answers = self.seen().relocalize(self.document.landmarks, views, self.layer)
-        before, self._counts = self._counts, count_verdicts(list(self.answers.values()))
+        answers = self.seen().relocalize(self.document.landmarks, views, self.layer)
+        self.answers = answers
+        before, self._counts = self._counts, count_verdicts(list(answers.values()))
         counts = ', '.join(f'{count} {verdict}' + (f' (was {before[verdict]})' if before else '')
                            for verdict, count in self._counts.items())
-        return f'{len(self.answers)} views: {counts}; similarities are simulated'
+        return f'{len(answers)} views: {counts}; similarities are simulated'
 
     def search_places(self) -> None:
         """Find where a robot would be accepted in the map, and places that look alike.
 
-        CliplocError: the map is empty, or the search was stopped; the last result stays.
+        CliplocError: the map is empty, or the search was stopped; the last result stays. After a
+        stop, ``allow_search`` comes before the next search.
         """
-        self._stopped.clear()
         self.share = 0.0
 
         def tell(share: float) -> None:
@@ -288,6 +301,10 @@ class Studio:
         """Stop the search of places."""
         self._stopped.set()
 
+    def allow_search(self) -> None:
+        """Let the next search of places go on; only a stop from now on ends it."""
+        self._stopped.clear()
+
     @property
     def is_stale(self) -> bool:
         """Whether the map was edited since the last search of places."""
@@ -296,15 +313,18 @@ class Studio:
 
     def relocalize_robot(self) -> str:
         """Let the running relocalizer relocalize."""
-        assert self.live is not None
-        return self.live.relocalize()
+        return self._robot().relocalize()
 
     def reload_robot(self) -> str:
         """Let the running relocalizer read its map again."""
-        assert self.live is not None
-        message = self.live.reload_map()
+        message = self._robot().reload_map()
         return message if self.document.is_saved else (
             f'{message}; without the edits not saved here')
+
+    def _robot(self) -> 'LiveRelocalizer':
+        if self.live is None:
+            raise EditError('no relocalizer is connected: start the studio with --ros')
+        return self.live
 
     def phrases(self, landmark_id: str) -> FoundPhrases:
         """Return up to five phrases for a landmark: CLIP's, or else the map's."""

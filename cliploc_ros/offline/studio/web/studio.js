@@ -127,7 +127,7 @@ function show(changed) {
       name => `${name.replaceAll('_', ' ')} ...`).join(' ');
     if (wantsCheck && state.rows.length && mode === 'review') {
       wantsCheck = false;
-      if (!state.review.total) send('check');
+      if (!state.review.total && !state.review.running.includes('check')) send('check');
     }
   }
 }
@@ -252,7 +252,7 @@ const PANELS = {
         : el('p', {className: 'note done'}, 'no fault found')) : note(one && 'new since the check'),
       one?.support != null ? note(`in ${one.support} ${one.support === 1 ? 'frame' : 'frames'}`
         + (one.ratio === null ? '' : `, ${Math.round(100 * one.ratio)} % of those that should show it`)) : null,
-      done === total ? buttons(button('Check again', doing('check'))) : null];
+      done === total ? buttons(button('Check again', doing('check'), {off: busy})) : null];
   },
   edit() {
     const {ids, one} = state.selection, boxes = state.file.has_boxes;
