@@ -80,7 +80,7 @@ def test_recorded_detections(shared_data, start, tester, tmp_path):
         if truth is not None:
             errors_m[stamp] = pose_error(poses[0], truth)[0] if poses else np.inf
             wrong += answer.success and errors_m[stamp] > 1.0
-    shares = [float(np.mean(np.array(list(errors_m.values())) < limit)) for limit in (0.25, 0.5, 1.0)]
+    shares = [float(np.mean(np.array([*errors_m.values()]) < limit)) for limit in (0.25, 0.5, 1.0)]
     print(f'\n{len(errors_m)} frames with ground truth: success at .25 / .5 / 1 m {shares}, '
           f'{wrong} accepted and wrong')
     limits = yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['recording'][
