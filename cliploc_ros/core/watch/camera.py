@@ -173,6 +173,7 @@ def _robust_mean(turns: deque[_Turn]) -> tuple[NDArray[np.float64], NDArray[np.f
     mean = np.median(vectors, axis=0)
     for _ in range(_ROUNDS):
         off = vectors - mean
+        # 3 axes: a deviation on each has half the weight
         weights = 1.0 / (1.0 + np.einsum('ni,nij,nj->n', off, informations, off) / 3.0)
         weighted = weights[:, None, None] * informations
         total = np.linalg.inv(weighted.sum(axis=0))

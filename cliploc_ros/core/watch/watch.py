@@ -57,8 +57,7 @@ class Belief:
 
     def __init__(self) -> None:
         self._log_odds = 0.0
-        self._looks: deque[_Look] = deque(
-            maxlen=int(CALIBRATION.watch.most_looks))
+        self._looks: deque[_Look] = deque(maxlen=int(CALIBRATION.watch.most_looks))
         self._last: tuple[Observation, NDArray[np.float64]] | None = None
         #: Whether the localizer made another statement since it was right last
         self.has_jumped = False
