@@ -42,6 +42,8 @@ from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.core.succession import FilterState, succeed
 from cliploc_ros.units import NS_PER_S
 
+# These are limits of time, so not in calibration.yaml. How sure a pose from a part of the crops
+# has to be is there, see its section search.
 #: Crops between two searches. A search takes less time than one crop of most networks on a CPU.
 BATCH = 4
 # Time that a request needs after its last crops [s]: for a search, which may take most of a fifth

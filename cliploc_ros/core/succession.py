@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import moved_pose
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,
@@ -26,7 +27,8 @@ from cliploc_ros.core.geometry.transforms import (
 # Odometry as a random walk: deviation on each axis after a metre and after a radian, the share of
 # cliploc_ros.core.fit.covariance. A filter that trusts its odometry less is less certain, not
 # wrong.
-_DRIFT = 0.03
+_DRIFT = CALIBRATION.covariance.odometry_drift
+# These are not in calibration.yaml: what a filter is given decides about no pose.
 # Answers further apart than this quantile contradict each other.
 _CONTRADICTION = float(chi2.ppf(0.99, 6))
 # An answer keeps this share of its information in directions in which it says nothing new: a

@@ -35,9 +35,12 @@ class Calibration(NamedTuple):
     #: Log odds that a recognized place is there, and no picture of it
     genuine: Terms
     attitude: Terms  #: The evidence of an attitude against a pose
+    mirror: Terms  #: How a pose of the mirrored image is found
     places: Terms  #: Log odds between places that look alike
+    twins: Terms  #: Which places of a map look alike
     prior: Terms  #: What a region says
     search: Terms  #: When a search is enough
+    refusals: Terms  #: Which cause a refusal names
     looks: Terms  #: What successive looks must agree on
     camera: Terms  #: Errors of a camera and its boxes, and when they are too large
     covariance: Terms  #: How covariances count

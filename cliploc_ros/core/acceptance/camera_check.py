@@ -59,7 +59,8 @@ _RIGHT = np.array([_TERMS.focal, _TERMS.aspect, _TERMS.point, _TERMS.point, _TER
                    _TERMS.corner, _TERMS.size])
 #: Deviations of the errors of a right camera_info.
 CALIBRATED = np.where(np.arange(ERRORS) < 4, _TERMS.calibrated * _RIGHT, 0.0)
-_WRONG = np.array([0.5, 0.3, 0.3, 0.3, 0.4, 0.4, 0.4])
+_WRONG = np.array([_TERMS.wrong_focal, _TERMS.wrong_aspect, _TERMS.wrong_point, _TERMS.wrong_point,
+                   _TERMS.wrong_corner, _TERMS.wrong_corner, _TERMS.wrong_size])
 # The errors that are large in each kind of wrong camera, the others are those of a right one.
 _KINDS = {'image': (0, 2, 3), 'focal length': (0,), 'aspect': (1,), 'principal point': (2, 3),
           'stretched image': (0, 1, 2, 3), 'convention': (4, 5), 'size': (6,)}
@@ -70,28 +71,7 @@ _DEVIATIONS = np.array([_RIGHT, *(np.where(np.isin(np.arange(ERRORS), errors), _
 _LOG_DEVIATIONS = np.log(_DEVIATIONS).sum(axis=1)
 _WEIGHTS = np.array([1.0 - _TERMS.wrong, *[_TERMS.wrong / len(_KINDS)] * len(_KINDS)])
 _PRIORS = _DEVIATIONS[:, :, None] ** -2.0 * np.eye(ERRORS)
-# Mean square of the residuals before any is seen, and how many residuals this counts as.
-_PRIOR_SQUARE, _PRIOR_RESIDUALS = 1.0, 6.0
-# An edge that is nearer to the border of the image is cut by it [px].
-_BORDER_PX = 2.0
-_MOST_VIEWS = 60
-# Log odds of a right camera after two to five views; no single look at a wrong one had less on TUM
-# fr3, see studies/camera.py.
-_FITS = -2.0
-# A camera_info with intrinsics that differ by less is the same: an autofocus moves.
-_SAME_CAMERA = 0.01
-# Boxes to remember; those that overlap by more are one box.
-_MOST_BOXES, _SAME_BOX_IOU = 200, 0.8
-# A line that cuts boxes is within the image if it is further from its border than this share.
-_INSIDE = 0.1
-# The least density of the ends of boxes that are not cut, as a multiple of their mean density, and
-# the share of the image in which it is measured.
-_LEAST_DENSITY, _NEAR_SHARE = 4.0, 0.1
-# Share of boxes whose middle is beyond the image, by mistake.
-_BEYOND = 0.01
-# Instants that are remembered, for the mounts.
-_MOST_INSTANTS = 20
-# No box that was recorded reaches further.
+# No box that was recorded reaches further: a file with one that does is broken.
 _FAR = 1e9
 
 
@@ -182,12 +162,13 @@ def looks_of(joined: JoinedFrames, pose: Finalist) -> list[CameraLook]:
         rotation, translation = camera_pose(joined.rig.cameras[number], pose.rotation,
                                             pose.translation)
         rows = (frame.scene.box_ellipses == pairs[:, None, :4]).all(axis=2).argmax(axis=1)
-        low, high = _BORDER_PX, np.array([seen.camera.width, seen.camera.height]) - _BORDER_PX
+        low = _TERMS.border_px
+        high = np.array([seen.camera.width, seen.camera.height]) - low
         left, top, right, bottom = seen.detections.bboxes_xyxy[rows].T
         is_edge = np.stack([left > low, right < high[0], top > low, bottom < high[1]], axis=1)
         fit = fit_camera(pairs, is_edge, vertical, rotation, translation, _WRONG)
-        square = max(1.0, (fit.square + _PRIOR_SQUARE * _PRIOR_RESIDUALS)
-                     / (max(0, int(is_edge.sum()) - 6 - ERRORS) + _PRIOR_RESIDUALS))
+        square = max(1.0, (fit.square + _TERMS.prior_square * _TERMS.prior_residuals)
+                     / (max(0, int(is_edge.sum()) - 6 - ERRORS) + _TERMS.prior_residuals))
         information = fit.information / square
         vector = information @ fit.errors + fit.errors / _WRONG ** 2 / square
         if not np.isfinite([*information.ravel(), *vector]).all():
@@ -224,7 +205,7 @@ class Views(NamedTuple):
 
     def joined(self, other: 'Views') -> 'Views':
         """Return these views and others, of which the last ones remain."""
-        return Views(*(np.concatenate(both)[-_MOST_VIEWS:]
+        return Views(*(np.concatenate(both)[-int(_TERMS.most_views):]
                        for both in zip(self, other, strict=True)))
 
     def odds(self, extent: float = 0.0) -> CameraOdds:
@@ -244,8 +225,8 @@ class Extent:
         high = np.minimum(boxes[:, None, 2:], self.boxes[:, 2:])
         shared = np.maximum(high - low, 0.0).prod(axis=2)
         areas, known = ((one[:, 2:] - one[:, :2]).prod(axis=1) for one in (boxes, self.boxes))
-        is_known = (shared > _SAME_BOX_IOU * (areas[:, None] + known - shared)).any(axis=1)
-        self.boxes = np.concatenate([self.boxes, boxes[~is_known]])[-_MOST_BOXES:]
+        is_known = (shared > _TERMS.same_box * (areas[:, None] + known - shared)).any(axis=1)
+        self.boxes = np.concatenate([self.boxes, boxes[~is_known]])[-int(_TERMS.most_boxes):]
 
     @property
     def reach(self) -> NDArray[np.float64]:
@@ -261,14 +242,14 @@ class Extent:
         reaches = np.hstack([self.boxes[:, 2:], size - self.boxes[:, :2]])
         lines, lengths = reaches.max(axis=0), np.tile(size, 2)
         # others that end at the same line, and the density of those that end near it
-        ends = (reaches > lines - _BORDER_PX).sum(axis=0) - 1
-        near = (reaches > lines - _NEAR_SHARE * lengths).sum(axis=0) - ends
-        density = np.maximum(_LEAST_DENSITY * count, near / _NEAR_SHARE) / lengths
-        is_line = (lines < (1.0 - _INSIDE) * lengths) & (ends > 0)
+        ends = (reaches > lines - _TERMS.border_px).sum(axis=0) - 1
+        near = (reaches > lines - _TERMS.near_share * lengths).sum(axis=0) - ends
+        density = np.maximum(_TERMS.least_density * count, near / _TERMS.near_share) / lengths
+        is_line = (lines < (1.0 - _TERMS.inside) * lengths) & (ends > 0)
         middles = (self.boxes[:, :2] + self.boxes[:, 2:]) / 2
         beyond = int(((middles < 0.0) | (middles > size)).any(axis=1).sum())
-        chances = [*np.where(is_line, pdtrc(ends - 1, _BORDER_PX * density), 1.0),
-                   float(bdtrc(beyond - 1, count, _BEYOND)) if beyond else 1.0]
+        chances = [*np.where(is_line, pdtrc(ends - 1, _TERMS.border_px * density), 1.0),
+                   float(bdtrc(beyond - 1, count, _TERMS.beyond)) if beyond else 1.0]
         # a chance p is evidence of 1 / (2 sqrt(p)) at most (Vovk and Wang 2021)
         evidence = _log_mean(-0.5 * np.log(np.maximum(chances, 1e-99))) - math.log(2.0)
         return float(np.clip(evidence, 0.0, _TERMS.extent))
@@ -285,7 +266,7 @@ class _Record:
 
     def see(self, observation: Observation) -> None:
         """Take in the boxes of a frame, unless looks have verified the camera."""
-        if self.by_looks > _FITS or self.by_extent > 0.0:
+        if self.by_looks > _TERMS.fits or self.by_extent > 0.0:
             self.extent.add(observation.detections.bboxes_xyxy)
             self.by_extent = self.extent.log_odds(self.camera)
             self.odds = self.views.odds(self.by_extent)
@@ -300,8 +281,8 @@ class _Record:
             gain = self.views.joined(self.since).odds().log_odds - self.by_looks
             if gain > _TERMS.view:
                 self.views, self.since = self.views.joined(self.since), Views()
-            elif (gain < -_TERMS.view and self.since.odds().log_odds < _FITS
-                  and self.by_extent < -_FITS):
+            elif (gain < -_TERMS.view and self.since.odds().log_odds < _TERMS.fits
+                  and self.by_extent < -_TERMS.fits):
                 self.views, self.since = self.since, Views()
         self.odds, self.by_looks = self.views.odds(self.by_extent), self.views.odds().log_odds
 
@@ -365,7 +346,8 @@ class CameraCheck:
 
     def __init__(self) -> None:
         self._records: dict[str, _Record] = {}
-        self._instants: deque[dict[str, tuple[int, int]]] = deque(maxlen=_MOST_INSTANTS)
+        self._instants: deque[dict[str, tuple[int, int]]] = deque(
+            maxlen=int(_TERMS.most_instants))
 
     def copied(self) -> 'CameraCheck':
         """Return what the looks so far say; it stays as it is."""
@@ -448,7 +430,7 @@ class CameraCheck:
             others_known, others_matched = every - (known, matched)
             if (len(of_one) >= _TERMS.mount_instants and min(known, others_known)
                     >= _TERMS.mount_objects and matched < _TERMS.mount_share * known
-                    and matched / known < 0.5 * others_matched / others_known):
+                    and matched / known < _TERMS.mount_others * others_matched / others_known):
                 found.append(name)
         return found
 
@@ -458,5 +440,5 @@ def _is_same(one: Camera, other: Camera) -> bool:
     if one == other:
         return True
     changes = np.array([one.fx, one.fy, one.cx, one.cy]) - [other.fx, other.fy, other.cx, other.cy]
-    return bool(np.abs(changes).max() <= _SAME_CAMERA * one.fx) and one == replace(
+    return bool(np.abs(changes).max() <= _TERMS.same_info * one.fx) and one == replace(
         other, fx=one.fx, fy=one.fy, cx=one.cx, cy=one.cy)

@@ -55,14 +55,9 @@ from cliploc_ros.core.map.joined_map import Place, place_of
 from cliploc_ros.core.search.frame_search import constraint_of, coverage_of, match_frame
 from cliploc_ros.core.search.strategies import MAX_DISTINCT
 
-# The most poses of objects that propose keyframes.
-_MOST_GUESSES = 3
 _NO_LOOKS = Looks()
 _FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])
 _UP = np.array([0.0, 0.0, 1.0])
-# Planes that are tried, poses that are refined, and frames with matches that count, the last ones:
-# a camera mirrors them all. Chosen on mirrored images of TUM fr3.
-_MOST_PLANES, _REFINED, _MOST_FRAMES = 16, 2, 3
 
 
 def search_contenders(joined: JoinedFrames, finalists: Sequence[Finalist],
@@ -100,7 +95,8 @@ class Comparison:
         self._last, self._none = joined.frames[-1].observation, none_right(joined.setting)
         contenders, seen = list(met), None
         if recognizer is not None:
-            seen = recognizer.recognize([one.pose for one in contenders[:_MOST_GUESSES]],
+            guesses = contenders[:int(CALIBRATION.keyframes.guesses)]
+            seen = recognizer.recognize([one.pose for one in guesses],
                                         constraint_of(self._last, joined.options))
             if seen.is_complete:  # what keyframes near a pose do not recognize
                 places = np.array([one.map_from_camera for one in seen.places]).reshape(-1, 4, 4)
@@ -187,7 +183,8 @@ class Comparison:
         if self._by_keyframes is None or self.place is None:
             assert found is not None
             return found
-        doubt = max(1.0, CALIBRATION.keyframes.good_covariance / self.place.inliers) ** 4
+        terms = CALIBRATION.keyframes
+        doubt = max(1.0, terms.good_covariance / self.place.inliers) ** terms.doubt_power
         pose, covariance = self._by_keyframes.pose, doubt * self.place.covariance
         return (pose, covariance) if found is None or doubt == 1.0 else fuse(*found, pose,
                                                                              covariance)
@@ -367,7 +364,8 @@ def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.
 
 def _chance_not_mirrored(joined: JoinedFrames, best: Contender) -> float:
     """Return the probability that no mirror image explains the detections instead."""
-    first = [row for row, found in enumerate(best.matches) if found][-_MOST_FRAMES:][0]
+    terms = CALIBRATION.mirror
+    first = [row for row, found in enumerate(best.matches) if found][-int(terms.frames):][0]
     joined = join_frames(joined.landmark_map, joined.options, joined.frames[first:])
     matches = best.matches[first:]
     mirrored = _mirrored(joined)
@@ -375,7 +373,7 @@ def _chance_not_mirrored(joined: JoinedFrames, best: Contender) -> float:
         sorted({one.landmark for found in matches for one in found})]
     starts = [unrefined(pose) for pose in _reflections(centers) @ best.pose @ _FLIP]
     starts.sort(key=lambda one: -verify_rig(mirrored.rig, one.rotation, one.translation).score)
-    found = [refined(mirrored, one) for one in starts[:_REFINED]]
+    found = [refined(mirrored, one) for one in starts[:int(terms.refined)]]
     supports = supports_of(mirrored, np.array([one.map_from_camera for one in found]),
                            [matches_of(mirrored.rig, one) for one in found])
     own, = utilities([best.support] if len(joined.frames) == len(best.matches)
@@ -412,7 +410,8 @@ def _reflections(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     middle = points.mean(axis=0)
     triples = np.array([*combinations(range(len(points)), 3)], dtype=np.int64).reshape(-1, 3)
-    chosen = np.linspace(0, len(triples) - 1, min(_MOST_PLANES, len(triples))).astype(np.int64)
+    most = int(CALIBRATION.mirror.planes)
+    chosen = np.linspace(0, len(triples) - 1, min(most, len(triples))).astype(np.int64)
     first, second, third = np.moveaxis(points[triples[chosen]], 1, 0)
     normals = np.cross(second - first, third - first)
     lengths = np.linalg.norm(normals, axis=1)

@@ -50,7 +50,7 @@ from cliploc_ros.core.map.similarities import (
 from cliploc_ros.core.observation import Detections, Region
 from cliploc_ros.core.search.scene import Scene
 
-# No image reaches further [px].
+# No image reaches further [px]: areas stay finite.
 _FAR_PX = 1e6
 
 

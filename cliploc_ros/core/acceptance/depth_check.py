@@ -28,8 +28,6 @@ from cliploc_ros.core.fit.verification import Rig, camera_pose, verify_rig
 from cliploc_ros.core.geometry.depth import depth_odds
 
 _TERMS = CALIBRATION.depth
-# Accepted poses that are remembered.
-_MOST_POSES = 20
 
 
 class DepthCheck(NamedTuple):
@@ -50,7 +48,7 @@ class DepthScale:
     """Whether depth is off by a factor, as accepted poses of one camera show."""
 
     def __init__(self) -> None:
-        self._ratios: deque[float] = deque(maxlen=_MOST_POSES)
+        self._ratios: deque[float] = deque(maxlen=int(_TERMS.most_poses))
 
     def add(self, check: DepthCheck) -> None:
         """Count an accepted pose."""

@@ -27,19 +27,9 @@ from cliploc_ros.core.keyframes.localization import PER_RADIAN
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import find_pose
 
-#: Motions of right poses are no further off, in squared deviations (95 %, dof 6).
-SURE_MOTION = float(chi2.ppf(0.95, 6))
-# Distances of pictures from the first camera [m], and how many points are tried on them.
-_PICTURES_M, _MOST_POINTS = (1.0, 2.0, 3.0), 200
-# A camera sees points that are further ahead than this [m].
-_AHEAD_M = 0.1
-# Errors of the intrinsics count from the first number of deviations on, up to the second.
-_SURE_DEVIATIONS, _MOST_ERROR = 2.0, 0.25
-# Of the points, the part whose extent counts: a few wrong ones lie anywhere [%].
-_CENTRAL = (5.0, 95.0)
-# Pictures that are recognized show many features, places also a few. More than these say no more:
-# the rooms of the fit have few features.
-_MANY = 40
+_TERMS = CALIBRATION.genuine
+#: Motions of right poses are no further off, in squared deviations (dof 6).
+SURE_MOTION = float(chi2.ppf(_TERMS.sure_motion, 6))
 
 
 class Motion(NamedTuple):
@@ -78,12 +68,12 @@ def compare_motion(deviation_per_metre: float, first: RecognizedPlace, second: R
         step = pose_difference(expected, pose)
         return float(step @ information @ step)
     # where the second image is recognized if both show a picture that faced the first
-    points = first.points[::1 + len(first.points) // _MOST_POINTS]
+    points = first.points[::1 + len(first.points) // int(_TERMS.picture_points)]
     inside = (points - first.map_from_camera[:3, 3]) @ first.map_from_camera[:3, :3]
     picture = np.inf
-    for away_m in _PICTURES_M:
+    for away_m in (_TERMS.near_picture_m, _TERMS.picture_m, _TERMS.far_picture_m):
         moved = (away_m * inside / inside[:, 2:] - way) @ first_from_second[:3, :3]
-        ahead = moved[:, 2] > _AHEAD_M
+        ahead = moved[:, 2] > _TERMS.ahead_m
         seen = find_pose(points[ahead], moved[ahead, :2] / moved[ahead, 2:])
         picture = min(picture, np.inf if seen is None else square(seen.map_from_camera))
     return Motion(square(second.map_from_camera), picture)
@@ -118,14 +108,15 @@ def signs_of(place: RecognizedPlace, support: Support, boxes: NDArray[np.float64
     """
     size = np.array([camera.width, camera.height], dtype=np.float64)
     corners = np.clip(boxes.reshape(-1, 2), 0.0, size)
-    ends = np.vstack([corners, np.percentile(place.pixels, _CENTRAL, axis=0)]) \
+    central = _TERMS.central_from, _TERMS.central_to
+    ends = np.vstack([corners, np.percentile(place.pixels, central, axis=0)]) \
         if len(place.pixels) else corners
     return Signs(
-        math.log(min(max(1, place.inliers), _MANY)), place.confirmed,
+        math.log(min(max(1, place.inliers), _TERMS.most_features)), place.confirmed,
         _error(place.focal_ratio, place.focal_deviation),
         _error(place.aspect_ratio, place.aspect_deviation),
         float((np.ptp(ends, axis=0) / size).max()) if len(ends) else 0.0,
-        support.unexplained / (support.unexplained + support.inliers + 1.0),
+        support.unexplained / (support.unexplained + support.inliers + _TERMS.further_object),
         min(1.0, rival / max(1, place.inliers)))
 
 
@@ -143,4 +134,5 @@ def chance_genuine(signs: Signs, motion: Motion | None = None,
 
 def _error(ratio: float, deviation: float) -> float:
     """Return the logarithm of a ratio, less the part that its deviation explains."""
-    return min(max(abs(math.log(ratio)) - _SURE_DEVIATIONS * deviation, 0.0), _MOST_ERROR)
+    return min(max(abs(math.log(ratio)) - _TERMS.sure_deviations * deviation, 0.0),
+               _TERMS.most_error)

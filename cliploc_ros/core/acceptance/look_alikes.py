@@ -34,32 +34,18 @@ from cliploc_ros.core.geometry.transforms import (
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.pairs import find_repeats
 
-# All constants are chosen on simulated worlds, see studies.worlds: kinds room,
-# office, shop, corridor, hall and two rooms, seeds 0 to 59.
-# A place: landmarks that a pose matched, and those nearer to it than this; at most
-# _MOST_LANDMARKS of them.
-_PLACE_M, _AROUND, _MOST_LANDMARKS = 4.0, 48, 64
-# Landmarks whose repeats are looked up, repeats that are compared, and moves that are verified.
-_LOOKED_UP, _COMPARED, _MOVES = 32, 128, 6
+_TERMS = CALIBRATION.twins
 _SAME_TURN = np.cos(np.radians(SAME_MOVE.angle_deg))
 _OWN_TURN = np.cos(np.radians(SAME_ANSWER.angle_deg))
 # Both places are upright: one is moved onto the other by a turn about the vertical.
-_MOST_TILT = np.cos(np.radians(20.0))
+_MOST_TILT = np.cos(np.radians(_TERMS.most_tilt_deg))
 # How near a landmark must lie to one of its class, each time after the move is fitted [m].
-_NEAR_M = (0.6, 0.45, 0.3)
-# The share was chosen between a desk of 39 landmarks (TUM fr3) that repeats .36 of them by chance,
-# and two halls (seeds 1004 and 1006) that mislead and repeat .39 and .38.
-_LEAST_LANDMARKS, _LEAST_SHARE, _LEAST_MATCHED, _ENOUGH = 4, 0.38, 0.4, 0.48
-# Two places differ where they share less than the first number, and are alike from the second one
-# on: share of the objects that a pose explains, and of the landmarks around it.
-_ALIKE, _ALIKE_AROUND = (0.3, 0.45), (0.45, 0.6)
+_NEAR_M = (_TERMS.first_near_m, _TERMS.second_near_m, _TERMS.last_near_m)
 # Columns of Support.shown.
 _COUNT, _LIKENESS, _UNLABELLED = 0, 3, 5
-# The share of the matched landmarks that must lie on an axis, and turns about it [rad].
-_LEAST_ON_AXIS, _TURNS = 0.5, np.radians([45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0])
+# Turns about an axis [rad].
+_TURNS = np.radians(np.arange(_TERMS.axis_step_deg, 360.0, _TERMS.axis_step_deg))
 _UP = np.array([0.0, 0.0, 1.0])
-# The most twins of a pose, and poses of the search whose places are compared.
-_TWINS, _OTHERS = 3, 5
 _NOBODY, _NOWHERE = np.empty(0, dtype=np.int64), np.empty((0, 4, 4))
 
 
@@ -85,7 +71,7 @@ class Alike(NamedTuple):
         Whoever furnished them alike may have hung the same posters, too.
         """
         elsewhere = self.found & ~np.isin(self.others, self.landmarks)
-        return np.asarray(elsewhere.sum(axis=1) >= _LEAST_SHARE * len(self.landmarks))
+        return np.asarray(elsewhere.sum(axis=1) >= _TERMS.least_share * len(self.landmarks))
 
 
 def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
@@ -108,26 +94,28 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
         Moves to try besides those that the map suggests.
     """
     # those matched, then those around, the nearest first
-    ranks = [*range(1, min(_AROUND, len(landmark_map)) + 1)]
-    distances, rows = landmark_map.tree.query(position, ranks, distance_upper_bound=_PLACE_M)
+    ranks = [*range(1, min(int(_TERMS.around), len(landmark_map)) + 1)]
+    distances, rows = landmark_map.tree.query(position, ranks,
+                                              distance_upper_bound=_TERMS.radius_m)
     rows = rows[np.isfinite(distances)]
-    rows = np.concatenate([matched, rows[~np.isin(rows, matched)]])[:_MOST_LANDMARKS]
-    if len(rows) < _LEAST_LANDMARKS:
+    rows = np.concatenate([matched, rows[~np.isin(rows, matched)]])
+    rows = rows[:int(_TERMS.most_landmarks)]
+    if len(rows) < _TERMS.least_landmarks:
         return Alike(_NOWHERE, rows, np.empty((0, len(rows)), np.int64),
                      np.empty((0, len(rows)), np.bool_))
     moves, others, found = _verified(landmark_map, rows, np.concatenate(
         [_moves_of_map(landmark_map, rows), moves]), position)
     shares = found.mean(axis=1)
-    alike = shares >= _LEAST_SHARE
+    alike = shares >= _TERMS.least_share
     if len(matched):
         # what the image shows may have moved at a place that is alike all around
-        alike &= ((found[:, :len(matched)].mean(axis=1) >= _LEAST_MATCHED)
-                  | (shares >= _ENOUGH))
+        alike &= ((found[:, :len(matched)].mean(axis=1) >= _TERMS.least_matched)
+                  | (shares >= _TERMS.enough))
     ends = np.einsum('nij,rj->nri', moves[:, :3, :3], landmark_map.centers[rows])
     misses = np.linalg.norm(ends + moves[:, None, :3, 3] - landmark_map.centers[others], axis=2)
     order = np.lexsort([(misses * found).sum(axis=1), -shares])
     order = order[alike[order]]
-    order = order[first_of_each(_are_same(moves[order], position), _TWINS)]
+    order = order[first_of_each(_are_same(moves[order], position), int(_TERMS.most))]
     return Alike(moves[order], rows, others[order], found[order])
 
 
@@ -152,7 +140,7 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
         These places.
     """
     position = map_from_camera[:3, 3]
-    moves = others[:_OTHERS] @ invert_transform(map_from_camera)
+    moves = others[:int(_TERMS.others)] @ invert_transform(map_from_camera)
     moves = moves[moves[:, 2, 2] > _MOST_TILT]
     upright = _upright_moves(np.arctan2(moves[:, 1, 0], moves[:, 0, 0]), position,
                              moves[:, :3, :3] @ position + moves[:, :3, 3])
@@ -185,7 +173,7 @@ def turned_about_axis(landmark_map: LandmarkMap, map_from_camera: NDArray[np.flo
         offsets -= (offsets @ axis)[..., None] * axis
         share = np.linalg.norm(offsets, axis=2) <= radii
         best = int(np.argmax(share.sum(axis=1)))
-        if share[best].mean() >= _LEAST_ON_AXIS:
+        if share[best].mean() >= _TERMS.on_axis:
             turns = Rotation.from_rotvec(_TURNS[:, None] * axis).as_matrix()
             moves = np.tile(np.eye(4), (len(turns), 1, 1))
             moves[:, :3, :3] = turns
@@ -221,8 +209,9 @@ def lead_over_twin(its: Support, twin: Support, place_share: float = 0.0,
             else:
                 further, counts = further + said, counts + sign * row[_COUNT]
     share = sum(its.shown[one][_COUNT] for one in common) / max(its.inliers, 1e-9)
-    alike = max(float(np.interp(share, _ALIKE, (0.0, 1.0))),
-                float(np.interp(place_share, _ALIKE_AROUND, (0.0, 1.0))))
+    alike = max(
+        float(np.interp(share, (terms.differ, terms.alike), (0.0, 1.0))),
+        float(np.interp(place_share, (terms.differ_around, terms.alike_around), (0.0, 1.0))))
     most = min(abs(further), terms.unlabelled * abs(counts), terms.aged)
     if is_room:
         lead *= 1.0 - (1.0 - terms.labels) * alike
@@ -231,8 +220,8 @@ def lead_over_twin(its: Support, twin: Support, place_share: float = 0.0,
 
 def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the moves (m, 4, 4) of a place onto others for which most pairs vote."""
-    repeats = find_repeats(landmark_map.pairs, rows[:_LOOKED_UP])
-    order = np.argsort(-repeats.votes, kind='stable')[:_COMPARED]
+    repeats = find_repeats(landmark_map.pairs, rows[:int(_TERMS.looked_up)])
+    order = np.argsort(-repeats.votes, kind='stable')[:int(_TERMS.compared)]
     moves = _upright_moves(repeats.turns[order], landmark_map.centers[repeats.landmarks[order]],
                            landmark_map.centers[repeats.others[order]])
     if len(moves) == 0:
@@ -244,7 +233,7 @@ def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray
     ends = weights @ (moves[:, :3, :3] @ middle + moves[:, :3, 3]) / votes[:, None]
     moves = _upright_moves(np.arctan2(weights @ moves[:, 1, 0], weights @ moves[:, 0, 0]),
                            middle, ends)[np.argsort(-votes, kind='stable')]
-    return moves[first_of_each(_are_same(moves, middle), _MOVES)]
+    return moves[first_of_each(_are_same(moves, middle), int(_TERMS.moves))]
 
 
 def _upright_moves(turns: NDArray[np.float64], before: NDArray[np.float64],
@@ -274,7 +263,7 @@ def _verified(landmark_map: LandmarkMap, rows: NDArray[np.int64], moves: NDArray
     for near_m in _NEAR_M:
         ends = np.einsum('nij,rj->nri', moves[:, :3, :3], centers) + moves[:, None, :3, 3]
         others, found = landmark_map.of_class_near(ends, rows, near_m)
-        kept = found.sum(axis=1) >= _LEAST_LANDMARKS
+        kept = found.sum(axis=1) >= _TERMS.least_landmarks
         moves, others, found = moves[kept], others[kept], found[kept]
         if near_m > _NEAR_M[-1]:
             # The upright moves (m, 4, 4) that take points (r, 3) nearest to others (m, r, 3).

@@ -26,8 +26,6 @@ from cliploc_ros.core.geometry.transforms import SAME_LOOK, invert_transform
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.observation import Observation
 
-_MOST_RECOGNIZED = 3
-
 
 class Look(NamedTuple):
     """The best pose of one frame."""
@@ -58,7 +56,7 @@ class Looks:
         past, recognized = (_before(some, look.observation) if is_linked else ()
                             for some in (self.past, self.recognized))
         if look.recognized is not None:
-            recognized = (*recognized, look)[-_MOST_RECOGNIZED:]
+            recognized = (*recognized, look)[-int(CALIBRATION.looks.most_recognized):]
         return Looks(() if accepted else (*past, look)[-int(CALIBRATION.looks.most):], recognized)
 
     def confidences_in(self, observation: Observation, map_from_camera: NDArray[np.float64]

@@ -14,8 +14,6 @@ from cliploc_ros.core.acceptance.genuine import Motion, Signs, chance_genuine
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.options import RelocalizerOptions
 
-# A refusal does not mention less likely rivals.
-_LEAST_RIVAL = 0.001
 _LOOK_ABOUT = 'turn the camera to more objects'
 Point = tuple[float, float, float]
 
@@ -240,8 +238,9 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
     weakest = min(('likely', likely), *((name, getattr(evidence, name)) for name in _FACTORS),
                   ('found', found), key=lambda factor: factor[1])[0]
     # a rival has most of the missing probability, or nearly that of the pose
-    ambiguous = rival is not None and rival.likely > max(
-        _LEAST_RIVAL, min(0.9 * evidence.likely, 0.5 * (1.0 - evidence.likely)))
+    terms = CALIBRATION.refusals
+    ambiguous = rival is not None and rival.likely > max(terms.least_rival, min(
+        terms.of_leading * evidence.likely, terms.of_missing * (1.0 - evidence.likely)))
     # the twin may be among the rivals, too
     if evidence.twin is not None and evidence.distinct < options.min_confidence and (
             weakest == 'distinct' or (weakest == 'likely' and ambiguous)):

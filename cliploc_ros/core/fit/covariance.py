@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import gammainc
 
+from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.fit.camera_fit import ERRORS, camera_jacobian
 from cliploc_ros.core.fit.refinement import (
     LEAST_DEVIATION,
@@ -41,29 +42,13 @@ from cliploc_ros.core.fit.refinement import (
 from cliploc_ros.core.fit.verification import Rig, verify_rig
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_difference
 
+_TERMS = CALIBRATION.covariance
 #: Variance of a direction that the boxes do not fix: m^2 and rad^2.
-PRIOR_VARIANCES = (100.0, 100.0, 100.0, 10.0, 10.0, 10.0)
-# Deviation of odometry between two frames, on each axis: a floor, which covers stamps and
-# interpolation, a share of the way, and an angle for each metre. The shares are guesses: wheels
-# and visual odometry drift by 1 to 5 % of distance and angle. The floors were chosen on the TUM
-# frames, the angle for each metre by the wheels of a Husky (python -m studies.sensors).
-_ODOMETRY_FLOOR_M = 0.005
-_ODOMETRY_FLOOR_RAD = np.radians(0.25)
-_ODOMETRY_DRIFT = 0.03
-_ODOMETRY_RAD_PER_M = np.radians(0.15)
+PRIOR_VARIANCES = np.repeat([_TERMS.unfixed_m2, _TERMS.unfixed_rad2], 3)
 # A camera that moves less stands still: rounding [m and rad].
 _STANDS_STILL = 1e-9
-# Weights of the first pose that covariance intersection tries.
+# Weights of the first pose that covariance intersection tries: steps of a search for a minimum.
 _WEIGHTS = np.linspace(0.0, 1.0, 11)
-# Probability that an object is not where its match says. Chosen on simulated worlds (seeds 0 to
-# 59) together with the TUM frames.
-_WRONG_SHARE = 0.07
-# Deviation of a pose that lost an object [m and rad]: the others are not arbitrarily far, since an
-# accepted pose is right to 1 m and 45 degrees.
-_WITHOUT_M, _WITHOUT_RAD = 0.5, 0.5
-# Mean square of the residuals before any is seen, how many residuals this counts as, and the most
-# that a residual counts. Three boxes alone would seem to fit perfectly.
-_PRIOR_SQUARE, _PRIOR_RESIDUALS, _MOST_RESIDUAL = 2.8, 6.0, 4.0
 #: Deviations of the errors of a perfect camera.
 EXACT = np.zeros(ERRORS)
 #: Of a pose whose boxes do not fix it.
@@ -80,9 +65,9 @@ def odometry_deviations(first_from_second: NDArray[np.float64]) -> NDArray[np.fl
     angle = float(Rotation.from_matrix(first_from_second[:3, :3]).magnitude())
     if way_m < _STANDS_STILL and angle < _STANDS_STILL:
         return np.zeros(6)
-    return np.repeat([_ODOMETRY_FLOOR_M + _ODOMETRY_DRIFT * way_m,
-                      _ODOMETRY_FLOOR_RAD + _ODOMETRY_DRIFT * angle
-                      + _ODOMETRY_RAD_PER_M * way_m], 3)
+    return np.repeat([_TERMS.odometry_floor_m + _TERMS.odometry_drift * way_m,
+                      np.radians(_TERMS.odometry_floor_deg) + _TERMS.odometry_drift * angle
+                      + np.radians(_TERMS.odometry_deg_per_m) * way_m], 3)
 
 
 def share_within(radius_m: float, covariance: NDArray[np.float64]) -> float:
@@ -173,7 +158,7 @@ class _Fit(NamedTuple):
 
 def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDArray[np.float64],
                        instants: NDArray[np.int64], shared: NDArray[np.float64] | None = None,
-                       wrong_share: float = _WRONG_SHARE,
+                       wrong_share: float = _TERMS.wrong_share,
                        mount_deviation: tuple[float, float] = (0.0, 0.0),
                        camera_deviations: NDArray[np.float64] = EXACT) -> NDArray[np.float64]:
     """Return the covariance (6, 6) of a pose that was refined on its inliers.
@@ -198,7 +183,7 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     found = verify_rig(rig, rotation, translation)
     fit = _linearize(one_to_one(rig, found, rotation, translation), rig.sigmas, rotation,
                      translation)
-    of_matches, prior = fit.information, np.diag(1.0 / np.array(PRIOR_VARIANCES))
+    of_matches, prior = fit.information, np.diag(1.0 / PRIOR_VARIANCES)
     of_objects = _sums(of_matches, fit.objects, len(fit.sigmas))
     verticals = fit.verticals.sum(axis=0)
     information = of_objects.sum(axis=0) + verticals + prior
@@ -236,7 +221,7 @@ def moves_with_cameras(rig: Rig, inliers: Inliers, rotation: NDArray[np.float64]
     """
     fit = _linearize(inliers, rig.sigmas, rotation, translation)
     information = (fit.information.sum(axis=0) + fit.verticals.sum(axis=0)
-                   + np.diag(1.0 / np.array(PRIOR_VARIANCES)))
+                   + np.diag(1.0 / PRIOR_VARIANCES))
     return np.asarray(-np.linalg.inv(information) @ fit.calibrations)
 
 
@@ -248,7 +233,7 @@ def _change_without_each(information: NDArray[np.float64], noise: NDArray[np.flo
     Without an object, a pose is not surer: only a gain counts. The limit would be a loss where
     boxes fix next to nothing.
     """
-    limit = np.diag(np.repeat([_WITHOUT_M ** -2, _WITHOUT_RAD ** -2], 3))
+    limit = np.diag(np.repeat([_TERMS.without_m ** -2, _TERMS.without_rad ** -2], 3))
     inverses = np.linalg.inv(information + limit)
     shifts = np.einsum('nij,nj->ni', inverses, gradients)
     without = inverses @ (noise + limit) @ inverses
@@ -321,11 +306,12 @@ def _mean_square(fit: _Fit) -> float:
     Views of an object together count as one. Six residuals are zero by construction.
     """
     views = len(fit.objects) / max(1, len(fit.sigmas))
-    squares = np.minimum(np.abs(fit.residuals), _MOST_RESIDUAL) ** 2
+    squares = np.minimum(np.abs(fit.residuals), _TERMS.most_residual) ** 2
     measured = np.bincount(fit.objects, fit.jacobian[:, 4:].any(axis=(1, 2))) > 0.0
     freedom = max(0, 4 * len(fit.sigmas) + int(measured.sum()) - 6)
-    return max(1.0, float((squares.sum() / max(views, 1.0) + _PRIOR_RESIDUALS * _PRIOR_SQUARE)
-                          / (freedom + _PRIOR_RESIDUALS)))
+    prior = _TERMS.prior_residuals * _TERMS.prior_square
+    return max(1.0, float((squares.sum() / max(views, 1.0) + prior)
+                          / (freedom + _TERMS.prior_residuals)))
 
 
 def _odometry_noise(cameras: NDArray[np.float64], information: NDArray[np.float64],

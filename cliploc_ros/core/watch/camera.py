@@ -30,15 +30,12 @@ from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import SAME_VIEW
 from cliploc_ros.core.watch.look import Alignment
 
-# Of the grey image at this width [px], see images in calibration.yaml.
-_WIDTH_PX = 320
-# Looks in a row until a fault is named, and its name.
-_FAULTS = {'dark': (3, 'the camera is in the dark, or covered'),
-           'bare': (3, 'the camera is covered, or before a bare wall'),
-           'frozen': (2, 'the image is frozen'),
-           'smooth': (5, 'the image is blurred, or the lens dirty')}
-# Looks that are averaged, and from how many on a turn is named.
-_MOST_LOOKS, _LEAST_LOOKS = 40, 8
+# The names of the faults.
+_FAULTS = {'dark': 'the camera is in the dark, or covered',
+           'bare': 'the camera is covered, or before a bare wall',
+           'frozen': 'the image is frozen',
+           'smooth': 'the image is blurred, or the lens dirty'}
+# Steps of the iteration for the weighted mean of some turns: a numerical bound.
 _ROUNDS = 10
 
 
@@ -56,11 +53,12 @@ class ImageFaults:
         The text is empty where there is none.
         """
         terms = CALIBRATION.images
-        height = max(1, round(image.shape[0] * _WIDTH_PX / image.shape[1]))
-        small = cv2.resize(image, (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+        width = int(terms.width_px)
+        height = max(1, round(image.shape[0] * width / image.shape[1]))
+        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
         mean, deviation = grey.mean(), grey.std()
-        is_dark = mean < terms.dark and np.quantile(grey, 0.95) < terms.dark_high
+        is_dark = mean < terms.dark and np.quantile(grey, terms.dark_part) < terms.dark_high
         is_bare = deviation < terms.bare and not is_dark
         is_smooth = cv2.Laplacian(grey, cv2.CV_32F).std() < terms.smooth
         moved = not SAME_VIEW.agree(pose, self._pose)  # true of the first one
@@ -76,8 +74,8 @@ class ImageFaults:
         self._checksum = checksum
         if moved:
             self._pose = pose
-        return next((words for name, (least, words) in _FAULTS.items()
-                     if self._counts[name] >= least), '')
+        return next((words for name, words in _FAULTS.items()
+                     if self._counts[name] >= terms[f'{name}_looks']), '')
 
 
 @dataclass(frozen=True)
@@ -119,7 +117,7 @@ class TurnEstimate:
     """The turns of the last looks. One from the spot of the last one replaces it."""
 
     def __init__(self) -> None:
-        self._turns: deque[_Turn] = deque(maxlen=_MOST_LOOKS)
+        self._turns: deque[_Turn] = deque(maxlen=int(CALIBRATION.turn.most_looks))
         #: None before it is known, or where it may be chance
         self.turn: CameraTurn | None = None
 
@@ -132,7 +130,7 @@ class TurnEstimate:
         if self._turns and not is_new:
             self._turns.pop()
         self._turns.append(_turn_of(fit.pose, information, given))
-        if len(self._turns) < _LEAST_LOOKS:
+        if len(self._turns) < terms.least_looks:
             return
         mean, covariance = _robust_mean(self._turns)
         angle = float(np.linalg.norm(mean))
@@ -175,6 +173,7 @@ def _robust_mean(turns: deque[_Turn]) -> tuple[NDArray[np.float64], NDArray[np.f
     mean = np.median(vectors, axis=0)
     for _ in range(_ROUNDS):
         off = vectors - mean
+        # 3 axes: a deviation on each has half the weight
         weights = 1.0 / (1.0 + np.einsum('ni,nij,nj->n', off, informations, off) / 3.0)
         weighted = weights[:, None, None] * informations
         total = np.linalg.inv(weighted.sum(axis=0))

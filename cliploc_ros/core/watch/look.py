@@ -48,18 +48,19 @@ from cliploc_ros.core.search.frame_search import SearchedFrame, constraint_of, m
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN
 from cliploc_ros.core.search.strategies import Leaders, Progress
 
-# Turns about x and y of the camera, and about z [deg]; shifts along x and z [m]. A box of 45 px
-# overlaps its outline by more than .2 if a pose of the grid is within 2 degrees (focal length 525
-# px). Near objects move by as much where the pose is off by decimetres.
-_TURNS_DEG, _ROLLS_DEG, _SHIFTS_M = (-8.0, -4.0, 0.0, 4.0, 8.0), (-6.0, 6.0), (-0.25, 0.0, 0.25)
+_TERMS = CALIBRATION.watch
+# The grid: turns about x and y of the camera, and about z [deg]; shifts along x and z [m].
+_TURNS_DEG = np.multiply((-2, -1, 0, 1, 2), _TERMS.grid_turn_deg)
+_ROLLS_DEG, _SHIFTS_M = (-_TERMS.grid_roll_deg, _TERMS.grid_roll_deg), (
+    -_TERMS.grid_shift_m, 0.0, _TERMS.grid_shift_m)
 _STEPS = np.array([*product(_TURNS_DEG, _TURNS_DEG, (0.0,), _SHIFTS_M, _SHIFTS_M),
                    *product(_TURNS_DEG, _TURNS_DEG, _ROLLS_DEG, (0.0,), (0.0,))])
 # Poses (k, 4, 4) of the grid, in the camera at the given pose.
 _GRID = np.tile(np.eye(4), (len(_STEPS), 1, 1))
 _GRID[:, :3, :3] = Rotation.from_rotvec(_STEPS[:, :3], degrees=True).as_matrix()
 _GRID[:, [0, 2], 3] = _STEPS[:, 3:]
-# Poses of the grid that are refined, and how far apart they are at least [m] [deg].
-_REFINED, _APART = 4, Tolerance(0.3, 5.0)
+# Those that are refined are no nearer to each other.
+_APART = Tolerance(_TERMS.apart_m, _TERMS.apart_deg)
 
 
 class Alignment(NamedTuple):
@@ -95,15 +96,15 @@ def align(joined: JoinedFrames, map_from_camera: NDArray[np.float64]) -> Alignme
     order = np.argsort(-scores, kind='stable')
     starts = starts[order[scores[order] > 0.0]]
     some = [unrefined(map_from_camera),
-            *(unrefined(starts[row]) for row in _APART.distinct(starts, _REFINED))]
+            *(unrefined(starts[row]) for row in _APART.distinct(starts, int(_TERMS.refined)))]
     if len(some) > 1:
         some += [refined(joined, one) for one in some]
-    found, terms = contenders_of(joined, some, [True] * len(some)), CALIBRATION.watch
+    found = contenders_of(joined, some, [True] * len(some))
     errors = [pose_error(one.pose, map_from_camera) for one in found]
     near = [row for row, error in enumerate(errors)
             if error[0] < SAME_NEIGHBOURHOOD.distance_m
             and error[1] < SAME_NEIGHBOURHOOD.angle_deg]
-    odds = [one.odds - 0.5 * ((away_m / terms.pull_m) ** 2 + (away_deg / terms.pull_deg) ** 2)
+    odds = [one.odds - 0.5 * ((away_m / _TERMS.pull_m) ** 2 + (away_deg / _TERMS.pull_deg) ** 2)
             for one, (away_m, away_deg) in zip(found, errors, strict=True)]
     fit = max(near, key=lambda row: odds[row])
     return Alignment(joined, found[fit], *errors[fit])
@@ -124,18 +125,17 @@ class LookEvidence(NamedTuple):
 
     def is_full(self, has_jumped: bool) -> bool:
         """Return whether a wrong pose would show; one that jumped need not be at a mapped spot."""
-        terms = CALIBRATION.watch
-        return self.known >= terms.full_objects and (
-            has_jumped or self.expected >= terms.full_mapped)
+        return self.known >= _TERMS.full_objects and (
+            has_jumped or self.expected >= _TERMS.full_mapped)
 
     @property
     def terms(self) -> dict[str, float]:
         """Return the terms of the model by their names in calibration.yaml."""
         return {
-            'none': 1.0, 'utility': min(self.utility, 12.0), 'any': float(self.matched > 0),
-            'unexplained': float(self.unexplained), 'missed': float(self.missed),
-            'away': math.log1p((self.away_m / 0.3) ** 2),
-            'turned': math.log1p((self.away_deg / 8.0) ** 2), 'crowd': self.crowd}
+            'none': 1.0, 'utility': min(self.utility, _TERMS.most_utility),
+            'any': float(self.matched > 0), 'unexplained': float(self.unexplained),
+            'missed': float(self.missed), 'away': math.log1p((self.away_m / _TERMS.away_m) ** 2),
+            'turned': math.log1p((self.away_deg / _TERMS.turned_deg) ** 2), 'crowd': self.crowd}
 
 
 def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
@@ -192,5 +192,5 @@ def by_vertical(map_from_camera: NDArray[np.float64], up_in_camera: NDArray[np.f
         return 0.0
     cosine = float(map_from_camera[2, :3] @ up_in_camera)
     tilt_deg = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
-    sigmas = tilt_deg / math.hypot(deviation_deg, CALIBRATION.watch.slope_deg)
+    sigmas = tilt_deg / math.hypot(deviation_deg, _TERMS.slope_deg)
     return -min(CALIBRATION.attitude.wrong_mount, 0.5 * sigmas ** 2)

@@ -42,8 +42,7 @@ from cliploc_ros.core.watch.look import (
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 
-# Looks that are kept to compare a new one with.
-_MOST_LOOKS = 10
+# Rounding of a pose that is given: what is further from a rigid transform is refused as input.
 _RIGID = 1e-3
 
 
@@ -58,7 +57,7 @@ class Belief:
 
     def __init__(self) -> None:
         self._log_odds = 0.0
-        self._looks: deque[_Look] = deque(maxlen=_MOST_LOOKS)
+        self._looks: deque[_Look] = deque(maxlen=int(CALIBRATION.watch.most_looks))
         self._last: tuple[Observation, NDArray[np.float64]] | None = None
         #: Whether the localizer made another statement since it was right last
         self.has_jumped = False
