@@ -19,17 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.ellipsoid import (
-    ellipse_bboxes,
-    ellipses_in_pixels,
-    project_ellipsoids,
-)
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.visibility import SHOWN_SHARE, look_at
 from cliploc_ros.core.observation import Detections
 
-#: A landmark is detected only if the image shows this share of its box.
-SHOWN_SHARE = 0.6
 #: Standard deviation of a box's edge: [px], and as a share of the box's extent; both are added in
 #: squares.
 EDGE_SIGMA_PX, EDGE_SIGMA_SHARE = 2.0, 0.04
@@ -83,17 +77,11 @@ class DetectorModel:
                 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the landmarks (k,) that a camera could detect, and their boxes (k, 4) [px]."""
         one = self.landmark_map
-        outlines = project_ellipsoids(invert_transform(map_from_camera), one.centers, one.shapes)
-        boxes = ellipse_bboxes(ellipses_in_pixels(outlines, self.camera))
-        size = [self.camera.width, self.camera.height] * 2
-        with np.errstate(invalid='ignore'):
-            clipped = np.clip(boxes, 0.0, size)
-            extent, shown = boxes[:, 2:] - boxes[:, :2], clipped[:, 2:] - clipped[:, :2]
-            distances = np.linalg.norm(one.centers - map_from_camera[:3, 3], axis=1)
-            visible = (shown.prod(axis=1) > SHOWN_SHARE * extent.prod(axis=1)) \
-                & (shown.min(axis=1) >= self.min_side_px) & (distances <= self.reach_m)
-        rows = np.nonzero(visible)[0]
-        return rows, clipped[rows]
+        found = look_at(self.camera, invert_transform(map_from_camera), one.centers, one.shapes,
+                        SHOWN_SHARE, self.min_side_px)
+        distances = np.linalg.norm(one.centers - map_from_camera[:3, 3], axis=1)
+        rows = np.nonzero(found.is_shown & (distances <= self.reach_m))[0]
+        return rows, found.shown[rows]
 
     def expected_detections(self, map_from_camera: NDArray[np.float64]) -> float:
         """Return how many landmarks the detector finds on average."""

@@ -13,12 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.ellipsoid import (
-    ellipse_bboxes,
-    ellipses_in_pixels,
-    project_ellipsoids,
-)
 from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.map.visibility import is_hidden, look_at
 from cliploc_ros.offline.simulation import CLASS_SHARE, shared_noise, similarities_of
 from studies.worlds.places import CLASS_NAMES, Objects, rows_of
 
@@ -134,29 +130,15 @@ def _in_view(objects: Objects, shapes: NDArray[np.float64], camera: Camera,
     """Return the objects in view (k,), the nearest first, and their boxes (k, 4) [px]."""
     distances = np.linalg.norm(objects.centers - map_from_camera[:3, 3], axis=1)
     near = np.argsort(distances)[:np.count_nonzero(distances < _RANGE_M)]
-    outlines = project_ellipsoids(invert_transform(map_from_camera), objects.centers[near],
-                                  shapes[near])
-    full = ellipse_bboxes(ellipses_in_pixels(outlines, camera))
-    clipped = np.clip(full, 0.0, [camera.width, camera.height] * 2)
-    extents = clipped[:, 2:] - clipped[:, :2]
-    seen = (extents >= _LEAST_SIDE_PX).all(axis=1)  # never true of NaN
-    seen &= extents.prod(axis=1) > _SHOWN_SHARE * (full[:, 2:] - full[:, :2]).prod(axis=1)
-    seen[seen] = ~_hidden(clipped[seen], _HIDDEN_SHARE, objects.wholes[near][seen])
-    return near[seen], full[seen]
-
-
-def _hidden(boxes: NDArray[np.float64], most: float, wholes: NDArray[np.int64]
-            ) -> NDArray[np.bool_]:
-    """Return of which of m boxes (m, 4) a nearer one covers more than a share; nearest first.
-
-    Parts of one thing do not hide one another; wholes (m,) are of Objects.
-    """
-    low = np.maximum(boxes[:, None, :2], boxes[None, :, :2])
-    high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
-    shared = np.maximum(high - low, 0.0).prod(axis=2)
-    share = shared / (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)[:, None]
+    found = look_at(camera, invert_transform(map_from_camera), objects.centers[near], shapes[near],
+                    _SHOWN_SHARE, _LEAST_SIDE_PX)
+    seen = np.nonzero(found.is_shown)[0]
+    near, full, wholes = near[seen], found.boxes[seen], objects.wholes[near[seen]]
+    # parts of one thing do not hide one another
     is_part = (wholes[:, None] == wholes) & (wholes > 0)
-    return np.asarray((~is_part & (np.tril(share, -1) > most)).any(axis=1))
+    is_nearer = np.tri(len(seen), k=-1, dtype=np.bool_) & ~is_part
+    free = ~is_hidden(found.shown[seen], is_nearer, _HIDDEN_SHARE)
+    return near[free], full[free]
 
 
 class Encoder(NamedTuple):

@@ -4,7 +4,8 @@
 
 An image should show the landmarks that are near, large, wholly in view and not hidden. Walls are
 in no map, so an expected landmark may be hidden. If the image shows a landmark beside it, it is
-not hidden. cliploc_ros.offline.mapping.evidence judges whole recordings.
+not hidden. cliploc_ros.offline.mapping.evidence judges whole recordings by the same criteria, and
+simulated detectors find what these let through, each with limits of its own.
 
 A detector finds some landmarks in each image and others hardly ever. The share of looks that find
 a landmark has a beta distribution, which each look narrows down. Then the probability of k misses
@@ -29,10 +30,15 @@ from cliploc_ros.core.geometry.ellipsoid import (
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 
-# A detector finds landmarks up to here [m], with sides from here on [px], of which the image shows
-# this share and nearer landmarks hide at most that share. Guesses, on the safe side.
-_REACH_M, _LEAST_SIDE_PX, _SHOWN_SHARE, _HIDDEN_SHARE = 6.0, 20.0, 0.75, 0.4
-# A landmark beside a shown one is within this angle of its direction, and not much further away.
+#: A detector finds a landmark only if the image shows this share of its box.
+SHOWN_SHARE = 0.6
+#: A place is out of view if nearer things hide more than this share of it. A guess.
+HIDDEN_SHARE = 0.4
+# A detector surely finds landmarks up to here [m], with sides from here on [px], of which the
+# image shows this share. Guesses, on the safe side.
+_REACH_M, _LEAST_SIDE_PX, _SURE_SHARE = 6.0, 20.0, 0.75
+# A landmark is beside a place within this angle of its direction, and before it if it is nearer
+# than this share of the place's distance. Guesses.
 _BESIDE_COSINE, _BESIDE_SHARE = np.cos(np.radians(20.0)), 0.8
 #: Sides of a landmark, equal angles about the vertical.
 SIDES = 8
@@ -50,6 +56,59 @@ _NAMED, _MOST_SEEN = 0.8, 15.0
 # The map is out of date where this many landmarks and this share of those that the last looks
 # expected are gone, by their probabilities.
 _HERE, _LEAST_GONE, _LEAST_SHARE = 10, 2.0, 0.25
+
+
+def is_in_image(box: NDArray[np.float64], bounds: NDArray[np.float64], least_share: float
+                ) -> NDArray[np.bool_]:
+    """Tell whether an image shows more than a share of a box (4,), or of each of n boxes (4, n).
+
+    Box and bounds (4,) of the image are left, top, right, bottom.
+    """
+    width = np.minimum(box[2], bounds[2]) - np.maximum(box[0], bounds[0])
+    height = np.minimum(box[3], bounds[3]) - np.maximum(box[1], bounds[1])
+    return (width > 0.0) & (height > 0.0) & (
+        width * height > least_share * (box[2] - box[0]) * (box[3] - box[1]))
+
+
+def is_beside(cosine: NDArray[np.float64], distance: NDArray[np.float64],
+              of_place: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell whether an image that shows a landmark shows a place, too: no wall is before it.
+
+    The landmark is beside the place or behind it, by the cosine between their directions, its
+    distance and that of the place.
+    """
+    return (cosine > _BESIDE_COSINE) & (distance >= _BESIDE_SHARE * of_place)
+
+
+class InImage(NamedTuple):
+    """The boxes of n ellipsoids in an image [px]."""
+
+    boxes: NDArray[np.float64]  #: (n, 4): NaN where not wholly in front of the camera
+    shown: NDArray[np.float64]  #: (n, 4): the part in the image
+    is_shown: NDArray[np.bool_]  #: (n,): whether that is a large enough share, and large enough
+
+
+def look_at(camera: Camera, camera_from_map: NDArray[np.float64], centers: NDArray[np.float64],
+            shapes: NDArray[np.float64], least_share: float, least_side_px: float) -> InImage:
+    """Return the boxes of ellipsoids (n, 3), (n, 6) in an image."""
+    boxes = ellipse_bboxes(ellipses_in_pixels(
+        project_ellipsoids(camera_from_map, centers, shapes), camera))
+    bounds = np.array([0.0, 0.0, camera.width, camera.height])
+    shown = np.clip(boxes, 0.0, np.tile(bounds[2:], 2))
+    return InImage(boxes, shown, is_in_image(boxes.T, bounds, least_share) & (
+        (shown[:, 2:] - shown[:, :2]).min(axis=1) >= least_side_px))
+
+
+def is_hidden(boxes: NDArray[np.float64], is_nearer: NDArray[np.bool_], most: float
+              ) -> NDArray[np.bool_]:
+    """Tell of which boxes (n, 4) a nearer one covers more than a share.
+
+    Row i of is_nearer (n, n) tells which boxes are nearer than box i.
+    """
+    shared = (np.minimum(boxes[:, None, 2:], boxes[:, 2:])
+              - np.maximum(boxes[:, None, :2], boxes[:, :2])).clip(0.0).prod(axis=2)
+    areas = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)
+    return np.asarray((is_nearer & (shared > most * areas[:, None])).any(axis=1))
 
 
 class Expected(NamedTuple):
@@ -75,27 +134,19 @@ def expect(landmark_map: LandmarkMap, camera: Camera, map_from_camera: NDArray[n
     near = np.sort(np.array(landmark_map.tree.query_ball_point(map_from_camera[:3, 3], _REACH_M),
                             dtype=np.int64))
     camera_from_map = invert_transform(map_from_camera)
-    outlines = project_ellipsoids(camera_from_map, landmark_map.centers[near],
-                                  landmark_map.shapes[near])
-    in_front = np.isfinite(outlines[:, 0])
-    near, boxes = near[in_front], ellipse_bboxes(ellipses_in_pixels(outlines[in_front], camera))
+    found = look_at(camera, camera_from_map, landmark_map.centers[near], landmark_map.shapes[near],
+                    _SURE_SHARE, _LEAST_SIDE_PX)
+    in_front = np.isfinite(found.boxes[:, 0])
+    near, boxes, is_shown = near[in_front], found.shown[in_front], found.is_shown[in_front]
     offsets = landmark_map.centers[near] @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
-    clipped = np.clip(boxes, 0.0, [camera.width, camera.height] * 2)
-    sides, full = clipped[:, 2:] - clipped[:, :2], boxes[:, 2:] - boxes[:, :2]
-    visible = (sides.min(axis=1, initial=np.inf) >= _LEAST_SIDE_PX) & (
-        sides.prod(axis=1) >= _SHOWN_SHARE * full.prod(axis=1))
-    # one nearer landmark hides a part
-    shared = (np.minimum(clipped[:, None, 2:], clipped[:, 2:])
-              - np.maximum(clipped[:, None, :2], clipped[:, :2])).clip(0.0).prod(axis=2)
-    areas, depths = np.maximum(sides.prod(axis=1), 1e-9), offsets[:, 2]
+    depths = offsets[:, 2]
     nearer = depths + landmark_map.semi_axes[near].max(axis=1) < depths[:, None]
-    visible &= ~(nearer & (shared > _HIDDEN_SHARE * areas[:, None])).any(axis=1)
+    visible = is_shown & ~is_hidden(boxes, nearer, HIDDEN_SHARE)
     was_seen = np.isin(landmark_map.objects[near], landmark_map.objects[shown])
-    # beside a seen one or before it
     distances = np.linalg.norm(offsets, axis=1)
     directions = offsets / np.maximum(distances, 1e-9)[:, None]
-    in_sight = ((directions @ directions[was_seen].T > _BESIDE_COSINE) & (
-        distances[was_seen] > _BESIDE_SHARE * distances[:, None])).any(axis=1)
+    in_sight = is_beside(directions @ directions[was_seen].T, distances[was_seen],
+                         distances[:, None]).any(axis=1)
     rows = np.nonzero(visible)[0]
     rows = rows[np.unique(landmark_map.objects[near[rows]], return_index=True)[1]]
     x, y, _ = (landmark_map.centers[near[rows]] - map_from_camera[:3, 3]).T

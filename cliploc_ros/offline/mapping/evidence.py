@@ -14,14 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.kernels.compiled import compiled
+from cliploc_ros.core.map import visibility
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.visibility import HIDDEN_SHARE, SHOWN_SHARE
 from cliploc_ros.offline.mapping.association import find_overlaps, ious_with
 from cliploc_ros.offline.mapping.fitting import accumulate
 from cliploc_ros.offline.mapping.landmarks import (
     LANDMARK_SIZE,
     Landmarks,
     group_boxes,
-    is_in_image,
     project_box,
 )
 from cliploc_ros.offline.mapping.options import MappingOptions
@@ -36,14 +37,6 @@ MIN_MEDIAN_IOU = 0.5
 MAX_SIGMA_SHARE = 0.1
 # IoU from which a landmark explains a box of its class.
 _EXPLAINED_IOU = 0.3
-
-
-# A place is in view if the frame shows another landmark this close to its direction, and not
-# nearer: otherwise a wall may hide it. It is out of view if landmarks or boxes hide this share.
-# Guesses.
-_BESIDE_DEG, _HIDDEN_SHARE = 20.0, 0.4
-# A landmark as near as this share of a place's distance is beside the place, not before it.
-_BESIDE_SHARE = 0.8
 # A class with fewer boxes is taken to be seen at the sizes of its boxes and of all classes only.
 _FEW_BOXES = 20
 _LEAST_QUANTILE = 0.1
@@ -52,6 +45,8 @@ _WINDOW = 1000
 # Points in a box at which the kernel asks whether something hides it: a 5 x 5 grid in the ellipse.
 _GRID = np.array([(x, y) for x in (-0.8, -0.4, 0.0, 0.4, 0.8) for y in (-0.8, -0.4, 0.0, 0.4, 0.8)
                   if x * x + y * y < 1.0])
+
+_is_in_image, _is_beside = compiled(visibility.is_in_image), compiled(visibility.is_beside)
 
 
 class Evidence(NamedTuple):
@@ -141,7 +136,7 @@ def is_expected(views, cameras, center, basis, reach):
             continue
         expected[frame] = project_box(
             views.rotations[frame], views.translations[frame], center, basis, box
-        ) and is_in_image(box, views.bounds[frame])
+        ) and _is_in_image(box, views.bounds[frame], SHOWN_SHARE)
     return expected
 
 
@@ -250,7 +245,7 @@ def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
         own = shown[views.offsets[first]:][:len(window.frames)]
         in_view = _in_view(
             window, places.centers, places.bases, radii, 2.0 * radii / np.maximum(least, 1e-6),
-            least, is_solid, own, np.cos(np.radians(_BESIDE_DEG)), _HIDDEN_SHARE)
+            least, is_solid, own)
         rows, was_seen = np.nonzero(own >= 0)[0], np.zeros_like(in_view)
         was_seen[window.frames[rows], own[rows]] = True
         for number, of_frames in enumerate((in_view | was_seen, was_seen)):
@@ -283,8 +278,7 @@ def _least_extents(views: Views, last_class: int) -> NDArray[np.float64]:
 
 
 @compiled
-def _in_view(views, centers, bases, radii, reaches, least, is_solid, shown, beside_cosine,
-             hidden_share):
+def _in_view(views, centers, bases, radii, reaches, least, is_solid, shown):
     """Return which places are in view in each frame (F, L)."""
     count = len(centers)
     farthest = reaches.max() if count else 0.0
@@ -302,17 +296,17 @@ def _in_view(views, centers, bases, radii, reaches, least, is_solid, shown, besi
         for i in range(in_front):
             place = near[i]
             box = boxes[place]
-            if distances[place] > reaches[place] or not is_in_image(box, views.bounds[frame]):
+            if distances[place] > reaches[place] or not _is_in_image(
+                    box, views.bounds[frame], SHOWN_SHARE):
                 continue
             # large enough to be detected
             if (box[2] - box[0]) * (box[3] - box[1]) < least[place] * least[place]:
                 continue
-            if not _has_beside(place, near[:in_front], was_seen, offsets, distances,
-                               beside_cosine):
+            if not _has_beside(place, near[:in_front], was_seen, offsets, distances):
                 continue
             in_view[frame, place] = _hidden(
                 place, near[:in_front], boxes, distances, radii, is_solid, shown, views.edges,
-                first, last) <= hidden_share
+                first, last) <= HIDDEN_SHARE
         for row in range(first, last):
             if shown[row] >= 0:
                 was_seen[shown[row]] = False
@@ -346,15 +340,13 @@ def _project_near(rotation, translation, centers, bases, farthest, boxes, offset
 
 
 @compiled
-def _has_beside(place, near, was_seen, offsets, distances, beside_cosine):
+def _has_beside(place, near, was_seen, offsets, distances):
     """Tell whether a frame shows another landmark beside a place or behind it."""
     for other in near:
         if other == place or not was_seen[other]:
             continue
-        if distances[other] < _BESIDE_SHARE * distances[place]:
-            continue
         cosine = (offsets[other] * offsets[place]).sum() / (distances[other] * distances[place])
-        if cosine > beside_cosine:
+        if _is_beside(cosine, distances[other], distances[place]):
             return True
     return False
 

@@ -24,7 +24,6 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.simulation import SHOWN_SHARE
 
 #: Numbers of a landmark: centre, then the upper triangle of D, row by row.
 LANDMARK_SIZE = 9
@@ -139,15 +138,6 @@ def _chain(rotation, p, g, axis, by_p, by_n, by_landmark, by_pose):
     by_pose[across] += turn * (2.0 * by_n[0] * naz + by_n[1] * (nzz - naa) - 2.0 * by_n[2] * naz)
     by_pose[own] += turn * (by_n[1] * nab + 2.0 * by_n[2] * nbz)
     by_pose[5] += turn * (-2.0 * by_n[0] * nab - by_n[1] * nbz)
-
-
-@compiled
-def is_in_image(box, bounds):
-    """Tell whether an image shows enough of a box (4,) for a detector."""
-    width = min(box[2], bounds[2]) - max(box[0], bounds[0])
-    height = min(box[3], bounds[3]) - max(box[1], bounds[1])
-    return width > 0.0 and height > 0.0 and width * height > (
-        SHOWN_SHARE * (box[2] - box[0]) * (box[3] - box[1]))
 
 
 @compiled
