@@ -74,8 +74,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._handoff = HandOff(self, self._robot.odometry)
         self._handoff.on_shown(self._robot.prior.follow)
         self._cases = CaseRecorder(bool(parameters.record_folder))
-        self._requests = Requests(self, self._frames, self._robot, self._pipeline, self._cases,
-                                  self._handoff)
+        self._requests = Requests(self, self._frames, self._robot, self._jumps, self._pipeline,
+                                  self._cases, self._handoff)
         self._watcher = Watcher(self, self._frames, self._robot, self._jumps, self._pipeline,
                                 self._requests, self._handoff, self._answer)
         self._counters = RequestCounters()
@@ -135,8 +135,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
 
     def _forget(self) -> None:
         """Forget all input: time jumped."""
-        for part in (self._frames, self._robot, self._map_to_odom, self._handoff, self._cases,
-                     self._watcher):
+        for part in (self._frames, self._robot, self._map_to_odom, self._cases, self._watcher):
             part.forget()
 
     def examine(self, health: Health) -> None:

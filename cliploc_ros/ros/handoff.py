@@ -34,7 +34,7 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_to_msg, stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.odometry import MOMENT_PATIENCE_S, OdometrySource
-from cliploc_ros.ros.inputs.stamps import TimeJumpError
+from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # The least variances of x, y, z [m^2] and of the rotations [rad^2]: a centimetre and a sixth of a
@@ -77,7 +77,6 @@ class HandOff:
         self._odometry = odometry
         self._changed = threading.Condition()
         self._stopped = threading.Event()
-        self._jumped_at = -math.inf
         # What the localizer shows since the pose was last published.
         self._shown: PoseWithCovarianceStamped | None = None
         self._pose_topic = ''
@@ -114,10 +113,6 @@ class HandOff:
         self._stopped.set()
         self._wake()
 
-    def forget(self) -> None:
-        """Withhold the pose of the hand-over under way: time jumped."""
-        self._jumped_at = time.monotonic()
-
     def missing(self) -> str:
         """Return that there is no localizer, and what to do; empty if there is one."""
         if not self._publisher.get_subscription_count():
@@ -129,7 +124,7 @@ class HandOff:
         return ''
 
     def hand_over(self, pose: PoseWithCovarianceStamped, parameters: RelocalizerParameters,
-                  deadline: float, received_at: float) -> None:
+                  deadline: float, received_at: float, jumps: TimeJumps) -> None:
         """Publish a pose on `initialpose` until the localizer shows it, and let it settle.
 
         A localizer that shows the pose is not reset again.
@@ -141,6 +136,8 @@ class HandOff:
         deadline, received_at : float
             When to return at the latest, and when the image arrived (monotonic clock) [s]. A
             hand-over that need not wait is made after the deadline, too.
+        jumps : TimeJumps
+            Of the node's clock.
 
         Raises
         ------
@@ -164,9 +161,7 @@ class HandOff:
                 raise NoLocalizerError(self._not_taken(given, times, begun_at))
             self.check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s, deadline)
             self._check_place(pose.header.stamp, deadline)
-            if self._jumped_at >= received_at:
-                raise TimeJumpError('time jumped back before the hand-over: the pose is from '
-                                    'before')
+            jumps.check(pose.header.stamp, received_at)
             if self._stopped.is_set():
                 raise HandOffError('the node was deactivated during the hand-over')
             given, times = usable_pose(pose, self._node.get_clock().now()), times + 1

@@ -183,9 +183,9 @@ class Requests:
     """
 
     def __init__(self, node: ManagedNode[RelocalizerParameters], frames: CameraRig,
-                 robot: RobotStateSource, pipeline: Pipeline, cases: CaseRecorder,
-                 handoff: HandOff) -> None:
-        self._node, self._frames, self._robot = node, frames, robot
+                 robot: RobotStateSource, jumps: TimeJumps, pipeline: Pipeline,
+                 cases: CaseRecorder, handoff: HandOff) -> None:
+        self._node, self._frames, self._robot, self._jumps = node, frames, robot, jumps
         self._pipeline, self._cases, self._handoff = pipeline, cases, handoff
         self._turn = threading.Lock()
         self._numbers = count(1)
@@ -283,7 +283,7 @@ class Requests:
             return answer, True
         try:
             self._handoff.hand_over(answer.pose, self._node.settings.snapshot(), deadline,
-                                    answer.received_at)
+                                    answer.received_at, self._jumps)
         except HandOffError as error:
             return (replace(answer, verdict=Verdict.WITHHELD, pose=None,
                             detail=f'{error} ({answer.message})'),

@@ -11,10 +11,12 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.parameter import Parameter
 from std_srvs.srv import Empty
 
 from cliploc_ros.ros.handoff import HandOff
 from cliploc_ros.ros.inputs.odometry import OdometrySource
+from cliploc_ros.ros.inputs.stamps import TimeJumps
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 PARAMETERS = RelocalizerParameters(base_frame='base_link')
@@ -64,13 +66,19 @@ class Robot:
         self.localizer = Localizer(make_node('amcl'))
         self.odometry = OdometrySource(self.node)
         self.handoff = HandOff(self.node, self.odometry)
+        self.jumps = TimeJumps(self.node, self.odometry.forget)
 
     def hand_over(self, timeout_s=10.0, **changes):
         """Hand a pose over; return how long it took [s]."""
         start = time.monotonic()
         self.handoff.hand_over(make_pose(), replace(PARAMETERS, **changes), start + timeout_s,
-                               start)
+                               start, self.jumps)
         return time.monotonic() - start
+
+    def jump(self):
+        """Have the relocalizer's clock jump: to simulated time, and back."""
+        for is_simulated in (True, False):
+            self.node.set_parameters([Parameter('use_sim_time', value=is_simulated)])
 
     def meet(self):
         """Wait until the relocalizer knows the localizer."""

@@ -10,7 +10,7 @@ from contextlib import nullcontext
 
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from handing_over import PARAMETERS, TEN_HZ, make_pose, tell
+from handing_over import PARAMETERS, TEN_HZ, Robot, make_pose, tell
 
 from cliploc_ros.ros.handoff import (
     HandOffError,
@@ -81,7 +81,7 @@ def test_a_jump_during_the_hand_over_withholds_the_pose(robot, wheels):
     with ThreadPoolExecutor(1) as pool:
         handing_over = pool.submit(robot.hand_over)
         robot.wait(lambda: robot.odometry._heard._waiters, 'it to wait for odometry')
-        robot.handoff.forget()
+        robot.jump()
         tell(robot, wheels, TEN_HZ)
         with pytest.raises(TimeJumpError):
             handing_over.result()
@@ -150,13 +150,14 @@ def test_a_robot_that_moves_meanwhile_gets_the_pose_no_more(silent, wheels):
     assert len(silent.localizer.poses) == 1
 
 
-@pytest.mark.parametrize(('what', 'error'), [('forget', TimeJumpError), ('stop', HandOffError)])
-def test_what_ends_a_hand_over_ends_the_wait_for_the_localizer(silent, what, error):
+@pytest.mark.parametrize(('end', 'error'), [
+    (Robot.jump, TimeJumpError), (lambda robot: robot.handoff.stop(), HandOffError)])
+def test_what_ends_a_hand_over_ends_the_wait_for_the_localizer(silent, end, error):
     with ThreadPoolExecutor(1) as pool:
         handing_over = pool.submit(silent.hand_over)
         silent.wait(lambda: silent.localizer.poses, 'the pose')
         start = time.monotonic()
-        getattr(silent.handoff, what)()
+        end(silent)
         with pytest.raises(error):
             handing_over.result()
     assert time.monotonic() - start < 3.0

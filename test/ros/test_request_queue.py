@@ -26,6 +26,7 @@ from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict
 from cliploc_ros.ros.handoff import HandOff
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
+from cliploc_ros.ros.inputs.stamps import TimeJumps
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.ros.request import Requests
@@ -48,8 +49,9 @@ class Answering(ManagedNode):
         self.robot = RobotStateSource(self)
         self.frames = CameraRig(self, RelocalizerParameters())
         pipeline = SimpleNamespace(localize=lambda frame, times, deadline: self.localize(frame))
-        self.requests = Requests(self, self.frames, self.robot, pipeline, CaseRecorder(False),
-                                 HandOff(self, self.robot.odometry))
+        jumps = TimeJumps(self, self.frames.forget)
+        self.requests = Requests(self, self.frames, self.robot, jumps, pipeline,
+                                 CaseRecorder(False), HandOff(self, self.robot.odometry))
 
     def load(self):
         return self.loads()
