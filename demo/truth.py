@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from cliploc_ros.core.geometry.ellipsoid import box_ious
 from cliploc_ros.errors import DatasetError
 
 #: A detector need not find a box that shows less of its object than this share.
@@ -85,17 +86,8 @@ def true_ids(bboxes_xyxy: npt.NDArray[np.float64], true_boxes: Sequence[TrueBox]
              ) -> tuple[str, ...]:
     """Return the object whose visible part fills each box (n, 4), or ''."""
     ids = []
-    for bbox in bboxes_xyxy:
-        ious = overlaps(bbox, np.array([one.bbox_xyxy for one in true_boxes]).reshape(-1, 4))
+    of_objects = np.array([one.bbox_xyxy for one in true_boxes]).reshape(-1, 4)
+    for ious in box_ious(bboxes_xyxy, of_objects):
         ids.append(true_boxes[int(np.argmax(ious))].object_id
                    if ious.max(initial=0.0) > SAME_OBJECT_IOU else '')
     return tuple(ids)
-
-
-def overlaps(bbox: npt.NDArray[np.float64], others: npt.NDArray[np.float64]
-             ) -> npt.NDArray[np.float64]:
-    """Return the IoU (n,) of a box (4,) with others (n, 4)."""
-    shared = (np.minimum(bbox[2:], others[:, 2:]) - np.maximum(bbox[:2], others[:, :2])
-              ).clip(0.0).prod(axis=1)
-    areas = (others[:, 2:] - others[:, :2]).prod(axis=1) + (bbox[2:] - bbox[:2]).prod()
-    return np.asarray(shared / (areas - shared))

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from cliploc_ros.command import run_command
+from cliploc_ros.core.geometry.ellipsoid import box_ious
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.files.storage import make_folder
@@ -35,7 +36,7 @@ from cliploc_ros.offline.evaluation.trials import make_queries
 from cliploc_ros.offline.recording.networks import RunNetworks
 from cliploc_ros.offline.recording.recorder import record_every_frame
 from demo import ASSETS
-from demo.truth import SAME_OBJECT_IOU, TrueFrame, overlaps, read_frames
+from demo.truth import SAME_OBJECT_IOU, TrueFrame, read_frames
 from demo.world import train_detector
 
 
@@ -69,7 +70,7 @@ def score_clip(frames: Sequence[QueryFrame], truth: Sequence[TrueFrame],
     ranks = []
     for frame, true_frame in zip(frames, truth, strict=True):
         for box in true_frame.boxes:
-            ious = overlaps(box.bbox_xyxy, frame.bboxes_xyxy)
+            ious = box_ious(box.bbox_xyxy[None], frame.bboxes_xyxy)[0]
             if box.object_id in landmark_ids and ious.max(initial=0.0) > SAME_OBJECT_IOU:
                 similarities = frame.similarities[int(np.argmax(ious))]
                 own = similarities[landmark_ids.index(box.object_id)]

@@ -45,6 +45,7 @@ from cliploc_ros.core.fit.finalists import Finalist
 from cliploc_ros.core.fit.refinement import one_to_one
 from cliploc_ros.core.fit.verification import camera_pose, verify_rig
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import box_ious
 from cliploc_ros.core.geometry.transforms import (
     RIGHT_M,
     SAME_BOXES,
@@ -221,11 +222,7 @@ class Extent:
 
     def add(self, boxes: NDArray[np.float64]) -> None:
         """Take in the boxes (n, 4) of a frame; those that were seen before count once."""
-        low = np.maximum(boxes[:, None, :2], self.boxes[:, :2])
-        high = np.minimum(boxes[:, None, 2:], self.boxes[:, 2:])
-        shared = np.maximum(high - low, 0.0).prod(axis=2)
-        areas, known = ((one[:, 2:] - one[:, :2]).prod(axis=1) for one in (boxes, self.boxes))
-        is_known = (shared > _TERMS.same_box * (areas[:, None] + known - shared)).any(axis=1)
+        is_known = (box_ious(boxes, self.boxes) > _TERMS.same_box).any(axis=1)
         self.boxes = np.concatenate([self.boxes, boxes[~is_known]])[-int(_TERMS.most_boxes):]
 
     @property

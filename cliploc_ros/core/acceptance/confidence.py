@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.depth import depth_errors, depth_odds
-from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
+from cliploc_ros.core.geometry.ellipsoid import box_ious, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import SAME_ANSWER, invert_transform
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.map.joined_map import parts_of
@@ -203,13 +203,8 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
 def one_thing(bboxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return to what degree each two of n boxes show one thing (n, n), 0 to 1."""
     boxes = np.clip(np.nan_to_num(bboxes_xyxy), -_FAR_PX, _FAR_PX)
-    low = np.maximum(boxes[:, None, :2], boxes[:, :2])
-    high = np.minimum(boxes[:, None, 2:], boxes[:, 2:])
-    shared = np.maximum(high - low, 0.0).prod(axis=2)
-    areas = np.diag(shared)
-    ious = shared / np.maximum(areas[:, None] + areas - shared, 1e-12)
     least, most = CALIBRATION.objects.two_things, CALIBRATION.objects.one_thing
-    found = np.clip((ious - least) / (most - least), 0.0, 1.0)
+    found = np.clip((box_ious(boxes, boxes) - least) / (most - least), 0.0, 1.0)
     np.fill_diagonal(found, 1.0)
     return np.asarray(found)
 

@@ -132,6 +132,21 @@ def ellipse_bboxes(ellipses: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([ellipses[:, :2] - half, ellipses[:, :2] + half], axis=1)
 
 
+def shared_areas(boxes: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the areas (n, m) that boxes (n, 4) share with others (m, 4)."""
+    low = np.maximum(boxes[:, None, :2], others[:, :2])
+    high = np.minimum(boxes[:, None, 2:], others[:, 2:])
+    return np.asarray(np.maximum(high - low, 0.0).prod(axis=2))
+
+
+def box_ious(boxes: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the IoU (n, m) of boxes (n, 4) with others (m, 4); 0 of boxes without an area."""
+    shared = shared_areas(boxes, others)
+    areas, of_others = (np.maximum(one[:, 2:] - one[:, :2], 0.0).prod(axis=1)
+                        for one in (boxes, others))
+    return np.asarray(shared / np.maximum(areas[:, None] + of_others - shared, 1e-12))
+
+
 def ellipses_in_pixels(ellipses: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
     """Return ellipses (n, 5) of the plane z = 1 as ellipses of the undistorted image [px]."""
     fx, fy = camera.fx, camera.fy

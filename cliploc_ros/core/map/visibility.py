@@ -26,6 +26,7 @@ from cliploc_ros.core.geometry.ellipsoid import (
     ellipse_bboxes,
     ellipses_in_pixels,
     project_ellipsoids,
+    shared_areas,
 )
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -105,10 +106,9 @@ def is_hidden(boxes: NDArray[np.float64], is_nearer: NDArray[np.bool_], most: fl
 
     Row i of is_nearer (n, n) tells which boxes are nearer than box i.
     """
-    shared = (np.minimum(boxes[:, None, 2:], boxes[:, 2:])
-              - np.maximum(boxes[:, None, :2], boxes[:, :2])).clip(0.0).prod(axis=2)
     areas = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)
-    return np.asarray((is_nearer & (shared > most * areas[:, None])).any(axis=1))
+    covers = shared_areas(boxes, boxes) > most * areas[:, None]
+    return np.asarray((is_nearer & covers).any(axis=1))
 
 
 class Expected(NamedTuple):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import box_ious
 from cliploc_ros.offline.mapping.evidence import widest_angle_deg
 from cliploc_ros.offline.mapping.fitting import Fit, fit_ellipsoid
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
@@ -64,10 +65,7 @@ class NewLandmark:
             raise EditError(f'the box is smaller than {MIN_BOX_PX:g} pixels; drag from corner to '
                             'corner')
         boxes = self._recording.detections.detections_of(view).bboxes_xyxy
-        overlap = np.clip(np.minimum(boxes[:, 2:], high) - np.maximum(boxes[:, :2], low), 0.0,
-                          None).prod(axis=1)
-        union = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1) + (high - low).prod() - overlap
-        ious = np.append(overlap / union, 0.0)
+        ious = np.append(box_ious(boxes, np.array([[*low, *high]])), 0.0)
         what, same = 'changed' if view in self.boxes else 'drew', int(np.argmax(ious))
         self._set({**self.boxes, view: [*low.tolist(), *high.tolist()]})
         if ious[same] > _SAME_IOU:
