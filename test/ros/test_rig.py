@@ -177,6 +177,20 @@ def test_a_silent_camera_holds_no_instant_up(cameras, heard):
     assert {one.left_out for one in found} == {('front',)}
 
 
+@pytest.mark.usefixtures('known')
+@pytest.mark.parametrize('rig', [math.inf], indirect=True)
+def test_a_frame_that_is_too_late_makes_no_instant_of_its_own(rig, cameras, wait, heard):
+    """Those who wait for a frame may have it."""
+    at_s = now_s()
+    cameras(at_s, {'front': 0.0, 'back': 0.0})
+    wait(lambda: heard[-1].stamp_ns == round(at_s * 1e9), 'the instant without a camera')
+    count, now = len(heard), time.monotonic()
+    cameras(at_s, {'left': 0.0})
+    assert names(rig.next_frame(now, now + 30.0)) == ['left']
+    time.sleep(0.7)  # all patience is over
+    assert len(heard) == count and heard[-1].left_out == ('left',)
+
+
 @pytest.mark.parametrize('rig', [0.2], indirect=True)
 def test_a_request_stays_subscribed_until_the_last_cameras_detections(rig, cameras, wait):
     """Each camera's detections come 1.2 s after those of the camera before."""
