@@ -110,9 +110,9 @@ def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_
     recorded = changed(files, tmp_path, query_group=np.arange(12) // 6,
                        is_main=np.arange(12) % 6 == 1)
     given = ('--queries', recorded, '--map', files / 'map.yaml', '--methods', 'auto',
-             '--no-figures', '--frames', 'all', '--fuse')
-    noise = ('--odometry-noise', 0.02, 0.5, '--trials')
-    for name, more in (('exact', ()), ('noisy', (*noise, 2))):
+             '--no-figures', '--fuse')
+    for name, more in (('exact', ('--frames', 'all')),
+                       ('noisy', ('--odometry-noise', 0.02, 0.5, '--trials', 2))):
         done = evaluate_here(*given, *more, '--out', tmp_path / name)
         assert done.returncode == 0, done.stderr
     exact, noisy = (results_of(tmp_path / name) for name in ('exact', 'noisy'))
@@ -122,7 +122,7 @@ def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_
     # each trial has noise of its own
     first, second = ([row['map_from_camera'] for row in noisy if row['trial'] == trial]
                      for trial in range(2))
-    assert first != second and len(first) == len(second) == 12
+    assert first != second and len(first) == len(second) == 2
     assert_error(evaluate_here(*small(files, '--methods', 'auto', '--fuse', '--out', tmp_path)),
                  '--fuse', 'neighbouring')
 

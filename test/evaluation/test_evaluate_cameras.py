@@ -26,7 +26,8 @@ def rig_bag(tmp_path_factory):
 def run(rig_bag, out, *arguments):
     return evaluate(list(map(str, (
         '--bag', rig_bag, *NETWORKS, '--methods', 'auto', '--trials', 1, '--sweep',
-        '--no-figures', '--image', 'image/compressed', '--out', out, *arguments))))
+        '--no-figures', '--workers', 1, '--image', 'image/compressed', '--out', out,
+        *arguments))))
 
 
 def results_of(folder):
