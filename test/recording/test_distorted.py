@@ -4,6 +4,7 @@
 
 import json
 import shutil
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -29,15 +30,20 @@ LENS = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, 'plumb_bob',
               (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
 
 
+@cache
+def places_in(straight):
+    """Return where a camera without distortion shows what each pixel of the lens shows."""
+    pixels = np.stack(np.meshgrid(np.arange(LENS.width), np.arange(LENS.height)), axis=-1)
+    places = straight.project_normalized(LENS.normalize_points(pixels.reshape(-1, 2)))
+    return places.reshape(LENS.height, LENS.width, 2).astype(np.float32)
+
+
 def bend(source, folder, every=1):
     """Write each n-th image of a walk of the demo as a camera with the lens takes it."""
     shutil.copytree(source, folder)
     rows = [row for row in (folder / 'rgb.txt').read_text().splitlines() if row[0] != '#'][::every]
     (folder / 'rgb.txt').write_text('\n'.join(rows) + '\n')
-    pixels = np.stack(np.meshgrid(np.arange(LENS.width), np.arange(LENS.height)), axis=-1)
-    straight = json.loads((folder / 'camera.json').read_text())
-    places = Camera(**straight).project_normalized(LENS.normalize_points(pixels.reshape(-1, 2)))
-    places = places.reshape(LENS.height, LENS.width, 2).astype(np.float32)
+    places = places_in(Camera(**json.loads((folder / 'camera.json').read_text())))
     for row in rows:
         file = folder / row.split()[1]
         image = cv2.remap(cv2.imread(str(file)), places, None, cv2.INTER_LINEAR)
@@ -62,7 +68,7 @@ def recorded(folder):
     """The observations of the walk for mapping; its map lies next to them."""
     bend(ASSETS / 'mapping', folder / 'mapping')
     assert build_map(arguments('--tum', folder / 'mapping', *NETWORKS, '--no-clip', '--no-check',
-                               '--out', folder / 'map.yaml', '--record-to',
+                               '--no-joint', '--out', folder / 'map.yaml', '--record-to',
                                folder / 'mapping.npz')) == 0
     return load_recorded(folder / 'mapping.npz').detections
 
@@ -106,7 +112,7 @@ def test_boxes_of_an_ideal_fisheye_are_undistorted():
 
 
 def test_a_recording_is_localized_in_the_map_of_the_room(folder):
-    bend(ASSETS / 'sequence', folder / 'sequence', every=3)
+    bend(ASSETS / 'sequence', folder / 'sequence', every=4)
     assert tum_to_bag(arguments(folder / 'sequence', folder / 'bag')) == 0
     assert evaluate(arguments(
         '--bag', folder / 'bag', '--map', ASSETS / 'map.yaml', *NETWORKS, '--clip-model',
