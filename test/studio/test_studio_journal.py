@@ -67,6 +67,7 @@ def test_replay_between_announcing_and_writing(path):
     """A studio that was killed while it saved: either content has the right edits."""
     document = Document(path)
     document.edit(edits.set_fields, ['cup_1'], label='first')
+    document.edit(edits.mark, ['book_1'], 'lock', is_locked=True)
     document._journal.append({'writing': document._file.with_landmarks(
         document.landmarks).digest})
     written = document._file.with_landmarks(document.landmarks).text
@@ -77,6 +78,8 @@ def test_replay_between_announcing_and_writing(path):
     path.write_text(written)
     again = Document(path)
     assert again.landmarks['cup_1'].label == 'first' and again.is_saved
+    assert again.landmarks['book_1'].marks.is_locked
+    assert not journal_of(path).with_name(f'{journal_of(path).name}.1').exists(), 'set aside'
 
 
 def test_edits_of_another_content_are_set_aside(path):
