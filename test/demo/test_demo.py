@@ -18,7 +18,7 @@ import yaml
 
 PROJECT = Path(__file__).resolve().parents[2]
 
-WAKE_UPS = 10
+WAKE_UPS = 5
 PATIENCE_S = 300.0
 ROW = re.compile(r'^(\d+) .*?(accepted|refused) .*?\(?([0-9.]+) m [0-9.]+°', re.MULTILINE)
 
