@@ -106,6 +106,7 @@ def test_the_doctor_looks_at_each_camera(four_cameras, start):
     assert {('detector', 'pass'), ('time', 'pass')} <= found
 
 
+@pytest.mark.full  # ros/test_combinations.py replays four cameras, test_record.py by evaluate
 def test_a_recorded_request_of_four_cameras_replays(four_cameras, tester, surroundings_map, cases,
                                                     replay):
     _, ask = four_cameras
