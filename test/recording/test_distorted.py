@@ -4,7 +4,6 @@
 
 import json
 import shutil
-from functools import cache
 from pathlib import Path
 
 import cv2
@@ -30,20 +29,17 @@ LENS = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, 'plumb_bob',
               (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
 
 
-@cache
-def places_in(straight):
-    """Return where a camera without distortion shows what each pixel of the lens shows."""
-    pixels = np.stack(np.meshgrid(np.arange(LENS.width), np.arange(LENS.height)), axis=-1)
-    places = straight.project_normalized(LENS.normalize_points(pixels.reshape(-1, 2)))
-    return places.reshape(LENS.height, LENS.width, 2).astype(np.float32)
-
-
 def bend(source, folder, every=1):
     """Write each n-th image of a walk of the demo as a camera with the lens takes it."""
     shutil.copytree(source, folder)
     rows = [row for row in (folder / 'rgb.txt').read_text().splitlines() if row[0] != '#'][::every]
     (folder / 'rgb.txt').write_text('\n'.join(rows) + '\n')
-    places = places_in(Camera(**json.loads((folder / 'camera.json').read_text())))
+    straight = json.loads((folder / 'camera.json').read_text())
+    pixels = np.stack(np.meshgrid(*map(np.arange, (640.0, 480.0))), axis=-1).reshape(-1, 1, 2)
+    points = cv2.undistortPoints(pixels, LENS.matrix, np.array(LENS.distortion),
+                                 criteria=(cv2.TERM_CRITERIA_COUNT, 100, 0.0)).reshape(-1, 2)
+    places = Camera(**straight).project_normalized(points)
+    places = places.reshape(LENS.height, LENS.width, 2).astype(np.float32)
     for row in rows:
         file = folder / row.split()[1]
         image = cv2.remap(cv2.imread(str(file)), places, None, cv2.INTER_LINEAR)
