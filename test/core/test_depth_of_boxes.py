@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Depth of the boxes: it helps where it is right, and does no harm where it is wrong."""
+"""Depth of boxes and of images: it helps where it is right, and does no harm where it is not."""
 
 from dataclasses import replace
 
@@ -9,15 +9,22 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
 from cliploc_ros.core.acceptance.depth_check import DepthCheck, DepthScale
+from cliploc_ros.core.depth_image import (
+    DepthCamera,
+    DepthImage,
+    depth_from_counts,
+    depths_of_boxes,
+)
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth import centre_depth, half_chord
 from cliploc_ros.core.geometry.ellipsoid import shape_matrices
-from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.errors import OptionsError
+from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.offline.evaluation.trials import simulate_depths
 
 ROOM = make_room()
@@ -140,3 +147,51 @@ def test_depth_is_off_by_eight_percent_at_most():
             scale.add(DepthCheck(4, 0.0, 0.0, one))
             assert scale.ratio == (ratio if number == 5 else 1.0)
         assert scale.is_wrong == is_wrong
+
+
+COLOR = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
+
+
+def test_depth_of_boxes_is_robust():
+    depths = np.full((480, 640), 4.0, dtype=np.float32)  # a wall
+    depths[100:200, 100:200] = 2.0  # an object, whose box is a little too large
+    depths[140:150, 100:200] = np.nan  # a hole
+    depths[300:400, 300:400] = np.nan
+    found, spreads = depths_of_boxes(DepthImage(depths), COLOR, np.array([
+        [90.0, 90.0, 210.0, 210.0], [305.0, 305.0, 395.0, 395.0], [600.0, 400.0, 700.0, 500.0],
+        [120.0, 120.0, 122.0, 122.0]]))
+    np.testing.assert_allclose(found, [2.0, np.nan, 4.0, np.nan])
+    np.testing.assert_allclose(spreads[[0, 2]], 0.0)
+    smaller, _ = depths_of_boxes(DepthImage(depths[::2, ::2]), COLOR, np.array([
+        [90.0, 90.0, 210.0, 210.0], [305.0, 305.0, 395.0, 395.0]]))
+    np.testing.assert_allclose(smaller, [2.0, np.nan])
+
+
+def test_depth_that_is_not_registered():
+    own = DepthCamera(585.0, 585.0, 320.0, 240.0, make_transform(
+        np.eye(3), np.array([-0.025, 0.0, 0.0])))
+    depths = np.full((480, 640), 4.0, dtype=np.float32)
+    depths[200:280, 400:480] = 1.0
+    # where the colour camera sees it: scaled by .897, shifted by 525 * 25 mm / 1 m = 13 px
+    left = 320 + (400 - 320) * 525 / 585 - 13.125
+    box = np.array([[left, 204.1, left + 71.8, 275.9]])
+    found, spread = depths_of_boxes(DepthImage(depths, own), COLOR, box)
+    np.testing.assert_allclose([found[0], spread[0]], [1.0, 0.0], atol=1e-6)
+    # a depth camera on its side, its x axis where the other's y axis is
+    aside = DepthCamera(585.0, 585.0, 240.0, 639.0 - 320.0, own.color_from_depth @ make_transform(
+        np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3)))
+    found, spread = depths_of_boxes(DepthImage(np.rot90(depths), aside), COLOR, box)
+    np.testing.assert_allclose([found[0], spread[0]], [1.0, 0.0], atol=1e-6)
+    # taken for registered, the box further left shows the wall
+    box = box - [20, 0, 20, 0]
+    assert depths_of_boxes(DepthImage(depths), COLOR, box)[0][0] == 4.0
+    assert depths_of_boxes(DepthImage(depths, own), COLOR, box)[0][0] == 1.0
+
+
+def test_counts_and_floats_are_depths_in_metres():
+    counts = np.array([[0, 65535, 1500]], dtype=np.uint16)
+    np.testing.assert_allclose(depth_from_counts(counts, None, 'x'), [[np.nan, np.nan, 1.5]])
+    metres = np.array([[0.0, np.inf, 1.5]])
+    np.testing.assert_allclose(depth_from_counts(metres, None, 'x'), [[np.nan, np.nan, 1.5]])
+    with pytest.raises(DatasetError, match='16-bit'):
+        depth_from_counts(np.zeros((2, 2, 3), dtype=np.uint8), None, 'x')

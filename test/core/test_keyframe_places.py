@@ -27,6 +27,7 @@ from cliploc_ros.core.keyframes.layer import (
     load_layer_of_map,
     save_layer,
 )
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, find_pose, free_focal
 from cliploc_ros.core.search.scene import Constraint
 from cliploc_ros.errors import MapError
@@ -81,6 +82,54 @@ def test_the_most_similar_keyframe_has_the_same_words():
     for keyframe in range(KEYFRAMES):
         similarities = layer.similarities(layer.unit_descriptors(keyframe))
         assert similarities.argmax() == keyframe
+
+
+@pytest.fixture
+def corridor():
+    """Twenty keyframes 10 m apart, each of forty points of its own in the middle of the image."""
+    layer = make_layer(ROOM, keyframes=20)
+    poses = layer.map_from_camera.copy()
+    poses[:, 0, 3] = 10.0 * np.arange(len(layer))
+    return replace(layer, map_from_camera=poses, points=np.random.default_rng(1).uniform(
+        (-0.4, -0.4, 1.0), (0.4, 0.4, 1.5), layer.points.shape).astype(np.float32))
+
+
+def features_at(layer, keyframe, shown=slice(None)):
+    """Features of some points of a keyframe, as its camera sees them 0.1 m to the right."""
+    rows = np.arange(*layer.offsets[keyframe:keyframe + 2])[shown]
+    points = layer.points[rows] - np.array([0.1, 0.0, 0.0])
+    return CAMERA.project_normalized(points[:, :2] / points[:, 2:]), layer.descriptors[rows]
+
+
+@pytest.mark.parametrize('misleading', [0, 15])
+def test_a_keyframe_is_found_though_others_look_more_like_the_image(corridor, misleading, rng):
+    """These show most words of the image, but their points agree on no pose."""
+    pixels, descriptors = features_at(corridor, 18, slice(30))
+    for keyframe in range(misleading):
+        descriptors = np.concatenate([descriptors, features_at(corridor, keyframe)[1]])
+    others = rng.uniform(0.0, (CAMERA.width, CAMERA.height), (len(descriptors) - len(pixels), 2))
+    seen = Features(np.concatenate([pixels, others]), descriptors,
+                    np.ones(len(descriptors), np.float32))
+    place, = KeyframeLocalizer(corridor).localize_features(seen, CAMERA).places
+    assert place.map_from_camera[:3, 3] == pytest.approx([180.1, 0.0, 0.0], abs=1e-3)
+    assert (place.inliers, place.keyframes) == (30, (18,))
+    assert abs(place.focal_ratio - 1.0) <= 3.0 * place.focal_deviation < 0.1
+
+
+def test_keyframes_know_what_is_inside_of_the_image(corridor):
+    localizer, (middle, aside) = KeyframeLocalizer(corridor), corridor.map_from_camera[[2, 2]]
+    aside[0, 3] -= 1.9
+    assert localizer.coverage(middle, CAMERA) > 0.0
+    assert localizer.coverage(aside, CAMERA) == 0.0
+
+
+def test_a_selected_keyframe_is_as_it_was(corridor):
+    one = corridor.select(np.arange(20) == 7)
+    assert one.offsets.tolist() == [0, POINTS]
+    np.testing.assert_array_equal(one.map_from_camera, corridor.map_from_camera[[7]])
+    for name in ('pixels', 'points', 'descriptors', 'words'):
+        np.testing.assert_array_equal(getattr(one, name),
+                                      getattr(corridor, name)[7 * POINTS:8 * POINTS])
 
 
 @pytest.mark.parametrize(('other', 'message'), [
@@ -304,4 +353,4 @@ def test_features_are_found_in_any_image():
     assert np.mean(np.abs(shifts).max(axis=1) < 0.5) > 0.9
     for empty in (np.zeros((480, 640, 3), np.uint8), np.zeros((1, 1, 3), np.uint8),
                   np.full((1, 1, 3), 255, np.uint8), np.full((2, 3000, 3), 90, np.uint8)):
-        assert len(extract(empty, 300)) == 0
+        assert extract(empty, 300).pixels.shape == (0, 2)

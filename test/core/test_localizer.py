@@ -243,6 +243,7 @@ def test_a_blocked_view_is_forgotten_after_twenty_looks(camera):
     for number in range(100):
         camera.look(number / 10, 9.0)
     means = [camera.look(10.0 + number / 10, 1.0) for number in range(15)]
+    assert means[0] == pytest.approx(1 / 20)
     assert [mean >= 0.5 for mean in means] == [False] * 9 + [True] * 6
 
 
@@ -338,6 +339,20 @@ def test_objects_seen_one_after_the_other_are_as_good_as_at_once(room, walk):
     # of the last frame alone
     assert [match.detection for match in found.matches] == [0, 1]
     assert [match.landmark for match in found.matches] == shares[-1]
+    # two objects tell of their camera where the vertical is known
+    upright = relocalizer.relocalize([knowing_up(*one) for one in zip(frames, walk, strict=True)])
+    assert (len(found.cameras), len(upright.cameras)) == (2, 4)
+
+
+def test_the_odometry_of_a_camera_that_looks_into_a_mirror_is_mirrored(room):
+    """From behind, things on a wall look as in a mirror, however the camera moves."""
+    wall = replace(room, centers=room.centers * [1.0, 1.0, 0.0] + [0.0, 0.0, 4.0],
+                   semi_axes=np.full((len(room), 3), 0.2))
+    walk = [moved(MAP_FROM_CAMERA, 0.2 * step, 4.0 * step) for step in range(4)]
+    one, four = (Relocalizer(wall, OPTIONS).relocalize([see(wall, pose) for pose in poses])
+                 for poses in (walk[:1], walk))
+    assert one.evidence.not_mirrored < 0.97
+    assert four.evidence.not_mirrored == pytest.approx(one.evidence.not_mirrored, abs=1e-3)
 
 
 @pytest.mark.filterwarnings('error')
@@ -413,8 +428,8 @@ def test_odometry_adds_more_error_to_frames_that_are_further_apart(room):
 
 def test_the_deviations_of_odometry():
     assert not odometry_deviations(np.eye(4)).any(), 'did not move'
-    deviations = odometry_deviations(make_transform(
-        Rotation.from_euler('z', 10, degrees=True).as_matrix(), np.array([0.5, 0.0, 0.0])))
+    assert odometry_deviations(pose(10.0))[3:] == pytest.approx(np.radians(0.25 + 0.03 * 10.0))
+    deviations = odometry_deviations(pose(10.0, 0.5))
     assert deviations[:3] == pytest.approx(0.005 + 0.03 * 0.5)
     assert deviations[3:] == pytest.approx(np.radians(0.25 + 0.03 * 10.0 + 0.15 * 0.5))
 

@@ -103,16 +103,21 @@ def test_a_doubled_map_is_not_its_own_twin(offset_m):
     assert len(found) == 0
 
 
-def test_poses_that_a_search_met_are_compared_too():
-    """Landmarks in a row above each other have no pairs with a direction."""
-    pile = np.array([[0.0, 0.0, 0.2 * row] for row in range(6)])
-    piles = make_map(np.concatenate([pile, pile + shift_along(5.0)]), CLASSES[:2] * 6)
-    assert len(find_repeats(piles.pairs, np.arange(6)).votes) == 0
-    met = move_of(0, (5.2, 0.1, 0.1))
-    found = find_twins(piles, np.eye(4), np.arange(6), met[None])[0]
-    assert np.allclose(found[0, :3, 3], [5, 0, 0], atol=1e-6)
+PILE = np.array([[0.0, 0.0, 0.2 * row] for row in range(6)])
+RING = 3.5 * np.array([[np.cos(angle), np.sin(angle), 0.0] for angle in np.arange(6) * np.pi / 3])
+
+
+@pytest.mark.parametrize(('place', 'turn_deg'), [(PILE, 0.0), (RING, 90.0)])
+def test_poses_that_a_search_met_are_compared_too(place, turn_deg):
+    """Landmarks above each other have no pairs with a direction, those far apart none at all."""
+    there = move_of(turn_deg, (20, 0, 0))
+    places = make_map(np.concatenate([place, moved(place, there)]), 'abcdef' * 2)
+    assert len(find_repeats(places.pairs, np.arange(6)).votes) == 0
+    met = move_of(turn_deg, (20.2, 0.1, 0.1))
+    found = find_twins(places, np.eye(4), np.arange(6), met[None])[0]
+    assert np.allclose(found[0], there, atol=1e-6)
     lying = make_transform(Rotation.from_euler('x', 90, degrees=True).as_matrix(), met[:3, 3])
-    assert len(find_twins(piles, np.eye(4), np.arange(6), lying[None])[0]) == 0
+    assert len(find_twins(places, np.eye(4), np.arange(6), lying[None])[0]) == 0
 
 
 def test_what_was_matched_must_look_alike_too():

@@ -12,7 +12,7 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.joined_map import MAX_MAPS, join_maps, parts_of, place_of
-from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_details import LandmarkDetails, join_details
 from cliploc_ros.core.map.landmark_embeddings import (
     LandmarkEmbeddings,
     embeddings_path,
@@ -109,6 +109,14 @@ def test_labels_may_stand_in_place_of_a_label():
     rows = [{'text': 'a mug', 'weight': 0.25}, {'text': 'a red cup', 'weight': 0.75}]
     assert read(CUP | {'labels': rows, 'label': 'mine'}).labels == ('mine',)
     assert read(CUP | {'labels': rows}).details == landmark_map.details
+    assert read(CUP | {'labels': rows, 'label': 'mine'}).weighted_labels == (
+        (('mine', 0.75), ('a mug', 0.25), ('a red cup', 0.75)),)
+
+
+def test_a_thing_that_was_two_landmarks_has_the_labels_of_both_by_their_frames():
+    often, once = (LandmarkDetails(support=count) for count in (3, 1))
+    joined = join_details([('a mug', 'cup', often), ('a bowl', 'cup', once)])
+    assert joined.labels == (('a mug', 0.75), ('a bowl', 0.25))
 
 
 @pytest.mark.parametrize(('fields', 'message'), [
@@ -150,6 +158,7 @@ def test_what_was_written_is_read_as_yaml_reads_it(tmp_path, details, label):
 
 @pytest.mark.parametrize(('before', 'after'), [
     ('center: [', 'center: [0'), ('0.', '.'), ('label: "', 'label: '),
+    ('center: [', 'center: [9999999'),
     ('semi_axes: [0', 'semi_axes: [-0'), ('semi_axes: [0', 'semi_axes: [1e9'),
     ('support: 37', 'support: 37.5'), ('support: 37', 'support: -37'), ('"cup": ', '"c\\ud83d": '),
     ('position_sigma: 0.0125', 'position_sigma: .nan'), ('    text: [', '    text: ["one more", '),
@@ -191,7 +200,8 @@ def write(tmp_path, content):
 
 
 def test_reads_every_field(tmp_path):
-    loaded = LandmarkMap.from_file(write(tmp_path, file_of({'cup_1': WITH_LABEL})))
+    others = {'/x': {'ros__parameters': {'k': 3}}, 'y': 1}
+    loaded = LandmarkMap.from_file(write(tmp_path, others | file_of({'cup_1': WITH_LABEL})))
     assert (loaded.frame_id, loaded.landmark_ids, loaded.labels, loaded.class_ids) == (
         'map', ('cup_1',), ('a red cup',), ('cup',))
     assert loaded.centers.tolist() == [[1.0, 2.0, 3.0]]

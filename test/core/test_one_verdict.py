@@ -82,6 +82,8 @@ def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
     assert strong.source == weak.source == 'both'
     assert error_m(strong, 0.05) < 1e-12
     assert error_m(weak) < 0.02, 'a few points hardly move the pose of objects'
+    points = ask(Says(place(0.05, inliers=9)), objects=0)
+    assert weak.evidence.by_points <= points.evidence.by_points, 'objects say no more for points'
 
 
 @pytest.mark.parametrize('cause', ['too few objects', 'a search cut short', 'earlier looks'])
@@ -111,6 +113,16 @@ def test_keyframes_alone_must_meet_the_rule_of_successive_looks():
     relocalizer = Relocalizer(ROOM, OPTIONS)
     found = relocalizer.locate([relocalizer.search(seen)], looks=looks, recognizer=Says(place()))
     assert found.refusal_kind == RefusalKind.FRAMES_DISAGREE
+
+
+def test_a_place_that_moves_otherwise_than_odometry_says_is_no_room():
+    first = Observation(CAMERA, SEEN.select(np.arange(0)), odom_from_camera=np.eye(4))
+    second = replace(first, stamp_ns=10, odom_from_camera=moved(0.3, np.eye(4)))
+    looks = Looks().with_look(Look(first, MAP_FROM_CAMERA, 0.99, place()), accepted=True)
+    relocalizer = Relocalizer(ROOM, OPTIONS)
+    found = [relocalizer.locate([relocalizer.search(one)], looks=looks, recognizer=Says(place()))
+             for one in (second, replace(second, odom_from_camera=np.eye(4)))]
+    assert [one.accepted for one in found] == [False, True]
 
 
 @pytest.mark.parametrize('inliers', [60, 400])
@@ -161,10 +173,12 @@ def test_the_twin_of_a_place_without_keyframes_stays_a_rival(lacking):
     assert found.refusal_kind == RefusalKind.LOOK_ALIKE
 
 
-def test_keyframes_tell_a_twin_that_they_cover_apart():
-    assert ask(Says(place(), covers=1.0), room=two_rooms()).accepted
-    both = ask(Says(place(), place(20.0, inliers=190), covers=1.0), room=two_rooms())
-    assert not both.accepted, 'both rooms are recognized'
+@pytest.mark.parametrize('covers', [1.0, 0.1])
+def test_keyframes_tell_a_twin_that_they_cover_as_well_apart(covers):
+    found = ask(Says(place(), covers=covers), room=two_rooms())
+    assert found.accepted and found.evidence.distinct > 0.99
+    both = ask(Says(place(), place(20.0, inliers=190), covers=covers), room=two_rooms())
+    assert not both.accepted and both.evidence.distinct < 0.6, 'both rooms are recognized'
 
 
 def test_fusing_takes_the_better_pose_of_each_direction():

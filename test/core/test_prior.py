@@ -166,6 +166,12 @@ def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries,
     assert wrong == 0
 
 
+def test_the_right_pose_is_met_whatever_the_vertical_says(room):
+    up = Rotation.from_euler('z', 90, degrees=True).apply(UP_IN_CAMERA)
+    found = Relocalizer(room, OPTIONS).relocalize([with_vertical(room, up)])
+    assert pose_error(found.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
+
+
 def test_two_objects_and_the_vertical_fix_a_pose(room):
     """But are refused, for four are asked; and without a vertical there is none."""
     options = RelocalizerOptions(matching='class')

@@ -16,7 +16,7 @@ from cliploc_ros.core.observation import Observation, Region
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import CASE, Case, Query, case_arrays, read_case
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.errors import DatasetError
+from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.models.observer import Observer
 
 ROOM = make_room()
@@ -97,6 +97,12 @@ def test_another_map_has_labels_of_its_own(tmp_path):
                    Observer(encoder, labels))
     assert encoder.count == 0
     assert pose_error(again.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
+    # similarities that are given need no crops
+    given = query(similarities=np.eye(12, dtype=np.float32))
+    Localizer(Relocalizer(ROOM, options)).answer(given, Observer(encoder, LABELS))
+    assert encoder.count == 0
+    with pytest.raises(OptionsError):
+        Localizer(Relocalizer(ROOM, options)).answer(query())
 
 
 def test_all_that_is_known_comes_back(tmp_path):

@@ -27,6 +27,7 @@ from cliploc_ros.core.geometry.transforms import (
     SAME_PLACE,
     invert_transform,
     make_transform,
+    pose_difference,
     pose_error,
 )
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
@@ -296,8 +297,11 @@ def test_the_covariance_holds_the_chance_that_an_object_is_wrong():
     assert np.trace(added[:3, :3]) > 0.01 * np.trace(
         fitted([MAP_FROM_CAMERA], ROOM.centers, 0.02)[1][:3, :3])
     displaced = ROOM.centers.copy()
-    displaced[4] += [0.15, 0.1, 0.0]
-    assert np.trace(added_in(displaced)[:3, :3]) > np.trace(added[:3, :3])
+    displaced[4] += [0.06, 0.04, 0.0]
+    # the pose would step back without this object
+    step = pose_difference(MAP_FROM_CAMERA, fitted([MAP_FROM_CAMERA], displaced, 0.02)[0])[:3]
+    more = (added_in(displaced) - added)[:3, :3]
+    assert step @ more @ step > 0.07 * (step @ step) ** 2 > 0.0
 
 
 def test_odometry_is_a_walk_through_the_frames_in_order_of_time():

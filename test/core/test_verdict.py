@@ -433,16 +433,23 @@ def at(x=0.0, degrees=0.0):
 def test_a_better_answer_tells_what_it_knows_better():
     _, known = succeed(None, at(), at(), OWN)
     better = OWN.copy()
-    better[1, 1] = 0.001
-    given, after = succeed(known, at(), at(), better)
-    assert after.covariance[1, 1] == pytest.approx(0.001, rel=1e-2)
-    assert after.covariance[0, 0] == pytest.approx(0.04, rel=1e-2)
-    assert given[1, 1] < 0.002 and given[0, 0] > 100.0
+    better[0, 0] = 0.001
+    given, after = succeed(known, at(), at(0.1), better)
+    assert after.covariance[0, 0] == pytest.approx(0.001, rel=1e-2)
+    assert after.covariance[1, 1] == pytest.approx(0.01, rel=1e-2)
+    assert given[0, 0] < 0.002 and given[1, 1] > 50.0
+    # nearly all of the way to it
+    assert after.map_from_camera[0, 3] == pytest.approx(0.1, abs=0.005)
 
 
-def test_a_robot_that_drove_on_is_told_anew():
-    _, known = succeed(None, at(), at(), OWN)
-    near, far = (succeed(known, at(way), at(way), OWN)[0] for way in (0.5, 50.0))
+def test_a_robot_that_drove_on_is_told_anew_wherever_the_map_begins():
+    given = []
+    for start in (0.0, 30.0):
+        _, known = succeed(None, at(start), at(start), OWN)
+        given.append([succeed(known, at(start + way), at(start + way), OWN)[0]
+                      for way in (0.5, 50.0)])
+    np.testing.assert_allclose(*given, rtol=1e-6, atol=1e-9)
+    near, far = given[0]
     assert near[0, 0] > 10.0 * OWN[0, 0]
     assert far[0, 0] < 2.0 * OWN[0, 0]
 

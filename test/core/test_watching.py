@@ -65,9 +65,9 @@ def test_good_images_have_no_fault(images):
     (lambda one: np.full_like(one, 90), 'covered', 3),
     (lambda one: cv2.GaussianBlur(one, (0, 0), 6.0), 'blurred', 5)])
 def test_a_fault_that_lasts_is_named(images, change, word, looks):
-    found = faults_of([change(one) for one in images], poses(6))
-    assert found[:looks - 1] == [''] * (looks - 1)
-    assert word in found[looks - 1]
+    found = faults_of([images[0], *map(change, images)], poses(7))
+    assert found[:looks] == [''] * looks
+    assert word in found[looks]
     # one good image ends it
     again = faults_of([*map(change, images), images[0]], poses(7))
     assert again[-1] == ''
@@ -246,6 +246,13 @@ def test_looks_that_say_the_opposite_are_no_repetitions():
                                      1.0 - TERMS.correlated])
 
 
+def test_without_odometry_looks_share_errors_for_some_seconds():
+    belief, seen = Belief(), Observation(CAMERA, NOTHING)
+    belief.add(seen, 3.0, is_full=True)
+    assert belief.add(replace(seen, stamp_ns=5 * NS_PER_S), 3.0, is_full=True) == pytest.approx(
+        1.0 - TERMS.correlated * np.exp(-5.0 / TERMS.correlated_s))
+
+
 @pytest.mark.parametrize(('way_m', 'time_s'), [(100.0, 0), (0.0, 100), (50.0, 200)])
 def test_the_way_and_the_time_make_a_sure_watch_unsure(way_m, time_s):
     belief, after = Belief(), moved(np.eye(4), way_m, 0.0)
@@ -293,6 +300,14 @@ def test_missing_landmarks_are_named(watch, room):
     assert named >= set(gone) & expected - {25} or len(named) >= 2
 
 
+def test_where_a_third_is_gone_the_map_is_out_of_date(watch, room):
+    there = np.nonzero(np.arange(COUNT) % 3)[0]
+    report = follow(watch, room, drive(36), rows=there)[-1]
+    assert report.state == WatchState.UNCERTAIN
+    assert report.probability > TERMS.localized
+    assert f'{len(report.missing)} landmarks' in report.reason
+
+
 @pytest.mark.parametrize('rotvec', [(3.0, 0.0, 0.0), (0.0, -6.0, 0.0), (0.0, 0.0, 8.0),
                                     (-2.0, 0.0, 0.0)])
 def test_the_turn_of_a_camera_is_known_after_twenty_looks(watch, room, rotvec):
@@ -335,6 +350,8 @@ def test_a_pose_against_the_vertical_is_less_likely():
     up = np.array([0.0, -1.0, 0.0])
     assert by_vertical(level, None, 1.0) == by_vertical(level, up, 1.0) == 0.0
     assert by_vertical(tilted, up, 1.0) < -3.0
+    upside_down = -up * (1.0 + 1e-12)  # by rounding
+    assert by_vertical(level, upside_down, 1.0) == -CALIBRATION.attitude.wrong_mount
 
 
 def things(*centers):
@@ -418,6 +435,11 @@ def test_a_pose_that_is_off_is_aligned_with_what_is_seen(room):
     options, pose = RelocalizerOptions(matching='class'), drive(1)[0]
     away = measure(align(look_at(room, see(room, pose), options), moved(pose, 0.2, 0.1)))[0]
     assert away.away_m == pytest.approx(np.hypot(0.2, 0.1), abs=0.06)
+    pose = drive(5)[4]
+    near, far = (align(look_at(room, see(room, pose), options), moved(pose, 0.0, 0.0, degrees))
+                 for degrees in (19.0, 21.0))
+    assert near.away_deg == pytest.approx(19.0, abs=0.2)
+    assert far.away_deg < 20.0, 'a localizer is never so far off'
 
 
 @pytest.mark.parametrize(('similarities', 'matching'), [(False, 'class'), (True, 'hybrid')])

@@ -11,14 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.depth_image import (
-    DepthCamera,
-    DepthImage,
-    depth_from_counts,
-    depths_of_boxes,
-)
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.bag_frames import BagTopics
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
@@ -273,44 +266,7 @@ def test_tum_rgbd(tmp_path):
     assert next(rgbd_frames(tmp_path, millimetres).read()).depth.depths_m[1, 1] == 5.0
 
 
-def test_depth_of_boxes_is_robust():
-    depths = np.full((480, 640), 4.0, dtype=np.float32)  # a wall
-    depths[100:200, 100:200] = 2.0  # an object, whose box is a little too large
-    depths[140:150, 100:200] = np.nan  # a hole
-    depths[300:400, 300:400] = np.nan
-    found, spreads = depths_of_boxes(DepthImage(depths), CAMERA, np.array([
-        [90.0, 90.0, 210.0, 210.0], [305.0, 305.0, 395.0, 395.0], [600.0, 400.0, 700.0, 500.0],
-        [120.0, 120.0, 122.0, 122.0]]))
-    np.testing.assert_allclose(found, [2.0, np.nan, 4.0, np.nan])
-    np.testing.assert_allclose(spreads[[0, 2]], 0.0)
-
-
-def test_depth_that_is_not_registered():
-    own = DepthCamera(585.0, 585.0, 320.0, 240.0, make_transform(
-        np.eye(3), np.array([-0.025, 0.0, 0.0])))
-    depths = np.full((480, 640), 4.0, dtype=np.float32)
-    depths[200:280, 400:480] = 1.0
-    # where the colour camera sees it: scaled by .897, shifted by 525 * 25 mm / 1 m = 13 px
-    left = 320 + (400 - 320) * 525 / 585 - 13.125
-    box = np.array([[left, 204.1, left + 71.8, 275.9]])
-    found, spread = depths_of_boxes(DepthImage(depths, own), CAMERA, box)
-    np.testing.assert_allclose([found[0], spread[0]], [1.0, 0.0], atol=1e-6)
-    # a depth camera on its side, its x axis where the other's y axis is
-    aside = DepthCamera(585.0, 585.0, 240.0, 639.0 - 320.0, own.color_from_depth @ make_transform(
-        np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3)))
-    found, spread = depths_of_boxes(DepthImage(np.rot90(depths), aside), CAMERA, box)
-    np.testing.assert_allclose([found[0], spread[0]], [1.0, 0.0], atol=1e-6)
-    # taken for registered, the box further left shows the wall
-    box = box - [20, 0, 20, 0]
-    assert depths_of_boxes(DepthImage(depths), CAMERA, box)[0][0] == 4.0
-    assert depths_of_boxes(DepthImage(depths, own), CAMERA, box)[0][0] == 1.0
-
-
-def test_counts_and_units():
-    counts = np.array([[0, 65535, 1500]], dtype=np.uint16)
-    np.testing.assert_allclose(depth_from_counts(counts, None, 'x'), [[np.nan, np.nan, 1.5]])
-    with pytest.raises(DatasetError, match='16-bit'):
-        depth_from_counts(np.zeros((2, 2, 3), dtype=np.uint8), None, 'x')
+def test_a_wrong_unit_is_named():
     check_depth_unit(np.array([2.0, np.nan], dtype=np.float32), 'x')
     check_depth_unit(np.array([np.nan], dtype=np.float32), 'x')
     for median in (2000.0, 0.002):
