@@ -166,10 +166,11 @@ def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries,
     assert wrong == 0
 
 
-def test_the_right_pose_is_met_whatever_the_vertical_says(room):
-    up = Rotation.from_euler('z', 90, degrees=True).apply(UP_IN_CAMERA)
+def test_the_right_pose_is_the_rival_of_one_by_a_wrong_vertical(room):
+    up = Rotation.from_euler('x', 45, degrees=True).apply(UP_IN_CAMERA)
     found = Relocalizer(room, OPTIONS).relocalize([with_vertical(room, up)])
-    assert pose_error(found.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
+    assert not found.accepted
+    assert found.evidence.rival.place == pytest.approx(MAP_FROM_CAMERA[:3, 3], abs=0.05)
 
 
 def test_two_objects_and_the_vertical_fix_a_pose(room):
