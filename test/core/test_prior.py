@@ -148,8 +148,7 @@ def with_vertical(room, up=UP_IN_CAMERA):
     return Observation(CAMERA, see_room(room), None, up_in_camera=up)
 
 
-@pytest.mark.parametrize('tilt_deg', [
-    90.0, 180.0])
+@pytest.mark.parametrize('tilt_deg', [90.0, 180.0])
 def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries, observe):
     """As by a wrong mount: what boxes say without it is among the rivals."""
     relocalizer, rng = Relocalizer(office_map, RelocalizerOptions()), np.random.default_rng(0)

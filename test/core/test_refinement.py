@@ -352,8 +352,5 @@ def distinct(order, most=None):
 def test_the_first_in_the_given_order_stands_for_its_place():
     assert distinct([0, 1, 2, 3, 4]) == [0, 2, 3]
     assert distinct([4, 1, 3, 2, 0]) == [4, 1, 3]
-
-
-def test_no_more_than_a_count():
     assert distinct([2, 0, 3], 2) == [2, 0]
     assert distinct([], 2) == []
