@@ -13,7 +13,7 @@ from scene import CAMERA, boxes_of, make_room, see_room
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.calibration import CALIBRATION
-from cliploc_ros.core.acceptance.camera_check import CameraCheck, Extent
+from cliploc_ros.core.acceptance.camera_check import CameraCheck, CameraLook, Extent
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.detector_check import DetectorCheck
 from cliploc_ros.core.fit.camera_fit import ERRORS, corrected, fit_camera
@@ -194,6 +194,18 @@ def test_nothing_is_known_of_a_new_camera():
     assert CameraCheck().judge([], np.eye(6)) == (1.0, '')
 
 
+@pytest.mark.parametrize(('error', 'size', 'said'), [
+    (0, 0.3, 'boxes fit fx 675 fy 675 '), (1, 0.2, 'boxes fit fx 553 fy 452 '),
+    (5, 0.4, 'off by +0.00 of their widths and +0.40'), (6, 0.6, '1.82 times as large')])
+def test_the_error_of_a_wrong_camera_is_named(error, size, said, rng):
+    check, information = CameraCheck(), 1e4 * np.eye(ERRORS)
+    check.see(query(rng).observation)
+    check.add([CameraLook('', True, place(rng), information, information[error] * size,
+                          np.zeros((3, ERRORS))) for _ in range(12)])
+    (fault,) = check.faults
+    assert said in fault
+
+
 @pytest.mark.parametrize('focal', [1.0, 1.3])
 def test_with_what_was_known_before_the_same_answer_comes_again(focal, rng):
     """As a recorded request is answered again, from a file."""
@@ -264,6 +276,7 @@ def test_a_fault_shows_over_frames_that_have_a_box_each():
     assert check.faults == []
     check.add(*[detections('62', count=1)] * 2)
     assert check.faults[0].is_certain and '62' in check.faults[0].text
+    assert check.explain(NOTHING_FOUND).refusal_kind is RefusalKind.WRONG_DETECTIONS
 
 
 @pytest.mark.parametrize('score', [87.0, -0.5])

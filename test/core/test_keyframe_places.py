@@ -116,6 +116,19 @@ def test_a_keyframe_is_found_though_others_look_more_like_the_image(corridor, mi
     assert abs(place.focal_ratio - 1.0) <= 3.0 * place.focal_deviation < 0.1
 
 
+def test_a_keyframe_near_a_guess_is_found_though_many_look_more_like_the_image(corridor):
+    pixels, descriptors = features_at(corridor, 18, slice(15))
+    others = [features_at(corridor, keyframe, slice(20)) for keyframe in range(15)]
+    shuffled = [places[::-1] for places, _ in others]
+    seen = Features(np.concatenate([pixels, *shuffled]),
+                    np.concatenate([descriptors, *(one for _, one in others)]),
+                    np.ones(315, np.float32))
+    localizer, guess = KeyframeLocalizer(corridor), corridor.map_from_camera[18]
+    assert localizer.localize_features(seen, CAMERA).places == ()
+    place, = localizer.localize_features(seen, CAMERA, (guess,)).places
+    assert place.keyframes == (18,)
+
+
 def test_keyframes_know_what_is_inside_of_the_image(corridor):
     localizer, (middle, aside) = KeyframeLocalizer(corridor), corridor.map_from_camera[[2, 2]]
     aside[0, 3] -= 1.9

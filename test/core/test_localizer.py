@@ -282,9 +282,9 @@ def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
         pixels=np.array([[0.0, 0.0], [640.0, 480.0]]))))
     image = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
 
-    def localize(seconds, run=0, detections=SEEN, by_keyframes=True):
+    def localize(seconds, run=0, detections=SEEN, by_keyframes=True, deadline=np.inf):
         found = session.answer(Query((frame(seconds, detections=detections),), (image,), run, 5,
-                                     5.0, by_keyframes))
+                                     5.0, by_keyframes), deadline=deadline)
         assert found.accepted
         return found
 
@@ -301,6 +301,9 @@ def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
     alone = localize(3, 1, NOTHING)
     assert alone.source == 'keyframes'
     np.testing.assert_array_equal(session.covariance_for_filter(alone), fine)
+    assert localize(4, by_keyframes=False).source == 'objects'
+    assert localize(5, deadline=0.0).source == 'objects', 'no time is left'
+    assert not session.query.by_keyframes
 
 
 ODOM_FROM_MAP = make_transform(Rotation.from_euler('z', 70, degrees=True).as_matrix(),

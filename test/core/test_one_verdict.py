@@ -82,6 +82,7 @@ def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
     assert strong.source == weak.source == 'both'
     assert error_m(strong, 0.05) < 1e-12
     assert error_m(weak) < 0.02, 'a few points hardly move the pose of objects'
+    assert [len(one.cameras) for one in (strong, weak)] == [0, 1], 'boxes tell of their camera'
     points = ask(Says(place(0.05, inliers=9)), objects=0)
     assert weak.evidence.by_points <= points.evidence.by_points, 'objects say no more for points'
 
@@ -130,6 +131,7 @@ def test_two_sources_that_contradict_each_other_are_refused(inliers):
     found = ask(Says(place(5.0, inliers=inliers)), objects=6)
     assert not found.accepted
     assert found.refusal_kind in {RefusalKind.CONTRADICTION, RefusalKind.UNEXPLAINED}
+    assert found.source == 'objects' and found.evidence.rival.is_other_source
 
 
 def test_a_place_that_the_layer_covers_but_does_not_recognize_loses_confidence():
@@ -179,6 +181,8 @@ def test_keyframes_tell_a_twin_that_they_cover_as_well_apart(covers):
     assert found.accepted and found.evidence.distinct > 0.99
     both = ask(Says(place(), place(20.0, inliers=190), covers=covers), room=two_rooms())
     assert not both.accepted and both.evidence.distinct < 0.6, 'both rooms are recognized'
+    weak = ask(Says(place(inliers=8, confirmed=0.0), covers=covers), room=two_rooms())
+    assert weak.source == 'both' and weak.evidence.distinct < 0.6, 'chance points tell nothing'
 
 
 def test_fusing_takes_the_better_pose_of_each_direction():
