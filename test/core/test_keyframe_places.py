@@ -28,7 +28,7 @@ from cliploc_ros.core.keyframes.layer import (
     save_layer,
 )
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
-from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, find_pose, free_focal
+from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, find_pose, free_focal, refine
 from cliploc_ros.core.search.scene import Constraint
 from cliploc_ros.errors import MapError
 from cliploc_ros.offline.recording.keyframe_layer import PosedFeatures, triangulate
@@ -252,6 +252,12 @@ def test_few_points_and_points_that_agree_on_nothing_give_no_pose():
     found = find_pose(points, rng.permutation(bearings))
     assert found is None or len(found.inliers) < 12
     assert find_pose(np.ones((20, 3)), np.zeros((20, 2))) is None
+
+
+@pytest.mark.parametrize('length_m', [0.0, 1.0])
+def test_points_on_a_line_or_in_one_place_give_no_pose(length_m):
+    points = np.linspace((0.0, 0.0, 2.0), (length_m, 0.5 * length_m, 2.0 + 0.3 * length_m), 20)
+    assert refine(points, points[:, :2] / points[:, 2:], np.eye(4)) is None
 
 
 def test_the_place_in_more_parts_of_the_image_leads_before_a_poster_with_more_points():
