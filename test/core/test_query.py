@@ -57,7 +57,8 @@ def equal(one, other):
 
 
 @pytest.mark.parametrize(('changes', 'count'), [
-    ({}, len(SEEN)), ({'min_confidence': 0.5}, 0), ({'crops': 'all'}, len(SEEN)),
+    ({}, len(SEEN)), ({'min_confidence': 0.5}, 0),
+    ({'crops': 'all', 'min_confidence': 0.5}, len(SEEN)),
     ({'algorithm': 'prosac', 'iterations': 50}, len(SEEN)), ({'matching': 'class'}, 0)])
 def test_the_crops_that_were_compared_are_compared_again(changes, count, tmp_path):
     options = RelocalizerOptions(**{'min_confidence': 1.0} | changes)
