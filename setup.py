@@ -64,7 +64,7 @@ setup(
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
         f'{PACKAGE}.offline.datasets': ['vision_msgs/msg/*.msg'],
-        f'{PACKAGE}.core.acceptance': ['calibration.yaml'],
+        f'{PACKAGE}.core': ['calibration.yaml'],
         f'{PACKAGE}.offline.studio': ['web/studio.*'],
         f'{PACKAGE}.offline.vocabulary': ['*.yaml'],
     },

@@ -18,7 +18,7 @@ MODULES = {'.'.join(path.relative_to(PROJECT).with_suffix('').parts).removesuffi
 # Lowest first. A module belongs to its longest prefix. It may import modules of the same prefix
 # and of lower layers, but none of another prefix in the same layer.
 LAYERS = (
-    ('errors', 'units', 'core.acceptance.calibration'),  # numbers only, of every layer above
+    ('errors', 'units', 'core.calibration'),
     ('files',),
     ('core.kernels',),
     ('core.geometry',),

@@ -24,4 +24,6 @@ geometry
     Transforms, camera, ellipses, ellipsoids, minimal solvers.
 kernels
     Functions compiled to machine code.
+calibration
+    The numbers that decide, read from calibration.yaml.
 """

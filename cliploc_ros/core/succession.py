@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import moved_pose
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.map.visibility import SHOWN_SHARE, look_at
+from cliploc_ros.core.map.visibility import SHOWN_SHARE, boxes_in_image
 from cliploc_ros.core.observation import Detections
 
 #: Standard deviation of a box's edge: [px], and as a share of the box's extent; both are added in
@@ -77,8 +77,8 @@ class DetectorModel:
                 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the landmarks (k,) that a camera could detect, and their boxes (k, 4) [px]."""
         one = self.landmark_map
-        found = look_at(self.camera, invert_transform(map_from_camera), one.centers, one.shapes,
-                        SHOWN_SHARE, self.min_side_px)
+        found = boxes_in_image(self.camera, invert_transform(map_from_camera), one.centers,
+                               one.shapes, SHOWN_SHARE, self.min_side_px)
         distances = np.linalg.norm(one.centers - map_from_camera[:3, 3], axis=1)
         rows = np.nonzero(found.is_shown & (distances <= self.reach_m))[0]
         return rows, found.shown[rows]

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.acceptance.confidence import (
     Setting,
     Support,
@@ -27,6 +26,7 @@ from cliploc_ros.core.acceptance.confidence import (
     none_right,
     utilities,
 )
+from cliploc_ros.core.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, pose_error
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer

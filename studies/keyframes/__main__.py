@@ -5,7 +5,7 @@
 ``collect`` makes maps and layers of a part of each site, changes queries, map or layer, and stores
 what objects and keyframes say about each query. A run that was stopped goes on. ``judge`` decides
 about the stored records as the package does now, and prints what each way accepts. ``fit`` fits
-the sections keyframes and genuine of core/acceptance/calibration.yaml to them, and prints what
+the sections keyframes and genuine of core/calibration.yaml to them, and prints what
 each room would accept by what the others fit.
 """
 

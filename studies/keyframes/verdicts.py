@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.contenders import contenders_of, join_frames, unrefined
 from cliploc_ros.core.acceptance.genuine import Signs
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.options import RelocalizerOptions

@@ -17,7 +17,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from cliploc_ros.command import not_negative, positive_int, run_command
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

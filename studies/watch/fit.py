@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
+from cliploc_ros.core.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.geometry.transforms import Tolerance
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.watch.look import LookEvidence, align, log_odds, look_at, measure

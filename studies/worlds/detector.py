@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.map.visibility import is_hidden, look_at
+from cliploc_ros.core.map.visibility import boxes_in_image, is_hidden
 from cliploc_ros.offline.simulation import CLASS_SHARE, shared_noise, similarities_of
 from studies.worlds.places import CLASS_NAMES, Objects, rows_of
 
@@ -130,8 +130,8 @@ def _in_view(objects: Objects, shapes: NDArray[np.float64], camera: Camera,
     """Return the objects in view (k,), the nearest first, and their boxes (k, 4) [px]."""
     distances = np.linalg.norm(objects.centers - map_from_camera[:3, 3], axis=1)
     near = np.argsort(distances)[:np.count_nonzero(distances < _RANGE_M)]
-    found = look_at(camera, invert_transform(map_from_camera), objects.centers[near], shapes[near],
-                    _SHOWN_SHARE, _LEAST_SIDE_PX)
+    found = boxes_in_image(camera, invert_transform(map_from_camera), objects.centers[near],
+                           shapes[near], _SHOWN_SHARE, _LEAST_SIDE_PX)
     seen = np.nonzero(found.is_shown)[0]
     near, full, wholes = near[seen], found.boxes[seen], objects.wholes[near[seen]]
     # parts of one thing do not hide one another

@@ -12,9 +12,9 @@ import pytest
 from scene import CAMERA, boxes_of, make_room, see_room
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.camera_check import CameraCheck, CameraLook, Extent
 from cliploc_ros.core.acceptance.verdict import RefusalKind
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.detector_check import DetectorCheck
 from cliploc_ros.core.fit.camera_fit import ERRORS, corrected, fit_camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error

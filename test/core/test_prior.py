@@ -13,8 +13,8 @@ from scene import CAMERA, MAP_FROM_CAMERA, doubled_room, make_room, see_room
 from scipy.spatial.transform import Rotation
 from test_map_file import floor, join
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.confidence import confidences, region_odds
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Observation, Region
 from cliploc_ros.core.options import RelocalizerOptions

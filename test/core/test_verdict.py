@@ -16,7 +16,6 @@ from scene import CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION, FILE
 from cliploc_ros.core.acceptance.confidence import (
     Setting,
     Support,
@@ -31,6 +30,7 @@ from cliploc_ros.core.acceptance.confidence import (
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, chance_genuine
 from cliploc_ros.core.acceptance.look_alikes import lead_over_twin, turned_about_axis
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, Rival, refusal
+from cliploc_ros.core.calibration import CALIBRATION, FILE
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.camera import Camera

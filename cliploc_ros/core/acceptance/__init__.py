@@ -21,6 +21,4 @@ camera_check
     Whether boxes, camera_info, mounts and map agree, over all looks of a localizer.
 verdict
     Accept or refuse, with the reason.
-calibration
-    The numbers of calibration.yaml.
 """

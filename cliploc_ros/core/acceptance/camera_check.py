@@ -37,8 +37,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, pdtrc
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.contenders import JoinedFrames
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.camera_fit import ERRORS, fit_camera
 from cliploc_ros.core.fit.covariance import moves_with_cameras, shares_within
 from cliploc_ros.core.fit.finalists import Finalist

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.camera_check import CALIBRATED
 from cliploc_ros.core.acceptance.confidence import (
     confidences,
@@ -44,6 +43,7 @@ from cliploc_ros.core.acceptance.genuine import Motion, Signs, compare_motion, s
 from cliploc_ros.core.acceptance.look_alikes import find_twins, lead_over_twin, turned_about_axis
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, is_exhaustive
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import fuse, share_within
 from cliploc_ros.core.fit.finalists import Finalist, covariance_of, matches_of, meetings_of
 from cliploc_ros.core.fit.verification import verify_rig

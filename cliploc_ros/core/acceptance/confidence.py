@@ -34,7 +34,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
+from cliploc_ros.core.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.depth import depth_errors, depth_odds
 from cliploc_ros.core.geometry.ellipsoid import box_ious, project_ellipsoids

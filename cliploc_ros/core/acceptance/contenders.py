@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.confidence import (
     Setting,
     Support,
@@ -20,6 +19,7 @@ from cliploc_ros.core.acceptance.confidence import (
     tilt_handicaps,
     utilities,
 )
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.verification import Rig, cameras_from_last, make_rig

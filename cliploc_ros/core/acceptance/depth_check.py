@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.finalists import Finalist
 from cliploc_ros.core.fit.refinement import (
     Inliers,

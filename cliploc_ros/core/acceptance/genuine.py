@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.acceptance.confidence import Support
+from cliploc_ros.core.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import move_covariance, pose_difference

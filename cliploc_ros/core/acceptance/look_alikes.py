@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.confidence import Support
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import (
     RIGHT_M,
     SAME_ANSWER,

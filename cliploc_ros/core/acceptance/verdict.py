@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, chance_genuine
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.options import RelocalizerOptions
 

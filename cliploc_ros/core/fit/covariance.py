@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import gammainc
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.camera_fit import ERRORS, camera_jacobian
 from cliploc_ros.core.fit.refinement import (
     LEAST_DEVIATION,

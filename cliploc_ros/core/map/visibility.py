@@ -89,8 +89,9 @@ class InImage(NamedTuple):
     is_shown: NDArray[np.bool_]  #: (n,): whether that is a large enough share, and large enough
 
 
-def look_at(camera: Camera, camera_from_map: NDArray[np.float64], centers: NDArray[np.float64],
-            shapes: NDArray[np.float64], least_share: float, least_side_px: float) -> InImage:
+def boxes_in_image(camera: Camera, camera_from_map: NDArray[np.float64],
+                   centers: NDArray[np.float64], shapes: NDArray[np.float64], least_share: float,
+                   least_side_px: float) -> InImage:
     """Return the boxes of ellipsoids (n, 3), (n, 6) in an image."""
     boxes = ellipse_bboxes(ellipses_in_pixels(
         project_ellipsoids(camera_from_map, centers, shapes), camera))
@@ -102,9 +103,9 @@ def look_at(camera: Camera, camera_from_map: NDArray[np.float64], centers: NDArr
 
 def is_hidden(boxes: NDArray[np.float64], is_nearer: NDArray[np.bool_], most: float
               ) -> NDArray[np.bool_]:
-    """Tell of which boxes (n, 4) a nearer one covers more than a share.
+    """Tell which boxes (n, 4) are hidden: a nearer box covers more than a share of them.
 
-    Row i of is_nearer (n, n) tells which boxes are nearer than box i.
+    Row i of is_nearer (n, n) marks the boxes that are nearer than box i.
     """
     areas = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)
     covers = shared_areas(boxes, boxes) > most * areas[:, None]
@@ -134,8 +135,8 @@ def expect(landmark_map: LandmarkMap, camera: Camera, map_from_camera: NDArray[n
     near = np.sort(np.array(landmark_map.tree.query_ball_point(map_from_camera[:3, 3], _REACH_M),
                             dtype=np.int64))
     camera_from_map = invert_transform(map_from_camera)
-    found = look_at(camera, camera_from_map, landmark_map.centers[near], landmark_map.shapes[near],
-                    _SURE_SHARE, _LEAST_SIDE_PX)
+    found = boxes_in_image(camera, camera_from_map, landmark_map.centers[near],
+                           landmark_map.shapes[near], _SURE_SHARE, _LEAST_SIDE_PX)
     in_front = np.isfinite(found.boxes[:, 0])
     near, boxes, is_shown = near[in_front], found.shown[in_front], found.is_shown[in_front]
     offsets = landmark_map.centers[near] @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]

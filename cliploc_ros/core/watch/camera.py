@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import SAME_VIEW
 from cliploc_ros.core.watch.look import Alignment
 

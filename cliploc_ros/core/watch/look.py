@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.acceptance.confidence import points_utility, utilities
 from cliploc_ros.core.acceptance.contenders import (
     Contender,
@@ -32,6 +31,7 @@ from cliploc_ros.core.acceptance.contenders import (
     refined,
     unrefined,
 )
+from cliploc_ros.core.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.fit.verification import scores_of
 from cliploc_ros.core.geometry.transforms import (
     SAME_ANSWER,

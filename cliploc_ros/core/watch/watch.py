@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.calibration import CALIBRATION
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import (
     SAME_PLACE,
     invert_transform,

@@ -44,29 +44,27 @@ class PhraseFinder:
 
     def __init__(self, clip: ClipOptions, vocabulary: Vocabulary, recording: Recording | None):
         self._clip, self._vocabulary, self._recording = clip, vocabulary, recording
-        self._fault: FoundPhrases | None = None
+        self._fault = ''
 
     def find(self, landmarks: Landmarks, landmark_id: str) -> FoundPhrases:
         """Return the phrases for a landmark, or why there are none.
 
         Weights that cannot be loaded are not tried again: the fault answers for all landmarks.
         """
-        if self._fault is not None:
-            return self._fault
+        if self._fault:
+            return FoundPhrases((), self._fault)
         try:
             return self._find(landmarks, landmark_id)
-        except CliplocError as error:
-            found = FoundPhrases((), f'CLIP offers no phrases: {error}')
-        except Exception as error:  # of torch, open_clip: the page shows it and goes on
-            logger.exception('CLIP finds no phrases for %s', landmark_id)
-            found = FoundPhrases((), f'CLIP offers no phrases: {type(error).__name__}: {error}')
-        if '_weights' not in vars(self):
-            self._fault = found
-        return found
+        except Exception as error:  # also of torch, open_clip: the page shows it and goes on
+            return FoundPhrases((), _explained(error))
 
     @cached_property
     def _weights(self) -> ClipWeights:
-        return resolve_clip_weights(self._clip)
+        try:
+            return resolve_clip_weights(self._clip)
+        except Exception as error:
+            self._fault = _explained(error)
+            raise
 
     @cached_property
     def _encoder(self) -> ClipEncoder:
@@ -101,3 +99,11 @@ class PhraseFinder:
         mean = np.sum(embeddings, axis=0)
         length = float(np.linalg.norm(mean))
         return np.asarray(mean / length, dtype=np.float32) if length > 0.0 else None
+
+
+def _explained(error: Exception) -> str:
+    """Return why there are no phrases; log an error that is not this package's own."""
+    if isinstance(error, CliplocError):
+        return f'CLIP offers no phrases: {error}'
+    logger.error('CLIP finds no phrases', exc_info=error)
+    return f'CLIP offers no phrases: {type(error).__name__}: {error}'

@@ -94,7 +94,7 @@ class Ellipsoids:
 
 
 class Labels:
-    """The labels of the landmarks in the scene: the nearest ones, as many as fit.
+    """Labels of the landmarks in the scene; where they overlap, the nearest landmarks keep theirs.
 
     They fit the window of the browser whose camera moved last.
     """

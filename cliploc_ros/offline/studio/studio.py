@@ -209,7 +209,10 @@ class Studio:
 
     def _toggle(self, ids: Sequence[str] | None, name: str, on: tuple[str, str],
                 off: tuple[str, str]) -> str:
-        """Set a mark, or clear it where all have it; a verb and its past tell of each."""
+        """Set a mark, or clear it if all landmarks have it.
+
+        `on` and `off` name setting and clearing: the verb, and its past tense for the log.
+        """
         if ids is not None and not (isinstance(ids, list)
                                     and all(isinstance(key, str) for key in ids)):
             raise EditError(f'{on[0]}: expected a list of ids, not {ids!r:.60}')

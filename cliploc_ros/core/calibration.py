@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers that decide whether a pose is accepted: calibration.yaml."""
+"""The numbers that decide whether a pose is accepted or doubted: calibration.yaml."""
 
 from pathlib import Path
 from typing import NamedTuple
