@@ -186,7 +186,7 @@ def test_4k_images_wait_for_a_slow_detector(node, camera, clients, wait):
     boxes.publish(Detection2DArray(header=Header(stamp=Time(sec=1))))
     wait(request.done, 'the answer')
     assert request.result().message == 'refused: nothing known'
-    set_values(node, timeout_s=3.0)
+    set_values(node, timeout_s=5.0)
     request = clients.submit(node.requests.answer)
     for number in range(13, 27):
         take(number)
