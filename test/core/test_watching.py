@@ -396,6 +396,15 @@ def test_a_landmark_is_missed_only_from_where_it_was_seen(side, is_missing):
     assert missing.named() == [0] * is_missing
 
 
+@pytest.mark.parametrize('seen', [0, 1, 20])
+def test_what_is_gone_stays_missing(seen):
+    """Years of looks that miss it neither bring it back nor end in an overflow."""
+    missing, yes = Missing(things((3, 0, 1))), np.array([True])
+    for was_seen in [yes] * seen + [~yes] * 20_000:
+        missing.add(Expected(np.array([0]), was_seen, yes, np.array([2])), 1.0)
+    assert missing.named() == [0]
+
+
 @pytest.mark.parametrize(('seen_every', 'misses', 'is_missing'), [(1, 3, True), (3, 6, False)])
 def test_what_a_detector_finds_now_and_then_is_not_missing_at_once(seen_every, misses, is_missing):
     """It finds the others in each look, or in every third."""

@@ -164,11 +164,17 @@ class _Record(NamedTuple):
     seen_from: int = 0  #: The sides from which it was seen, a bit each
 
     def gone(self, share: float) -> float:
-        """Return the probability that it is gone, where looks find a landmark at a share."""
+        """Return the probability that it is gone, where looks find a landmark at a share.
+
+        Misses count up to the number that says most. Further ones would say that not even chance
+        matches it, thus that it is there and hardly ever found: a landmark that is taken away
+        would no longer be missed after some hundred looks.
+        """
         found = _OF_SHARE * share + self.found
         missed = _OF_SHARE * (1.0 - share) + self.missed
-        there = betaln(found, missed + self.misses) - betaln(found, missed)
-        odds = log(_GONE / (1.0 - _GONE)) + self.misses * log(1.0 - _BY_CHANCE) - there
+        misses = min(self.misses, max(0.0, found / _BY_CHANCE - found - missed))
+        there = betaln(found, missed + misses) - betaln(found, missed)
+        odds = log(_GONE / (1.0 - _GONE)) + misses * log(1.0 - _BY_CHANCE) - there
         return float(1.0 / (1.0 + exp(-odds)))
 
 
