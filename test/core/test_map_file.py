@@ -125,7 +125,9 @@ def test_a_thing_that_was_two_landmarks_has_the_labels_of_both_by_their_frames()
     ({'labels': [{'text': 'a', 'weight': 0.0}]}, 'above 0'),
     ({'label': 'a', 'class_weights': ['cup']}, 'class_weights'),
     ({'label': 'a', 'position_sigma': float('nan')}, 'position_sigma: nan'),
-    ({'label': 'a', 'seen_ratio': -0.5}, 'seen_ratio: -0.5')])
+    ({'label': 'a', 'seen_ratio': -0.5}, 'seen_ratio: -0.5'),
+    ({'label': 'a', 'seen_ratio': 10**400}, 'seen_ratio: 10'),
+    ({'label': 'a', 'center': [10**400, 0, 0]}, 'center: .*not finite')])
 def test_refuses_wrong_details(fields, message):
     with pytest.raises(MapError, match=message):
         read(CUP | fields)
@@ -249,6 +251,12 @@ def test_what_has_no_end_is_not_read(tmp_path):
     for path in ('/dev/zero', pipe, tmp_path):
         with pytest.raises(MapError, match='regular file'):
             LandmarkMap.from_file(path)
+
+
+@pytest.mark.parametrize('name', ['a\0b', '\ud800', 'x' * 5000])
+def test_names_that_no_file_can_have(name):
+    with pytest.raises(MapError, match=r'names no file|too long'):
+        LandmarkMap.from_file(name)
 
 
 def unit_rows(count, seed):

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a map may say of a landmark besides its ellipsoid: optional fields of the map file."""
 
-import math
+import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -144,6 +144,6 @@ def _text(value: Any, where: str) -> str:
 def _number(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise MapError(f'{where}: must be a number, not {value!r}')
-    if not math.isfinite(value) or value < 0.0:
+    if not 0.0 <= value <= sys.float_info.max:  # an int may be larger than any float
         raise MapError(f'{where}: {value} must be finite and not negative')
     return float(value)

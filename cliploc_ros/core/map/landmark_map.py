@@ -4,6 +4,7 @@
 
 import math
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -449,7 +450,7 @@ def _numbers(value: Any, count: int, where: str) -> tuple[float, ...]:
     numeric = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
     if len(values) != count or not numeric:
         raise MapError(f'{where}: must be {count} numbers, not {_shorten(value)}')
-    if not all(map(math.isfinite, values)):
+    if not all(abs(v) <= sys.float_info.max for v in values):  # ints may be larger
         raise MapError(f'{where}: {_shorten(value)} has values that are not finite')
     return tuple(map(float, values))
 

@@ -80,6 +80,8 @@ def read_text(path: str | os.PathLike[str]) -> str:
         raise MapError(f'{path.absolute()}: {error.strerror}') from error
     except UnicodeDecodeError as error:
         raise MapError(f'{path}: not a text file in UTF-8 (byte {error.start})') from error
+    except ValueError as error:
+        raise MapError(f'{str(path)!r}: names no file: {error}') from error
 
 
 def parse_parameters(text: str, path: str | os.PathLike[str]) -> dict[str, Any]:
