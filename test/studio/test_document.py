@@ -165,6 +165,20 @@ def test_reloading_is_an_edit(document, path):
     assert document.landmarks['cup_1'].label == 'mine' and 'book_1' not in document.landmarks
 
 
+def test_a_file_that_is_gone_is_saved_but_not_reloaded(document, path):
+    path.unlink()
+    with pytest.raises(MapError, match='no such file; saving writes it'):
+        document.reload()
+    assert document.landmarks
+    document.save()
+    assert LandmarkMap.from_file(path).landmark_ids == tuple(document.landmarks)
+
+
+def test_a_map_whose_name_is_too_long_is_refused(tmp_path):
+    with pytest.raises(DatasetError, match='too long'):
+        Document(tmp_path / ('x' * 300))
+
+
 def test_a_new_map_starts_empty(tmp_path):
     path = tmp_path / 'new.yaml'
     document = Document(path)

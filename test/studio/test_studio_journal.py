@@ -97,7 +97,10 @@ def test_edits_of_another_content_are_set_aside(path):
 @pytest.mark.parametrize('tail', [
     b'{"do": "edit", "what": "cu', b'\xff\xfe\n', b'{}\n',
     b'{"do": "edit", "what": "x", "before": {"a": null}, '
-                                  b'"after": {"a": {"fields": {"label": NaN}, "locked": 1}}}\n'])
+                                  b'"after": {"a": {"fields": {"label": NaN}, "locked": 1}}}\n',
+    b'{"do": "edit", "what": "x", "after": {"cup_1": {"marks": {}, "fields": {"label": "a", '
+    b'"class_id": "a", "orientation": [0, 0, 0, 1], "semi_axes": [1, 1, 1], '
+    b'"center": [1' + b'0' * 400 + b', 0, 0]}}}}\n'])
 def test_a_broken_journal_loses_its_end_only(path, tail):
     document = Document(path)
     document.edit(edits.set_fields, ['cup_1'], label='mine')

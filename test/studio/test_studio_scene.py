@@ -18,6 +18,7 @@ from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.studio import viewpoint
 from cliploc_ros.offline.studio.cloud import find_cloud
+from cliploc_ros.offline.studio.layers import Layers, draw_answers
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.walls import OCCUPIED, UNKNOWN, Walls, draw_walls
 
@@ -74,6 +75,16 @@ def test_walls_lie_where_the_grid_has_them(server, yaw):
     cells = {(int(y), int(x)) for x, y in np.floor(in_grid[:, :2] / 0.1)}
     assert cells == {(4, 33), (20, 7)}
     assert turn.apply([0.0, 0.0, 1.0])[2] == pytest.approx(-1.0), 'its face is up'
+
+
+def test_other_answers_take_the_place_of_the_first_ones(server, studio, recwarn):
+    """Viser warns of a node that went with its parent."""
+    layers = Layers(server.scene)
+    for view in (0, 5):
+        layers.show('Answers', studio.recording.relocalize(
+            studio.document.landmarks, [view], None), draw_answers)
+    layers.show('Answers', None, draw_answers)
+    assert not [str(one.message) for one in recwarn]
 
 
 def test_up_is_found_where_the_map_is_in_a_cameras_frame():

@@ -261,10 +261,13 @@ class Document:
     def reload(self) -> str:
         """Take the map from the file; this is an edit that undo takes back.
 
-        CliplocError: the file is no map.
+        CliplocError: the file is no map, or there is none.
         """
         with self.lock:
-            self._file = read_map_file(self.path)
+            file = read_map_file(self.path)
+            if file.digest == NO_FILE:
+                raise MapError(f'{self.path}: no such file; saving writes it')
+            self._file = file
             self._look_file = self._read_looks()
             before = self.landmarks
             found = {key: replace(one, marks=before[key].marks if key in before else Marks())

@@ -145,8 +145,8 @@ def draw_answers(scene: viser.SceneApi, answers: Mapping[int, Trial]) -> list[An
     colors = [_VERDICT_RGB[one.verdict] for one in answers.values()]
     found = [(one, rgb) for one, rgb in zip(answers.values(), colors, strict=True)
              if one.estimate is not None]
-    return [_dots(scene, '/answers', np.reshape([one.position for one in answers.values()],
-                                                (-1, 3)), 0.03, colors or (0, 0, 0)),
+    return [_dots(scene, '/answers/places', np.reshape(
+        [one.position for one in answers.values()], (-1, 3)), 0.03, colors or (0, 0, 0)),
             _lines(scene, '/answers/lines', [(one.position, one.estimate) for one, _ in found],
                    np.repeat([rgb for _, rgb in found] or np.empty((0, 3)), 2, axis=0).reshape(
                        -1, 2, 3).astype(np.uint8), 2.0)]
