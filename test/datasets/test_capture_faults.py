@@ -49,6 +49,7 @@ def edited(folder, edit, name='transforms.json'):
 
 def test_folders_without_poses_or_images(shots, tmp_path):
     refuses(tmp_path / 'gone', 'no such folder')
+    refuses(tmp_path / ('x' * 300), 'no such folder')
     (tmp_path / 'photos').mkdir()
     shutil.copy(shots[0].path, tmp_path / 'photos')
     refuses(tmp_path / 'photos', 'need poses')

@@ -235,6 +235,9 @@ def test_what_is_no_pose_of_seven_scenes(tmp_path):
     path = tmp_path / 'frame-000000.pose.txt'
     path.write_text('# of the depth camera\n1 0 0 0 # x\n0 1 0 0\n0 0 1 0\n0 0 0 1\n')
     assert next(rgbd_frames(tmp_path, NO_OPTIONS).read()).map_from_camera is not None
+    path.write_text('1 0 0 1e300\n0 1 0 0\n0 0 1 0\n0 0 0 1\n')
+    with pytest.raises(DatasetError, match=r'color\.jpg is 1e\+300 m from the origin'):
+        rgbd_frames(tmp_path, NO_OPTIONS)
     path.write_text('1 0 0 0\n0 1 0\n')
     with pytest.raises(DatasetError, match=r'pose\.txt:2: is no 4x4 matrix'):
         rgbd_frames(tmp_path, NO_OPTIONS)

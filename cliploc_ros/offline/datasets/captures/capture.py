@@ -25,7 +25,6 @@ IMAGES = ('.jpg', '.jpeg', '.png')
 _INVENTED_STEP_NS = NS_PER_S
 # Files write their rotations with a few digits.
 _ROTATION_TOLERANCE = 1e-2
-_MOST_M = 1e6
 _AS_USUAL = DepthFormat()
 
 
@@ -116,8 +115,6 @@ def _sound(pose: NDArray[np.float64] | None, where: str) -> NDArray[np.float64] 
         raise DatasetError(f'{where} is no rotation and translation' + (
             ': it is a reflection; export with right-handed axes'
             if is_mirrored else ': its axes have no unit length or are not at right angles'))
-    if np.abs(pose[:3, 3]).max() > _MOST_M:
-        raise DatasetError(f'{where} is {np.abs(pose[:3, 3]).max():.3g} m from the origin')
     left, _, right = np.linalg.svd(pose[:3, :3])
     sound = pose.copy()
     sound[:3, :3] = left @ right

@@ -31,6 +31,8 @@ AXES: Mapping[str, Callable[[_Pose], _Pose]] = {
 UP: Mapping[str, _Pose] = {
     'z': np.eye(3), 'y': np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
 
+# A map reaches no further [m].
+_MOST_M = 1e7
 # Pairs of images that tell the axes: with this much of a turn, which an error of axes turns round.
 _PAIRS, _TRIED, _REACH = 4, 12, 20
 _TURN_DEG = (4.0, 30.0)
@@ -51,7 +53,15 @@ def place_images(files: Sequence[ImageFile], axes: str, scale: float = 1.0,
     scale : float
         Metres of a stored unit.
     map_from_stored : ndarray (3, 3)
+
+    Raises
+    ------
+    DatasetError
+        A pose is too far from the origin; names its image.
     """
+    for one in files:
+        if one.pose is not None and (far := np.abs(one.pose[:3, 3]).max()) > _MOST_M:
+            raise DatasetError(f'pose of {one.color} is {far:.3g} m from the origin')
     return tuple(one if one.pose is None else one._replace(pose=move_poses(
         np.array(AXES[axes](one.pose))[None], scale, map_from_stored)[0]) for one in files)
 
