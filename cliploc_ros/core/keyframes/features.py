@@ -21,6 +21,8 @@ _SCALE = 512.0
 # A dark image is made brighter first, until one pixel in a hundred is at least so bright: SIFT
 # leaves out features of little contrast.
 _DARK = 160.0
+# Less than SIFT's own .04: floors, walls and boxes have little contrast.
+_CONTRAST = 0.02
 # A match is refused if another feature of the other image is nearly as similar (Lowe, 2004).
 _RATIO = 0.85
 
@@ -51,7 +53,7 @@ def extract(image_rgb: NDArray[np.uint8], most: int, longest_side_px: int = 800)
     bright = float(np.percentile(gray, 99))
     if 0.0 < bright < _DARK:
         gray = cv2.convertScaleAbs(gray, alpha=_DARK / bright)
-    sift = cv2.SIFT.create(nfeatures=most)
+    sift = cv2.SIFT.create(nfeatures=most, contrastThreshold=_CONTRAST)
     points, descriptors = sift.detectAndCompute(gray, None)
     if descriptors is None:
         return Features(np.empty((0, 2)), np.empty((0, DIMENSIONS), np.uint8),

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
@@ -15,7 +16,13 @@ from cliploc_ros.core.geometry.transforms import SAME_ANSWER, SAME_SIGHT, invert
 from cliploc_ros.core.keyframes.features import Features, extract, match, unit_rows
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
-from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, agreeing, find_pose, free_focal
+from cliploc_ros.core.keyframes.point_pose import (
+    LEAST_INLIERS,
+    agreeing,
+    find_pose,
+    free_focal,
+    refine,
+)
 from cliploc_ros.core.search.scene import Constraint
 
 # Most features of a query, and its longest side. At the size of keyframes, features take twice the
@@ -31,6 +38,13 @@ _ENOUGH_INLIERS, _MORE = 100, 5
 # place, the next 25 are matched by the strongest 600 features. A chance pose has up to 8 inliers
 # there, so 20 are required.
 _FURTHER, _STRONGEST, _CLEAR = 25, 600, 20
+# A thorough look: features at full size, and of the keyframes with the most similar words those
+# that share the most of the strongest features.
+_THOROUGH_FEATURES, _THOROUGH_PX = 3000, 1600
+_CANDIDATES, _VOTERS, _VOTED = 100, 300, 20
+# Then points of keyframes near the pose are looked for where it puts them: within this angle
+# (8 px at f = 525 px), and at least so similar.
+_GUIDED_RADIUS, _GUIDED_COSINE, _GUIDED_KEYFRAMES = 8.0 / 525.0, 0.8, 12
 #: Places of an image that do not agree with each other.
 MOST_PLACES = 3
 # Similar keyframes of which those elsewhere are chosen.
@@ -76,8 +90,10 @@ class _Matched(NamedTuple):
         return _Matched(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
 
-def query_features(image_rgb: NDArray[np.uint8]) -> Features:
+def query_features(image_rgb: NDArray[np.uint8], thorough: bool = False) -> Features:
     """Return the features of an image (h, w, 3) that is to be localized."""
+    if thorough:
+        return extract(image_rgb, _THOROUGH_FEATURES, _THOROUGH_PX)
     return extract(image_rgb, _QUERY_FEATURES, _QUERY_PX)
 
 
@@ -110,7 +126,8 @@ class KeyframeLocalizer:
 
     def localize_features(self, features: Features, camera: Camera,
                           guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
-                          constraint: Constraint = NOTHING_KNOWN) -> Recognition:
+                          constraint: Constraint = NOTHING_KNOWN, thorough: bool = False
+                          ) -> Recognition:
         """Find where an image with these features was taken.
 
         Parameters
@@ -132,6 +149,19 @@ class KeyframeLocalizer:
             return Recognition()
         descriptors = unit_rows(features.descriptors)
         look = _Look(features, bearings[known], camera, constraint)
+        search = self._search_thoroughly if thorough else self._search_fast
+        first, matched = search(descriptors, look, guesses, deadline)
+        places = _places(first, matched, look)
+        if thorough and places:
+            places[0] = self._guided(places[0], look, descriptors)
+        if time.monotonic() > deadline:
+            return Recognition(is_complete=False)
+        return Recognition(tuple(self._recognized(one, look) for one in places))
+
+    def _search_fast(self, descriptors: NDArray[np.float32], look: _Look,
+                     guesses: Sequence[NDArray[np.float64]], deadline: float
+                     ) -> tuple['_Place | None', _Matched]:
+        """Return the best pose among a few similar keyframes, and all matches with them."""
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable').tolist()
         chosen = self._choose(ranks, guesses)
         matched = self._match(descriptors, chosen, deadline)
@@ -148,10 +178,64 @@ class KeyframeLocalizer:
             near = self._search_further(descriptors, look, ranks[_SIMILAR + _MORE:], deadline)
             matched = matched.join(self._match(descriptors, near, deadline))
             first = _place(matched, look)
-        places = _places(first, matched, look)
-        if time.monotonic() > deadline:
-            return Recognition(is_complete=False)
-        return Recognition(tuple(self._recognized(one, look) for one in places))
+        return first, matched
+
+    def _search_thoroughly(self, descriptors: NDArray[np.float32], look: _Look,
+                           guesses: Sequence[NDArray[np.float64]], deadline: float
+                           ) -> tuple['_Place | None', _Matched]:
+        """Return the best pose among many voted keyframes, and all matches with them."""
+        ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable')[:_CANDIDATES]
+        votes = np.array([len(match(descriptors[:_VOTERS], self.layer.unit_descriptors(one)))
+                          for one in ranks.tolist()])
+        chosen = ranks[np.argsort(-votes, kind='stable')][:_VOTED].tolist()
+        for guess in guesses:
+            near = keyframes_near(self.layer.map_from_camera, guess)[:PROPOSED].tolist()
+            chosen += [one for one in near if one not in chosen]
+        matched = self._match(descriptors, chosen, deadline)
+        first = _place(matched, look)
+        if first is not None:
+            near = keyframes_near(self.layer.map_from_camera, first.map_from_camera)
+            more = [one for one in near[:_MORE].tolist() if one not in chosen]
+            matched = matched.join(self._match(descriptors, more, deadline))
+            first = _place(matched, look)
+        return first, matched
+
+    def _guided(self, place: '_Place', look: '_Look', descriptors: NDArray[np.float32]
+                ) -> '_Place':
+        """Return a place refined by all points that the image shows where the pose puts them."""
+        camera_from_map = invert_transform(place.map_from_camera)
+        near = keyframes_near(self.layer.map_from_camera, place.map_from_camera)
+        counts = np.bincount(place.inliers.keyframes, minlength=len(self.layer))
+        used = np.argsort(-counts, kind='stable')[:np.count_nonzero(counts)]
+        tree = cKDTree(look.bearings)
+        points, features = [place.inliers.points], [place.inliers.features]
+        for keyframe in list(dict.fromkeys([*used.tolist(), *near.tolist()]))[:_GUIDED_KEYFRAMES]:
+            theirs = self.layer.points_in_map(keyframe)
+            inside = theirs @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
+            with np.errstate(divide='ignore', invalid='ignore'):
+                shown = inside[:, :2] / inside[:, 2:]
+            rows = np.nonzero((inside[:, 2] > 0.1) & (np.abs(shown) < 5.0).all(axis=1))[0]
+            if not len(rows):
+                continue
+            found = tree.query_ball_point(shown[rows], _GUIDED_RADIUS)
+            lengths = np.array([len(one) for one in found])
+            of_points = np.repeat(rows, lengths)
+            of_features = np.array([one for some in found for one in some], dtype=np.int64)
+            unit = self.layer.unit_descriptors(keyframe)
+            cosines = np.einsum('kd,kd->k', unit[of_points], descriptors[of_features])
+            order = np.argsort(-cosines, kind='stable')
+            order = order[cosines[order] > _GUIDED_COSINE]
+            _, first = np.unique(of_points[order], return_index=True)
+            _, other = np.unique(of_features[order], return_index=True)
+            kept = order[np.intersect1d(first, other)]
+            points.append(theirs[of_points[kept]])
+            features.append(of_features[kept])
+        rows = np.concatenate(features)
+        refined = refine(np.concatenate(points), look.bearings[rows], camera_from_map)
+        if refined is None:
+            return place
+        return place._replace(map_from_camera=refined.map_from_camera,
+                              covariance=refined.covariance)
 
     def _search_further(self, descriptors: NDArray[np.float32], look: _Look, ranks: Sequence[int],
                         deadline: float) -> list[int]:
@@ -345,6 +429,7 @@ class ImageRecognizer:
         self._deadline = deadline
         self._begin_stage = begin_stage
         self._known: tuple[set[int], Recognition] | None = None
+        self.thorough = False
         #: Time that it took so far [ms].
         self.spent_ms = 0.0
 
@@ -359,7 +444,8 @@ class ImageRecognizer:
             if callable(self._features):
                 self._features = self._features()
             self._known = near, self._keyframes.localize_features(
-                self._features, self._camera, guesses, self._deadline, constraint)
+                self._features, self._camera, guesses, self._deadline, constraint,
+                self.thorough)
             self.spent_ms += 1e3 * (time.perf_counter() - begin)
             self._begin_stage('search')
         return self._known[1]
