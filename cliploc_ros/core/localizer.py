@@ -16,7 +16,6 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -28,9 +27,10 @@ from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import SAME_VIEW, pose_error
 from cliploc_ros.core.keyframes.localization import (
+    LEAST_S,
+    ImageFeatures,
     ImageRecognizer,
     KeyframeLocalizer,
-    query_features,
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities, Similarities
@@ -49,8 +49,6 @@ BATCH = 4
 # Time that a request needs after its last crops [s]: for a search, which may take most of a fifth
 # of the time that is left, and for the answer. Guesses.
 _SEARCHES, _MOST_SHARE, _ANSWER_S = 2.0, 0.2, 0.1
-# With less time left, the objects' answer stands: extracting features cannot be stopped.
-_LEAST_S = 0.5
 _NO_LOOKS = Looks()
 _NO_ROWS = np.empty(0, dtype=np.int64)
 
@@ -176,7 +174,9 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
         found = relocalizer.locate([*earlier, frame], budget, looks, recognizer, cameras)
         search_ms, budget = search_ms + found.search_ms, None
         if found.accepted or crops is None or not len(left) or (count := crops.room()) <= 0:
-            return frame, replace(found, search_ms=search_ms)
+            found = replace(found, search_ms=search_ms)
+            return frame, relocalizer.look_again(found, [*earlier, frame], looks, recognizer,
+                                                 cameras)
         compared, left = np.append(compared, left[:count]), left[count:]
         observation = replace(observation, similarities=crops.compare(compared),
                               compared=compared)
@@ -252,7 +252,7 @@ class Localizer:
         if query.cameras is not None:
             self.cameras = query.cameras.copied()
         query = replace(query, cameras=self.cameras.copied(), by_keyframes=query.by_keyframes
-                        and deadline - time.monotonic() >= _LEAST_S)
+                        and deadline - time.monotonic() >= LEAST_S)
         others = [self.with_free_crops(query, row, crops) for row in range(len(query.frames) - 1)]
         for one in query.frames:
             self.cameras.see(one)
@@ -275,8 +275,9 @@ class Localizer:
         """Return the keyframe search of the newest image; None without keyframes or image."""
         if self._keyframes is None or not query.images or not query.by_keyframes:
             return None
-        return ImageRecognizer(self._keyframes, partial(query_features, query.images[-1]),
-                               query.newest.camera, deadline, begin_stage)
+        features = ImageFeatures(lambda: query.images[-1], query.newest.camera)
+        return ImageRecognizer(self._keyframes, features, deadline, begin_stage,
+                               query.is_thorough)
 
     def with_free_crops(self, query: Query, row: int, source: CropSource | None,
                         begin_stage: Callable[[str], None] = lambda stage: None) -> Observation:
@@ -380,7 +381,9 @@ class Localizer:
         searched, found = localize_on_demand(
             self._relocalizer, [*(frame for one in earlier for frame in one.searched), *beside],
             newest, crops, looks, recognizer, budget, self.cameras)
-        self.query = replace(query, frames=(*others, searched.observation), rooms=tuple(rooms))
+        self.query = replace(query, frames=(*others, searched.observation), rooms=tuple(rooms),
+                             is_thorough=found.recognition is not None
+                             and found.recognition.is_thorough)
         if is_alone:
             return found
         self._instants = [*earlier, KeptInstant((*beside, searched), anchor)]

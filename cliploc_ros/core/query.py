@@ -44,6 +44,7 @@ class Query:
     limit: int = 1
     length_s: float = 0.0
     by_keyframes: bool = True  #: Whether there is time for keyframes
+    is_thorough: bool = True  #: Whether to search them thoroughly where a fast pass is refused
     #: What looks before said of the cameras; None: the localizer knows it
     cameras: CameraCheck | None = None
     #: How many crops of the last frame the first search had, and how many each further search was
@@ -136,7 +137,7 @@ def _fields_of(query: Query) -> dict[str, Any]:
     """Return what JSON keeps of a query."""
     return {
         **{name: getattr(query, name) for name in
-           ('run', 'limit', 'length_s', 'by_keyframes', 'rooms')},
+           ('run', 'limit', 'length_s', 'by_keyframes', 'is_thorough', 'rooms')},
         'cameras': None if query.cameras is None else query.cameras.fields(),
         'has_images': bool(query.images),
         'frames': [asdict(replace(one, similarities=None)) | {'crops': (
@@ -154,6 +155,7 @@ def _query_of(about: Mapping[str, Any], images: Iterator[NDArray[np.uint8]],
     _expect(bool(frames) and (not rooms or frames[-1].compared is not None), 'frames')
     return Query(frames, decoded, None if run is None else _count(run), _count(about['limit']),
                  float(_numbers(about['length_s'])), bool(about['by_keyframes']),
+                 bool(about.get('is_thorough')),
                  None if cameras is None else CameraCheck.of_fields(cameras), rooms)
 
 

@@ -99,6 +99,13 @@ class Relocalization:
         return self.recognition.places[0] if self.recognition and self.recognition.places else None
 
     @property
+    def keyframe_search(self) -> str:
+        """Return how far the search of keyframes went: 'none', 'fast' or 'thorough'."""
+        if self.recognition is None:
+            return 'none'
+        return 'thorough' if self.recognition.is_thorough else 'fast'
+
+    @property
     def solved(self) -> bool:
         """Return whether any pose was found, accepted or not."""
         return bool(self.hypotheses)
@@ -213,7 +220,8 @@ class Relocalizer:
         budget = self.begin(len(observations))
         frames = [self.search(one, budget.search_end(number, len(observations)))
                   for number, one in enumerate(observations, start=1)]
-        return self.locate(frames, budget, recognizer=recognizer)
+        return self.look_again(self.locate(frames, budget, recognizer=recognizer), frames,
+                               recognizer=recognizer)
 
     def begin(self, frames: int, cameras: int = 1) -> TimeBudget:
         """Return the time budget of a relocalization with some frames; it starts now.
@@ -274,6 +282,19 @@ class Relocalizer:
             evidence=evidence, covariance=covariance, best_iteration=shown.finalist.iteration,
             search_ms=budget.elapsed_ms, source=compared.source,
             recognition=compared.recognition, depth=depth, cameras=tuple(seen))
+
+    def look_again(self, found: Relocalization, frames: Sequence[SearchedFrame],
+                   looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None,
+                   cameras: CameraCheck | None = None) -> Relocalization:
+        """Return a result of locate; a refused one after a thorough search of the keyframes.
+
+        It stays where there is no time for that, or too little. Arguments as for locate.
+        """
+        if found.accepted or recognizer is None or not recognizer.begin_thorough():
+            return found
+        again = self.locate(frames, None, looks, recognizer, cameras)
+        kept = found if again.recognition is None or not again.recognition.is_complete else again
+        return replace(kept, search_ms=found.search_ms + again.search_ms)
 
     def _meet(self, joined: JoinedFrames, budget: TimeBudget) -> list[Contender]:
         """Return the best poses that the search met, see search_contenders."""

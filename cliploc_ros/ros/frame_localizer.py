@@ -124,7 +124,9 @@ class FrameLocalizer:
         CliplocError: names what to fix in the frame or in the parameters.
         """
         times.begin('decoding')
-        query = self.instants.query(frame, parameters, known)
+        # a frame without a deadline is one of many: the next one is its second look
+        query = replace(self.instants.query(frame, parameters, known),
+                        is_thorough=not math.isinf(deadline))
         found = self.answer(query, parameters.options(), times, deadline)
         assert self.localizer.query is not None
         query, seen = self.localizer.query, self.localizer.query.newest

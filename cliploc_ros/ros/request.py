@@ -298,6 +298,8 @@ def _summary(localized: Localized, stages_ms: Mapping[str, float]) -> str:
     keyframes = '' if found.source == 'objects' else f', pose by {found.source}'
     if found.recognized is not None:
         keyframes += f', {found.recognized.inliers} points of keyframes agree'
+    if found.keyframe_search == 'thorough':
+        keyframes += ', thorough search of keyframes'
     count = len(localized.query.frames)
     cameras = f', {count} cameras' if count > 1 else ''
     if localized.left_out:
@@ -330,7 +332,8 @@ def _figures(localized: Localized, parameters: RelocalizerParameters) -> dict[st
             'cameras': len(localized.query.frames), 'confidence': f'{found.confidence:.6f}',
             'confidence needed': f'{needed:g}',
             'landmarks': 0 if evidence is None else evidence.inliers,
-            'keyframe points': 0 if points is None else points.inliers}
+            'keyframe points': 0 if points is None else points.inliers,
+            'keyframe search': found.keyframe_search}
 
 
 def time_is_up(stages_ms: Mapping[str, float]) -> str:

@@ -59,7 +59,7 @@ class Case:
     looks: int = 1  # 2: the robot looks once more from 20 cm aside
     is_strange: bool = False  # the image is of another site: every accepted pose is false
     focal: float = 1.0  # the robot takes the focal length for this many times the true one
-    features: int = 2000
+    features: int = 3000
     draws_classes: bool = False  # the class of each box is drawn again
     prior: str = ''  # known wrongly: 'height' (1 to 3 m too high) or 'vertical' (by 30 degrees)
     world: Callable[[World, Rng], World] | None = None  # changes map and layer

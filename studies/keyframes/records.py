@@ -18,6 +18,7 @@ from cliploc_ros.core.keyframes.features import DIMENSIONS, Features
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import (
     NOTHING_KNOWN,
+    ImageFeatures,
     ImageRecognizer,
     KeyframeLocalizer,
 )
@@ -40,6 +41,7 @@ from demo import ASSETS
 from studies.keyframes.cases import (
     Case,
     Floats,
+    Image,
     Place,
     Query,
     Rng,
@@ -59,7 +61,7 @@ class Seen(NamedTuple):
     """What is known of one image: the search of its objects, and what keyframes say."""
 
     searched: SearchedFrame
-    seen: Recognition
+    seen: tuple[Recognition, Recognition]  #: In the fast pass and in the thorough one
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,21 +85,21 @@ class StoredCase:
     records: tuple[Record, ...]
 
 
-_NO_FEATURES = Features(np.empty((0, 2)), np.empty((0, DIMENSIONS), np.uint8),
-                        np.empty(0, np.float32))
+_NO_IMAGE = np.empty((0, 0, 3), dtype=np.uint8)
 
 
 class StoredRecognizer(ImageRecognizer):
     """Says of an image again what keyframes said when it was collected."""
 
-    def __init__(self, seen: Recognition, keyframes: KeyframeLocalizer, camera: Camera) -> None:
-        super().__init__(keyframes, _NO_FEATURES, camera)
+    def __init__(self, seen: tuple[Recognition, Recognition], keyframes: KeyframeLocalizer,
+                 camera: Camera) -> None:
+        super().__init__(keyframes, ImageFeatures(lambda: _NO_IMAGE, camera))
         self._seen = seen
 
     def recognize(self, guesses: Sequence[Floats], constraint: Constraint = NOTHING_KNOWN
                   ) -> Recognition:
         """Return what was stored."""
-        return self._seen
+        return self._seen[self.is_thorough]
 
 
 def localize(landmark_map: LandmarkMap, options: RelocalizerOptions,
@@ -106,7 +108,8 @@ def localize(landmark_map: LandmarkMap, options: RelocalizerOptions,
     """Return the answer at the last look of a robot that looked before, too."""
     relocalizer, looks = Relocalizer(landmark_map, options), Looks()
     for count, (frame, recognizer) in enumerate(zip(frames, recognizers, strict=True), start=1):
-        found = relocalizer.locate(frames[:count], looks=looks, recognizer=recognizer)
+        found = relocalizer.look_again(relocalizer.locate(
+            frames[:count], looks=looks, recognizer=recognizer), frames[:count], looks, recognizer)
         if found.map_from_camera is not None:
             looks = looks.with_look(Look(frame.observation, found.map_from_camera,
                                          found.confidence, found.recognized))
@@ -171,6 +174,19 @@ def _build(place: Place, folder: Path, looker: Looker) -> tuple[LandmarkMap, Key
     return landmark_map, layer
 
 
+class _Features(ImageFeatures):
+    """The strongest features of an image, up to a number; kept from run to run."""
+
+    def __init__(self, image: Image, camera: Camera, looker: Looker, most: int) -> None:
+        super().__init__(lambda: image, camera)
+        self._looker, self._most = looker, most
+
+    def of_pass(self, is_thorough: bool) -> tuple[Features, float]:
+        """Return the features of a pass; finding them took no time that counts."""
+        found = self._looker.features(self._read_rgb(), is_thorough)
+        return Features(*(column[:self._most] for column in vars(found).values())), 0.0
+
+
 def _ask(number: int, case: Case, query: Query, landmark_map: LandmarkMap,
          localizer: KeyframeLocalizer, looker: Looker, rng: Rng) -> Record:
     # by classes alone: CLIP's weights are no part of this study
@@ -184,12 +200,13 @@ def _ask(number: int, case: Case, query: Query, landmark_map: LandmarkMap,
         searched = relocalizer.search(Observation(
             camera, boxes, stamp_ns=second * 1_000_000_000, up_in_camera=query.up_in_camera,
             odom_from_camera=odom))
-        recognizer = ImageRecognizer(localizer, Features(
-            *(column[:case.features] for column in vars(looker.features(image)).values())),
-            camera)
-        found = relocalizer.locate([*(one.searched for one in looks), searched],
-                                   recognizer=recognizer)
-        looks.append(Seen(searched, found.recognition or Recognition()))
+        recognizer = ImageRecognizer(localizer, _Features(image, camera, looker, case.features))
+        frames, seen = [*(one.searched for one in looks), searched], list[Recognition]()
+        for _ in range(2):
+            found = relocalizer.locate(frames, recognizer=recognizer)
+            seen.append(found.recognition or Recognition())
+            recognizer.begin_thorough()
+        looks.append(Seen(searched, (seen[0], seen[1])))
     return Record(number, tuple(looks), query.truths, options)
 
 

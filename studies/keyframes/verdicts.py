@@ -114,7 +114,7 @@ def place_rows(case: StoredCase) -> list[Row]:
     for record in case.records:
         look = record.looks[-1]
         joined = join_frames(case.landmark_map, record.options, [look.searched])
-        places = look.seen.places
+        places = [one for seen in look.seen for one in seen.places]
         for place, one in zip(places, contenders_of(joined, [
                 unrefined(place.map_from_camera) for place in places], [True] * len(places)),
                 strict=True):

@@ -166,7 +166,7 @@ def _outcome(task: Task, asked: str, query: PosedQuery, way: str, known: str,
     relocalizer = Relocalizer(landmark_map, RelocalizerOptions(matching='class'))
     recognizer = None
     if way != OBJECTS and query.image is not None:
-        recognizer = ImageRecognizer(keyframes, query.image.features, query.image.camera)
+        recognizer = ImageRecognizer(keyframes, query.image)
     found = relocalizer.relocalize([observation], recognizer)
     outcome = Outcome(
         room=task.room, kind=task.kind, part=task.part, asked=asked, number=query.number, way=way,

@@ -20,7 +20,7 @@ from cliploc_ros.command import positive
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes import features
 from cliploc_ros.core.keyframes.features import Features
-from cliploc_ros.core.keyframes.localization import query_features
+from cliploc_ros.core.keyframes.localization import ImageFeatures, query_features
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.files.storage import make_folder, write_file
@@ -35,7 +35,7 @@ from cliploc_ros.offline.datasets.frames import (
     RawFrame,
     folder_frames,
 )
-from cliploc_ros.offline.evaluation.trials import ImageFeatures, PosedQuery, with_vertical
+from cliploc_ros.offline.evaluation.trials import PosedQuery, with_vertical
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
 from cliploc_ros.units import NS_PER_S
@@ -74,9 +74,10 @@ class Looker:
             return self._detector.detect(image_rgb)
         return Detections(*self._kept(image_rgb, Path(self._model).stem, find))
 
-    def features(self, image_rgb: Image) -> Features:
-        """Return the features of an image."""
-        return Features(*self._kept(image_rgb, self._code, lambda: query_features(image_rgb)))
+    def features(self, image_rgb: Image, is_thorough: bool) -> Features:
+        """Return the features of an image for a pass."""
+        return Features(*self._kept(image_rgb, f'{self._code}.{is_thorough:d}',
+                                    lambda: query_features(image_rgb, is_thorough)))
 
     def _kept(self, image_rgb: Image, what: str, find: Callable[[], Any]) -> tuple[Any, ...]:
         digest = hashlib.sha256(image_rgb.tobytes()).hexdigest()[:24]
@@ -84,6 +85,18 @@ class Looker:
         if not path.exists():
             keep(path, tuple(vars(find()).values()))
         return tuple(pickle.loads(path.read_bytes()))
+
+
+class KeptFeatures(ImageFeatures):
+    """The features of an image, from an earlier run if there was one."""
+
+    def __init__(self, looker: Looker, raw: RawFrame) -> None:
+        super().__init__(lambda: raw.color()[0], raw.color()[1])
+        self._looker = looker
+
+    def of_pass(self, is_thorough: bool) -> tuple[Features, float]:
+        """Return the features of a pass; finding them took no time that counts."""
+        return self._looker.features(self._read_rgb(), is_thorough), 0.0
 
 
 def keep(path: Path, what: Any) -> None:
@@ -110,7 +123,7 @@ class Room:
     frames: Frames
     raws: tuple[RawFrame, ...]
     detections: PosedDetections
-    features: tuple[tuple[Features, Camera], ...]
+    features: tuple[ImageFeatures, ...]
     has_poses: bool
     ups: Floats | None  #: (n, 3): measured verticals in the camera; None: they are simulated
 
@@ -137,7 +150,7 @@ class Room:
         """Return all images as queries, with all that is known of them."""
         plain = [PosedQuery(row, observation_of(self.detections, row, raw.stamp_ns),
                        self.detections.map_from_camera[row],
-                       image=ImageFeatures(*self.features[row], 0.0))
+                       image=self.features[row])
                  for row, raw in enumerate(self.raws)]
         if self.ups is None:
             return with_vertical(plain, _VERTICAL_DEG)
@@ -217,8 +230,7 @@ def _seen(frames: Frames, raws: tuple[RawFrame, ...], options: RoomOptions, name
                                  EVERY_FRAME, reading=name), options.out / f'{name}.npz')
     looker = Looker(options.out / 'looks', options.model)
     return {'detections': recorded.detections,
-            'features': tuple((looker.features(image_rgb), camera)
-                              for image_rgb, camera in (raw.color() for raw in raws))}
+            'features': tuple(KeptFeatures(looker, raw) for raw in raws)}
 
 
 def _robot_view(color: Callable[[], tuple[Image, Camera]]

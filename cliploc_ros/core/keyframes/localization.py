@@ -38,13 +38,17 @@ _ENOUGH_INLIERS, _MORE = 100, 5
 # place, the next 25 are matched by the strongest 600 features. A chance pose has up to 8 inliers
 # there, so 20 are required.
 _FURTHER, _STRONGEST, _CLEAR = 25, 600, 20
-# A thorough look: features at full size, and of the keyframes with the most similar words those
-# that share the most of the strongest features.
+# The thorough pass: features at full size. Of the keyframes with the most similar words, those are
+# matched that share the most of the image's strongest features.
 _THOROUGH_FEATURES, _THOROUGH_PX = 3000, 1600
 _CANDIDATES, _VOTERS, _VOTED = 100, 300, 20
-# Then points of keyframes near the pose are looked for where it puts them: within this angle
-# (8 px at f = 525 px), and at least so similar.
+# Then the points of keyframes near the pose are looked for where it puts them: within this angle
+# (8 px at f = 525 px), by descriptors that are at least so similar.
 _GUIDED_RADIUS, _GUIDED_COSINE, _GUIDED_KEYFRAMES = 8.0 / 525.0, 0.8, 12
+# Points nearer to the camera than this are not looked for [m], nor those so far off its axis.
+_GUIDED_LEAST_M, _GUIDED_MOST_BEARING = 0.1, 5.0
+#: With less time left, no pass begins [s]: finding features cannot be stopped.
+LEAST_S = 0.5
 #: Places of an image that do not agree with each other.
 MOST_PLACES = 3
 # Similar keyframes of which those elsewhere are chosen.
@@ -90,11 +94,34 @@ class _Matched(NamedTuple):
         return _Matched(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
 
-def query_features(image_rgb: NDArray[np.uint8], thorough: bool = False) -> Features:
-    """Return the features of an image (h, w, 3) that is to be localized."""
-    if thorough:
-        return extract(image_rgb, _THOROUGH_FEATURES, _THOROUGH_PX)
-    return extract(image_rgb, _QUERY_FEATURES, _QUERY_PX)
+def query_features(image_rgb: NDArray[np.uint8], is_thorough: bool = False) -> Features:
+    """Return the features of an image (h, w, 3) that is to be localized, for one of two passes."""
+    return extract(image_rgb, *((_THOROUGH_FEATURES, _THOROUGH_PX) if is_thorough
+                                else (_QUERY_FEATURES, _QUERY_PX)))
+
+
+class ImageFeatures:
+    """The features of an image for both passes, each found when it is needed first.
+
+    Parameters
+    ----------
+    read_rgb : callable
+        Returns the image (h, w, 3).
+    camera : Camera
+        That took the image.
+    """
+
+    def __init__(self, read_rgb: Callable[[], NDArray[np.uint8]], camera: Camera) -> None:
+        self._read_rgb, self.camera = read_rgb, camera
+        self._found: dict[bool, tuple[Features, float]] = {}
+
+    def of_pass(self, is_thorough: bool) -> tuple[Features, float]:
+        """Return the features of a pass, and how long finding them took [ms]."""
+        if is_thorough not in self._found:
+            image_rgb, begin = self._read_rgb(), time.perf_counter()
+            features = query_features(image_rgb, is_thorough)
+            self._found[is_thorough] = features, 1e3 * (time.perf_counter() - begin)
+        return self._found[is_thorough]
 
 
 class _Look(NamedTuple):
@@ -126,7 +153,7 @@ class KeyframeLocalizer:
 
     def localize_features(self, features: Features, camera: Camera,
                           guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
-                          constraint: Constraint = NOTHING_KNOWN, thorough: bool = False
+                          constraint: Constraint = NOTHING_KNOWN, is_thorough: bool = False
                           ) -> Recognition:
         """Find where an image with these features was taken.
 
@@ -140,23 +167,27 @@ class KeyframeLocalizer:
             No further keyframe is matched then (monotonic clock) [s].
         constraint : Constraint, optional
             Poses that its height range or max_tilt excludes are no places.
+        is_thorough : bool, optional
+            Whether to match many keyframes instead of a few, and to refine the pose by all of
+            their points. It takes several times as long.
         """
         bearings = camera.normalize_points(features.pixels)
         known = np.isfinite(bearings).all(axis=1)
         features = Features(features.pixels[known], features.descriptors[known],
                             features.strengths[known])
         if len(features) < LEAST_INLIERS:
-            return Recognition()
+            return Recognition(is_thorough=is_thorough)
         descriptors = unit_rows(features.descriptors)
         look = _Look(features, bearings[known], camera, constraint)
-        search = self._search_thoroughly if thorough else self._search_fast
+        search = self._search_thoroughly if is_thorough else self._search_fast
         first, matched = search(descriptors, look, guesses, deadline)
         places = _places(first, matched, look)
-        if thorough and places:
+        if is_thorough and places:
             places[0] = self._guided(places[0], look, descriptors)
         if time.monotonic() > deadline:
-            return Recognition(is_complete=False)
-        return Recognition(tuple(self._recognized(one, look) for one in places))
+            return Recognition(is_complete=False, is_thorough=is_thorough)
+        return Recognition(tuple(self._recognized(one, look) for one in places),
+                           is_thorough=is_thorough)
 
     def _search_fast(self, descriptors: NDArray[np.float32], look: _Look,
                      guesses: Sequence[NDArray[np.float64]], deadline: float
@@ -185,12 +216,12 @@ class KeyframeLocalizer:
                            ) -> tuple['_Place | None', _Matched]:
         """Return the best pose among many voted keyframes, and all matches with them."""
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable')[:_CANDIDATES]
-        votes = np.array([len(match(descriptors[:_VOTERS], self.layer.unit_descriptors(one)))
-                          for one in ranks.tolist()])
-        chosen = ranks[np.argsort(-votes, kind='stable')][:_VOTED].tolist()
+        votes = [len(self._match(descriptors[:_VOTERS], [one], deadline).features)
+                 for one in ranks.tolist()]
+        chosen = ranks[np.argsort(-np.array(votes), kind='stable')][:_VOTED].tolist()
         for guess in guesses:
-            near = keyframes_near(self.layer.map_from_camera, guess)[:PROPOSED].tolist()
-            chosen += [one for one in near if one not in chosen]
+            chosen += keyframes_near(self.layer.map_from_camera, guess)[:PROPOSED].tolist()
+        chosen = [*dict.fromkeys(chosen)]
         matched = self._match(descriptors, chosen, deadline)
         first = _place(matched, look)
         if first is not None:
@@ -200,42 +231,42 @@ class KeyframeLocalizer:
             first = _place(matched, look)
         return first, matched
 
-    def _guided(self, place: '_Place', look: '_Look', descriptors: NDArray[np.float32]
-                ) -> '_Place':
-        """Return a place refined by all points that the image shows where the pose puts them."""
+    def _guided(self, place: '_Place', look: _Look, descriptors: NDArray[np.float32]) -> '_Place':
+        """Return a place refined by all points that the image shows where the pose puts them.
+
+        They are no further evidence for it: some are found near any place by chance.
+        """
         camera_from_map = invert_transform(place.map_from_camera)
         near = keyframes_near(self.layer.map_from_camera, place.map_from_camera)
-        counts = np.bincount(place.inliers.keyframes, minlength=len(self.layer))
-        used = np.argsort(-counts, kind='stable')[:np.count_nonzero(counts)]
+        seen = dict.fromkeys([*self._used(place)[0].tolist(), *near.tolist()])
         tree = cKDTree(look.bearings)
         points, features = [place.inliers.points], [place.inliers.features]
-        for keyframe in list(dict.fromkeys([*used.tolist(), *near.tolist()]))[:_GUIDED_KEYFRAMES]:
+        for keyframe in [*seen][:_GUIDED_KEYFRAMES]:
             theirs = self.layer.points_in_map(keyframe)
             inside = theirs @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
-            with np.errstate(divide='ignore', invalid='ignore'):
-                shown = inside[:, :2] / inside[:, 2:]
-            rows = np.nonzero((inside[:, 2] > 0.1) & (np.abs(shown) < 5.0).all(axis=1))[0]
-            if not len(rows):
-                continue
-            found = tree.query_ball_point(shown[rows], _GUIDED_RADIUS)
-            lengths = np.array([len(one) for one in found])
-            of_points = np.repeat(rows, lengths)
+            rows = np.nonzero((inside[:, 2] > _GUIDED_LEAST_M) & (
+                np.abs(inside[:, :2]) < _GUIDED_MOST_BEARING * inside[:, 2:]).all(axis=1))[0]
+            found = tree.query_ball_point(inside[rows, :2] / inside[rows, 2:], _GUIDED_RADIUS)
+            of_points = np.repeat(rows, [len(some) for some in found])
             of_features = np.array([one for some in found for one in some], dtype=np.int64)
-            unit = self.layer.unit_descriptors(keyframe)
-            cosines = np.einsum('kd,kd->k', unit[of_points], descriptors[of_features])
+            cosines = np.einsum('kd,kd->k', self.layer.unit_descriptors(keyframe)[of_points],
+                                descriptors[of_features])
+            # pairs of which each is the other's most similar one there
             order = np.argsort(-cosines, kind='stable')
             order = order[cosines[order] > _GUIDED_COSINE]
-            _, first = np.unique(of_points[order], return_index=True)
-            _, other = np.unique(of_features[order], return_index=True)
-            kept = order[np.intersect1d(first, other)]
-            points.append(theirs[of_points[kept]])
-            features.append(of_features[kept])
-        rows = np.concatenate(features)
-        refined = refine(np.concatenate(points), look.bearings[rows], camera_from_map)
-        if refined is None:
-            return place
-        return place._replace(map_from_camera=refined.map_from_camera,
-                              covariance=refined.covariance)
+            mutual = np.intersect1d(np.unique(of_points[order], return_index=True)[1],
+                                    np.unique(of_features[order], return_index=True)[1])
+            points.append(theirs[of_points[order[mutual]]])
+            features.append(of_features[order[mutual]])
+        refined = refine(np.concatenate(points), look.bearings[np.concatenate(features)],
+                         camera_from_map)
+        return place if refined is None else place._replace(
+            map_from_camera=refined.map_from_camera, covariance=refined.covariance)
+
+    def _used(self, place: '_Place') -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the keyframes whose points agree with a place, the most first, and how many."""
+        counts = np.bincount(place.inliers.keyframes, minlength=len(self.layer))
+        return np.argsort(-counts, kind='stable')[:np.count_nonzero(counts)], counts
 
     def _search_further(self, descriptors: NDArray[np.float32], look: _Look, ranks: Sequence[int],
                         deadline: float) -> list[int]:
@@ -257,8 +288,7 @@ class KeyframeLocalizer:
 
     def _recognized(self, place: '_Place', look: '_Look') -> RecognizedPlace:
         """Return a place with the evidence for and against it."""
-        counts = np.bincount(place.inliers.keyframes, minlength=len(self.layer))
-        used = np.argsort(-counts, kind='stable')[:np.count_nonzero(counts)]
+        used, counts = self._used(place)
         pose, shared = place.map_from_camera, self._shared(place.map_from_camera, counts)
         covariance = _MUCH_ALIKE**2 * place.covariance + shared
         evidence = (*self._confirmed(place, look, used), *_focal(place, look, used))
@@ -414,24 +444,34 @@ class ImageRecognizer:
 
     Parameters
     ----------
-    features : Features or callable
-        Of the image; a callable is called when they are needed first.
+    deadline : float
+        See localize_features.
     begin_stage : callable
         Takes the name of a stage that begins: 'keyframes', and 'search' after them.
+    may_be_thorough : bool
+        Whether the image may be searched thoroughly.
     """
 
-    def __init__(self, keyframes: KeyframeLocalizer, features: Features | Callable[[], Features],
-                 camera: Camera, deadline: float = np.inf,
-                 begin_stage: Callable[[str], None] = lambda stage: None) -> None:
-        self._keyframes = keyframes
-        self._features = features
-        self._camera = camera
+    def __init__(self, keyframes: KeyframeLocalizer, features: ImageFeatures,
+                 deadline: float = np.inf,
+                 begin_stage: Callable[[str], None] = lambda stage: None,
+                 may_be_thorough: bool = True) -> None:
+        self._keyframes, self._features = keyframes, features
         self._deadline = deadline
         self._begin_stage = begin_stage
+        self._may_be_thorough = may_be_thorough
         self._known: tuple[set[int], Recognition] | None = None
-        self.thorough = False
-        #: Time that it took so far [ms].
+        self.is_thorough = False  #: Whether the search is a thorough one
+        #: Time that it took so far [ms], features included.
         self.spent_ms = 0.0
+
+    def begin_thorough(self) -> bool:
+        """Search thoroughly from now on; False: it does already, may not, or has no time left."""
+        if self.is_thorough or not self._may_be_thorough or (
+                self._deadline - time.monotonic() < LEAST_S):
+            return False
+        self.is_thorough, self._known = True, None
+        return True
 
     def recognize(self, guesses: Sequence[NDArray[np.float64]],
                   constraint: Constraint = NOTHING_KNOWN) -> Recognition:
@@ -440,12 +480,13 @@ class ImageRecognizer:
             self._keyframes.layer.map_from_camera, guess)[:PROPOSED].tolist()}
         if self._known is None or not near <= self._known[0]:
             self._begin_stage('keyframes')
+            features, features_ms = self._features.of_pass(self.is_thorough)
+            if self._known is None:
+                self.spent_ms += features_ms
             begin = time.perf_counter()
-            if callable(self._features):
-                self._features = self._features()
             self._known = near, self._keyframes.localize_features(
-                self._features, self._camera, guesses, self._deadline, constraint,
-                self.thorough)
+                features, self._features.camera, guesses, self._deadline, constraint,
+                self.is_thorough)
             self.spent_ms += 1e3 * (time.perf_counter() - begin)
             self._begin_stage('search')
         return self._known[1]
@@ -457,4 +498,4 @@ class ImageRecognizer:
 
     def coverage(self, map_from_camera: NDArray[np.float64]) -> float:
         """Return KeyframeLocalizer.coverage for the camera of the image."""
-        return self._keyframes.coverage(map_from_camera, self._camera)
+        return self._keyframes.coverage(map_from_camera, self._features.camera)

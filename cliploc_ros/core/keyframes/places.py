@@ -55,3 +55,4 @@ class Recognition(NamedTuple):
     #: Whether all keyframes were matched that should be. A search that the deadline cut has no
     #: places: it may have missed their rivals.
     is_complete: bool = True
+    is_thorough: bool = False  #: Whether the thorough pass found them, see ImageRecognizer

@@ -5,22 +5,23 @@
 import logging
 import os
 import tempfile
-import time
 from collections import defaultdict, deque
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
-from cliploc_ros.core.keyframes.localization import query_features
+from cliploc_ros.core.keyframes.localization import ImageFeatures
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.models.map_rows import embed_map
-from cliploc_ros.offline.datasets.frames import Frames
+from cliploc_ros.offline.datasets.frames import Frames, RawFrame
 from cliploc_ros.offline.datasets.observations import Queries, QueryFrame, Recorded
-from cliploc_ros.offline.evaluation.trials import ImageFeatures, PosedQuery
+from cliploc_ros.offline.evaluation.trials import PosedQuery
 from cliploc_ros.offline.recording.recorder import RecordingOptions, observation_file, record_once
 
 logger = logging.getLogger(__name__)
@@ -96,9 +97,12 @@ def with_features(queries: Sequence[PosedQuery], frames: Frames) -> tuple[PosedQ
         if not waiting[raw.stamp_ns]:
             continue  # of images of one stamp, more than were recorded
         row = waiting[raw.stamp_ns].popleft()
-        frame = raw.decode()
-        begin = time.perf_counter()
-        features = query_features(frame.image_rgb)
-        spent_ms = 1e3 * (time.perf_counter() - begin)
-        found[row] = replace(queries[row], image=ImageFeatures(features, frame.camera, spent_ms))
+        # decoded again where a pass needs it: the images of a long recording fill the memory
+        features = ImageFeatures(partial(_image_of, raw), raw.color()[1])
+        features.of_pass(is_thorough=False)
+        found[row] = replace(queries[row], image=features)
     return tuple(found)
+
+
+def _image_of(raw: RawFrame) -> NDArray[np.uint8]:
+    return raw.color()[0]

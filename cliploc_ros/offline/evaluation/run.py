@@ -243,8 +243,8 @@ def describe(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], methods: 
         'methods': {one.name: {name: str(value) for name, value in asdict(one.options).items()}
                     for one in methods},
         'keyframes': None if layer is None else {
-            'digest': _digest([*(query.image.features.descriptors for query in queries
-                                 if query.image is not None),
+            'digest': _digest([*(query.image.of_pass(is_thorough=False)[0].descriptors
+                                 for query in queries if query.image is not None),
                                layer.map_from_camera, layer.points, layer.descriptors]),
             'methods': [one.name for one in methods if one.keyframes]}}
 

@@ -5,7 +5,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,11 @@ from cliploc_ros.core.geometry.depth import (
     half_chord,
 )
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
-from cliploc_ros.core.keyframes.features import Features
-from cliploc_ros.core.keyframes.localization import ImageRecognizer, KeyframeLocalizer
+from cliploc_ros.core.keyframes.localization import (
+    ImageFeatures,
+    ImageRecognizer,
+    KeyframeLocalizer,
+)
 from cliploc_ros.core.map.joined_map import place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
@@ -34,14 +37,6 @@ from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.offline.datasets.observations import Queries
 from cliploc_ros.offline.evaluation.methods import Method
 from cliploc_ros.units import NS_PER_S
-
-
-class ImageFeatures(NamedTuple):
-    """Local features, the camera that they are of, and the time that they took [ms]."""
-
-    features: Features
-    camera: Camera
-    spent_ms: float
 
 
 @dataclass(frozen=True)
@@ -91,6 +86,7 @@ class Result:
     #: Points of keyframes that agree on their pose, whatever the pose comes from
     keyframe_inliers: int = 0
     keyframes_ms: float = 0.0  #: Time of features, matching and the pose from them [ms]
+    keyframe_search: str = 'none'  #: How far it went: 'none', 'fast' or 'thorough'
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields, for JSON."""
@@ -160,19 +156,17 @@ def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Se
                  and localizer.can_do_without_crops(method.options))
     results = []
     for query in queries:
-        recognizer, spent_ms = None, 0.0
+        recognizer = None
         observations = [*query.neighbours, query.observation]
         if keyframes is not None and query.image is not None and method.keyframes:
-            recognizer = ImageRecognizer(keyframes, query.image.features, query.image.camera)
+            recognizer = ImageRecognizer(keyframes, query.image)
         if on_demand:
             found, crops_share = _localize_on_demand(relocalizer, observations, recognizer)
         else:
             found = relocalizer.relocalize(observations, recognizer)
             crops_share = float(method.options.needs_similarities)
-        if recognizer is not None and query.image is not None:
-            spent_ms = query.image.spent_ms + recognizer.spent_ms
         results.append(_judge(landmark_map, method.name, trial, query, found, crops_share,
-                              spent_ms))
+                              recognizer))
     return results
 
 
@@ -199,7 +193,8 @@ def _localize_on_demand(relocalizer: Relocalizer, observations: Sequence[Observa
 
 
 def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: PosedQuery,
-           found: Relocalization, crops_share: float, keyframes_ms: float) -> Result:
+           found: Relocalization, crops_share: float, recognizer: ImageRecognizer | None
+           ) -> Result:
     pose = found.map_from_camera
     error_m, error_deg = (None, None) if pose is None else pose_error(pose, query.map_from_camera)
     return Result(
@@ -220,7 +215,8 @@ def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: PosedQuery
         refusal_kind=found.refusal_kind or '',
         source='' if pose is None else found.source,
         keyframe_inliers=0 if found.recognized is None else found.recognized.inliers,
-        keyframes_ms=keyframes_ms)
+        keyframes_ms=0.0 if recognizer is None else recognizer.spent_ms,
+        keyframe_search=found.keyframe_search)
 
 
 # Of the boxes of a kitchen, a tenth have no depth. The share of those whose depth is of something

@@ -18,9 +18,9 @@ from scipy.spatial import cKDTree
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import (
+    ImageFeatures,
     ImageRecognizer,
     KeyframeLocalizer,
-    query_features,
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
@@ -74,8 +74,8 @@ class RecordedKeyframes(NamedTuple):
                           - detections.stamps_s[frame]) > _SAME_TIME_S
         image = self.image_of(frame) if is_other.any() else None
         return None if image is None else ImageRecognizer(
-            KeyframeLocalizer(self.layer.select(is_other)), query_features(image),
-            detections.camera_of(frame))
+            KeyframeLocalizer(self.layer.select(is_other)),
+            ImageFeatures(lambda: image, detections.camera_of(frame)))
 
 
 def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterator[Fold]:
@@ -242,9 +242,9 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
             trial = judge()
             if (localizer is not None and keyframes is not None
                     and (image := keyframes.image_of(frame)) is not None):
-                trial = replace(judge(ImageRecognizer(
-                    localizer, query_features(image), observation.camera)),
-                    by_objects=trial.verdict)
+                features = ImageFeatures(partial(np.asarray, image), observation.camera)
+                trial = replace(judge(ImageRecognizer(localizer, features)),
+                                by_objects=trial.verdict)
             trials.append(replace(trial, is_judged=is_judged))
     return sorted(trials, key=lambda one: one.stamp_s or 0.0)
 
