@@ -92,8 +92,9 @@ class StoredRecognizer(ImageRecognizer):
     """Says of an image again what keyframes said when it was collected."""
 
     def __init__(self, seen: tuple[Recognition, Recognition], keyframes: KeyframeLocalizer,
-                 camera: Camera) -> None:
-        super().__init__(keyframes, ImageFeatures(lambda: _NO_IMAGE, camera))
+                 camera: Camera, may_be_thorough: bool) -> None:
+        super().__init__(keyframes, ImageFeatures(lambda: _NO_IMAGE, camera),
+                         may_be_thorough=may_be_thorough)
         self._seen = seen
 
     def recognize(self, guesses: Sequence[Floats], constraint: Constraint = NOTHING_KNOWN

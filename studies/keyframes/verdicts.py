@@ -44,8 +44,8 @@ _UNTROUBLED = ('plain', 'image', 'classes', 'features')
 _WEIGHT = 4.0
 # Deviations of the Gaussian prior of all coefficients but the first, for signs of deviation 1.
 _PRIOR = 3.0
-#: What answers.
-WAYS = ('objects', 'keyframes', 'both')
+#: What answers; fast: both, without the thorough search of keyframes.
+WAYS = ('objects', 'keyframes', 'both', 'fast')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +70,8 @@ def decide(case: StoredCase, record: Record, way: str) -> Relocalization:
         searched = [relocalizer.search(without_boxes(one.observation)) for one in searched]
     return localize(case.landmark_map, record.options, searched, [
         None if way == 'objects' else StoredRecognizer(
-            one.seen, keyframes, one.searched.observation.camera) for one in record.looks])
+            one.seen, keyframes, one.searched.observation.camera, may_be_thorough=way != 'fast')
+        for one in record.looks])
 
 
 @lru_cache(maxsize=1)
