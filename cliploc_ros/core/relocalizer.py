@@ -253,7 +253,8 @@ class Relocalizer:
         compared = Comparison(joined, met, looks, recognizer)
         result = Relocalization(
             False, '', tried=sum(one.progress.tried for one in frames),
-            coverage=coverage_of(frames), stamp_ns=frames[-1].observation.stamp_ns)
+            coverage=coverage_of(frames), stamp_ns=frames[-1].observation.stamp_ns,
+            recognition=compared.recognition)
         if not compared.contenders:
             kind, reason = _nothing_found(frames)
             return replace(result, reason=reason, refusal_kind=kind, search_ms=budget.elapsed_ms)
@@ -280,8 +281,8 @@ class Relocalizer:
             refusal_kind=refused.kind if refused else None,
             hypotheses=hypotheses, frame_matches=tuple(shown.matches),
             evidence=evidence, covariance=covariance, best_iteration=shown.finalist.iteration,
-            search_ms=budget.elapsed_ms, source=compared.source,
-            recognition=compared.recognition, depth=depth, cameras=tuple(seen))
+            search_ms=budget.elapsed_ms, source=compared.source, depth=depth,
+            cameras=tuple(seen))
 
     def look_again(self, found: Relocalization, frames: Sequence[SearchedFrame],
                    looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None,
@@ -293,7 +294,8 @@ class Relocalizer:
         if found.accepted or recognizer is None or not recognizer.begin_thorough():
             return found
         again = self.locate(frames, None, looks, recognizer, cameras)
-        kept = found if again.recognition is None or not again.recognition.is_complete else again
+        assert again.recognition is not None
+        kept = again if again.recognition.is_complete else found
         return replace(kept, search_ms=found.search_ms + again.search_ms)
 
     def _meet(self, joined: JoinedFrames, budget: TimeBudget) -> list[Contender]:

@@ -3,6 +3,7 @@
 """Keyframes of real images: the kitchen with depth, the office without."""
 
 import time
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -16,9 +17,11 @@ from cliploc_ros.core.keyframes.localization import (
     KeyframeLocalizer,
     query_features,
 )
+from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.watch import Watch
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
@@ -81,6 +84,51 @@ def test_the_kitchen_is_found_to_centimetres_and_accepted(layer, queries, answer
         assert found.accepted, found.reason
         assert pose_error(found.map_from_camera, frame.map_from_camera)[0] < 0.1
         assert np.sqrt(np.trace(found.covariance[:3, :3])) < 0.1
+
+
+def test_a_refused_image_is_searched_thoroughly(layer, kitchen, room):
+    localizer, frame = KeyframeLocalizer(layer), next(kitchen.select([33]).read())
+    query = Query((Observation(frame.camera, NO_OBJECTS, np.empty((0, len(room)))),),
+                  (frame.image_rgb,), None)
+
+    def ask(query, deadline=np.inf):
+        by = Localizer(Relocalizer(room, OPTIONS), localizer)
+        return by.answer(query, deadline=deadline), by.query
+    fast, fast_query = ask(replace(query, is_thorough=False))
+    assert (fast.accepted, fast.keyframe_search) == (False, 'fast')
+    thorough, thorough_query = ask(query)
+    assert (thorough.accepted, thorough.keyframe_search) == (True, 'thorough')
+    assert thorough.recognized.inliers > 1.3 * fast.recognized.inliers
+    error_m, _ = pose_error(thorough.map_from_camera, frame.map_from_camera)
+    assert error_m < min(0.1, pose_error(fast.map_from_camera, frame.map_from_camera)[0])
+    # a recorded query says how far the search went: the answer comes again
+    for found, recorded in ((fast, fast_query), (thorough, thorough_query)):
+        again, _ = ask(recorded)
+        np.testing.assert_array_equal(again.map_from_camera, found.map_from_camera)
+        assert again.confidence == found.confidence
+
+
+def test_a_thorough_search_that_time_cuts_short_changes_nothing(layer, kitchen, room):
+    frame = next(kitchen.select([33]).read())
+    fast = ImageRecognizer(KeyframeLocalizer(layer), ImageFeatures(
+        lambda: frame.image_rgb, frame.camera), may_be_thorough=False)
+    expected = Relocalizer(room, OPTIONS).relocalize([Observation(frame.camera, NO_OBJECTS)], fast)
+
+    reads, deadline = [], time.monotonic() + 3.0
+
+    def late():
+        reads.append(1)
+        if len(reads) == 2:  # for the thorough search
+            time.sleep(max(0.0, deadline - time.monotonic()))
+        return frame.image_rgb
+    recognizer = ImageRecognizer(KeyframeLocalizer(layer), ImageFeatures(late, frame.camera),
+                                 deadline)
+    found = Relocalizer(room, OPTIONS).relocalize([Observation(frame.camera, NO_OBJECTS)],
+                                                  recognizer)
+    assert len(reads) == 2
+    assert found.keyframe_search == 'fast'
+    np.testing.assert_array_equal(found.map_from_camera, expected.map_from_camera)
+    assert not recognizer.begin_thorough(), 'no time is left'
 
 
 @pytest.mark.parametrize('name', ['dark and noisy', 'blurred', 'unevenly lit', 'half covered'])

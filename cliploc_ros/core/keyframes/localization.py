@@ -234,13 +234,14 @@ class KeyframeLocalizer:
     def _guided(self, place: '_Place', look: _Look, descriptors: NDArray[np.float32]) -> '_Place':
         """Return a place refined by all points that the image shows where the pose puts them.
 
-        They are no further evidence for it: some are found near any place by chance.
+        They tell how far the place reaches in the image. They are no further evidence that it is
+        the right one: some are found near any place by chance.
         """
         camera_from_map = invert_transform(place.map_from_camera)
         near = keyframes_near(self.layer.map_from_camera, place.map_from_camera)
         seen = dict.fromkeys([*self._used(place)[0].tolist(), *near.tolist()])
         tree = cKDTree(look.bearings)
-        points, features = [place.inliers.points], [place.inliers.features]
+        matched = place.inliers
         for keyframe in [*seen][:_GUIDED_KEYFRAMES]:
             theirs = self.layer.points_in_map(keyframe)
             inside = theirs @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
@@ -256,12 +257,14 @@ class KeyframeLocalizer:
             order = order[cosines[order] > _GUIDED_COSINE]
             mutual = np.intersect1d(np.unique(of_points[order], return_index=True)[1],
                                     np.unique(of_features[order], return_index=True)[1])
-            points.append(theirs[of_points[order[mutual]]])
-            features.append(of_features[order[mutual]])
-        refined = refine(np.concatenate(points), look.bearings[np.concatenate(features)],
-                         camera_from_map)
+            of_points, kept = of_points[order[mutual]], of_features[order[mutual]]
+            matched = matched.join(_Matched(
+                kept, theirs[of_points], np.full(len(kept), keyframe),
+                of_points + self.layer.rows(keyframe).start))
+        refined = refine(matched.points, look.bearings[matched.features], camera_from_map)
         return place if refined is None else place._replace(
-            map_from_camera=refined.map_from_camera, covariance=refined.covariance)
+            map_from_camera=refined.map_from_camera, covariance=refined.covariance,
+            inliers=matched.select(refined.inliers))
 
     def _used(self, place: '_Place') -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the keyframes whose points agree with a place, the most first, and how many."""
