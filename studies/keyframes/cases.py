@@ -288,7 +288,10 @@ def make_query(case: Case, place: Place, others: Sequence[Place], frame: RawFram
     picture = case.picture and make_picture(*case.picture, frame.color()[1], *source.color(), rng)
     shots: list[tuple[Image, Camera, Floats | None]] = []
     # `odom_from_camera` of one or two poses, with the error that the package expects.
-    steps = [invert_transform(poses[0]) @ pose for pose in poses]
+    # Poses of files are rounded, so their rotations are made exact.
+    exact = [make_transform(Rotation.from_matrix(pose[:3, :3]).as_matrix(), pose[:3, 3])
+             for pose in poses]
+    steps = [invert_transform(exact[0]) @ pose for pose in exact]
     errors = [odometry_deviations(step) * rng.normal(size=6) for step in steps]
     odometry = [step @ make_transform(Rotation.from_rotvec(error[3:]).as_matrix(), error[:3])
                 for step, error in zip(steps, errors, strict=True)]

@@ -219,11 +219,10 @@ class Comparison:
 
         In the last frame, since keyframes are recognized there.
         """
-        if self.place is None or self.recognition is None:
+        if self.place is None:
             return None
         boxes = self._last.detections.bboxes_xyxy[[one.detection for one in best.matches[-1]]]
-        return signs_of(self.place, best.support, boxes, self._last.camera, max(
-            (one.inliers for one in self.recognition.places if one is not self.place), default=0))
+        return signs_of(self.place, best.support, boxes, self._last.camera)
 
     def _motion(self) -> Motion | None:
         """Return the motion since an earlier look by keyframes, if there was one."""

@@ -93,12 +93,10 @@ class Signs(NamedTuple):
     reach: float
     #: Share of the detected objects of the map's classes that the pose does not explain
     unexplained: float
-    #: Number of features that agree with another place, as a share of those that agree here
-    rival: float
 
 
 def signs_of(place: RecognizedPlace, support: Support, boxes: NDArray[np.float64],
-             camera: Camera, rival: int) -> Signs:
+             camera: Camera) -> Signs:
     """Return the signs at a recognized place.
 
     Parameters
@@ -116,8 +114,7 @@ def signs_of(place: RecognizedPlace, support: Support, boxes: NDArray[np.float64
         _error(place.focal_ratio, place.focal_deviation),
         _error(place.aspect_ratio, place.aspect_deviation),
         float((np.ptp(ends, axis=0) / size).max()) if len(ends) else 0.0,
-        support.unexplained / (support.unexplained + support.inliers + _TERMS.further_object),
-        min(1.0, rival / max(1, place.inliers)))
+        support.unexplained / (support.unexplained + support.inliers + _TERMS.further_object))
 
 
 def chance_genuine(signs: Signs, motion: Motion | None = None,
