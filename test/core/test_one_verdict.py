@@ -36,6 +36,9 @@ class Says:
     def recognize(self, guesses, prior=NOTHING_KNOWN):
         return self._seen
 
+    def begin_thorough(self):
+        return False
+
     def coverage(self, map_from_camera):
         return self._covers if np.isscalar(self._covers) else self._covers(map_from_camera)
 
