@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
@@ -19,7 +20,7 @@ from cliploc_ros.core.keyframes.localization import ImageFeatures
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.models.map_rows import embed_map
-from cliploc_ros.offline.datasets.frames import Frames, RawFrame
+from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.datasets.observations import Queries, QueryFrame, Recorded
 from cliploc_ros.offline.evaluation.trials import PosedQuery
 from cliploc_ros.offline.recording.recorder import RecordingOptions, observation_file, record_once
@@ -97,12 +98,15 @@ def with_features(queries: Sequence[PosedQuery], frames: Frames) -> tuple[PosedQ
         if not waiting[raw.stamp_ns]:
             continue  # of images of one stamp, more than were recorded
         row = waiting[raw.stamp_ns].popleft()
-        # decoded again where a pass needs it: the images of a long recording fill the memory
-        features = ImageFeatures(partial(_image_of, raw), raw.color()[1])
+        image_rgb, camera = raw.color()
+        # a pass decodes it again: the images of a long recording would fill the memory
+        _, content = cv2.imencode('.png', image_rgb, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        features = ImageFeatures(partial(_decoded, content), camera)
         features.of_pass(is_thorough=False)
         found[row] = replace(queries[row], image=features)
     return tuple(found)
 
 
-def _image_of(raw: RawFrame) -> NDArray[np.uint8]:
-    return raw.color()[0]
+def _decoded(content: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an image of a lossless PNG, whose channels are in any order."""
+    return np.asarray(cv2.imdecode(content, cv2.IMREAD_COLOR), dtype=np.uint8)
