@@ -100,7 +100,8 @@ class StoredRecognizer(ImageRecognizer):
     def recognize(self, guesses: Sequence[Floats], constraint: Constraint = NOTHING_KNOWN
                   ) -> Recognition:
         """Return what was stored."""
-        return self._seen[self.is_thorough]
+        self._known = set(), self._seen[self._fast is not None]
+        return self._known[1]
 
 
 def localize(landmark_map: LandmarkMap, options: RelocalizerOptions,

@@ -28,6 +28,7 @@ from cliploc_ros.core.keyframes.layer import (
     save_layer,
 )
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, find_pose, free_focal, refine
 from cliploc_ros.core.search.scene import Constraint
 from cliploc_ros.errors import MapError
@@ -110,10 +111,41 @@ def test_a_keyframe_is_found_though_others_look_more_like_the_image(corridor, mi
     others = rng.uniform(0.0, (CAMERA.width, CAMERA.height), (len(descriptors) - len(pixels), 2))
     seen = Features(np.concatenate([pixels, others]), descriptors,
                     np.ones(len(descriptors), np.float32))
-    place, = KeyframeLocalizer(corridor).localize_features(seen, CAMERA).places
+    localizer = KeyframeLocalizer(corridor)
+    fast = localizer.localize_features(seen, CAMERA)
+    # the thorough pass, whose pooled matches show the pose less clearly, does not lose it
+    for place, in (fast.places, localizer.localize_features(seen, CAMERA, fast=fast).places):
+        assert place.map_from_camera[:3, 3] == pytest.approx([180.1, 0.0, 0.0], abs=1e-3)
+        assert (place.inliers, place.keyframes) == (30, (18,))
+        assert abs(place.focal_ratio - 1.0) <= 3.0 * place.focal_deviation < 0.1
+
+
+@pytest.mark.parametrize('fast', [None, Recognition()])
+@pytest.mark.parametrize('has_empty', [False, True])
+def test_one_keyframe_and_one_without_points_are_searched(corridor, has_empty, fast):
+    layer, pose = corridor.select(np.arange(20) == 18), corridor.map_from_camera[18]
+    if has_empty:  # another one that sees the same, but keeps no point of it
+        layer = replace(layer, map_from_camera=np.array([pose, pose]), offsets=np.array(
+            [0, 0, POINTS]))
+    pixels, descriptors = features_at(corridor, 18)
+    seen = Features(pixels, descriptors, np.ones(len(pixels), np.float32))
+    place, = KeyframeLocalizer(layer).localize_features(seen, CAMERA, fast=fast).places
+    assert place.inliers == POINTS
     assert place.map_from_camera[:3, 3] == pytest.approx([180.1, 0.0, 0.0], abs=1e-3)
-    assert (place.inliers, place.keyframes) == (30, (18,))
-    assert abs(place.focal_ratio - 1.0) <= 3.0 * place.focal_deviation < 0.1
+
+
+def test_a_pose_is_refined_by_points_that_matching_missed(corridor, rng):
+    """Half of the features look so much like two points that their match is unclear."""
+    layer = replace(corridor, map_from_camera=corridor.map_from_camera.copy())
+    layer.map_from_camera[17] = layer.map_from_camera[18]
+    pixels, descriptors = features_at(layer, 18)
+    layer.descriptors[layer.rows(17)] = descriptors[::-1]  # other points that look the same
+    pixels = pixels + rng.normal(0.0, 0.5, pixels.shape)
+    seen = Features(pixels, descriptors, np.ones(len(pixels), np.float32))
+    fast, thorough = (KeyframeLocalizer(layer).localize_features(
+        seen, CAMERA, fast=one).places[0] for one in (None, Recognition()))
+    assert thorough.inliers == fast.inliers, 'they are no further evidence'
+    assert len(thorough.pixels) >= len(fast.pixels)
 
 
 def test_a_keyframe_near_a_guess_is_found_though_many_look_more_like_the_image(corridor):

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where features meet: cameras, what is known besides, and what asks, in one process."""
 
+import math
 import time
 from dataclasses import asdict, replace
 from itertools import product
@@ -85,16 +86,17 @@ class Drive:
                     robot @ mount, 0, 0.05 * number) if self.has_odometry else None)))
         return frames[:self.cameras], robot @ MOUNTS[0]
 
-    def localize(self, number=0):
+    def localize(self, number=0, deadline=math.inf):
         """Answer for an instant as the node does; return the result and the pose's error [m]."""
         ((frame, state), *beside), truth = self.see(number)
         found = self.localizer.localize(frame, self.parameters, KnownBefore(
-            state, beside, self.region), StageTimes('waiting', time.monotonic()))
+            state, beside, self.region), StageTimes('waiting', time.monotonic()), deadline)
         answer = Answer(Verdict.ACCEPTED if found.found.accepted else Verdict.REFUSED, '',
                         received_at=frame.received_at, query=found.query)
         self.recorder.add(answer)
         self.recorder.end(answer)
-        return found, pose_error(found.found.map_from_camera, truth)[0]
+        pose = found.found.map_from_camera
+        return found, math.inf if pose is None else pose_error(pose, truth)[0]
 
     def recorded(self):
         """Store the request; return what another localizer answers to the file."""
@@ -116,6 +118,22 @@ def equal(one, other):
     np.testing.assert_array_equal(one.covariance, other.covariance)
     assert (one.accepted, one.evidence, one.reason) == (other.accepted, other.evidence,
                                                         other.reason)
+
+
+@pytest.mark.parametrize('cameras', [1, 3])
+@pytest.mark.parametrize(('left_s', 'searched'), [(60.0, 'thorough'), (0.4, 'none'),
+                                                  (math.inf, 'fast')])
+def test_a_refused_request_searches_keyframes_as_far_as_its_time_allows(
+        cameras, left_s, searched, tmp_path):
+    """A frame of continuous mode has no deadline, and no thorough pass."""
+    drive = Drive(cameras, 'all', tmp_path)
+    drive.objects = 2
+    found, _ = drive.localize(deadline=time.monotonic() + left_s)
+    assert not found.found.accepted
+    assert found.found.keyframe_search == searched
+    case, again = drive.recorded()
+    assert again.keyframe_search == searched
+    assert case.queries[-1].is_thorough == (searched == 'thorough')
 
 
 @pytest.mark.parametrize(('cameras', 'known'), COMBINATIONS)

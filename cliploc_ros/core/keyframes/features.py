@@ -83,12 +83,11 @@ def match(ours: NDArray[np.float32], theirs: NDArray[np.float32]) -> NDArray[np.
     if len(ours) == 0 or len(theirs) < 2:
         return np.empty((0, 2), dtype=np.int64)
     cosines = ours @ theirs.T
-    rows, best = np.arange(len(ours)), cosines.argmax(axis=1)
-    mutual = cosines.argmax(axis=0)[best] == rows
-    first = cosines[rows, best]
-    cosines[rows, best] = -1.0
-    second = cosines.max(axis=1)
+    best = cosines.argmax(axis=1)
+    first = cosines[np.arange(len(ours)), best]
+    rows = np.nonzero(first >= cosines.max(axis=0)[best])[0]
+    others = cosines[rows]
+    others[np.arange(len(rows)), best[rows]] = -1.0
     # squared distances of unit vectors are 2 - 2 cos
-    clear = (1.0 - first) < _RATIO**2 * (1.0 - second)
-    kept = np.nonzero(mutual & clear)[0]
+    kept = rows[(1.0 - first[rows]) < _RATIO**2 * (1.0 - others.max(axis=1, initial=-1.0))]
     return np.stack([kept, best[kept]], axis=1)

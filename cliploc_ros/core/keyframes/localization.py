@@ -153,7 +153,7 @@ class KeyframeLocalizer:
 
     def localize_features(self, features: Features, camera: Camera,
                           guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
-                          constraint: Constraint = NOTHING_KNOWN, is_thorough: bool = False
+                          constraint: Constraint = NOTHING_KNOWN, fast: Recognition | None = None
                           ) -> Recognition:
         """Find where an image with these features was taken.
 
@@ -167,11 +167,12 @@ class KeyframeLocalizer:
             No further keyframe is matched then (monotonic clock) [s].
         constraint : Constraint, optional
             Poses that its height range or max_tilt excludes are no places.
-        is_thorough : bool, optional
-            Whether to match many keyframes instead of a few, and to refine the pose by all of
-            their points. It takes several times as long.
+        fast : Recognition, optional
+            What the fast pass found. With it, this is the thorough pass: many keyframes are
+            matched instead of a few, and the pose is refined by all of their points. It takes
+            several times as long.
         """
-        bearings = camera.normalize_points(features.pixels)
+        is_thorough, bearings = fast is not None, camera.normalize_points(features.pixels)
         known = np.isfinite(bearings).all(axis=1)
         features = Features(features.pixels[known], features.descriptors[known],
                             features.strengths[known])
@@ -179,11 +180,13 @@ class KeyframeLocalizer:
             return Recognition(is_thorough=is_thorough)
         descriptors = unit_rows(features.descriptors)
         look = _Look(features, bearings[known], camera, constraint)
-        search = self._search_thoroughly if is_thorough else self._search_fast
-        first, matched = search(descriptors, look, guesses, deadline)
-        places = _places(first, matched, look)
-        if is_thorough and places:
-            places[0] = self._guided(places[0], look, descriptors)
+        if fast is None:
+            places = _places(*self._search_fast(descriptors, look, guesses, deadline), look)
+        else:
+            places = _places(*self._search_thoroughly(
+                descriptors, look, guesses, [one.map_from_camera for one in fast.places], deadline
+            ), look)
+            places[:1] = [self._guided(one, look, descriptors) for one in places[:1]]
         if time.monotonic() > deadline:
             return Recognition(is_complete=False, is_thorough=is_thorough)
         return Recognition(tuple(self._recognized(one, look) for one in places),
@@ -212,23 +215,27 @@ class KeyframeLocalizer:
         return first, matched
 
     def _search_thoroughly(self, descriptors: NDArray[np.float32], look: _Look,
-                           guesses: Sequence[NDArray[np.float64]], deadline: float
+                           guesses: Sequence[NDArray[np.float64]],
+                           found: Sequence[NDArray[np.float64]], deadline: float
                            ) -> tuple['_Place | None', _Matched]:
-        """Return the best pose among many voted keyframes, and all matches with them."""
+        """Return the best pose among many voted keyframes, and all matches with them.
+
+        The poses (4, 4) that were found before compete, too.
+        """
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable')[:_CANDIDATES]
         votes = [len(self._match(descriptors[:_VOTERS], [one], deadline).features)
                  for one in ranks.tolist()]
         chosen = ranks[np.argsort(-np.array(votes), kind='stable')][:_VOTED].tolist()
-        for guess in guesses:
+        for guess in (*guesses, *found):
             chosen += keyframes_near(self.layer.map_from_camera, guess)[:PROPOSED].tolist()
         chosen = [*dict.fromkeys(chosen)]
         matched = self._match(descriptors, chosen, deadline)
-        first = _place(matched, look)
+        first = _place(matched, look, found=found)
         if first is not None:
             near = keyframes_near(self.layer.map_from_camera, first.map_from_camera)
             more = [one for one in near[:_MORE].tolist() if one not in chosen]
             matched = matched.join(self._match(descriptors, more, deadline))
-            first = _place(matched, look)
+            first = _place(matched, look, found=[first.map_from_camera])
         return first, matched
 
     def _guided(self, place: '_Place', look: _Look, descriptors: NDArray[np.float32]) -> '_Place':
@@ -245,8 +252,9 @@ class KeyframeLocalizer:
         for keyframe in [*seen][:_GUIDED_KEYFRAMES]:
             theirs = self.layer.points_in_map(keyframe)
             inside = theirs @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
-            rows = np.nonzero((inside[:, 2] > _GUIDED_LEAST_M) & (
-                np.abs(inside[:, :2]) < _GUIDED_MOST_BEARING * inside[:, 2:]).all(axis=1))[0]
+            ahead = np.isfinite(inside).all(axis=1) & (inside[:, 2] > _GUIDED_LEAST_M)
+            rows = np.nonzero(ahead & (np.abs(inside[:, :2]) < _GUIDED_MOST_BEARING
+                                       * inside[:, 2:]).all(axis=1))[0]
             found = tree.query_ball_point(inside[rows, :2] / inside[rows, 2:], _GUIDED_RADIUS)
             of_points = np.repeat(rows, [len(some) for some in found])
             of_features = np.array([one for some in found for one in some], dtype=np.int64)
@@ -390,14 +398,19 @@ def _places(first: _Place | None, matched: _Matched, look: _Look) -> list[_Place
     return sorted(places, key=lambda one: -np.count_nonzero(one.cells))
 
 
-def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS) -> _Place | None:
-    found = find_pose(matched.points, look.bearings[matched.features], iterations)
-    if found is None:
-        return None
-    inliers = matched.select(found.inliers)
-    features = np.unique(inliers.features)
-    return _Place(found.map_from_camera, found.covariance, matched, inliers, len(features),
-                  _count(look.features.pixels[features], look.camera))
+def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS,
+           found: Sequence[NDArray[np.float64]] = ()) -> _Place | None:
+    """Return the pose that most features agree with, a new one or one of those found before."""
+    bearings, places = look.bearings[matched.features], list[_Place]()
+    for pose in (find_pose(matched.points, bearings, iterations),
+                 *(refine(matched.points, bearings, invert_transform(one)) for one in found)):
+        if pose is not None:
+            inliers = matched.select(pose.inliers)
+            features = np.unique(inliers.features)
+            places.append(_Place(pose.map_from_camera, pose.covariance, matched, inliers,
+                                 len(features), _count(look.features.pixels[features],
+                                                       look.camera)))
+    return max(places, key=lambda one: one.agreed, default=None)
 
 
 def _focal(place: _Place, look: _Look, used: NDArray[np.int64]
@@ -464,16 +477,16 @@ class ImageRecognizer:
         self._begin_stage = begin_stage
         self._may_be_thorough = may_be_thorough
         self._known: tuple[set[int], Recognition] | None = None
-        self.is_thorough = False  #: Whether the search is a thorough one
+        self._fast: Recognition | None = None
         #: Time that it took so far [ms], features included.
         self.spent_ms = 0.0
 
     def begin_thorough(self) -> bool:
         """Search thoroughly from now on; False: it does already, may not, or has no time left."""
-        if self.is_thorough or not self._may_be_thorough or (
+        if self._fast is not None or self._known is None or not self._may_be_thorough or (
                 self._deadline - time.monotonic() < LEAST_S):
             return False
-        self.is_thorough, self._known = True, None
+        (_, self._fast), self._known = self._known, None
         return True
 
     def recognize(self, guesses: Sequence[NDArray[np.float64]],
@@ -483,13 +496,12 @@ class ImageRecognizer:
             self._keyframes.layer.map_from_camera, guess)[:PROPOSED].tolist()}
         if self._known is None or not near <= self._known[0]:
             self._begin_stage('keyframes')
-            features, features_ms = self._features.of_pass(self.is_thorough)
+            features, features_ms = self._features.of_pass(self._fast is not None)
             if self._known is None:
                 self.spent_ms += features_ms
             begin = time.perf_counter()
             self._known = near, self._keyframes.localize_features(
-                features, self._features.camera, guesses, self._deadline, constraint,
-                self.is_thorough)
+                features, self._features.camera, guesses, self._deadline, constraint, self._fast)
             self.spent_ms += 1e3 * (time.perf_counter() - begin)
             self._begin_stage('search')
         return self._known[1]

@@ -18,7 +18,7 @@ _MOST_ERROR = 3.0 / 525.0
 _SURE = 0.9999
 # Least squares end after some steps, or one that is small [m, rad]; none changes the logarithm of
 # the focal length by more.
-_STEPS, _SMALL_STEP, _MOST_STEP = 6, 1e-5, 0.3
+_STEPS, _SMALL_STEP, _MOST_STEP = 6, 1e-4, 0.3
 # Tolerances of the inliers, as multiples: for a pose of three points, and for one with a focal
 # length that may be half the true one. None is wrong by more than the logarithm.
 _ROUGH, _WRONG_FOCAL, _MOST_LOGARITHM = (2.0, 1.0), (12.0, 6.0, 3.0, 1.0), np.log(10.0)
