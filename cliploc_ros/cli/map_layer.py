@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.command import option, positive_int
-from cliploc_ros.errors import MapError, MappingError, OptionsError
+from cliploc_ros.errors import MapError, MappingError, ModelError, OptionsError
 
 if TYPE_CHECKING:
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
@@ -25,6 +25,8 @@ def add_layer_options(parser: argparse.ArgumentParser) -> None:
            'has images, and a layer can be made of them)', action=argparse.BooleanOptionalAction)
     option(group, '--keyframe-points N', 'the most points of a keyframe, 146 bytes each '
            '(%(default)s)', positive_int, _DEFAULT_POINTS)
+    option(group, '--keyframe-features', 'sift, or xfeat: a network of 2.7 MB, which is downloaded '
+           'once (%(default)s)', default='sift', choices=FEATURES)
     option(group, '--keyframe-images', 'also store small images of the keyframes, for the debug '
            'image: anyone who has the file sees the place')
 
@@ -98,17 +100,18 @@ def read_layer(map_file: Path, landmark_map: 'LandmarkMap', wanted: bool | None
                ) -> 'KeyframeLayer | None':
     """Return the layer next to a map; None where there is none, or none is wanted.
 
-    With `wanted` None a bad layer is left out with a note, as the relocalizer does. MapError: the
-    layer is wanted, and is missing or bad.
+    With `wanted` None a bad layer is left out with a note, as the relocalizer does. MapError,
+    ModelError: the layer is wanted, and is missing or bad, or the network of its features is.
     """
     from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
+    from cliploc_ros.models.xfeat import feature_kinds
 
     path = layer_path(map_file)
     if wanted is False or (wanted is None and not path.exists()):
         return None
     try:
-        return load_layer_of_map(path, landmark_map)
-    except MapError as error:
+        return load_layer_of_map(path, landmark_map, feature_kinds())
+    except (MapError, ModelError) as error:
         if wanted:
             raise
         print(f'without keyframes: {error}', flush=True)

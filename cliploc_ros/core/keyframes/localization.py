@@ -12,15 +12,16 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import SAME_ANSWER, SAME_SIGHT, invert_transform
-from cliploc_ros.core.keyframes.features import Features, extract, match, unit_rows
+from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, Features
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, agreeing, find_pose, free_focal
 from cliploc_ros.core.search.scene import Constraint
+from cliploc_ros.errors import MapError
 
-# Most features of a query, and its longest side. At the size of keyframes, features take twice the
-# time at equal success.
-_QUERY_FEATURES, _QUERY_PX = 2000, 400
+# Most features of a query. At the size of keyframes, features take twice the time at equal
+# success: a kind has a smaller one for queries.
+_QUERY_FEATURES = 2000
 # Keyframes that are matched: the most similar ones, then the most similar ones elsewhere, so that
 # a place that looks alike is found, and those where objects propose.
 _SIMILAR, _ELSEWHERE, PROPOSED = 5, 2, 3
@@ -76,9 +77,12 @@ class _Matched(NamedTuple):
         return _Matched(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
 
-def query_features(image_rgb: NDArray[np.uint8]) -> Features:
-    """Return the features of an image (h, w, 3) that is to be localized."""
-    return extract(image_rgb, _QUERY_FEATURES, _QUERY_PX)
+def query_features(image_rgb: NDArray[np.uint8], kind: FeatureKind = SIFT) -> Features:
+    """Return the features of an image (h, w, 3) that is to be localized.
+
+    The kind is that of the layer in which it is localized.
+    """
+    return kind.extract(image_rgb, _QUERY_FEATURES, kind.query_px)
 
 
 class _Look(NamedTuple):
@@ -88,6 +92,7 @@ class _Look(NamedTuple):
     bearings: NDArray[np.float64]
     camera: Camera
     constraint: Constraint = NOTHING_KNOWN
+    least_inliers: int = 0
 
 
 class _Place(NamedTuple):
@@ -123,15 +128,24 @@ class KeyframeLocalizer:
             No further keyframe is matched then (monotonic clock) [s].
         constraint : Constraint, optional
             Poses that its height range or max_tilt excludes are no places.
+
+        Raises
+        ------
+        MapError
+            The features are of another kind than those of the layer.
         """
+        kind = self.layer.kind
+        if features.descriptors.shape[1] != kind.dimensions:
+            raise MapError(f'features of {features.descriptors.shape[1]} numbers, but the '
+                           f'keyframes have {kind.name}: extract them with the kind of the layer')
         bearings = camera.normalize_points(features.pixels)
         known = np.isfinite(bearings).all(axis=1)
         features = Features(features.pixels[known], features.descriptors[known],
                             features.strengths[known])
         if len(features) < LEAST_INLIERS:
             return Recognition()
-        descriptors = unit_rows(features.descriptors)
-        look = _Look(features, bearings[known], camera, constraint)
+        descriptors = kind.units(features.descriptors)
+        look = _Look(features, bearings[known], camera, constraint, kind.least_inliers)
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable').tolist()
         chosen = self._choose(ranks, guesses)
         matched = self._match(descriptors, chosen, deadline)
@@ -204,7 +218,7 @@ class KeyframeLocalizer:
         for keyframe in chosen:
             if time.monotonic() > deadline:
                 break
-            pairs = match(descriptors, self.layer.unit_descriptors(keyframe))
+            pairs = self.layer.kind.match(descriptors, self.layer.unit_descriptors(keyframe))
             inside = self.layer.points_in_map(keyframe)[pairs[:, 1]]
             known = np.isfinite(inside).all(axis=1)
             features.append(pairs[known, 0])
@@ -279,6 +293,8 @@ def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS) -> _Pl
         return None
     inliers = matched.select(found.inliers)
     features = np.unique(inliers.features)
+    if len(features) < look.least_inliers:
+        return None
     return _Place(found.map_from_camera, found.covariance, matched, inliers, len(features),
                   _count(look.features.pixels[features], look.camera))
 

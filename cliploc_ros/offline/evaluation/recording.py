@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from cliploc_ros.core.keyframes.features import SIFT, FeatureKind
 from cliploc_ros.core.keyframes.localization import query_features
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
@@ -81,7 +82,8 @@ def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap,
                    tuple(frames))
 
 
-def with_features(queries: Sequence[PosedQuery], frames: Frames) -> tuple[PosedQuery, ...]:
+def with_features(queries: Sequence[PosedQuery], frames: Frames, kind: FeatureKind = SIFT
+                  ) -> tuple[PosedQuery, ...]:
     """Return queries with the features of their images; those without an image stay.
 
     The queries were recorded from these frames.
@@ -98,7 +100,7 @@ def with_features(queries: Sequence[PosedQuery], frames: Frames) -> tuple[PosedQ
         row = waiting[raw.stamp_ns].popleft()
         frame = raw.decode()
         begin = time.perf_counter()
-        features = query_features(frame.image_rgb)
+        features = query_features(frame.image_rgb, kind)
         spent_ms = 1e3 * (time.perf_counter() - begin)
         found[row] = replace(queries[row], image=ImageFeatures(features, frame.camera, spent_ms))
     return tuple(found)

@@ -74,8 +74,8 @@ class RecordedKeyframes(NamedTuple):
                           - detections.stamps_s[frame]) > _SAME_TIME_S
         image = self.image_of(frame) if is_other.any() else None
         return None if image is None else ImageRecognizer(
-            KeyframeLocalizer(self.layer.select(is_other)), query_features(image),
-            detections.camera_of(frame))
+            KeyframeLocalizer(self.layer.select(is_other)),
+            query_features(image, self.layer.kind), detections.camera_of(frame))
 
 
 def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterator[Fold]:
@@ -243,8 +243,8 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
             if (localizer is not None and keyframes is not None
                     and (image := keyframes.image_of(frame)) is not None):
                 trial = replace(judge(ImageRecognizer(
-                    localizer, query_features(image), observation.camera)),
-                    by_objects=trial.verdict)
+                    localizer, query_features(image, keyframes.layer.kind),
+                    observation.camera)), by_objects=trial.verdict)
             trials.append(replace(trial, is_judged=is_judged))
     return sorted(trials, key=lambda one: one.stamp_s or 0.0)
 
