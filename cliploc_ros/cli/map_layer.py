@@ -10,11 +10,13 @@ from cliploc_ros.command import option, positive_int
 from cliploc_ros.errors import MapError, MappingError, ModelError, OptionsError
 
 if TYPE_CHECKING:
+    from cliploc_ros.core.keyframes.features import FeatureKind
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.datasets.frames import Frames
 
 _DEFAULT_POINTS = 600
+SIFT, XFEAT = FEATURES = 'sift', 'xfeat'
 
 
 def add_layer_options(parser: argparse.ArgumentParser) -> None:
@@ -23,10 +25,11 @@ def add_layer_options(parser: argparse.ArgumentParser) -> None:
     option(group, '--keyframe-layer', 'write NAME.keyframes.npz: local features of the images of '
            '--keyframes, with their places from depth or triangulated (default: where the source '
            'has images, and a layer can be made of them)', action=argparse.BooleanOptionalAction)
-    option(group, '--keyframe-points N', 'the most points of a keyframe, 146 bytes each '
-           '(%(default)s)', positive_int, _DEFAULT_POINTS)
-    option(group, '--keyframe-features', 'sift, or xfeat: a network of 2.7 MB, which is downloaded '
-           'once (%(default)s)', default='sift', choices=FEATURES)
+    option(group, '--keyframe-points N', 'the most points of a keyframe, 146 bytes each, or 82 '
+           'with xfeat (%(default)s)', positive_int, _DEFAULT_POINTS)
+    option(group, '--keyframe-features', 'what finds the features of the keyframes, and later '
+           'those of the images to localize; xfeat is a network of 2.7 MB, which is downloaded '
+           'once (%(default)s)', default=SIFT, choices=FEATURES)
     option(group, '--keyframe-images', 'also store small images of the keyframes, for the debug '
            'image: anyone who has the file sees the place')
 
@@ -34,13 +37,18 @@ def add_layer_options(parser: argparse.ArgumentParser) -> None:
 def check_layer_options(options: argparse.Namespace) -> None:
     """Refuse a layer that cannot be made, before the work is done.
 
-    OptionsError: the message names the options that do not go together.
+    OptionsError: the message names the options that do not go together. ModelError: the network of
+    the features is missing.
     """
     problem = _problem(options)
     if options.keyframe_layer and problem:
         raise OptionsError(f'--keyframe-layer is not for {problem}')
     if options.keyframe_images and (problem or options.keyframe_layer is False):
         raise OptionsError('--keyframe-images is for --keyframe-layer')
+    if options.keyframe_features == XFEAT:
+        if problem or options.keyframe_layer is False:
+            raise OptionsError('--keyframe-features is for --keyframe-layer')
+        _feature_kind(options)
 
 
 def _problem(options: argparse.Namespace) -> str:
@@ -71,11 +79,20 @@ def make_layer(options: argparse.Namespace, frames: 'Frames | None', landmark_ma
     distance_m, angle_deg = options.keyframes
     try:
         return build_layer(frames, landmark_map, LayerOptions(
-            distance_m, angle_deg, options.keyframe_points, options.keyframe_images)), ''
+            distance_m, angle_deg, options.keyframe_points, options.keyframe_images,
+            _feature_kind(options))), ''
     except MappingError as error:
         if options.keyframe_layer:
             raise
         return None, f'no keyframes: {error}'
+
+
+def _feature_kind(options: argparse.Namespace) -> 'FeatureKind':
+    """Return the kind of features that a layer gets; ModelError: see load_xfeat."""
+    from cliploc_ros.core.keyframes import features
+    from cliploc_ros.models.xfeat import load_xfeat
+
+    return load_xfeat() if options.keyframe_features == XFEAT else features.SIFT
 
 
 def write_layer(map_file: Path, layer: 'KeyframeLayer') -> str:

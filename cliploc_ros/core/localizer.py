@@ -275,8 +275,9 @@ class Localizer:
         """Return the keyframe search of the newest image; None without keyframes or image."""
         if self._keyframes is None or not query.images or not query.by_keyframes:
             return None
-        return ImageRecognizer(self._keyframes, partial(
-            query_features, query.images[-1], self._keyframes.layer.kind), query.newest.camera, deadline, begin_stage)
+        features = partial(query_features, query.images[-1], self._keyframes.layer.kind)
+        return ImageRecognizer(self._keyframes, features, query.newest.camera, deadline,
+                               begin_stage)
 
     def with_free_crops(self, query: Query, row: int, source: CropSource | None,
                         begin_stage: Callable[[str], None] = lambda stage: None) -> Observation:

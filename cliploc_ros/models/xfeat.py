@@ -10,7 +10,6 @@ import hashlib
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.request import urlopen
 
 import cv2
 import numpy as np
@@ -65,6 +64,8 @@ def load_xfeat(cache_dir: str = '') -> FeatureKind:
     file = folder / FILE_NAME
 
     def fetch() -> Path:
+        from urllib.request import urlopen
+
         with urlopen(_URL, timeout=_PATIENCE_S) as answer:
             content = answer.read()
         _check(content, _URL)
@@ -75,7 +76,8 @@ def load_xfeat(cache_dir: str = '') -> FeatureKind:
         download(FILE_NAME, folder, f'Without a network: download {_URL} on another machine into '
                  f'{folder}, {WITHOUT_XFEAT}', fetch)
     _network(file)
-    return FeatureKind(XFEAT, _DIMENSIONS, partial(_extract, file), _ZERO, _SCALE, _RATIO, _LEAST_INLIERS, _QUERY_PX)
+    return FeatureKind(XFEAT, _DIMENSIONS, partial(_extract, file), _ZERO, _SCALE, _RATIO,
+                       _LEAST_INLIERS, _QUERY_PX)
 
 
 def _check(content: bytes, source: object) -> None:

@@ -27,8 +27,8 @@ from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, in_its_map
 from cliploc_ros.core.watch.watch import Watch, WatchReport
 from cliploc_ros.errors import MapError, ModelError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.xfeat import feature_kinds
 from cliploc_ros.models.profiles import with_encoder
+from cliploc_ros.models.xfeat import feature_kinds
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.instants import Instants
 from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState

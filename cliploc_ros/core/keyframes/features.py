@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Local features of an image, and which of two images show the same point.
 
-A FeatureKind finds features and compares them. The one that is built in is SIFT (Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", 2004) with the square root
-of Arandjelovic and Zisserman ("Three things everyone should know to improve object retrieval",
+A FeatureKind finds features and compares them. The one that needs no file is SIFT (Lowe,
+"Distinctive Image Features from Scale-Invariant Keypoints", 2004) with the square root of
+Arandjelovic and Zisserman ("Three things everyone should know to improve object retrieval",
 2012). OpenCV finds the features; a descriptor takes 128 bytes.
 """
 

@@ -305,7 +305,7 @@ def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float
     inside = ((places >= 0) & (places < [[width], [height]])).all(axis=0)
     near = np.full((height, width), np.inf, dtype=np.float32)
     np.minimum.at(near, (places[1, inside], places[0, inside]), values[inside])
-    nearest = cv2.erode(near, _BESIDE)
+    nearest = cv2.erode(near, _BESIDE, borderType=cv2.BORDER_REPLICATE)
     furthest = cv2.dilate(np.where(np.isfinite(near), near, 0.0), _BESIDE)
     rows = np.round(pixels * (width / camera.width, height / camera.height)).astype(np.int64)
     rows = np.clip(rows, 0, (width - 1, height - 1))
