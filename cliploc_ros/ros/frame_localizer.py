@@ -28,7 +28,6 @@ from cliploc_ros.core.watch.watch import Watch, WatchReport
 from cliploc_ros.errors import MapError, ModelError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.profiles import with_encoder
-from cliploc_ros.models.xfeat import feature_kinds
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.instants import Instants
 from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
@@ -259,6 +258,7 @@ def load_keyframes(parameters: RelocalizerParameters, landmark_map: LandmarkMap
     path = keyframes_path(parameters)
     if path is None:
         return None
+    from cliploc_ros.models.xfeat import feature_kinds
     try:
         layer = load_layer_of_map(path, landmark_map, feature_kinds(parameters.cache_dir))
         return Keyframes(KeyframeLocalizer(layer), str(path), layer_hash(path))

@@ -149,13 +149,13 @@ def test_features_of_different_kinds_are_not_compared(layer_file, room, image_rg
         load_layer_of_map(layer_file, room)
     mixed = tmp_path / 'mixed.npz'
     save_layer(mixed, replace(layer, kind=SIFT))
-    with pytest.raises(MapError, match='of 64 numbers, but those of the kind .* have 128'):
+    with pytest.raises(MapError, match=r'of 64 numbers, but those of the kind .* have 128'):
         load_layer_of_map(mixed, room, kinds)
 
 
 @pytest.mark.usefixtures('no_network')
 def test_a_missing_or_another_file_is_named_with_what_to_do(layer_file, room, tmp_path, caplog):
-    with pytest.raises(ModelError, match='Without a network: download https.*keyframe-features'):
+    with pytest.raises(ModelError, match=r'Without a network: download https.*keyframe-features'):
         load_xfeat(str(tmp_path))
     parameters = RelocalizerParameters(keyframes_file=str(layer_file), cache_dir=str(tmp_path))
     with caplog.at_level(logging.ERROR):
@@ -163,7 +163,7 @@ def test_a_missing_or_another_file_is_named_with_what_to_do(layer_file, room, tm
     assert 'without keyframes: cannot download xfeat.onnx' in caplog.text
     assert list((tmp_path / 'weights').iterdir()) == []
     (tmp_path / 'weights' / FILE_NAME).write_bytes(b'<html>')
-    with pytest.raises(ModelError, match='is not the published XFeat.* remove it'):
+    with pytest.raises(ModelError, match=r'is not the published XFeat.* remove it'):
         load_xfeat(str(tmp_path))
 
 
