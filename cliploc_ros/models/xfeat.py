@@ -68,7 +68,8 @@ def load_xfeat(cache_dir: str = '') -> FeatureKind:
 
         with urlopen(_URL, timeout=_PATIENCE_S) as answer:
             content = answer.read()
-        _check(content, _URL)
+        if not _is_published(content):
+            raise ValueError('another file came')
         with replace_file(file) as partial_file:
             partial_file.write_bytes(content)
         return file
@@ -80,11 +81,9 @@ def load_xfeat(cache_dir: str = '') -> FeatureKind:
                        _LEAST_INLIERS, _QUERY_PX)
 
 
-def _check(content: bytes, source: object) -> None:
-    """Refuse another file than the published one: its tensors have other names."""
-    if hashlib.sha256(content).hexdigest() != _SHA256:
-        raise ModelError(f'{source} is not the published XFeat (SHA-256 {_SHA256[:8]}...): remove '
-                         f'it, {WITHOUT_XFEAT}')
+def _is_published(content: bytes) -> bool:
+    """Return whether a file is the published one: the tensors of another have other names."""
+    return hashlib.sha256(content).hexdigest() == _SHA256
 
 
 @cache
@@ -95,10 +94,14 @@ def _network(file: Path) -> 'Network':
     if import_openvino() is None:
         raise ModelError(f'{file} needs OpenVINO: pip install openvino, {WITHOUT_XFEAT}')
     try:
-        _check(file.read_bytes(), file)
+        is_published = _is_published(file.read_bytes())
+    except OSError as error:
+        raise ModelError(f'{file} cannot be read: {error.strerror}, {WITHOUT_XFEAT}') from error
+    if not is_published:
+        raise ModelError(f'{file} is not the published XFeat, whose SHA-256 is {_SHA256}: remove '
+                         f'it, {WITHOUT_XFEAT}')
+    try:
         return Network(any_size(import_openvino().Core().read_model(file)), {})
-    except ModelError:
-        raise
     except Exception as error:  # OpenVINO has no exceptions of its own
         raise ModelError(f'OpenVINO does not run {file}: {first_line(error)}; update OpenVINO, '
                          f'{WITHOUT_XFEAT}') from error

@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """XFeat with the published file: its features, and keyframes that have them."""
 
+import http.server
 import logging
 import pickle
 import shutil
 import subprocess
 import sys
+import threading
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import openvino
@@ -165,6 +168,24 @@ def test_a_missing_or_another_file_is_named_with_what_to_do(layer_file, room, tm
     (tmp_path / 'weights' / FILE_NAME).write_bytes(b'<html>')
     with pytest.raises(ModelError, match=r'is not the published XFeat.* remove it'):
         load_xfeat(str(tmp_path))
+
+
+def test_only_the_published_file_is_kept_of_a_download(published, tmp_path, monkeypatch):
+    served = tmp_path / 'served'
+    served.mkdir()
+    handler = partial(http.server.SimpleHTTPRequestHandler, directory=served)
+    with http.server.HTTPServer(('127.0.0.1', 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        monkeypatch.setattr(
+            'cliploc_ros.models.xfeat._URL', f'http://127.0.0.1:{server.server_port}/{FILE_NAME}')
+        (served / FILE_NAME).write_bytes(published.read_bytes()[:-1])
+        with pytest.raises(ModelError, match='another file came'):
+            load_xfeat(str(tmp_path))
+        assert list((tmp_path / 'weights').iterdir()) == []
+        shutil.copy(published, served / FILE_NAME)
+        assert load_xfeat(str(tmp_path)).dimensions == 64
+        server.shutdown()
+    assert (tmp_path / 'weights' / FILE_NAME).read_bytes() == published.read_bytes()
 
 
 @pytest.mark.usefixtures('no_network')
