@@ -277,7 +277,7 @@ def _layer_of(arrays: dict[str, NDArray[Any]], kinds: FeatureKinds) -> KeyframeL
         raise ArrayError('array images or image_offsets is missing')
     try:
         header = json.loads(str(arrays.pop('header')))
-        version, name = header.get('version'), header.get('descriptors')
+        version, name = header.get('version'), str(header.get('descriptors'))
     except (AttributeError, ValueError, RecursionError) as error:
         raise ArrayError(f'its header is no JSON object ({error})') from error
     if version != VERSION:
