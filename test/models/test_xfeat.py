@@ -157,10 +157,13 @@ def test_features_of_different_kinds_are_not_compared(layer_file, room, image_rg
 
 
 @pytest.mark.usefixtures('no_network')
-def test_a_missing_or_another_file_is_named_with_what_to_do(layer_file, room, tmp_path, caplog):
+def test_a_missing_or_another_file_is_named_with_what_to_do(layer_file, room, cache_dir, tmp_path,
+                                                            caplog):
     with pytest.raises(ModelError, match=r'Without a network: download https.*keyframe-features'):
         load_xfeat(str(tmp_path))
-    parameters = RelocalizerParameters(keyframes_file=str(layer_file), cache_dir=str(tmp_path))
+    parameters = RelocalizerParameters(keyframes_file=str(layer_file), cache_dir=str(cache_dir))
+    assert len(load_keyframes(parameters, room).localizer.layer) == 10
+    parameters = replace(parameters, cache_dir=str(tmp_path))
     with caplog.at_level(logging.ERROR):
         assert load_keyframes(parameters, room) is None
     assert 'without keyframes: cannot download xfeat.onnx' in caplog.text
