@@ -16,11 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 DIMENSIONS = 128  #: Of a descriptor of SIFT
+# A unit vector of square roots times this fits into a byte; no entry of a real one exceeds .5.
+_SCALE = 512.0
 # A dark image is made brighter first, until one pixel in a hundred is at least so bright: SIFT
 # leaves out features of little contrast.
 _DARK = 160.0
-# Of SIFT, see FeatureKind; no entry of a real vector exceeds .5.
-_RATIO, _SCALE = 0.85, 512.0
+# A match is refused if another feature of the other image is nearly as similar (Lowe, 2004).
+_RATIO = 0.85
 
 
 @dataclass(frozen=True)
@@ -48,8 +50,7 @@ class FeatureKind:
     #: An entry of a unit vector is stored as a byte: this plus `scale` times the entry
     zero: int = 0
     scale: float = _SCALE
-    #: A match is refused if another feature of the other image is nearly as similar (Lowe, 2004):
-    #: if the distances have a ratio above this
+    #: The most similar feature of another image is at most this share as far as the second one
     ratio: float = _RATIO
     least_inliers: int = 0  #: With fewer features that agree, a pose may be one of chance
     query_px: int = 400  #: Longest side of an image that is to be localized, at first
