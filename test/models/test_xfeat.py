@@ -136,7 +136,7 @@ def test_a_layer_localizes_real_images(layer_file, room, kitchen, cache_dir):
     assert layer_file.stat().st_size < 60e3 * len(layer)
     localizer = KeyframeLocalizer(pickle.loads(pickle.dumps(layer)))  # as evaluate's workers do
     for frame in kitchen.select(range(1, 30, 6)).read():
-        best = localizer.localize_features(query_features(frame.image_rgb, layer.kind),
+        best = localizer.localize_features(query_features(frame.image_rgb, kind=layer.kind),
                                            frame.camera).places[0]
         assert pose_error(best.map_from_camera, frame.map_from_camera)[0] < 0.1
         assert best.inliers > 20
