@@ -177,7 +177,7 @@ def evaluate(options: argparse.Namespace) -> int:
     if len(asked) > 1:
         queries = trials.join_cameras(asked, options.sync_tolerance)
     if layer is not None:
-        queries = with_features(queries, next(iter(images.values())))
+        queries = with_features(queries, next(iter(images.values())), layer.kind)
         notes = {layer.camera_note(one.image.camera) for one in queries if one.image is not None}
         print(''.join(f'note: {note}\n' for note in sorted(notes) if note), end='', flush=True)
 

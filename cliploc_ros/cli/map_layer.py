@@ -7,14 +7,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.command import option, positive_int
-from cliploc_ros.errors import MapError, MappingError, OptionsError
+from cliploc_ros.errors import MapError, MappingError, ModelError, OptionsError
 
 if TYPE_CHECKING:
+    from cliploc_ros.core.keyframes.features import FeatureKind
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.datasets.frames import Frames
 
 _DEFAULT_POINTS = 600
+SIFT, XFEAT = FEATURES = 'sift', 'xfeat'
 
 
 def add_layer_options(parser: argparse.ArgumentParser) -> None:
@@ -23,8 +25,11 @@ def add_layer_options(parser: argparse.ArgumentParser) -> None:
     option(group, '--keyframe-layer', 'write NAME.keyframes.npz: local features of the images of '
            '--keyframes, with their places from depth or triangulated (default: where the source '
            'has images, and a layer can be made of them)', action=argparse.BooleanOptionalAction)
-    option(group, '--keyframe-points N', 'the most points of a keyframe, 146 bytes each '
-           '(%(default)s)', positive_int, _DEFAULT_POINTS)
+    option(group, '--keyframe-points N', 'the most points of a keyframe, 146 bytes each, or 82 '
+           'with xfeat (%(default)s)', positive_int, _DEFAULT_POINTS)
+    option(group, '--keyframe-features', 'what finds the features of the keyframes, and later '
+           'those of the images to localize; xfeat is a network of 2.7 MB, which is downloaded '
+           'once (%(default)s)', default=SIFT, choices=FEATURES)
     option(group, '--keyframe-images', 'also store small images of the keyframes, for the debug '
            'image: anyone who has the file sees the place')
 
@@ -32,13 +37,18 @@ def add_layer_options(parser: argparse.ArgumentParser) -> None:
 def check_layer_options(options: argparse.Namespace) -> None:
     """Refuse a layer that cannot be made, before the work is done.
 
-    OptionsError: the message names the options that do not go together.
+    OptionsError: the message names the options that do not go together. ModelError: the network of
+    the features is missing.
     """
     problem = _problem(options)
     if options.keyframe_layer and problem:
         raise OptionsError(f'--keyframe-layer is not for {problem}')
     if options.keyframe_images and (problem or options.keyframe_layer is False):
         raise OptionsError('--keyframe-images is for --keyframe-layer')
+    if options.keyframe_features == XFEAT:
+        if problem or options.keyframe_layer is False:
+            raise OptionsError('--keyframe-features is for --keyframe-layer')
+        _feature_kind(options)
 
 
 def _problem(options: argparse.Namespace) -> str:
@@ -69,11 +79,20 @@ def make_layer(options: argparse.Namespace, frames: 'Frames | None', landmark_ma
     distance_m, angle_deg = options.keyframes
     try:
         return build_layer(frames, landmark_map, LayerOptions(
-            distance_m, angle_deg, options.keyframe_points, options.keyframe_images)), ''
+            distance_m, angle_deg, options.keyframe_points, options.keyframe_images,
+            _feature_kind(options))), ''
     except MappingError as error:
         if options.keyframe_layer:
             raise
         return None, f'no keyframes: {error}'
+
+
+def _feature_kind(options: argparse.Namespace) -> 'FeatureKind':
+    """Return the kind of features that a layer gets; ModelError: see load_xfeat."""
+    from cliploc_ros.core.keyframes import features
+    from cliploc_ros.models.xfeat import load_xfeat
+
+    return load_xfeat() if options.keyframe_features == XFEAT else features.SIFT
 
 
 def write_layer(map_file: Path, layer: 'KeyframeLayer') -> str:
@@ -98,17 +117,18 @@ def read_layer(map_file: Path, landmark_map: 'LandmarkMap', wanted: bool | None
                ) -> 'KeyframeLayer | None':
     """Return the layer next to a map; None where there is none, or none is wanted.
 
-    With `wanted` None a bad layer is left out with a note, as the relocalizer does. MapError: the
-    layer is wanted, and is missing or bad.
+    With `wanted` None a bad layer is left out with a note, as the relocalizer does. MapError,
+    ModelError: the layer is wanted, and is missing or bad, or the network of its features is.
     """
     from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
+    from cliploc_ros.models.xfeat import feature_kinds
 
     path = layer_path(map_file)
     if wanted is False or (wanted is None and not path.exists()):
         return None
     try:
-        return load_layer_of_map(path, landmark_map)
-    except MapError as error:
+        return load_layer_of_map(path, landmark_map, feature_kinds())
+    except (MapError, ModelError) as error:
         if wanted:
             raise
         print(f'without keyframes: {error}', flush=True)

@@ -275,7 +275,8 @@ class Localizer:
         """Return the keyframe search of the newest image; None without keyframes or image."""
         if self._keyframes is None or not query.images or not query.by_keyframes:
             return None
-        features = ImageFeatures(lambda: query.images[-1], query.newest.camera)
+        features = ImageFeatures(lambda: query.images[-1], query.newest.camera,
+                                 self._keyframes.layer.kind)
         return ImageRecognizer(self._keyframes, features, deadline, begin_stage,
                                query.is_thorough)
 

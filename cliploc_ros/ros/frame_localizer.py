@@ -25,7 +25,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, in_its_map
 from cliploc_ros.core.watch.watch import Watch, WatchReport
-from cliploc_ros.errors import MapError
+from cliploc_ros.errors import MapError, ModelError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.profiles import with_encoder
 from cliploc_ros.ros.inputs.frame_source import Frame
@@ -254,15 +254,17 @@ def load_keyframes(parameters: RelocalizerParameters, landmark_map: LandmarkMap
                    ) -> Keyframes | None:
     """Return the layer that the parameters name; None without one, or where it is bad.
 
-    A bad layer is logged with what to do, and the relocalizer goes on with the landmarks.
+    A bad layer, or one whose features cannot be found here, is logged with what to do, and the
+    relocalizer goes on with the landmarks.
     """
     path = keyframes_path(parameters)
     if path is None:
         return None
+    from cliploc_ros.models.xfeat import feature_kinds
     try:
-        layer = load_layer_of_map(path, landmark_map)
+        layer = load_layer_of_map(path, landmark_map, feature_kinds(parameters.cache_dir))
         return Keyframes(KeyframeLocalizer(layer), str(path), layer_hash(path))
-    except MapError as error:
+    except (MapError, ModelError) as error:
         logger.error('localizing without keyframes: %s', error)
         return None
 

@@ -77,7 +77,7 @@ class Looker:
     def features(self, image_rgb: Image, is_thorough: bool) -> Features:
         """Return the features of an image for a pass."""
         return Features(*self._kept(image_rgb, f'{self._code}.{is_thorough:d}',
-                                    lambda: query_features(image_rgb, is_thorough)))
+                                    lambda: query_features(image_rgb, is_thorough=is_thorough)))
 
     def _kept(self, image_rgb: Image, what: str, find: Callable[[], Any]) -> tuple[Any, ...]:
         digest = hashlib.sha256(image_rgb.tobytes()).hexdigest()[:24]

@@ -189,6 +189,7 @@ def test_the_layer_of_another_map_is_named(file, other, message):
 
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'header': {'version': 2}}, 'version 2'), ({'header': {'descriptors': 'orb-32'}}, 'orb-32'),
+    ({'header': {'descriptors': []}}, r"kind '\[\]', expected rootsift"),
     ({'header': {'camera': 7}}, 'camera'), ({'points': None}, 'points'),
     ({'points': np.zeros((3, 3), np.float32)}, r'points has shape'),
     ({'offsets': np.zeros(KEYFRAMES + 1, np.int64)}, 'offsets'),

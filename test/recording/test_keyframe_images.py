@@ -19,7 +19,11 @@ from cliploc_ros.offline.datasets.folders import tum_frames
 from cliploc_ros.offline.datasets.frames import Frames, PosedImage, RawFrame
 from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
-from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
+from cliploc_ros.offline.recording.keyframe_layer import (
+    LayerOptions,
+    build_layer,
+    depths_of_points,
+)
 
 ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 WITH_IMAGES = LayerOptions(most_points=200, images=True)
@@ -46,6 +50,14 @@ def wall(frame):
             yield RawFrame(0, seen.stamp_ns, seen.map_from_camera,
                            lambda: (seen.image_rgb, seen.camera), lambda: depth)
     return Frames(ASSETS, 1, read_raw)
+
+
+def test_at_the_edge_of_a_depth_image_a_pixel_without_depth_has_none(frame):
+    depths = np.full((480, 640), 2.0, np.float32)
+    depths[:, :320] = np.nan
+    found = depths_of_points(DepthImage(depths, None), frame.camera, np.array(
+        [[0.0, 0.0], [0.0, 240.0], [200.0, 479.0], [639.0, 0.0], [639.0, 479.0]]))
+    np.testing.assert_array_equal(found, [np.nan, np.nan, np.nan, 2.0, 2.0])
 
 
 def test_many_images_are_chosen_as_by_comparing_all(frame, demo_map):

@@ -2,20 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Local features of an image, and which of two images show the same point.
 
-SIFT (Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", 2004) with the square root
-of Arandjelovic and Zisserman ("Three things everyone should know to improve object retrieval",
+A FeatureKind finds features and compares them. The one that needs no file is SIFT (Lowe,
+"Distinctive Image Features from Scale-Invariant Keypoints", 2004) with the square root of
+Arandjelovic and Zisserman ("Three things everyone should know to improve object retrieval",
 2012). OpenCV finds the features; a descriptor takes 128 bytes.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-#: Identifies the descriptors: those of another kind must not be compared with these.
-KIND = 'rootsift-128-uint8'
-DIMENSIONS = 128
+DIMENSIONS = 128  #: Of a descriptor of SIFT
 # A unit vector of square roots times this fits into a byte; no entry of a real one exceeds .5.
 _SCALE = 512.0
 # A dark image is made brighter first, until one pixel in a hundred is at least so bright: SIFT
@@ -32,12 +32,46 @@ class Features:
     """The n features of an image."""
 
     pixels: NDArray[np.float64]  #: (n, 2) [px] in the image as it is, distorted
-    descriptors: NDArray[np.uint8]  #: (n, 128)
+    descriptors: NDArray[np.uint8]  #: (n, d)
     strengths: NDArray[np.float32]  #: (n,): response of the detector; the strongest is first
 
     def __len__(self) -> int:
         """Return the number of features."""
         return len(self.pixels)
+
+
+@dataclass(frozen=True)
+class FeatureKind:
+    """How features of a kind are found, stored and compared."""
+
+    #: Identifies the descriptors: those of another kind must not be compared with these
+    name: str
+    dimensions: int  #: Of a descriptor: d
+    #: Takes an image (h, w, 3), the most features, and the longest side that it is made smaller to
+    extract: Callable[[NDArray[np.uint8], int, int], Features]
+    #: An entry of a unit vector is stored as a byte: this plus `scale` times the entry
+    zero: int = 0
+    scale: float = _SCALE
+    #: The most similar feature of another image is at most this share as far as the second one
+    ratio: float = _RATIO
+    least_inliers: int = 0  #: With fewer features that agree, a pose may be one of chance
+    query_px: int = 400  #: Longest side of an image that is to be localized, at first
+
+    def compact(self, units: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """Return unit vectors (n, d) as descriptors."""
+        return compact(units, self.zero, self.scale)
+
+    def units(self, descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Return descriptors (n, d) as unit vectors."""
+        return unit_rows(descriptors, self.zero)
+
+    def match(self, ours: NDArray[np.float32], theirs: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Return the pairs of rows of two images' unit descriptors, see the function match."""
+        return match(ours, theirs, self.ratio)
+
+
+#: Kinds by their names; a call makes one, which may load or download something.
+FeatureKinds = Mapping[str, Callable[[], FeatureKind]]
 
 
 def extract(image_rgb: NDArray[np.uint8], most: int, longest_side_px: int = 800) -> Features:
@@ -61,21 +95,31 @@ def extract(image_rgb: NDArray[np.uint8], most: int, longest_side_px: int = 800)
     strengths = np.array([point.response for point in points], dtype=np.float32)
     rows = np.argsort(-strengths, kind='stable')[:most]
     pixels = (np.array([point.pt for point in points])[rows] + 0.5) / scale - 0.5
-    # descriptors as bytes: square roots of shares, times _SCALE
     found = descriptors[rows]
     shares = found / np.maximum(found.sum(axis=1, keepdims=True), 1e-9)
-    compact = np.clip(np.round(_SCALE * np.sqrt(shares)), 0, 255).astype(np.uint8)
-    return Features(pixels, compact, strengths[rows])
+    return Features(pixels, compact(np.sqrt(shares)), strengths[rows])
 
 
-def unit_rows(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return descriptors (n, d) as unit vectors."""
-    rows = descriptors.astype(np.float32)
+#: The kind that needs no file.
+SIFT = FeatureKind('rootsift-128-uint8', DIMENSIONS, extract)
+ONLY_SIFT: FeatureKinds = {SIFT.name: lambda: SIFT}
+
+
+def compact(units: NDArray[np.float32], zero: int = 0, scale: float = _SCALE
+            ) -> NDArray[np.uint8]:
+    """Return unit vectors (n, d) as descriptors, see FeatureKind."""
+    return np.clip(np.round(scale * units) + zero, 0, 255).astype(np.uint8)
+
+
+def unit_rows(descriptors: NDArray[np.uint8], zero: int = 0) -> NDArray[np.float32]:
+    """Return descriptors (n, d) as unit vectors; a byte of `zero` stands for 0."""
+    rows = descriptors.astype(np.float32) - zero
     rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
     return rows
 
 
-def match(ours: NDArray[np.float32], theirs: NDArray[np.float32]) -> NDArray[np.int64]:
+def match(ours: NDArray[np.float32], theirs: NDArray[np.float32], ratio: float = _RATIO
+          ) -> NDArray[np.int64]:
     """Return the pairs (k, 2) of rows of two images' unit descriptors that show the same point.
 
     Each is the other's most similar one, and clearly more similar than the second of theirs.
@@ -89,5 +133,5 @@ def match(ours: NDArray[np.float32], theirs: NDArray[np.float32]) -> NDArray[np.
     others = cosines[rows]
     others[np.arange(len(rows)), best[rows]] = -1.0
     # squared distances of unit vectors are 2 - 2 cos
-    kept = rows[(1.0 - first[rows]) < _RATIO**2 * (1.0 - others.max(axis=1, initial=-1.0))]
+    kept = rows[(1.0 - first[rows]) < ratio**2 * (1.0 - others.max(axis=1, initial=-1.0))]
     return np.stack([kept, best[kept]], axis=1)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import are_rigid
-from cliploc_ros.core.keyframes.features import DIMENSIONS, KIND, unit_rows
+from cliploc_ros.core.keyframes.features import ONLY_SIFT, SIFT, FeatureKind, FeatureKinds
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CameraError, MapError
 from cliploc_ros.files.arrays import ArrayError, Arrays, Check, Field, Offsets, Schema
@@ -62,9 +62,9 @@ class KeyframeLayer:
     #: (n, 2): where the keyframe shows each point, undistorted [1/16 px]
     pixels: NDArray[np.uint16]
     points: NDArray[np.float32]  #: (n, 3): in the optical coordinate frame of their keyframe [m]
-    descriptors: NDArray[np.uint8]  #: (n, 128)
+    descriptors: NDArray[np.uint8]  #: (n, d)
     words: NDArray[np.uint16]  #: (n,): word of each descriptor
-    vocabulary: NDArray[np.uint8]  #: (W, 128): the words' mean descriptors
+    vocabulary: NDArray[np.uint8]  #: (W, d): the words' mean descriptors
     #: How far a pose is off that was found from a keyframe a metre away, as a standard deviation
     #: on each axis [m]: the error that its points share
     deviation_per_metre: float = FROM_DEPTH
@@ -75,6 +75,7 @@ class KeyframeLayer:
     other_cameras: tuple[Camera, ...] = ()  #: Of a robot with several cameras
     #: (K,): which camera took each keyframe, 0 for the first one; None: the first one took all
     camera_rows: NDArray[np.int64] | None = None
+    kind: FeatureKind = SIFT  #: Of the descriptors
 
     def __len__(self) -> int:
         """Return the number of keyframes."""
@@ -129,15 +130,15 @@ class KeyframeLayer:
         return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
     def unit_descriptors(self, keyframe: int) -> NDArray[np.float32]:
-        """Return the descriptors (m, 128) of a keyframe as unit vectors."""
-        return unit_rows(np.asarray(self.descriptors[self.rows(keyframe)]))
+        """Return the descriptors (m, d) of a keyframe as unit vectors."""
+        return self.kind.units(np.asarray(self.descriptors[self.rows(keyframe)]))
 
     def similarities(self, descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return how similar each keyframe (K,) is to an image.
 
         Parameters
         ----------
-        descriptors : ndarray (n, 128)
+        descriptors : ndarray (n, d)
             Unit vectors of the image.
         """
         profiles, weights = self._profiles
@@ -147,7 +148,7 @@ class KeyframeLayer:
 
     @cached_property
     def _unit_vocabulary(self) -> NDArray[np.float32]:
-        return unit_rows(self.vocabulary)
+        return self.kind.units(self.vocabulary)
 
     @cached_property
     def _profiles(self) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
@@ -168,7 +169,7 @@ def nearest_words(descriptors: NDArray[np.float32], vocabulary: NDArray[np.float
                   ) -> NDArray[np.int64]:
     """Return the most similar word (n,) of each descriptor; both are unit vectors."""
     found = [np.argmax(part @ vocabulary.T, axis=1) for part in np.array_split(
-        descriptors.reshape(-1, DIMENSIONS), 1 + len(descriptors) // 4096)]
+        descriptors.reshape(-1, vocabulary.shape[1]), 1 + len(descriptors) // 4096)]
     return np.concatenate(found)
 
 
@@ -187,9 +188,9 @@ _SCHEMA = Schema('file of keyframes', {
     'offsets': Field('int64', ('K+1',), (Offsets('descriptors', 'points'),)),
     'pixels': Field('uint16', ('n', 2), stays=True),
     'points': Field('float32', ('n', 3), stays=True),
-    'descriptors': Field('uint8', ('n', DIMENSIONS), stays=True),
+    'descriptors': Field('uint8', ('n', 'd'), stays=True),
     'words': Field('uint16', ('n',), (_check_words,)),
-    'vocabulary': Field('uint8', ('W', DIMENSIONS)),
+    'vocabulary': Field('uint8', ('W', 'd')),
     # only there where images were asked for, both of them
     'images': Field('uint8', ('b',), is_optional=True, stays=True),
     'image_offsets': Field('int64', ('K+1',), (Offsets('images', 'bytes'),), is_optional=True),
@@ -210,7 +211,7 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
 
     MapError: the file cannot be written.
     """
-    header = {'version': VERSION, 'descriptors': KIND, 'frame_id': layer.frame_id,
+    header = {'version': VERSION, 'descriptors': layer.kind.name, 'frame_id': layer.frame_id,
               'deviation_per_metre': layer.deviation_per_metre,
               'camera': _numbers_of(layer.camera)}
     if layer.other_cameras:
@@ -245,14 +246,16 @@ def remove_layer(map_path: str | os.PathLike[str]) -> str:
     return f'removed {path}: its keyframes belonged to the map before'
 
 
-def load_layer_of_map(path: Path, landmark_map: LandmarkMap) -> KeyframeLayer:
-    """Read the layer of a map.
+def load_layer_of_map(path: Path, landmark_map: LandmarkMap, kinds: FeatureKinds = ONLY_SIFT
+                      ) -> KeyframeLayer:
+    """Read the layer of a map, and make the kind of its features.
 
-    MapError: the file is invalid or belongs to another map; says what to do.
+    MapError: the file is invalid or belongs to another map; says what to do. Other CliplocErrors:
+    from the kind.
     """
     arrays = _SCHEMA.read(path)
     try:
-        layer = _layer_of(arrays)
+        layer = _layer_of(arrays, kinds)
         _check_map(layer, landmark_map)
     except ArrayError as error:
         raise _SCHEMA.invalid(path, error) from error
@@ -269,18 +272,18 @@ def layer_hash(path: Path) -> str:
     return hashlib.sha256(repr(content).encode()).hexdigest()[:_HASH_DIGITS]
 
 
-def _layer_of(arrays: dict[str, NDArray[Any]]) -> KeyframeLayer:
+def _layer_of(arrays: dict[str, NDArray[Any]], kinds: FeatureKinds) -> KeyframeLayer:
     if ('images' in arrays) != ('image_offsets' in arrays):
         raise ArrayError('array images or image_offsets is missing')
     try:
         header = json.loads(str(arrays.pop('header')))
-        version, kind = header.get('version'), header.get('descriptors')
+        version, name = header.get('version'), str(header.get('descriptors'))
     except (AttributeError, ValueError, RecursionError) as error:
         raise ArrayError(f'its header is no JSON object ({error})') from error
     if version != VERSION:
         raise ArrayError(f'is of version {version!r}, expected {VERSION}')
-    if kind != KIND:
-        raise ArrayError(f'has descriptors of the kind {kind!r}, expected {KIND!r}')
+    if name not in kinds:
+        raise ArrayError(f'has descriptors of the kind {name!r}, expected {" or ".join(kinds)}')
     try:
         camera, *others = (Camera(*(one[name] for name in _CAMERA))
                            for one in (header['camera'], *header.get('other_cameras', ())))
@@ -292,10 +295,14 @@ def _layer_of(arrays: dict[str, NDArray[Any]]) -> KeyframeLayer:
     rows = arrays.get('camera_rows', np.zeros(1, dtype=np.int64))
     if not ((rows >= 0) & (rows <= len(others))).all():
         raise ArrayError(f'array camera_rows names none of the {1 + len(others)} cameras')
+    kind, dimensions = kinds[name](), arrays['descriptors'].shape[1]
+    if dimensions != kind.dimensions:
+        raise ArrayError(f'has descriptors of {dimensions} numbers, but those of the kind {name} '
+                         f'have {kind.dimensions}')
     return KeyframeLayer(str(header.get('frame_id', '')),
                          tuple(map(str, arrays.pop('landmark_ids'))),
                          arrays.pop('landmark_centers'), camera, **arrays,
-                         deviation_per_metre=deviation, other_cameras=tuple(others))
+                         deviation_per_metre=deviation, other_cameras=tuple(others), kind=kind)
 
 
 def _check_map(layer: KeyframeLayer, landmark_map: LandmarkMap) -> None:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import SAME_ANSWER, SAME_SIGHT, invert_transform
-from cliploc_ros.core.keyframes.features import Features, extract, match, unit_rows
+from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, Features
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import (
@@ -24,10 +24,11 @@ from cliploc_ros.core.keyframes.point_pose import (
     refine,
 )
 from cliploc_ros.core.search.scene import Constraint
+from cliploc_ros.errors import MapError
 
-# Most features of a query, and its longest side. At the size of keyframes, features take twice the
-# time at equal success.
-_QUERY_FEATURES, _QUERY_PX = 2000, 400
+# Most features of a query. At the size of keyframes, features take twice the time at equal
+# success: a kind has a smaller one for queries.
+_QUERY_FEATURES = 2000
 # Keyframes that are matched: the most similar ones, then the most similar ones elsewhere, so that
 # a place that looks alike is found, and those where objects propose.
 _SIMILAR, _ELSEWHERE, PROPOSED = 5, 2, 3
@@ -94,10 +95,14 @@ class _Matched(NamedTuple):
         return _Matched(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
 
-def query_features(image_rgb: NDArray[np.uint8], is_thorough: bool = False) -> Features:
-    """Return the features of an image (h, w, 3) that is to be localized, for one of two passes."""
-    return extract(image_rgb, *((_THOROUGH_FEATURES, _THOROUGH_PX) if is_thorough
-                                else (_QUERY_FEATURES, _QUERY_PX)))
+def query_features(image_rgb: NDArray[np.uint8], kind: FeatureKind = SIFT,
+                   is_thorough: bool = False) -> Features:
+    """Return the features of an image (h, w, 3) that is to be localized, for one of two passes.
+
+    The kind is that of the layer in which it is localized.
+    """
+    return kind.extract(image_rgb, *((_THOROUGH_FEATURES, _THOROUGH_PX) if is_thorough
+                                     else (_QUERY_FEATURES, kind.query_px)))
 
 
 class ImageFeatures:
@@ -109,17 +114,20 @@ class ImageFeatures:
         Returns the image (h, w, 3).
     camera : Camera
         That took the image.
+    kind : FeatureKind
+        Of the layer in which the image is localized.
     """
 
-    def __init__(self, read_rgb: Callable[[], NDArray[np.uint8]], camera: Camera) -> None:
-        self._read_rgb, self.camera = read_rgb, camera
+    def __init__(self, read_rgb: Callable[[], NDArray[np.uint8]], camera: Camera,
+                 kind: FeatureKind = SIFT) -> None:
+        self._read_rgb, self.camera, self._kind = read_rgb, camera, kind
         self._found: dict[bool, tuple[Features, float]] = {}
 
     def of_pass(self, is_thorough: bool) -> tuple[Features, float]:
         """Return the features of a pass, and how long finding them took [ms]."""
         if is_thorough not in self._found:
             image_rgb, begin = self._read_rgb(), time.perf_counter()
-            features = query_features(image_rgb, is_thorough)
+            features = query_features(image_rgb, self._kind, is_thorough)
             self._found[is_thorough] = features, 1e3 * (time.perf_counter() - begin)
         return self._found[is_thorough]
 
@@ -131,6 +139,7 @@ class _Look(NamedTuple):
     bearings: NDArray[np.float64]
     camera: Camera
     constraint: Constraint = NOTHING_KNOWN
+    least_inliers: int = 0
 
 
 class _Place(NamedTuple):
@@ -171,15 +180,24 @@ class KeyframeLocalizer:
             What the fast pass found. With it, this is the thorough pass: many keyframes are
             matched instead of a few, and the pose is refined by all of their points. It takes
             several times as long.
+
+        Raises
+        ------
+        MapError
+            The features are of another kind than those of the layer.
         """
-        is_thorough, bearings = fast is not None, camera.normalize_points(features.pixels)
+        kind, is_thorough = self.layer.kind, fast is not None
+        if features.descriptors.shape[1] != kind.dimensions:
+            raise MapError(f'features of {features.descriptors.shape[1]} numbers, but the '
+                           f'keyframes have {kind.name}: extract them with the kind of the layer')
+        bearings = camera.normalize_points(features.pixels)
         known = np.isfinite(bearings).all(axis=1)
         features = Features(features.pixels[known], features.descriptors[known],
                             features.strengths[known])
         if len(features) < LEAST_INLIERS:
             return Recognition(is_thorough=is_thorough)
-        descriptors = unit_rows(features.descriptors)
-        look = _Look(features, bearings[known], camera, constraint)
+        descriptors = kind.units(features.descriptors)
+        look = _Look(features, bearings[known], camera, constraint, kind.least_inliers)
         if fast is None:
             places = _places(*self._search_fast(descriptors, look, guesses, deadline), look)
         else:
@@ -329,7 +347,7 @@ class KeyframeLocalizer:
         for keyframe in chosen:
             if time.monotonic() > deadline:
                 break
-            pairs = match(descriptors, self.layer.unit_descriptors(keyframe))
+            pairs = self.layer.kind.match(descriptors, self.layer.unit_descriptors(keyframe))
             inside = self.layer.points_in_map(keyframe)[pairs[:, 1]]
             known = np.isfinite(inside).all(axis=1)
             features.append(pairs[known, 0])
@@ -404,9 +422,11 @@ def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS,
     bearings, places = look.bearings[matched.features], list[_Place]()
     for pose in (find_pose(matched.points, bearings, iterations),
                  *(refine(matched.points, bearings, invert_transform(one)) for one in found)):
-        if pose is not None:
-            inliers = matched.select(pose.inliers)
-            features = np.unique(inliers.features)
+        if pose is None:
+            continue
+        inliers = matched.select(pose.inliers)
+        features = np.unique(inliers.features)
+        if len(features) >= look.least_inliers:
             places.append(_Place(pose.map_from_camera, pose.covariance, matched, inliers,
                                  len(features), _count(look.features.pixels[features],
                                                        look.camera)))

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from cliploc_ros.core.keyframes.features import SIFT, FeatureKind
 from cliploc_ros.core.keyframes.localization import ImageFeatures
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
@@ -83,7 +84,8 @@ def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap,
                    tuple(frames))
 
 
-def with_features(queries: Sequence[PosedQuery], frames: Frames) -> tuple[PosedQuery, ...]:
+def with_features(queries: Sequence[PosedQuery], frames: Frames, kind: FeatureKind = SIFT
+                  ) -> tuple[PosedQuery, ...]:
     """Return queries with the features of their images; those without an image stay.
 
     The queries were recorded from these frames.
@@ -101,7 +103,7 @@ def with_features(queries: Sequence[PosedQuery], frames: Frames) -> tuple[PosedQ
         image_rgb, camera = raw.color()
         # a pass decodes it again: the images of a long recording would fill the memory
         _, content = cv2.imencode('.png', image_rgb, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        features = ImageFeatures(partial(_decoded, content), camera)
+        features = ImageFeatures(partial(_decoded, content), camera, kind)
         features.of_pass(is_thorough=False)
         found[row] = replace(queries[row], image=features)
     return tuple(found)

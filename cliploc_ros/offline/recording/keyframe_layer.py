@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.depth_image import DepthImage, points_in_color
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.keyframes.features import extract, match, unit_rows
+from cliploc_ros.core.keyframes.features import SIFT, FeatureKind
 from cliploc_ros.core.keyframes.layer import (
     FROM_DEPTH,
     PIXEL_SCALE,
@@ -28,6 +28,8 @@ from cliploc_ros.offline.datasets.frames import Frames, PosedImage, undistorted
 
 # Features that are found in an image, before those without a point are left out.
 _MOST_FOUND = 2000
+# A larger image is made smaller first.
+_LONGEST_PX = 800
 # An image with fewer points is no keyframe.
 _LEAST_POINTS = 20
 # Stored images are for people: 7 to 9 kB each.
@@ -60,6 +62,7 @@ class LayerOptions:
     most_points: int = 600
     #: Whether to store small images of the keyframes, too, for people to look at
     images: bool = False
+    kind: FeatureKind = SIFT  #: Of the features
 
     def __post_init__(self) -> None:
         """Refuse values that make no layer."""
@@ -79,7 +82,7 @@ class PosedFeatures(NamedTuple):
 
     map_from_camera: NDArray[np.float64]  #: (4, 4)
     bearings: NDArray[np.float64]  #: (n, 2): on the plane z = 1
-    descriptors: NDArray[np.uint8]  #: (n, 128)
+    descriptors: NDArray[np.uint8]  #: (n, d)
 
 
 class _Keyframe(NamedTuple):
@@ -111,7 +114,7 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
     images = [one.posed for one in seen]
     # of each keyframe (n, 3), in its own coordinate frame; NaN where unknown
     points = [np.column_stack([one.posed.bearings, np.ones(len(one.depths))]) * one.depths[:, None]
-              if np.isfinite(one.depths).any() else triangulate(images, row)
+              if np.isfinite(one.depths).any() else triangulate(images, row, options.kind)
               for row, one in enumerate(seen)]
     # the strongest features that have a point
     kept = [np.nonzero(np.isfinite(found).all(axis=1))[0][:options.most_points]
@@ -125,7 +128,7 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
                       [images[row] for row in rows],
                       [points[row] for row in rows], [kept[row] for row in rows],
                       FROM_DEPTH if any(np.isfinite(one.depths).any() for one in seen)
-                      else TRIANGULATED)
+                      else TRIANGULATED, options.kind)
     if not options.images:
         return layer
     jpegs = [seen[row].jpeg for row in rows]
@@ -159,7 +162,7 @@ def _chosen(frames: Frames, options: LayerOptions) -> Iterator[PosedImage]:
 def _look(frame: PosedImage, options: LayerOptions) -> _Keyframe:
     """Return the features of an image; with depth, only those that have some."""
     assert frame.map_from_camera is not None
-    features = extract(frame.image_rgb, _MOST_FOUND)
+    features = options.kind.extract(frame.image_rgb, _MOST_FOUND, _LONGEST_PX)
     bearings = frame.camera.normalize_points(features.pixels)
     depths = np.full(len(features), np.nan)
     known = np.isfinite(bearings).all(axis=1)
@@ -189,14 +192,15 @@ def _small_jpeg(frame: PosedImage) -> bytes:
 
 def _assemble(landmark_map: LandmarkMap, cameras: Sequence[Camera],
               images: Sequence[PosedFeatures], points: Sequence[NDArray[np.float64]],
-              kept: Sequence[NDArray[np.int64]], deviation_per_metre: float) -> KeyframeLayer:
+              kept: Sequence[NDArray[np.int64]], deviation_per_metre: float, kind: FeatureKind
+              ) -> KeyframeLayer:
     descriptors = np.concatenate([one.descriptors[rows]
                                   for one, rows in zip(images, kept, strict=True)])
     pixels = np.concatenate([
         one.bearings[rows] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         for one, rows, camera in zip(images, kept, cameras, strict=True)])
     camera, *others = dict.fromkeys(cameras)
-    vocabulary = learn_words(descriptors)
+    vocabulary = learn_words(descriptors, kind)
     return KeyframeLayer(
         landmark_map.frame_id, landmark_map.landmark_ids,
         landmark_map.centers.astype(np.float32), camera,
@@ -205,13 +209,14 @@ def _assemble(landmark_map: LandmarkMap, cameras: Sequence[Camera],
         np.clip(np.round(pixels * PIXEL_SCALE), 0, 65535).astype(np.uint16),
         np.concatenate([one[rows] for one, rows in zip(points, kept, strict=True)]
                        ).astype(np.float32),
-        descriptors, nearest_words(unit_rows(descriptors), unit_rows(vocabulary)
+        descriptors, nearest_words(kind.units(descriptors), kind.units(vocabulary)
                                    ).astype(np.uint16), vocabulary, deviation_per_metre,
         other_cameras=tuple(others), camera_rows=None if not others else np.array(
-            [[camera, *others].index(one) for one in cameras]))
+            [[camera, *others].index(one) for one in cameras]), kind=kind)
 
 
-def triangulate(images: Sequence[PosedFeatures], row: int) -> NDArray[np.float64]:
+def triangulate(images: Sequence[PosedFeatures], row: int, kind: FeatureKind = SIFT
+                ) -> NDArray[np.float64]:
     """Return the points (n, 3) of an image's features in its own coordinate frame [m].
 
     Each feature is matched in the neighbouring images. Each match gives a point. The point
@@ -228,9 +233,9 @@ def triangulate(images: Sequence[PosedFeatures], row: int) -> NDArray[np.float64
     seen = np.full((len(neighbours), count, 2), np.nan)
     cameras = np.array([invert_transform(images[one].map_from_camera) @ ours.map_from_camera
                         for one in neighbours]).reshape(-1, 4, 4)
-    descriptors = unit_rows(ours.descriptors)
+    descriptors = kind.units(ours.descriptors)
     for number, one in enumerate(neighbours):
-        pairs = match(descriptors, unit_rows(images[one].descriptors))
+        pairs = kind.match(descriptors, kind.units(images[one].descriptors))
         seen[number, pairs[:, 0]] = images[one].bearings[pairs[:, 1]]
     best = np.full((count, 3), np.nan)
     scores = np.zeros(count)
@@ -300,7 +305,7 @@ def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float
     inside = ((places >= 0) & (places < [[width], [height]])).all(axis=0)
     near = np.full((height, width), np.inf, dtype=np.float32)
     np.minimum.at(near, (places[1, inside], places[0, inside]), values[inside])
-    nearest = cv2.erode(near, _BESIDE)
+    nearest = cv2.erode(near, _BESIDE, borderType=cv2.BORDER_REPLICATE)
     furthest = cv2.dilate(np.where(np.isfinite(near), near, 0.0), _BESIDE)
     rows = np.round(pixels * (width / camera.width, height / camera.height)).astype(np.int64)
     rows = np.clip(rows, 0, (width - 1, height - 1))
@@ -310,13 +315,13 @@ def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float
                         np.float32(np.nan))
 
 
-def learn_words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the vocabulary (W, 128) of some descriptors (n, 128), by k-means.
+def learn_words(descriptors: NDArray[np.uint8], kind: FeatureKind = SIFT) -> NDArray[np.uint8]:
+    """Return the vocabulary (W, d) of some descriptors (n, d), by k-means.
 
     The start is every n-th descriptor, so equal layers have equal words.
     """
     step = max(1, len(descriptors) // _MOST_LEARNED)
-    learned = unit_rows(descriptors[::step])
+    learned = kind.units(descriptors[::step])
     count = min(_WORDS, len(learned))
     means = learned[np.linspace(0, len(learned) - 1, count).astype(np.int64)]
     for _ in range(_STEPS):
@@ -325,4 +330,4 @@ def learn_words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
         found, starts = np.unique(words[order], return_index=True)
         sums = np.add.reduceat(learned[order], starts, axis=0)
         means[found] = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
-    return np.asarray(np.clip(np.round(means * 512.0), 0, 255), dtype=np.uint8)
+    return kind.compact(means)

@@ -75,7 +75,7 @@ class RecordedKeyframes(NamedTuple):
         image = self.image_of(frame) if is_other.any() else None
         return None if image is None else ImageRecognizer(
             KeyframeLocalizer(self.layer.select(is_other)),
-            ImageFeatures(lambda: image, detections.camera_of(frame)))
+            ImageFeatures(lambda: image, detections.camera_of(frame), self.layer.kind))
 
 
 def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterator[Fold]:
@@ -242,7 +242,8 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
             trial = judge()
             if (localizer is not None and keyframes is not None
                     and (image := keyframes.image_of(frame)) is not None):
-                features = ImageFeatures(partial(np.asarray, image), observation.camera)
+                features = ImageFeatures(partial(np.asarray, image), observation.camera,
+                                         keyframes.layer.kind)
                 trial = replace(judge(ImageRecognizer(localizer, features)),
                                 by_objects=trial.verdict)
             trials.append(replace(trial, is_judged=is_judged))

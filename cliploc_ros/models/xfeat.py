@@ -1,0 +1,166 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""XFeat: local features that a small network finds, in OpenVINO on a CPU.
+
+Potje et al., "XFeat: Accelerated Features for Lightweight Image Matching", CVPR 2024. The authors
+publish the network for images of 640 x 640; here it takes images of any size, by the same numbers.
+"""
+
+import hashlib
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.keyframes.features import (
+    SIFT,
+    FeatureKind,
+    FeatureKinds,
+    Features,
+    compact,
+)
+from cliploc_ros.errors import ModelError
+from cliploc_ros.files.storage import replace_file, resolve_cache_dir
+from cliploc_ros.models.devices import import_openvino
+from cliploc_ros.models.files import download, first_line
+
+if TYPE_CHECKING:  # loaded where a layer has these features
+    from cliploc_ros.models.openvino_networks import Network
+
+XFEAT = 'xfeat-64-uint8'
+FILE_NAME = 'xfeat.onnx'
+_URL = ('https://raw.githubusercontent.com/verlab/accelerated_features/'
+        'c58e74fc86c0e1f9038e0fb8807de59d27dd30d5/weights/xfeat.onnx')
+_SHA256 = '54041f61f0d9b1968451a65fe0fd79e96692b1d8266c54a6939a73e847df5988'
+_PATIENCE_S = 10.0
+WITHOUT_XFEAT = 'or make the layer again with build_map --keyframe-features sift'
+# Sides of an input are multiples of this, and a cell of the outputs has so many pixels.
+_STEP, _CELL = 32, 8
+_DIMENSIONS = 64
+# See FeatureKind. Up to 20 features agree with poses of other places by chance.
+_ZERO, _SCALE, _RATIO, _LEAST_INLIERS, _QUERY_PX = 128, 256.0, 0.95, 21, 640
+# XFeat's own: a feature is the most likely one of the pixels beside it, and at least so likely.
+_BESIDE, _LEAST = np.ones((5, 5), dtype=np.uint8), 0.05
+# Tensors of the published network: the normalized image, its cells of 8 x 8 pixels as channels,
+# two feature maps that are enlarged, and how much.
+_IMAGE, _CELLS, _ENLARGED = '126', '1250', {'226': 2.0, '241': 4.0}
+
+
+def feature_kinds(cache_dir: str = '') -> FeatureKinds:
+    """Return the kinds of features that layers have; see load_xfeat."""
+    return {SIFT.name: lambda: SIFT, XFEAT: partial(load_xfeat, cache_dir)}
+
+
+def load_xfeat(cache_dir: str = '') -> FeatureKind:
+    """Return XFeat, ready for images. Its file of 2.7 MB is downloaded once.
+
+    ModelError: the file is missing and cannot be downloaded, or is another one, or OpenVINO is not
+    installed or does not run it.
+    """
+    folder = resolve_cache_dir(cache_dir) / 'weights'
+    file = folder / FILE_NAME
+
+    def fetch() -> Path:
+        from urllib.request import urlopen
+
+        with urlopen(_URL, timeout=_PATIENCE_S) as answer:
+            content = answer.read()
+        if not _is_published(content):
+            raise ValueError('another file came')
+        with replace_file(file) as partial_file:
+            partial_file.write_bytes(content)
+        return file
+    if not file.exists():
+        download(FILE_NAME, folder, f'Without a network: download {_URL} on another machine into '
+                 f'{folder}, {WITHOUT_XFEAT}', fetch)
+    _network(file)
+    return FeatureKind(XFEAT, _DIMENSIONS, partial(_extract, file), _ZERO, _SCALE, _RATIO,
+                       _LEAST_INLIERS, _QUERY_PX)
+
+
+def _is_published(content: bytes) -> bool:
+    """Return whether a file is the published one: the tensors of another have other names."""
+    return hashlib.sha256(content).hexdigest() == _SHA256
+
+
+@cache
+def _network(file: Path) -> 'Network':
+    """Return the network of a file; ModelError: see load_xfeat."""
+    from cliploc_ros.models.openvino_networks import Network
+
+    if import_openvino() is None:
+        raise ModelError(f'{file} needs OpenVINO: pip install openvino, {WITHOUT_XFEAT}')
+    try:
+        is_published = _is_published(file.read_bytes())
+    except OSError as error:
+        raise ModelError(f'{file} cannot be read: {error.strerror}, {WITHOUT_XFEAT}') from error
+    if not is_published:
+        raise ModelError(f'{file} is not the published XFeat, whose SHA-256 is {_SHA256}: remove '
+                         f'it, {WITHOUT_XFEAT}')
+    try:
+        return Network(any_size(import_openvino().Core().read_model(file)), {})
+    except Exception as error:  # OpenVINO has no exceptions of its own
+        raise ModelError(f'OpenVINO does not run {file}: {first_line(error)}; update OpenVINO, '
+                         f'{WITHOUT_XFEAT}') from error
+
+
+def any_size(network: Any) -> Any:
+    """Return the published network for images of any size, with one output.
+
+    The output (1, 130, h / 8, w / 8) has the descriptors as unit vectors (64), how likely each
+    pixel of a cell is the feature (64) and that none is (1), and the reliability (1).
+    """
+    from openvino import Model
+    from openvino import opset13 as layers
+
+    tensors = {name: output for node in network.get_ops() for output in node.outputs()
+               for name in output.names}
+    # 640 x 640 of them were cut out one after another
+    tensors[_CELLS].replace(layers.space_to_depth(
+        tensors[_IMAGE], 'blocks_first', _CELL).output(0))
+    for name, factor in _ENLARGED.items():
+        small = tensors[name].get_node().input_value(0)
+        tensors[name].replace(layers.interpolate(
+            small, np.full(2, factor, np.float32), 'linear_onnx', 'scales', axes=[2, 3],
+            coordinate_transformation_mode='pytorch_half_pixel').output(0))
+    descriptors, likely, reliable = (one.input_value(0) for one in network.get_results())
+    joined = layers.concat([layers.normalize_l2(descriptors, np.array([1]), 1e-12, 'max'),
+                            layers.softmax(likely, 1), reliable], 1)
+    found = Model([layers.result(joined)], network.get_parameters(), 'xfeat')
+    found.reshape([1, 3, -1, -1])
+    return found
+
+
+def _extract(file: Path, image_rgb: NDArray[np.uint8], most: int, longest_side_px: int
+             ) -> Features:
+    """Return the strongest features of an image (h, w, 3), see FeatureKind."""
+    sides = np.array(image_rgb.shape[1::-1])
+    scale = min(1.0, longest_side_px / sides.max())
+    size = np.maximum(1, (scale * sides).astype(np.int64) // _STEP) * _STEP
+    image = cv2.resize(image_rgb, size.tolist(), interpolation=cv2.INTER_AREA)
+    found = _network(file)(np.asarray(cv2.dnn.blobFromImage(image, 1.0 / 255.0)))[0]
+    columns, rows = size // _CELL
+    likely = found[_DIMENSIONS:-2].reshape(_CELL, _CELL, rows, columns)
+    likely = np.ascontiguousarray(likely.transpose(2, 0, 3, 1)).reshape(size[::-1])
+    y, x = np.nonzero((likely == cv2.dilate(likely, _BESIDE)) & (likely > _LEAST))
+    strengths = (likely * cv2.resize(found[-1], size.tolist()))[y, x]
+    order = np.argsort(-strengths, kind='stable')[:most]
+    pixels = np.column_stack([x, y])[order] + 0.5
+    units = _sampled(np.ascontiguousarray(found[:_DIMENSIONS].transpose(1, 2, 0)),
+                     pixels / _CELL - 0.5)
+    units /= np.maximum(np.linalg.norm(units, axis=1, keepdims=True), 1e-9)
+    return Features(pixels / (size / sides) - 0.5, compact(units, _ZERO, _SCALE), strengths[order])
+
+
+def _sampled(cells: NDArray[np.float32], places: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the vectors (n, d) of cells (h, w, d) at places (n, 2), by cubic interpolation."""
+    beside = np.floor(places).astype(np.int64)[..., None] + np.arange(-1, 3)
+    off = np.abs(places[..., None] - beside)
+    weights = np.where(off < 1.0, (1.25 * off - 2.25) * off**2 + 1.0,
+                       ((-0.75 * off + 3.75) * off - 6.0) * off + 3.0).astype(np.float32)
+    x, y = np.clip(beside, 0, np.array(cells.shape[1::-1])[:, None] - 1).transpose(1, 0, 2)
+    near = cells[y[:, :, None], x[:, None]].reshape(-1, 16, cells.shape[2])
+    return ((weights[:, 1, :, None] * weights[:, 0, None]).reshape(-1, 1, 16) @ near)[:, 0]
