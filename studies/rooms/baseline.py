@@ -47,7 +47,7 @@ class SiftMap:
         for one, other in combinations(range(len(seen)), 2):
             if poses[one, :3, 2] @ poses[other, :3, 2] < np.cos(np.radians(_MOST_DEG)):
                 continue
-            pairs = match(self._descriptors[one], self._descriptors[other])
+            pairs, _ = match(self._descriptors[one], self._descriptors[other])
             near = _is_epipolar(rays[one][pairs[:, 0]], rays[other][pairs[:, 1]],
                                 invert_transform(poses[other]) @ poses[one])
             matches.append(pairs[near] + (starts[one], starts[other]))
@@ -62,7 +62,7 @@ class SiftMap:
         found = set[tuple[int, float, float, float]]()
         for theirs, points in zip(self._descriptors, self._points, strict=True):
             known = np.nonzero(np.isfinite(points[:, 0]))[0]
-            pairs = match(descriptors, theirs)
+            pairs, _ = match(descriptors, theirs)
             pairs = pairs[np.isin(pairs[:, 1], known)]
             found |= {(one, *points[other]) for one, other in pairs.tolist()}
         if len(found) < _LEAST_INLIERS:

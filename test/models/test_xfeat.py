@@ -111,13 +111,13 @@ def test_features_of_a_real_image(xfeat, image_rgb):
     assert ((found.pixels > -0.5) & (found.pixels < (639.5, 479.5))).all()
     # moved by a cell of the network, the image has the same features there
     moved = xfeat.extract(np.roll(image_rgb, 32, axis=1), 500, 640)
-    pairs = xfeat.match(xfeat.units(found.descriptors), xfeat.units(moved.descriptors))
+    pairs, _ = xfeat.match(xfeat.units(found.descriptors), xfeat.units(moved.descriptors))
     steps = moved.pixels[pairs[:, 1]] - found.pixels[pairs[:, 0]]
     assert np.mean(np.abs(steps - (32, 0)).max(axis=1) < 1.0) > 0.9
     assert len(pairs) > 250
     # a smaller one shows the same places
     small = xfeat.extract(image_rgb, 500, 416)
-    pairs = xfeat.match(xfeat.units(found.descriptors), xfeat.units(small.descriptors))
+    pairs, _ = xfeat.match(xfeat.units(found.descriptors), xfeat.units(small.descriptors))
     steps = small.pixels[pairs[:, 1]] - found.pixels[pairs[:, 0]]
     assert np.abs(np.median(steps, axis=0)).max() < 0.5
 

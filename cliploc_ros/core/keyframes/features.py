@@ -65,7 +65,8 @@ class FeatureKind:
         """Return descriptors (n, d) as unit vectors."""
         return unit_rows(descriptors, self.zero)
 
-    def match(self, ours: NDArray[np.float32], theirs: NDArray[np.float32]) -> NDArray[np.int64]:
+    def match(self, ours: NDArray[np.float32], theirs: NDArray[np.float32]
+              ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Return the pairs of rows of two images' unit descriptors, see the function match."""
         return match(ours, theirs, self.ratio)
 
@@ -119,13 +120,20 @@ def unit_rows(descriptors: NDArray[np.uint8], zero: int = 0) -> NDArray[np.float
 
 
 def match(ours: NDArray[np.float32], theirs: NDArray[np.float32], ratio: float = _RATIO
-          ) -> NDArray[np.int64]:
-    """Return the pairs (k, 2) of rows of two images' unit descriptors that show the same point.
+          ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return which rows of two images' unit descriptors show the same point, and how clearly.
 
     Each is the other's most similar one, and clearly more similar than the second of theirs.
+
+    Returns
+    -------
+    pairs : ndarray (k, 2) of int
+        Rows of ours and theirs.
+    shares : ndarray (k,)
+        Squared distance of each as a share of that to the second of theirs.
     """
     if len(ours) == 0 or len(theirs) < 2:
-        return np.empty((0, 2), dtype=np.int64)
+        return np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.float32)
     cosines = ours @ theirs.T
     best = cosines.argmax(axis=1)
     first = cosines[np.arange(len(ours)), best]
@@ -133,5 +141,6 @@ def match(ours: NDArray[np.float32], theirs: NDArray[np.float32], ratio: float =
     others = cosines[rows]
     others[np.arange(len(rows)), best[rows]] = -1.0
     # squared distances of unit vectors are 2 - 2 cos
-    kept = rows[(1.0 - first[rows]) < ratio**2 * (1.0 - others.max(axis=1, initial=-1.0))]
-    return np.stack([kept, best[kept]], axis=1)
+    shares = (1.0 - first[rows]) / np.maximum(1.0 - others.max(axis=1, initial=-1.0), 1e-9)
+    rows, shares = rows[shares < ratio**2], shares[shares < ratio**2]
+    return np.stack([rows, best[rows]], axis=1), shares

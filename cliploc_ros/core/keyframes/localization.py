@@ -4,7 +4,7 @@
 
 import time
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,19 +80,24 @@ _KEYFRAME_M, _KEYFRAME_RAD, PER_RADIAN = 0.012, np.radians(0.45), 0.04
 
 
 class _Matched(NamedTuple):
-    """Matches of an image: feature, point in the map, its keyframe and row, k of each."""
+    """Matches of an image: feature, point in the map, its keyframe and row, k of each.
+
+    Their shares say how clear they are, see core.keyframes.features.match.
+    """
 
     features: NDArray[np.int64]
     points: NDArray[np.float64]
     keyframes: NDArray[np.int64]
     rows: NDArray[np.int64]
+    shares: NDArray[np.float32]
 
     def select(self, chosen: NDArray[np.int64]) -> '_Matched':
-        return _Matched(self.features[chosen], self.points[chosen], self.keyframes[chosen],
-                        self.rows[chosen])
+        columns: Any = self
+        return _Matched(*(column[chosen] for column in columns))
 
     def join(self, other: '_Matched') -> '_Matched':
-        return _Matched(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
+        pairs: Any = zip(self, other, strict=True)
+        return _Matched(*(np.concatenate(pair) for pair in pairs))
 
 
 def query_features(image_rgb: NDArray[np.uint8], kind: FeatureKind = SIFT,
@@ -286,7 +291,7 @@ class KeyframeLocalizer:
             of_points, kept = of_points[order[mutual]], of_features[order[mutual]]
             matched = matched.join(_Matched(
                 kept, theirs[of_points], np.full(len(kept), keyframe),
-                of_points + self.layer.rows(keyframe).start))
+                of_points + self.layer.rows(keyframe).start, np.ones(len(kept), np.float32)))
         refined = refine(matched.points, look.bearings[matched.features], camera_from_map)
         return place if refined is None else place._replace(
             map_from_camera=refined.map_from_camera, covariance=refined.covariance,
@@ -343,19 +348,21 @@ class KeyframeLocalizer:
     def _match(self, descriptors: NDArray[np.float32], chosen: Sequence[int], deadline: float
                ) -> _Matched:
         features, points, keyframes = [np.empty(0, np.int64)], [np.empty((0, 3))], []
-        rows = [np.empty(0, np.int64)]
+        rows, shares = [np.empty(0, np.int64)], [np.empty(0, np.float32)]
         for keyframe in chosen:
             if time.monotonic() > deadline:
                 break
-            pairs = self.layer.kind.match(descriptors, self.layer.unit_descriptors(keyframe))
+            pairs, its = self.layer.kind.match(descriptors, self.layer.unit_descriptors(keyframe))
             inside = self.layer.points_in_map(keyframe)[pairs[:, 1]]
             known = np.isfinite(inside).all(axis=1)
             features.append(pairs[known, 0])
             points.append(inside[known])
             keyframes += [keyframe] * int(known.sum())
             rows.append(self.layer.offsets[keyframe] + pairs[known, 1])
+            shares.append(its[known])
         return _Matched(np.concatenate(features), np.concatenate(points),
-                        np.array(keyframes, dtype=np.int64), np.concatenate(rows))
+                        np.array(keyframes, dtype=np.int64), np.concatenate(rows),
+                        np.concatenate(shares))
 
     def _confirmed(self, place: '_Place', look: '_Look', used: NDArray[np.int64]
                    ) -> tuple[float, float, tuple[int, int]]:
@@ -419,8 +426,9 @@ def _places(first: _Place | None, matched: _Matched, look: _Look) -> list[_Place
 def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS,
            found: Sequence[NDArray[np.float64]] = ()) -> _Place | None:
     """Return the pose that most features agree with, a new one or one of those found before."""
+    matched = matched.select(np.argsort(matched.shares, kind='stable'))
     bearings, places = look.bearings[matched.features], list[_Place]()
-    for pose in (find_pose(matched.points, bearings, iterations),
+    for pose in (find_pose(matched.points, bearings, iterations, are_best_first=True),
                  *(refine(matched.points, bearings, invert_transform(one)) for one in found)):
         if pose is None:
             continue

@@ -39,18 +39,21 @@ class PointPose(NamedTuple):
     covariance: NDArray[np.float64]
 
 
-def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], iterations: int = 3000
-              ) -> PointPose | None:
+def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], iterations: int = 3000,
+              are_best_first: bool = False) -> PointPose | None:
     """Return the pose that most points agree with; None where there is none.
 
     MSAC of OpenCV finds it, and robust least squares refines it on the inliers. Its own local
     optimization, MAGSAC++ and PoseLib took longer at equal success. Points (n, 3) are in the map
-    [m], bearings (n, 2) where the image shows them, on the plane z = 1.
+    [m], bearings (n, 2) where the image shows them, on the plane z = 1. Where the best matches are
+    first, samples are drawn of them first (PROSAC; Chum and Matas 2005).
     """
     if len(points) < LEAST_INLIERS:
         return None
     options = cv2.UsacParams()
     options.score, options.loMethod = cv2.SCORE_METHOD_MSAC, cv2.LOCAL_OPTIM_NULL
+    if are_best_first:
+        options.sampler = cv2.SAMPLING_PROSAC
     options.maxIterations, options.confidence, options.threshold = iterations, _SURE, _MOST_ERROR
     middle = points.mean(axis=0)  # OpenCV computes with floats: keep numbers small
     try:

@@ -235,7 +235,7 @@ def triangulate(images: Sequence[PosedFeatures], row: int, kind: FeatureKind = S
                         for one in neighbours]).reshape(-1, 4, 4)
     descriptors = kind.units(ours.descriptors)
     for number, one in enumerate(neighbours):
-        pairs = kind.match(descriptors, kind.units(images[one].descriptors))
+        pairs, _ = kind.match(descriptors, kind.units(images[one].descriptors))
         seen[number, pairs[:, 0]] = images[one].bearings[pairs[:, 1]]
     best = np.full((count, 3), np.nan)
     scores = np.zeros(count)

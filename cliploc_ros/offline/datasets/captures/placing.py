@@ -137,7 +137,7 @@ def _epipolar_errors(first: ImageFile, second: ImageFile) -> dict[str, float]:
         image, camera = read_color(file)
         features: Features = extract(image, _FEATURES, _LONGEST_PX)
         looks.append((camera.normalize_points(features.pixels), unit_rows(features.descriptors)))
-    rows = match(looks[0][1], looks[1][1])
+    rows, _ = match(looks[0][1], looks[1][1])
     points = [np.column_stack([look[0][rows[:, side]], np.ones(len(rows))])
               for side, look in enumerate(looks)]
     known = np.isfinite(points[0]).all(axis=1) & np.isfinite(points[1]).all(axis=1)
