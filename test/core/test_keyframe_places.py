@@ -304,7 +304,8 @@ def test_the_place_in_more_parts_of_the_image_leads_before_a_poster_with_more_po
     features = Features(seen * LENS.fx + (LENS.cx, LENS.cy),
                         np.zeros((180, DIMENSIONS), np.uint8), np.ones(180, np.float32))
     matched = localization._Matched(np.arange(180), np.concatenate([points, shown]),
-                                    np.repeat([0, 1], [60, 120]), np.arange(180))
+                                    np.repeat([0, 1], [60, 120]), np.arange(180),
+                                    np.zeros(180, np.float32))
     look_at = localization._Look(features, seen, LENS)
     first, second = localization._places(localization._place(matched, look_at), matched, look_at)
     assert pose_error(first.map_from_camera, room)[0] < 1e-3
@@ -346,7 +347,7 @@ def places_of(*rows):
     counts = [len(some) for some in rows]
     matched = localization._Matched(np.concatenate(rows), np.concatenate(rooms),
                                     np.repeat(np.arange(len(rows)), counts),
-                                    np.arange(sum(counts)))
+                                    np.arange(sum(counts)), np.zeros(sum(counts), np.float32))
     look_at = localization._Look(features, bearings, LENS)
     found = localization._places(localization._place(matched, look_at), matched, look_at)
     return found, sorted(np.round([one.map_from_camera[0, 3] - pose[0, 3] for one in found]))
