@@ -41,7 +41,8 @@ WITHOUT_XFEAT = 'or make the layer again with build_map --keyframe-features sift
 _STEP, _CELL = 32, 8
 _DIMENSIONS = 64
 # See FeatureKind. Up to 20 features agree with poses of other places by chance.
-_ZERO, _SCALE, _RATIO, _LEAST_INLIERS, _QUERY_PX = 128, 256.0, 0.95, 21, 640
+_ZERO, _SCALE, _RATIO, _LEAST_INLIERS = 128, 256.0, 0.95, 21
+_QUERY_PX, _QUERY_MOST = 640, 2000
 # XFeat's own: a feature is the most likely one of the pixels beside it, and at least so likely.
 _BESIDE, _LEAST = np.ones((5, 5), dtype=np.uint8), 0.05
 # Tensors of the published network: the normalized image, its cells of 8 x 8 pixels as channels,
@@ -78,7 +79,7 @@ def load_xfeat(cache_dir: str = '') -> FeatureKind:
                  f'{folder}, {WITHOUT_XFEAT}', fetch)
     _network(file)
     return FeatureKind(XFEAT, _DIMENSIONS, partial(_extract, file), _ZERO, _SCALE, _RATIO,
-                       _LEAST_INLIERS, _QUERY_PX)
+                       _LEAST_INLIERS, _QUERY_PX, _QUERY_MOST)
 
 
 def _is_published(content: bytes) -> bool:

@@ -55,7 +55,10 @@ class FeatureKind:
     #: The most similar feature of another image is at most this share as far as the second one
     ratio: float = _RATIO
     least_inliers: int = 0  #: With fewer features that agree, a pose may be one of chance
-    query_px: int = 400  #: Longest side of an image that is to be localized, at first
+    #: Of an image that is to be localized, at first: its longest side, and the most features. At
+    #: the size of keyframes, features take twice the time at equal success.
+    query_px: int = 400
+    query_most: int = 600
 
     def compact(self, units: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Return unit vectors (n, d) as descriptors."""

@@ -26,9 +26,6 @@ from cliploc_ros.core.keyframes.point_pose import (
 from cliploc_ros.core.search.scene import Constraint
 from cliploc_ros.errors import MapError
 
-# Most features of a query. At the size of keyframes, features take twice the time at equal
-# success: a kind has a smaller one for queries.
-_QUERY_FEATURES = 2000
 # Keyframes that are matched: the most similar ones, then the most similar ones elsewhere, so that
 # a place that looks alike is found, and those where objects propose.
 _SIMILAR, _ELSEWHERE, PROPOSED = 5, 2, 3
@@ -107,7 +104,7 @@ def query_features(image_rgb: NDArray[np.uint8], kind: FeatureKind = SIFT,
     The kind is that of the layer in which it is localized.
     """
     return kind.extract(image_rgb, *((_THOROUGH_FEATURES, _THOROUGH_PX) if is_thorough
-                                     else (_QUERY_FEATURES, kind.query_px)))
+                                     else (kind.query_most, kind.query_px)))
 
 
 class ImageFeatures:
