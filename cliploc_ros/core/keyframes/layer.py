@@ -29,7 +29,8 @@ from cliploc_ros.core.geometry.transforms import are_rigid
 from cliploc_ros.core.keyframes.features import DIMENSIONS, KIND, unit_rows
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CameraError, MapError
-from cliploc_ros.files.arrays import ArrayError, Arrays, Check, Field, Offsets, Schema
+from cliploc_ros.files.arrays import FINITE, ArrayError, Arrays, Check, Field, Offsets, Schema
+from cliploc_ros.files.storage import parse_json
 
 # Focal lengths, as shares of the image's width, count as equal within this.
 _SAME_FOCAL = 0.02
@@ -181,12 +182,12 @@ def _check_words(name: str, arrays: Arrays) -> None:
 _SCHEMA = Schema('file of keyframes', {
     'header': Field('text'),
     'landmark_ids': Field('text', ('L',)),
-    'landmark_centers': Field('float32', ('L', 3)),
+    'landmark_centers': Field('float32', ('L', 3), (FINITE,)),
     'map_from_camera': Field('float64', ('K', 4, 4), (
-        Check('is no rigid transform', lambda poses: ~are_rigid(poses)),)),
+        FINITE, Check('is no rigid transform', lambda poses: ~are_rigid(poses)))),
     'offsets': Field('int64', ('K+1',), (Offsets('descriptors', 'points'),)),
     'pixels': Field('uint16', ('n', 2), stays=True),
-    'points': Field('float32', ('n', 3), stays=True),
+    'points': Field('float32', ('n', 3), (FINITE,), stays=True),
     'descriptors': Field('uint8', ('n', DIMENSIONS), stays=True),
     'words': Field('uint16', ('n',), (_check_words,)),
     'vocabulary': Field('uint8', ('W', DIMENSIONS)),
@@ -196,7 +197,7 @@ _SCHEMA = Schema('file of keyframes', {
     # only there for several cameras, which the header has
     'camera_rows': Field('int64', ('K',), is_optional=True),
 }, MapError, 'make the layer again with build_map --keyframe-layer, or remove the file',
-    {'K': 'keyframes', 'W': 'keyframes'}, is_stored=True, checks_sums=False,
+    {'K': 'keyframes', 'W': 'keyframes'}, is_stored=True,
     largest_read=256_000_000)
 
 
@@ -273,9 +274,9 @@ def _layer_of(arrays: dict[str, NDArray[Any]]) -> KeyframeLayer:
     if ('images' in arrays) != ('image_offsets' in arrays):
         raise ArrayError('array images or image_offsets is missing')
     try:
-        header = json.loads(str(arrays.pop('header')))
+        header = parse_json(str(arrays.pop('header')))
         version, kind = header.get('version'), header.get('descriptors')
-    except (AttributeError, ValueError, RecursionError) as error:
+    except (AttributeError, ValueError) as error:
         raise ArrayError(f'its header is no JSON object ({error})') from error
     if version != VERSION:
         raise ArrayError(f'is of version {version!r}, expected {VERSION}')

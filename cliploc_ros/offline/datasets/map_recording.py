@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from cliploc_ros.core.geometry.transforms import is_rigid, make_transform
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.files.storage import write_text
+from cliploc_ros.files.storage import parse_json, read_file, write_text
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
@@ -75,15 +76,15 @@ def load_recording(map_file: Path) -> MapRecording | None:
     if not path.is_file():
         return None
     try:
-        values = json.loads(path.read_text(encoding='utf-8'))
+        values = parse_json(read_file(path))
         paths = {name: map_file.resolve().parent / values[name] for name in _PATHS
                  if values.get(name) is not None}
         found = MapRecording(**(values | {
             name: one if one.exists() else None for name, one in paths.items()}))
         turn = np.array(found.rotation, dtype=float)
-        is_valid = turn.shape == (3, 3) and 0.0 < found.scale < np.inf and np.allclose(
-            turn @ turn.T, np.eye(3), atol=1e-6)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        is_valid = turn.shape == (3, 3) and 0.0 < found.scale < np.inf and is_rigid(
+            make_transform(turn, np.zeros(3)))
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise DatasetError(f'{path}: cannot be read: {error}; remove it') from error
     if not is_valid:
         raise DatasetError(f'{path}: has no valid scale and rotation; remove it')

@@ -31,7 +31,7 @@ from cliploc_ros.core.map.landmark_map import find_map_node
 from cliploc_ros.core.map.map_file import quoted
 from cliploc_ros.core.map.parameter_file import parse_parameters, read_text
 from cliploc_ros.errors import MapError
-from cliploc_ros.files.storage import replace_file
+from cliploc_ros.files.storage import read_file, replace_file
 from cliploc_ros.offline.studio.landmark import (
     KNOWN_FIELDS,
     Encoded,
@@ -116,7 +116,7 @@ class MapFile:
     def digest_on_disk(self) -> str:
         """Return the digest of the file as it is now, NO_FILE where there is none."""
         try:
-            return _digest_of(self.path.read_bytes())
+            return _digest_of(read_file(self.path))
         except FileNotFoundError:
             return NO_FILE
         except OSError as error:

@@ -27,6 +27,8 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
+from cliploc_ros.files.storage import parse_json
+
 LOOPBACK_NAMES = ('127.0.0.1', 'localhost', '::1')
 _FILES = Path(__file__).parent / 'web'
 _TYPES = {'.html': 'text/html; charset=utf-8', '.css': 'text/css; charset=utf-8',
@@ -84,10 +86,10 @@ class Board:
         sender = asyncio.create_task(send())
         try:
             async for text in connection:
-                message = json.loads(text)
+                message = parse_json(text)
                 if isinstance(message, dict):
                     await asyncio.to_thread(do, message)
-        except (ConnectionClosed, ValueError, RecursionError):
+        except (ConnectionClosed, ValueError):
             pass
         finally:
             self._pages.discard(event)
