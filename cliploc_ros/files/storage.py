@@ -4,6 +4,7 @@
 
 import atexit
 import errno
+import glob
 import json
 import logging
 import os
@@ -11,7 +12,7 @@ import secrets
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -105,6 +106,59 @@ def replace_file(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+#: Writes a file to a path, with the digest of its set in it.
+WriteOfSet = Callable[[Path, str], object]
+
+
+def replace_set(path: Path, digest: str, write: WriteOfSet,
+                besides: Mapping[Path, WriteOfSet | None]) -> None:
+    """Write a file and those beside it as one: whenever the process ends, a whole set is there.
+
+    Those beside are written under other names first. The file itself takes its place in one step,
+    and from then on its set is the new one: finish_set does what a kill leaves. Files that are not
+    of its set have another digest.
+
+    Parameters
+    ----------
+    besides : mapping
+        The other files in the same folder; None removes one.
+
+    OSError, and what the callables raise: nothing was changed. OptionsError: the set was written,
+    and a file that is not of it cannot be removed.
+    """
+    staged = {other: _staged(other, digest) for other, make in besides.items() if make is not None}
+    try:
+        for other, make in besides.items():
+            if make is not None:
+                make(staged[other], digest)
+        write(path, digest)
+    except BaseException:
+        for one in staged.values():
+            with suppress(OSError):
+                one.unlink(missing_ok=True)
+        raise
+    for other in besides:
+        if other not in staged:
+            try:
+                other.unlink(missing_ok=True)
+            except OSError as error:
+                raise OptionsError(f'{other}: is not of {path.name} that was written; it cannot '
+                                   f'be removed: {error.strerror}; remove it') from error
+    finish_set(path, digest)
+
+
+def finish_set(path: Path, digest: str) -> None:
+    """Put in place what a killed writer left of the set of a file, where that is allowed."""
+    pattern = _staged(path, digest).with_suffix('').name
+    for staged in path.parent.glob(f'{glob.escape(pattern)}.*') if digest else ():
+        with suppress(OSError):  # the writer has done it meanwhile, or the folder is read-only
+            staged.replace(staged.with_name(staged.name.removeprefix(f'.{digest}.')))
+
+
+def _staged(path: Path, digest: str) -> Path:
+    return path.with_name(f'.{digest}.{path.name}')
 
 
 def make_folder(folder: Path) -> None:

@@ -28,6 +28,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import are_rigid
 from cliploc_ros.core.keyframes.features import DIMENSIONS, KIND, unit_rows
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.parameter_file import check_set
 from cliploc_ros.errors import CameraError, MapError
 from cliploc_ros.files.arrays import FINITE, ArrayError, Arrays, Check, Field, Offsets, Schema
 from cliploc_ros.files.storage import parse_json
@@ -76,6 +77,7 @@ class KeyframeLayer:
     other_cameras: tuple[Camera, ...] = ()  #: Of a robot with several cameras
     #: (K,): which camera took each keyframe, 0 for the first one; None: the first one took all
     camera_rows: NDArray[np.int64] | None = None
+    set_digest: str = ''  #: Of the map that it was written with; '' where it is unknown
 
     def __len__(self) -> int:
         """Return the number of keyframes."""
@@ -206,6 +208,11 @@ def layer_path(map_path: str | os.PathLike[str]) -> Path:
     return Path(map_path).with_suffix('.keyframes.npz')
 
 
+def removed_layer(map_path: str | os.PathLike[str]) -> str:
+    """Return that the layer of a map went with it, for the user."""
+    return f'removed {layer_path(map_path)}: its keyframes belonged to the map before'
+
+
 def save_layer(path: Path, layer: KeyframeLayer) -> None:
     """Write a layer in one step: an existing file is replaced complete, or stays.
 
@@ -214,6 +221,8 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
     header = {'version': VERSION, 'descriptors': KIND, 'frame_id': layer.frame_id,
               'deviation_per_metre': layer.deviation_per_metre,
               'camera': _numbers_of(layer.camera)}
+    if layer.set_digest:
+        header['set'] = layer.set_digest
     if layer.other_cameras:
         header['other_cameras'] = list(map(_numbers_of, layer.other_cameras))
     names = [name for name in _SCHEMA.fields
@@ -228,22 +237,6 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
 
 def _numbers_of(camera: Camera) -> dict[str, float]:
     return {name: getattr(camera, name) for name in _CAMERA}
-
-
-def remove_layer(map_path: str | os.PathLike[str]) -> str:
-    """Remove the layer of a map that another one has replaced; return a note, '' without one.
-
-    MapError: the file cannot be removed.
-    """
-    path = layer_path(map_path)
-    try:
-        path.unlink()
-    except FileNotFoundError:
-        return ''
-    except OSError as error:
-        raise MapError(f'{path}: belongs to the map before and cannot be removed: '
-                       f'{error.strerror}; remove it') from error
-    return f'removed {path}: its keyframes belonged to the map before'
 
 
 def load_layer_of_map(path: Path, landmark_map: LandmarkMap) -> KeyframeLayer:
@@ -296,11 +289,16 @@ def _layer_of(arrays: dict[str, NDArray[Any]]) -> KeyframeLayer:
     return KeyframeLayer(str(header.get('frame_id', '')),
                          tuple(map(str, arrays.pop('landmark_ids'))),
                          arrays.pop('landmark_centers'), camera, **arrays,
-                         deviation_per_metre=deviation, other_cameras=tuple(others))
+                         deviation_per_metre=deviation, other_cameras=tuple(others),
+                         set_digest=str(header.get('set', '')))
 
 
 def _check_map(layer: KeyframeLayer, landmark_map: LandmarkMap) -> None:
     """Refuse the layer of another map. Landmarks may be new, gone or moved, but not in general."""
+    try:
+        check_set(layer.set_digest, landmark_map.map_set.family)
+    except ValueError as error:
+        raise ArrayError(str(error)) from error
     if layer.frame_id != landmark_map.frame_id:
         raise ArrayError(f"is of a map in frame '{layer.frame_id}', not "
                           f"'{landmark_map.frame_id}'")

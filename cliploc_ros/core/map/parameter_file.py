@@ -31,6 +31,8 @@ _MAX_DEPTH = 16
 # Values, keys and collections, which PyYAML reads at 3 us each. A landmark has about 30; larger
 # maps have the layout of write_map.
 _MAX_EVENTS = 6_000_000
+# The labels of a landmark may be a list of mappings; no field has more.
+_MOST_IN_LIST = 1000
 # Words that YAML 1.1, and so ROS, reads as booleans.
 _TRUE = frozenset({'y', 'yes', 'true', 'on'})
 _FALSE = frozenset({'n', 'no', 'false', 'off'})
@@ -49,6 +51,7 @@ _HEAD = re.compile(
     r'(?:#[ -~\u00a0-\ud7ff]*\n)*+/\*\*:\n  ros__parameters:\n    map:\n'
     rf'      frame_id: ({_TEXT})\n'
     r'      landmarks:\n')
+_SET = re.compile(r'(?:#.*\n)*?# set ([0-9a-f]{12}) ([0-9a-f]{12})\n')
 _INDENT = ' ' * 10
 # Groups of _LANDMARK before those of the details.
 _PLAIN = 6
@@ -112,8 +115,9 @@ def _build_tree(text: str) -> Any:
         elif isinstance(event, yaml.MappingStartEvent | yaml.SequenceStartEvent):
             if len(stack) > _MAX_DEPTH:
                 raise _TreeError(f'line {line}: nested deeper than {_MAX_DEPTH} levels')
-            if stack[1:] and isinstance(stack[-1][0], list):
-                raise _TreeError(f'line {line}: a list holds plain values only, as in ROS')
+            outer = stack[-1][0]
+            if isinstance(outer, list) and len(outer) > _MOST_IN_LIST:
+                raise _TreeError(f'line {line}: a list of more than {_MOST_IN_LIST} collections')
             collection: Any = {} if isinstance(event, yaml.MappingStartEvent) else []
             _add(stack[-1], collection, line)
             stack.append((collection, []))
@@ -174,6 +178,29 @@ _LANDMARK = re.compile(''.join([
       for name in ('position_sigma', 'shared_sigma', 'shared_sigma_deg', 'seen_ratio',
                    'baseline_deg', 'last_seen')),
     rf'(?:{_INDENT}source: ({_TEXT})\n)?+']))
+
+
+class MapSet(NamedTuple):
+    """Which files belong to a map, by what its head says; '' where it says nothing."""
+
+    family: str = ''  #: Of the first map, which updates kept: keyframes hold for all of them
+    digest: str = ''  #: Of this map
+
+
+#: Of a map that does not say it.
+NO_SET = MapSet()
+
+
+def check_set(digest: str, of_map: str) -> None:
+    """Raise ValueError for a file of another set than a map's. An unknown one is accepted."""
+    if digest and of_map and digest != of_map:
+        raise ValueError(f'is of the set {digest}, its map of {of_map}')
+
+
+def set_of(text: str) -> MapSet:
+    """Return the set of a map file by its text, or by the beginning of it."""
+    found = _SET.match(text)
+    return MapSet(found[1], found[2]) if found else NO_SET
 
 
 class WrittenMap(NamedTuple):

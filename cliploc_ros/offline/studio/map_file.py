@@ -269,6 +269,7 @@ class LookFile(NamedTuple):
     encoder_key: str
     looks: Mapping[str, Encoded]
     state: tuple[int, int] | None
+    set_digest: str = ''  #: As in the head of the map, which an edit keeps
 
     def write(self, landmarks: Landmarks) -> tuple['LookFile', str]:
         """Write the looks of all landmarks of the map in one step.
@@ -290,7 +291,7 @@ class LookFile(NamedTuple):
         save_landmark_embeddings(self.path, LandmarkEmbeddings(
             self.encoder_key, tuple(landmarks), np.array([one.mean for one in rows]),
             np.concatenate([one.medoids for one in rows]),
-            np.cumsum([0, *(len(one.medoids) for one in rows)])))
+            np.cumsum([0, *(len(one.medoids) for one in rows)]), self.set_digest))
         return self._replace(looks=known, state=_state_of(self.path)), ''
 
 
@@ -304,7 +305,8 @@ def read_look_file(map_path: Path) -> tuple[LookFile, str]:
         embeddings = load_landmark_embeddings(path)
     except MapError as error:
         return nothing, f'{error}. The studio leaves this file as it is'
-    return nothing._replace(encoder_key=embeddings.encoder_key, looks=looks_of(embeddings)), ''
+    return nothing._replace(encoder_key=embeddings.encoder_key, looks=looks_of(embeddings),
+                            set_digest=embeddings.set_digest), ''
 
 
 def _state_of(path: Path) -> tuple[int, int] | None:
