@@ -201,6 +201,11 @@ class Schema:
                                      ) from error
                 raise ArrayError(f'is no complete npz file ({error})') from error
             with archive:
+                try:
+                    for member in archive.infolist():
+                        archive.open(member).close()  # a damaged name would hide an array
+                except Exception as error:  # as above
+                    raise ArrayError(f'is damaged ({error})') from error
                 return self._arrays_of(file, archive)
 
     def _arrays_of(self, file: BinaryIO, archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:

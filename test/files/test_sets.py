@@ -15,11 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from disks import own_numbers
-from scene import CAMERA, make_room
+from whole_sets import ROOM, made_map, write_set
 
-from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, load_layer_of_map
+from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
 from cliploc_ros.core.map.landmark_embeddings import (
-    LandmarkEmbeddings,
     embeddings_path,
     load_embeddings_of_map,
     load_landmark_embeddings,
@@ -32,32 +31,9 @@ from cliploc_ros.offline.datasets.map_recording import (
     load_recording,
     recording_path,
 )
-from cliploc_ros.offline.make_map import MadeMap, write_made_map
+from cliploc_ros.offline.make_map import write_made_map
 
 PROJECT = Path(__file__).resolve().parents[2]
-ROOM = make_room()
-
-
-def made_map(number):
-    """A map whose files all tell its number: the room a little further on."""
-    landmark_map = replace(ROOM, centers=ROOM.centers + np.array([0.01, 0.0, 0.0]) * number)
-    count = len(ROOM)
-    row = np.zeros((1, 8), dtype=np.float16)
-    row[0, number % 8] = 1.0
-    layer = KeyframeLayer(
-        'map', ROOM.landmark_ids, landmark_map.centers.astype(np.float32), CAMERA,
-        np.tile(np.eye(4), (1, 1, 1)), np.array([0, 5]), np.zeros((5, 2), np.uint16),
-        np.full((5, 3), number, dtype=np.float32), np.zeros((5, 128), np.uint8),
-        np.zeros(5, np.uint16), np.ones((1, 128), np.uint8))
-    return MadeMap(landmark_map, None, LandmarkEmbeddings(
-        'key', ROOM.landmark_ids, np.repeat(row, count, axis=0), np.empty((0, 8), np.float16),
-        np.zeros(count + 1, dtype=np.int64)), layer)
-
-
-def write(path, number):
-    return write_made_map(path, made_map(number), ['a test'],
-                          MapRecording(path.with_name('seen.npz'), scale=1.0 + number))
-
 
 def read(path):
     """The numbers that the files of a map tell: one for each of them."""
@@ -72,13 +48,13 @@ def read(path):
 @pytest.fixture
 def path(tmp_path):
     (tmp_path / 'seen.npz').touch()
-    write(tmp_path / 'a.yaml', 0)
+    write_set(tmp_path / 'a.yaml', 0)
     return tmp_path / 'a.yaml'
 
 
 def write_again_and_again(path, first):
     for number in range(first, first + 1000):
-        write(path, number)
+        write_set(path, number)
 
 
 def test_a_kill_leaves_one_whole_set(path):
@@ -101,7 +77,7 @@ def test_a_kill_leaves_one_whole_set(path):
 def test_files_of_another_set_are_refused(path):
     """As a copy of a part of a folder leaves them."""
     others = [path.with_name('b.yaml')]
-    write(others[0], 5)
+    write_set(others[0], 5)
     for of in (embeddings_path, layer_path, recording_path):
         of(others[0]).replace(of(path))
     landmark_map = LandmarkMap.from_file(path)
