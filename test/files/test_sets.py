@@ -32,6 +32,7 @@ from cliploc_ros.offline.datasets.map_recording import (
     recording_path,
 )
 from cliploc_ros.offline.make_map import write_made_map
+from cliploc_ros.offline.studio.document import Document
 
 PROJECT = Path(__file__).resolve().parents[2]
 
@@ -87,6 +88,19 @@ def test_files_of_another_set_are_refused(path):
         load_layer_of_map(layer_path(path), landmark_map)
     with pytest.raises(DatasetError, match='is of the set'):
         load_recording(path)
+    document = Document(path)
+    document.close()
+    assert 'is of the set' in document.notes[0]
+    assert all(one.look is None for one in document.landmarks.values())
+
+
+def test_the_studio_finishes_what_a_killed_writer_left(path):
+    others = embeddings_path(path)
+    digest = LandmarkMap.from_file(path).map_set.digest
+    others.rename(others.with_name(f'.{digest}.{others.name}'))
+    document = Document(path)
+    document.close()
+    assert others.exists() and document.encoder_key == 'key'
 
 
 def test_an_update_keeps_the_keyframes_and_no_embeddings(path):

@@ -39,7 +39,7 @@ def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
     MapError
         A file cannot be written.
     """
-    path = Path(os.path.realpath(path))
+    path = Path(path)
 
     def write(place: Path, digest: str) -> None:
         family = landmark_map.map_set.family or digest

@@ -148,7 +148,8 @@ class Document:
 
     def to_map(self) -> LandmarkMap:
         """Return the map as the relocalizer knows it; MapError where it has no landmarks."""
-        return map_of(self.landmarks, self.frame_id, self.path.name)
+        return replace(map_of(self.landmarks, self.frame_id, self.path.name),
+                       map_set=self._file.map_set)
 
     # ---- edits ----------------------------------------------------------------------------------
 
@@ -298,7 +299,7 @@ class Document:
                            'relocalizer refuses a map with unknown fields',)
 
     def _read_looks(self) -> LookFile:
-        found, fault = read_look_file(self.path)
+        found, fault = read_look_file(self._file)
         self.notes += (fault,) if fault else ()
         return found
 
