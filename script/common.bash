@@ -54,17 +54,31 @@ explain_failure() {
 
 free_mb() { df --output=avail -m "$root" | tail -n 1 | tr -d ' '; }
 
+# pip_install_locked VENV REQUIREMENTS [PIP OPTION...]: the releases of the lock of this kind of
+# machine, whose hashes have to agree; UNLOCKED=1 takes the newest that the requirements allow.
+pip_install_locked() {
+  local prefix=$1 file=$2
+  shift 2
+  if [[ -n ${UNLOCKED:-} ]]; then
+    pip_install "$prefix" "$file" "$@"
+  else
+    pip_install "$prefix" "$root/script/lock/$kind.txt" --require-hashes
+  fi
+}
+
 # pip_install VENV REQUIREMENTS [PIP OPTION...]: install once for each content of the file.
 pip_install() {
-  local prefix=$1 file=$2 name hash
+  local prefix=$1 file=$2 name hash constraint=()
   shift 2
   name=$(basename "$file" .txt)
   hash=$(hash_of "$file" "$root"/script/constraints*.txt)
+  # In a lock, and only there, all is pinned.
+  [[ $file == */lock/* ]] || constraint=(--constraint "$root/script/constraints.txt")
   is_done "$prefix/.$name.done" "$hash" && return
   say "installing script/$name.txt with pip"
   # Python compiles a module when it is first used, and most of them never are.
   run_step "$(basename "$prefix")-$name" "$prefix/bin/python" -m pip install --resume-retries 20 \
-    --no-compile --disable-pip-version-check --no-input --constraint "$root/script/constraints.txt" --requirement "$file" "$@"
+    --no-compile --disable-pip-version-check --no-input "${constraint[@]}" --requirement "$file" "$@"
   set_done "$prefix/.$name.done" "$hash"
 }
 

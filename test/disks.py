@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A small disk that only one process sees."""
+"""What only one process sees: a small disk, numbers of processes."""
 
 import subprocess
 
@@ -16,8 +16,16 @@ def small_disk(folder) -> list[str]:
     The command gets a mount namespace of its own, which needs no privileges; the test is skipped
     where the system forbids that.
     """
-    command = [*_MOUNT, str(folder)]
+    return _tried([*_MOUNT, str(folder)])
+
+
+def own_numbers() -> list[str]:
+    """Return the prefix of a command that runs it as the first process of a container."""
+    return _tried(['unshare', '--map-root-user', '--pid', '--fork'])
+
+
+def _tried(command: list[str]) -> list[str]:
     tried = subprocess.run([*command, 'true'], capture_output=True, text=True, check=False)
     if tried.returncode:
-        pytest.skip(f'no mount namespaces here: {tried.stderr.strip()}')
+        pytest.skip(f'no namespaces here: {tried.stderr.strip()}')
     return command

@@ -8,6 +8,9 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
+import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 PROJECT = Path(__file__).resolve().parents[1]
 # Keys of rosdep that name a package of apt on Ubuntu 24.04. The build farm takes no others.
@@ -49,3 +52,31 @@ def test_extras_are_what_the_tests_run_with(extras):
                        for part in ('', '-models', '-test', '-all'))
     assert {one for extra in extras.values() for one in extra} <= set(required.splitlines())
     assert all('<' in one or '==' in one for one in extras['all'])
+
+
+@pytest.mark.parametrize(('lock', 'files'), [
+    ('pypi', ('requirements', 'requirements-ros', 'constraints')),
+    ('jazzy', ('requirements', 'constraints', 'constraints-jazzy'))])
+def test_locks_meet_their_requirements_and_hold_hashes(lock, files):
+    """script/freeze writes them again."""
+    text = re.sub(r' \\\n +', ' ', read(f'script/lock/{lock}.txt'))
+    lines = [line for line in text.splitlines() if line and line[0] != '#']
+    assert all(re.fullmatch(r'\S+==\S+( ; [^-]+)?( --hash=sha256:[0-9a-f]{64})+', line)
+               for line in lines)
+    versions = dict(line.split()[0].split('==') for line in lines)
+    for file in files:
+        for line in filter(None, read(f'script/{file}.txt').splitlines()):
+            if line[0] != '#':
+                wanted = Requirement(line)
+                version = versions.get(canonicalize_name(wanted.name))
+                if version is None and file.startswith('constraints'):
+                    continue
+                assert version is not None and version in wanted.specifier, line
+
+
+def test_container_and_setup_install_the_locks():
+    assert 'pip install --no-cache-dir --require-hashes' in read('docker/Dockerfile')
+    assert '"$root/script/lock/$kind.txt" --require-hashes' in read('script/common.bash')
+    workflow = yaml.safe_load(read('.github/workflows/release.yml'))
+    steps = ' '.join(one.get('run', '') for one in workflow['jobs']['bill-of-materials']['steps'])
+    assert 'cyclonedx-py" requirements' in steps and 'script/lock' in steps

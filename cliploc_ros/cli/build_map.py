@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -94,12 +94,9 @@ def build(options: argparse.Namespace) -> int:
     """Build as the command line asks; return the exit code."""
     # Late, so that --help is fast.
     from cliploc_ros.cli import sources
-    from cliploc_ros.core.keyframes.layer import remove_layer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.core.map.map_file import write_map
     from cliploc_ros.offline.datasets.frames import move_frames
-    from cliploc_ros.offline.datasets.map_recording import save_recording
-    from cliploc_ros.offline.make_map import find_labeller, make_map, update_map
+    from cliploc_ros.offline.make_map import find_labeller, make_map, update_map, write_made_map
     from cliploc_ros.offline.mapping.options import MappingOptions, OdometryErrors
 
     begin = time.monotonic()
@@ -138,13 +135,8 @@ def build(options: argparse.Namespace) -> int:
         _write_report(options.report, made.report.as_dict())
         lines = made.report.lines()
         head = [f'{update.name}, updated by build_map from {name}', lines[0]]
-    write_map(path, made.landmark_map, head, made.embeddings)
-    save_recording(path, sources.recording_of(options, source.file, scale, rotation))
-    is_same_map = update is not None and path.resolve() == update.resolve()
-    if layer is not None:
-        lines.append(map_layer.write_layer(path, layer))
-    elif not is_same_map and (removed := remove_layer(path)):
-        lines.append(removed)
+    lines += write_made_map(path, replace(made, layer=layer), head, sources.recording_of(
+        options, source.file, scale, rotation), update)
     print('\n'.join(lines))
     for text in filter(None, (labeller.note, note)):
         print(f'note: {text}')

@@ -71,7 +71,7 @@ def make_parser() -> argparse.ArgumentParser:
 def import_map(options: argparse.Namespace) -> int:
     """Import as the command line asks; return the exit code."""
     # Late, so that --help is fast.
-    from cliploc_ros.core.keyframes.layer import remove_layer
+    from cliploc_ros.core.keyframes.layer import layer_path, removed_layer
     from cliploc_ros.core.map.map_file import write_map
     from cliploc_ros.files.storage import write_text
     from cliploc_ros.offline.datasets.map_formats.given_map import place, refit
@@ -98,12 +98,13 @@ def import_map(options: argparse.Namespace) -> int:
             f'{len(imported.landmark_map)} landmarks as the file has them',
             *(f'note: {note}' for note in imported.notes),
             'note: maps of other systems localize better after --refit OBSERVATIONS')))
+    of_map_before = recording_path(options.out), layer_path(options.out)
+    had_layer = of_map_before[1].exists()
     write_map(options.out, result.landmark_map,
               [f'imported by import_map from {options.input.name} ({options.format})',
-               *result.notes[:1]])
-    recording_path(options.out).unlink(missing_ok=True)  # of the map before
-    if note := remove_layer(options.out):
-        print(note)
+               *result.notes[:1]], besides=dict.fromkeys(of_map_before))
+    if had_layer:
+        print(removed_layer(options.out))
     if options.report is not None:
         write_text(options.report, json.dumps({
             'landmarks': len(result.landmark_map), 'lines': result.notes,

@@ -95,18 +95,6 @@ def _feature_kind(options: argparse.Namespace) -> 'FeatureKind':
     return load_xfeat() if options.keyframe_features == XFEAT else features.SIFT
 
 
-def write_layer(map_file: Path, layer: 'KeyframeLayer') -> str:
-    """Write a layer next to its map; return what was written, in a line."""
-    from cliploc_ros.core.keyframes.layer import layer_path, save_layer
-
-    path = layer_path(map_file)
-    save_layer(path, layer)
-    megabytes = path.stat().st_size / 1e6
-    images = '' if layer.images is None else f' and images of {layer.images.size / 1e6:.1f} MB'
-    return (f'keyframes: {len(layer)} with {len(layer.points)} points{images}, {megabytes:.1f} MB '
-            f'({50 * megabytes / len(layer):.1f} MB per 50), in {path}')
-
-
 def add_use_option(parser: argparse.ArgumentParser, what: str) -> None:
     """Add the switch --keyframes to a parser; what it does is for the help."""
     option(parser, '--keyframes', f'{what} (default: if NAME.keyframes.npz lies next to the map)',

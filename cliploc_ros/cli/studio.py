@@ -63,8 +63,8 @@ def make_parser() -> argparse.ArgumentParser:
            "the map's coordinate frame")
     option(parser, '--port N', 'the next free one from this on (%(default)s)', within(0, 65535),
            8080)
-    option(parser, '--host ADDRESS', 'listen at this address too; the URL then holds a token '
-           '(%(default)s: this machine only)', default=_LOOPBACK)
+    option(parser, '--host ADDRESS', 'listen at this address too (%(default)s: this machine only)',
+           default=_LOOPBACK)
     option(parser, '--ros', "show the running relocalizer's last answer in the map, and let it "
            'relocalize and reload the map')
     option(parser, '--relocalizer NAME', 'its name, with its namespace (%(default)s)',
@@ -78,6 +78,7 @@ def serve(options: argparse.Namespace) -> int:
     # Late, so that --help is fast.
     from cliploc_ros.offline.mapping.tilt import tilt_note
     from cliploc_ros.offline.studio.page import serve_studio
+    from cliploc_ros.offline.studio.web import once
 
     studio = open_studio(options)
     try:
@@ -91,7 +92,7 @@ def serve(options: argparse.Namespace) -> int:
                 print(f'note: {note}')
             print(f'studio: {url}', flush=True)
             if not options.no_browser:
-                webbrowser.open(url)
+                webbrowser.open(once(url))
             threading.Event().wait()
     finally:
         studio.document.close()

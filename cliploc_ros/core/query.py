@@ -27,6 +27,7 @@ from cliploc_ros.core.observation import Detections, Observation, Region
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import CliplocError, DatasetError
 from cliploc_ros.files.arrays import Arrays, Field, Offsets, Schema
+from cliploc_ros.files.storage import parse_json
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ def read_case(path: Path) -> Case:
     """
     arrays = CASE.read(path)
     try:
-        about = json.loads(arrays['about'].tobytes())
+        about = parse_json(arrays['about'].tobytes())
         images, crops = _parts(arrays, 'image'), _parts(arrays, 'crop')
         first, *others = (_query_of(one, images, crops) for one in about['queries'])
         report = dict(about['report'])

@@ -5,7 +5,7 @@
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.map.joined_map import MapPart, parts_of, place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.options import RelocalizerOptions, used_time_s
 from cliploc_ros.core.search.frame_search import SearchedFrame, check_k, coverage_of, search_frame
 from cliploc_ros.core.warm_up import call_every_kernel
 
@@ -153,11 +153,12 @@ def in_its_map(found: Relocalization, landmark_map: LandmarkMap
 
 @dataclass(frozen=True)
 class TimeBudget:
-    """A time budget that runs from `start`. All times are those of time.perf_counter [s]."""
+    """A time budget that runs from `start`. Times are those of used_time_s [s]."""
 
     start: float
     total_s: float  #: Infinite for no limit
     frames: int  #: Number of frames that are localized together
+    begun_s: float = field(default_factory=time.perf_counter)  #: When it began, of perf_counter
 
     def search_end(self, number: int = 1, count: int = 1) -> float:
         """Return when the search of a frame ends: the number-th of count frames to search."""
@@ -171,7 +172,7 @@ class TimeBudget:
     @property
     def elapsed_ms(self) -> float:
         """Return the time since the start [ms]."""
-        return (time.perf_counter() - self.start) * 1e3
+        return (time.perf_counter() - self.begun_s) * 1e3
 
     def _time_s(self, share: float, earlier_s: float) -> float:
         scale = min(1.0, self.total_s / _SHORT_BUDGET_S)
@@ -228,10 +229,10 @@ class Relocalizer:
 
         What several cameras see at one instant has the time of each.
         """
-        return TimeBudget(time.perf_counter(), cameras * self.options.time_budget_s, frames)
+        return TimeBudget(used_time_s(), cameras * self.options.time_budget_s, frames)
 
     def search(self, observation: Observation, deadline: float = math.inf) -> SearchedFrame:
-        """Search one frame, until a deadline of time.perf_counter [s]."""
+        """Search one frame, until a deadline of used_time_s [s]."""
         return search_frame(self.landmark_map, observation, self.options, deadline)
 
     def locate(self, frames: Sequence[SearchedFrame], budget: TimeBudget | None = None,

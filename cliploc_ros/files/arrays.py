@@ -3,22 +3,23 @@
 """The schema of an npz file: which arrays it holds, of which type and shape, with which values.
 
 A reader is a table of fields. An untrusted file ends in an error that names file, array and row:
-pickles are refused, and no array is larger than the file says.
+pickles are refused, check sums are compared, and no array is larger than the file says.
 """
 
+import math
+import os
 import struct
 import zipfile
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.files.storage import replace_file
+from cliploc_ros.files.storage import open_file, replace_file
 
 #: Arrays by name.
 Arrays = Mapping[str, NDArray[Any]]
@@ -29,6 +30,11 @@ _ROWS_AT_ONCE = 10_000
 # Of a member of a zip file: where the lengths of its name and of a further field stand, and where
 # the name begins.
 _ZIP_LENGTHS, _ZIP_HEAD = 26, 30
+# Arrays may take this much memory [bytes], or so many times what the file takes on the disk: a
+# small file may declare any size, and so may one with holes.
+_MOST_BYTES, _MOST_GROWTH = 512 * 2**20, 8
+# Beyond any pixel, coordinate [m] and time [s].
+_MOST = 1e10
 
 
 class ArrayError(Exception):
@@ -68,7 +74,7 @@ class Offsets:
 
 def _is_not_finite(values: NDArray[Any]) -> NDArray[np.bool_]:
     """Look at some rows at once: the array may stay in its file."""
-    return np.concatenate([~np.isfinite(rows.reshape(len(rows), -1)).all(axis=1)
+    return np.concatenate([~(np.abs(rows.astype(float).reshape(len(rows), -1)) <= _MOST).all(1)
                            for rows in np.array_split(values, len(values) // _ROWS_AT_ONCE + 1)])
 
 
@@ -78,7 +84,7 @@ def _is_repeated(values: NDArray[Any]) -> NDArray[np.bool_]:
     return repeated
 
 
-FINITE = Check('is not finite', _is_not_finite)
+FINITE = Check('is beyond any measure or not finite', _is_not_finite)
 UNIQUE = Check('repeats an id', _is_repeated)
 BOX = Check('is not left, top, right, bottom',
             lambda boxes: (boxes[:, :2] >= boxes[:, 2:]).any(axis=1))
@@ -115,8 +121,6 @@ class Schema:
     #: Arrays of other kinds of files, and what a file is that has one where a field is missing
     others: Mapping[str, str] = field(default_factory=dict)
     is_stored: bool = False  #: Whether compressed arrays are refused
-    #: Whether to compare the check sums of arrays that stay in the file, which reads it once
-    checks_sums: bool = True
     #: In files up to this size all arrays are read [bytes]: a program that writes over a mapped
     #: file in place would kill this process
     largest_read: int = 0
@@ -184,53 +188,89 @@ class Schema:
 
     def _arrays(self, path: Path) -> dict[str, NDArray[Any]]:
         try:
-            archive = zipfile.ZipFile(path)
-        except Exception as error:  # whatever zipfile meets in a broken file
-            with suppress(OSError), path.open('rb') as file:
+            file = open_file(path)
+        except OSError as error:
+            raise ArrayError(f'cannot be read: {error.strerror}') from error
+        with file:
+            try:
+                archive = zipfile.ZipFile(file)
+            except Exception as error:  # whatever zipfile meets in a broken file
+                file.seek(0)
                 if file.read(6) == b'\x93NUMPY':
                     raise ArrayError('is a single array, not an npz file of named arrays'
                                      ) from error
-            raise ArrayError(f'is no complete npz file ({error})') from error
-        with archive:
-            names = {name.removesuffix('.npy') for name in archive.namelist()}
-            for name, one in self.fields.items():
-                if name not in names and not one.is_optional:
-                    hints = [f' ({what})' for other, what in self.others.items() if other in names]
-                    raise ArrayError(f'array {name} is missing{"".join(hints)}')
-            arrays = {}
-            for name, one in self.fields.items():
-                if name in names:
-                    try:
-                        arrays[name] = self._array(path, archive, name, one.stays)
-                    except ArrayError:
-                        raise
-                    except Exception as error:  # whatever numpy and zipfile meet in a broken file
-                        raise ArrayError(f'array {name} cannot be read: {error}') from error
-            return arrays
+                raise ArrayError(f'is no complete npz file ({error})') from error
+            with archive:
+                try:
+                    for member in archive.infolist():
+                        archive.open(member).close()  # a damaged name would hide an array
+                except Exception as error:  # as above
+                    raise ArrayError(f'is damaged ({error})') from error
+                return self._arrays_of(file, archive)
 
-    def _array(self, path: Path, archive: zipfile.ZipFile, name: str, stays: bool) -> NDArray[Any]:
-        member = archive.getinfo(f'{name}.npy')
-        is_compressed = member.compress_type != zipfile.ZIP_STORED
-        if is_compressed and self.is_stored:
-            raise ArrayError(f'array {name} is compressed')
-        with archive.open(member) as stream:
-            if not stays or is_compressed:
-                array = np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
-                return np.char.decode(array, 'utf-8') if array.dtype.kind == 'S' else array
-            version = np.lib.format.read_magic(stream)
-            read = (np.lib.format.read_array_header_1_0 if version == (1, 0)
-                    else np.lib.format.read_array_header_2_0)
-            shape, by_columns, dtype = read(stream)
-            start = stream.tell()
-            while self.checks_sums and stream.read(1 << 20):
-                pass  # to the end, where zipfile compares the check sum
-        with path.open('rb') as file:
-            # the local header repeats name and a further field, whose length may be another one
-            file.seek(member.header_offset + _ZIP_LENGTHS)
-            start += member.header_offset + _ZIP_HEAD + sum(struct.unpack('<HH', file.read(4)))
-        if dtype.hasobject:
-            raise ArrayError(f'array {name} cannot be read: it holds objects')
-        if 0 in shape:
-            return np.empty(shape, dtype)
-        mapped = np.memmap(path, dtype, 'r', start, shape, 'F' if by_columns else 'C')
-        return mapped if path.stat().st_size > self.largest_read else np.array(mapped)
+    def _arrays_of(self, file: BinaryIO, archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
+        names = {name.removesuffix('.npy') for name in archive.namelist()}
+        for name, one in self.fields.items():
+            if name not in names and not one.is_optional:
+                hints = [f' ({what})' for other, what in self.others.items() if other in names]
+                raise ArrayError(f'array {name} is missing{"".join(hints)}')
+        size = os.fstat(file.fileno())
+        wanted = {name: (archive.getinfo(f'{name}.npy'), one.stays)
+                  for name, one in self.fields.items() if name in names}
+        wanted = {name: (member, stays and member.compress_type == zipfile.ZIP_STORED)
+                  for name, (member, stays) in wanted.items()}
+        is_large = size.st_size > self.largest_read
+        unpacked = sum(member.file_size for member, stays in wanted.values()
+                       if not (stays and is_large))
+        on_disk = 512 * size.st_blocks or size.st_size  # some network file systems count none
+        if unpacked > max(_MOST_BYTES, _MOST_GROWTH * on_disk):
+            raise ArrayError(f'unpacks to {unpacked >> 20} MiB, much more than the file takes')
+        arrays = {}
+        for name, (member, stays) in wanted.items():
+            if self.is_stored and member.compress_type != zipfile.ZIP_STORED:
+                raise ArrayError(f'array {name} is compressed')
+            try:
+                mapped = _mapped(file, archive, member) if stays and is_large else None
+                arrays[name] = _array(archive, member) if mapped is None else mapped
+            except Exception as error:  # whatever numpy and zipfile meet in a broken file
+                raise ArrayError(f'array {name} cannot be read: {error}') from error
+        return arrays
+
+
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+    """Return an array of a file, whose memory is not more than what the archive declares."""
+    _header(archive, member)
+    with archive.open(member) as stream:
+        array = np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
+    return np.char.decode(array, 'utf-8') if array.dtype.kind == 'S' else array
+
+
+def _mapped(file: BinaryIO, archive: zipfile.ZipFile, member: zipfile.ZipInfo
+            ) -> NDArray[Any]:
+    """Return an array that stays in its file, whose check sum was compared."""
+    shape, by_columns, dtype, start = _header(archive, member)
+    with archive.open(member) as stream:
+        while stream.read(1 << 20):
+            pass  # to the end, where zipfile compares the check sum
+    # the local header repeats name and a further field, whose length may be another one
+    file.seek(member.header_offset + _ZIP_LENGTHS)
+    start += member.header_offset + _ZIP_HEAD + sum(struct.unpack('<HH', file.read(4)))
+    if 0 in shape:
+        return np.empty(shape, dtype)
+    return np.memmap(file, dtype, 'r', start, shape, 'F' if by_columns else 'C')
+
+
+def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo
+            ) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
+    """Return shape, whether columns come first, type, and where the values begin in a member."""
+    with archive.open(member) as stream:
+        version = np.lib.format.read_magic(stream)
+        read = (np.lib.format.read_array_header_1_0 if version == (1, 0)
+                else np.lib.format.read_array_header_2_0)
+        shape, by_columns, dtype = read(stream)
+        start = stream.tell()
+    if dtype.hasobject:
+        raise ValueError('it holds objects')
+    if (size := math.prod(shape) * dtype.itemsize) != member.file_size - start:
+        raise ValueError(f'its values take {size} bytes, the file has {member.file_size - start}')
+    return shape, by_columns, dtype, start

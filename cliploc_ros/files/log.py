@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from cliploc_ros.errors import CliplocError
+from cliploc_ros.files.storage import open_file, parse_json
 
 # During a drag, a hundred entries a second need not each wait for the disk.
 _SYNC_INTERVAL_S = 0.5
@@ -34,11 +35,13 @@ class Log:
     """
 
     def __init__(self, path: Path, error: type[CliplocError], advice: str,
-                 parse: Callable[[bytes], Any] = json.loads) -> None:
+                 parse: Callable[[bytes], Any] = parse_json) -> None:
         self.path = path
         self._error, self._advice, self._parse = error, advice, parse
         self._synced_s = 0.0
         try:
+            if path.exists():
+                open_file(path).close()  # to say what else it is
             self._file = path.open('a+b', buffering=0)
         except OSError as problem:
             raise self._unwritable(problem) from problem

@@ -1,21 +1,85 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where files are kept, and how one takes the place of another."""
+"""Reading files of any origin, where files are kept, and how one takes the place of another."""
 
 import atexit
+import errno
+import glob
+import json
 import logging
 import os
+import secrets
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
+from typing import Any, BinaryIO
 
 from cliploc_ros.errors import OptionsError
 
 logger = logging.getLogger(__name__)
+
+#: The largest file that is read into memory as a whole [bytes].
+MOST_BYTES = 256 * 2**20
+# Values of a JSON text, each of which takes up to 64 bytes of memory, and digits of its integers:
+# 64 bits have 19 or 20.
+_MOST_VALUES = 8_000_000
+_MOST_DIGITS = 20
+
+
+def open_file(path: str | os.PathLike[str]) -> BinaryIO:
+    """Open a regular file to read it, whatever else a path of any origin names.
+
+    OSError: there is none. A pipe would wait for a writer, a device would never end.
+    """
+    try:
+        mode = Path(path).stat().st_mode  # first: a device may act as soon as it is opened
+        if stat.S_ISREG(mode):
+            file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), 'rb')
+            mode = os.fstat(file.fileno()).st_mode
+            if stat.S_ISREG(mode):
+                return file
+            file.close()
+    except ValueError as error:  # a zero byte, or no UTF-8
+        raise OSError(errno.EINVAL, f'names no file: {error}') from error
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, 'a folder, not a regular file')
+    raise OSError(errno.EINVAL, 'not a regular file')
+
+
+def read_file(path: str | os.PathLike[str], most_bytes: int = MOST_BYTES) -> bytes:
+    """Return the content of a regular file; OSError: there is none, or it is too large."""
+    with open_file(path) as file:
+        # a sparse file has any size
+        size = os.fstat(file.fileno()).st_size
+        content = file.read(most_bytes + 1) if size <= most_bytes else b''
+    if max(size, len(content)) > most_bytes:
+        raise OSError(errno.EFBIG, f'larger than {most_bytes // 2**20} MiB')
+    return content
+
+
+def parse_json(text: str | bytes, **options: Any) -> Any:
+    """Return the value of a JSON text, see json.loads.
+
+    ValueError: it is no JSON, or nested so deeply, so long, or with such numbers that no file of
+    this package or of the programs that it reads is.
+    """
+    marks = (b',', b'[', b'{') if isinstance(text, bytes) else (',', '[', '{')
+    if sum(map(text.count, marks)) > _MOST_VALUES:  # type: ignore[arg-type]
+        raise ValueError(f'holds more than {_MOST_VALUES} values')
+    try:
+        return json.loads(text, parse_int=_integer, **options)
+    except RecursionError as error:
+        raise ValueError('is nested too deeply') from error
+
+
+def _integer(digits: str) -> int:
+    if len(digits) > _MOST_DIGITS:
+        raise ValueError(f'holds an integer of {len(digits)} digits')
+    return int(digits)
 
 
 @contextmanager
@@ -30,7 +94,8 @@ def replace_file(path: Path) -> Iterator[Path]:
     OSError: the folder is missing, read-only or full.
     """
     path = Path(os.path.realpath(path))
-    partial = path.with_name(f'.{os.getpid()}.{path.name}')
+    # two containers that share the folder may have processes of the same number
+    partial = path.with_name(f'.{secrets.token_hex(6)}.{path.name}')
     try:
         yield partial
         with partial.open('rb+') as file:
@@ -43,6 +108,59 @@ def replace_file(path: Path) -> Iterator[Path]:
             partial.unlink(missing_ok=True)
 
 
+#: Writes a file to a path, with the digest of its set in it.
+WriteOfSet = Callable[[Path, str], object]
+
+
+def replace_set(path: Path, digest: str, write: WriteOfSet,
+                besides: Mapping[Path, WriteOfSet | None]) -> None:
+    """Write a file and those beside it as one: whenever the process ends, a whole set is there.
+
+    Those beside are written under other names first. The file itself takes its place in one step,
+    and from then on its set is the new one: finish_set does what a kill leaves. Files that are not
+    of its set have another digest.
+
+    Parameters
+    ----------
+    besides : mapping
+        The other files in the same folder; None removes one.
+
+    OSError, and what the callables raise: nothing was changed. OptionsError: the set was written,
+    and a file that is not of it cannot be removed.
+    """
+    staged = {other: _staged(other, digest) for other, make in besides.items() if make is not None}
+    try:
+        for other, make in besides.items():
+            if make is not None:
+                make(staged[other], digest)
+        write(path, digest)
+    except BaseException:
+        for one in staged.values():
+            with suppress(OSError):
+                one.unlink(missing_ok=True)
+        raise
+    for other in besides:
+        if other not in staged:
+            try:
+                other.unlink(missing_ok=True)
+            except OSError as error:
+                raise OptionsError(f'{other}: is not of {path.name} that was written; it cannot '
+                                   f'be removed: {error.strerror}; remove it') from error
+    finish_set(path, digest)
+
+
+def finish_set(path: Path, digest: str) -> None:
+    """Put in place what a killed writer left of the set of a file, where that is allowed."""
+    pattern = _staged(path, digest).with_suffix('').name
+    for staged in path.parent.glob(f'{glob.escape(pattern)}.*') if digest else ():
+        with suppress(OSError):  # the writer has done it meanwhile, or the folder is read-only
+            staged.replace(staged.with_name(staged.name.removeprefix(f'.{digest}.')))
+
+
+def _staged(path: Path, digest: str) -> Path:
+    return path.with_name(f'.{digest}.{path.name}')
+
+
 def make_folder(folder: Path) -> None:
     """Create the output folder and its parents.
 
@@ -50,7 +168,7 @@ def make_folder(folder: Path) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f'.{os.getpid()}.probe'
+        probe = folder / f'.{secrets.token_hex(6)}.probe'
         probe.touch()
         probe.unlink(missing_ok=True)
     except OSError as error:
@@ -96,9 +214,18 @@ def resolve_cache_dir(cache_dir: str) -> Path:
         status = folder.stat()
     except OSError:  # the first write reports it
         return folder
-    if status.st_uid != os.getuid() or status.st_mode & stat.S_IWOTH:
+    if is_foreign(status, {os.getuid()}):
         return _process_cache(f'other users own {folder} or can write to it')
     return folder
+
+
+def is_foreign(status: os.stat_result, owners: Collection[int]) -> bool:
+    """Return whether others than some owners can write to a file or folder, or own it.
+
+    The group of this process is its user's own, in any other one may be anyone.
+    """
+    return (status.st_uid not in owners or bool(status.st_mode & stat.S_IWOTH)
+            or (bool(status.st_mode & stat.S_IWGRP) and status.st_gid not in (os.getgid(), 0)))
 
 
 @cache

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the CLIP that the options name: architecture, file of weights, activation."""
 
-import json
 import os
 import zipfile
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cliploc_ros.errors import ModelError, OptionsError, did_you_mean
-from cliploc_ros.files.storage import resolve_cache_dir
+from cliploc_ros.files.storage import parse_json, read_file, resolve_cache_dir
 from cliploc_ros.models.devices import check_run, needs_pytorch
 from cliploc_ros.models.files import check_weights_file, download, fingerprint_file
 from cliploc_ros.models.openvino_networks import (
@@ -166,7 +165,7 @@ def _add_config(name: str) -> str:
     if not file.exists():
         raise ModelError(f'{file} does not exist: check the path of the model config')
     try:
-        config = json.loads(file.read_text(encoding='utf-8'))
+        config = parse_json(read_file(file))
     except (OSError, ValueError) as error:
         raise ModelError(f'{file} cannot be read as JSON, as a model config is: {error}') from None
     missing = ([part for part in _CONFIG_PARTS if part not in config]

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from cliploc_ros.errors import ModelError
+from cliploc_ros.files.storage import open_file
 
 _BLOCK_BYTES = 64 * 1024
 _BLOCK_COUNT = 66
@@ -35,7 +36,7 @@ def fingerprint_file(path: Path) -> str:
     last = max(size - _BLOCK_BYTES, 0)
     offsets = sorted({last * index // (_BLOCK_COUNT - 1) for index in range(_BLOCK_COUNT)})
     digest = hashlib.sha256(str(size).encode())
-    with path.open('rb') as file:
+    with open_file(path) as file:
         for offset in offsets:
             file.seek(offset)
             digest.update(file.read(_BLOCK_BYTES))
@@ -53,7 +54,7 @@ def check_weights_file(path: Path) -> None:
         raise ModelError(f'{path} does not exist: check the path of the weights')
     try:
         size = path.stat().st_size
-        with path.open('rb') as file:
+        with open_file(path) as file:
             head = file.read(512)
     except OSError as error:
         raise ModelError(f'{path} cannot be read: {error.strerror}') from error

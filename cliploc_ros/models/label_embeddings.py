@@ -7,7 +7,6 @@ import hashlib
 import json
 import logging
 import os
-import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -16,6 +15,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from cliploc_ros.core.map.landmark_details import WeightedLabels
+from cliploc_ros.errors import ModelError
+from cliploc_ros.files.arrays import Check, Field, Schema
 from cliploc_ros.files.storage import replace_file
 from cliploc_ros.models.files import remove_unused
 
@@ -28,6 +29,12 @@ logger = logging.getLogger(__name__)
 PART = 65_536
 # Descriptions that are mixed at once.
 _BLOCK = 8_192
+# L labels, d numbers, t bytes that say which labels and encoder.
+_SCHEMA = Schema('file of label embeddings', {
+    'identity': Field('uint8', ('t',)),
+    'embeddings': Field('float32', ('L', 'd'), (Check('is not of unit length', lambda rows: ~(
+        np.abs(np.einsum('ij,ij->i', rows, rows) - 1.0) <= 2e-3)),)),
+}, ModelError)
 
 
 class LabelCache:
@@ -51,17 +58,14 @@ class LabelCache:
         if not file.exists():
             return None
         try:
-            with np.load(file, allow_pickle=False) as archive:
-                found = bytes(archive['identity'])
-                embeddings = np.asarray(archive['embeddings'])
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            arrays = _SCHEMA.read(file)
+        except ModelError as error:
             return self._ignore(file, error)
-        if found != _identity(key, labels):
+        embeddings = arrays['embeddings']
+        if bytes(arrays['identity']) != _identity(key, labels):
             return self._ignore(file, 'it belongs to other weights or labels')
-        if (embeddings.shape != (len(labels), embed_dim) or embeddings.dtype != np.float32
-                or not np.allclose(np.einsum('ij,ij->i', embeddings, embeddings), 1.0,
-                                   atol=2e-3)):
-            return self._ignore(file, 'its embeddings are not unit rows of the expected shape')
+        if embeddings.shape != (len(labels), embed_dim):
+            return self._ignore(file, 'its embeddings are not of the expected shape')
         with contextlib.suppress(OSError):  # a read-only cache works too
             os.utime(file)
         return embeddings

@@ -79,7 +79,8 @@ def _images(key: str, embed_dim: int, landmark_map: LandmarkMap, map_file: str
             ) -> LandmarkEmbeddings | None:
     """Return the image embeddings of a map, if there are some of this encoder."""
     try:
-        images = load_embeddings_of_map(map_file, landmark_map.landmark_ids)
+        images = load_embeddings_of_map(map_file, landmark_map.landmark_ids,
+                                        landmark_map.map_set)
     except MapError as error:
         logger.warning('only labels are compared: %s', error)
         return None

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.errors import CliplocError, ModelError
-from cliploc_ros.files.storage import resolve_cache_dir
+from cliploc_ros.files.storage import parse_json, read_file, resolve_cache_dir
 from cliploc_ros.models.devices import count_threads, free_memory, import_openvino
 from cliploc_ros.models.files import fingerprint_file, first_line, remove_unused
 
@@ -152,14 +152,14 @@ def stored_folders(cache_dir: str, name: str, identity: Sequence[str], beside: P
 def stored_about(folder: Path) -> dict[str, Any]:
     """Return what the user of a stored network needs; empty where the file is damaged."""
     try:
-        return dict(json.loads((folder / ABOUT).read_text())['about'])
+        return dict(parse_json(read_file(folder / ABOUT))['about'])
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return {}
 
 
 def stored_identity(folder: Path) -> list[str]:
     """Return the identity of a stored network, whose description is sound."""
-    return list(json.loads((folder / ABOUT).read_text())['identity'])
+    return list(parse_json(read_file(folder / ABOUT))['identity'])
 
 
 def network_folder(root: Path, name: str, identity: Sequence[str]) -> Path:
@@ -204,7 +204,7 @@ def open_stored(folder: Path, precisions: Precisions = FP32, identity: Sequence[
 
     Without an identity, that of the folder is taken.
     """
-    stored = json.loads((folder / ABOUT).read_text())
+    stored = parse_json(read_file(folder / ABOUT))
     if identity and stored['identity'] != list(identity):
         raise ValueError('it belongs to another network')
     for name in (_XML, _WEIGHTS, _PROBE):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.files.storage import read_file
 from cliploc_ros.models.devices import (
     import_openvino,
     needs_pytorch,
@@ -112,7 +113,7 @@ def open_export(folder: Path, options: DetectorOptions) -> OpenVinoYolo:
 
 def _read_metadata(file: Path) -> dict[str, Any]:
     try:
-        read = yaml.safe_load(file.read_text(encoding='utf-8'))
+        read = yaml.safe_load(read_file(file, 2**20))
     except (OSError, ValueError, yaml.YAMLError) as error:
         raise ModelError(f'{file} cannot be read: {first_line(error)}; export the network again'
                          ) from error

@@ -2,19 +2,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mapping as a library: what a recording shows becomes a map with labels, images and keyframes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, removed_layer, save_layer
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import MappingError, ModelError
+from cliploc_ros.files.storage import WriteOfSet
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
 from cliploc_ros.offline.datasets.frames import Frames
+from cliploc_ros.offline.datasets.map_recording import (
+    MapRecording,
+    recording_path,
+    save_recording,
+)
 from cliploc_ros.offline.mapping.building import MappingReport, build_map
 from cliploc_ros.offline.mapping.labelling import embed_landmarks, label_landmarks
 from cliploc_ros.offline.mapping.landmarks import classes_of
@@ -205,7 +213,7 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
         loaded.
     """
     old = LandmarkMap.from_file(path)
-    old_embeddings = load_embeddings_of_map(path, old.landmark_ids)
+    old_embeddings = load_embeddings_of_map(path, old.landmark_ids, old.map_set)
     updated = update_landmarks(old, detections, options, old_embeddings)
     landmark_map, first = updated.landmark_map, updated.first_new
     if first == len(landmark_map):
@@ -220,3 +228,31 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
         replace(updated.report, new=tuple(
             replace(one, label=texts[one.landmark_id]) for one in updated.report.new)),
         updated.embeddings)
+
+
+def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording: MapRecording,
+                   updated: Path | None = None) -> list[str]:
+    """Write a map and what lies next to it as one set; return lines about its keyframes.
+
+    Those of a map that is updated in its place stay, those of any other map before go.
+
+    CliplocError: a file cannot be written; nothing was changed.
+    """
+    layer, landmark_map, lines = made.layer, made.landmark_map, []
+    besides: dict[Path, WriteOfSet | None] = {
+        recording_path(path): partial(save_recording, path, recording)}
+    if layer is not None:
+        besides[layer_path(path)] = lambda place, digest: save_layer(
+            place, replace(layer, set_digest=digest))
+    elif updated is not None and path.resolve() == updated.resolve():
+        landmark_map = replace(landmark_map, map_set=LandmarkMap.from_file(updated).map_set)
+    else:
+        lines += [removed_layer(path)] * layer_path(path).exists()
+        besides[layer_path(path)] = None
+    write_map(path, landmark_map, comments, made.embeddings, besides)
+    if layer is None:
+        return lines
+    megabytes = layer_path(path).stat().st_size / 1e6
+    images = '' if layer.images is None else f' and images of {layer.images.size / 1e6:.1f} MB'
+    return [f'keyframes: {len(layer)} with {len(layer.points)} points{images}, {megabytes:.1f} MB '
+            f'({50 * megabytes / len(layer):.1f} MB per 50), in {layer_path(path)}']

@@ -26,7 +26,7 @@ from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, in_its_map
 from cliploc_ros.core.watch.watch import Watch, WatchReport
 from cliploc_ros.errors import MapError, ModelError
-from cliploc_ros.files.storage import resolve_cache_dir
+from cliploc_ros.files.storage import read_file, resolve_cache_dir
 from cliploc_ros.models.profiles import with_encoder
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.instants import Instants
@@ -323,8 +323,8 @@ def load_hashed_map(node: Node, files: Sequence[str]) -> tuple[LandmarkMap, str]
 def _hash_of(files: Sequence[str]) -> str:
     """Return the hash of files; empty where load_map says what is wrong."""
     try:
-        return _hash(b''.join(Path(file).read_bytes() for file in files))
-    except (OSError, ValueError):
+        return _hash(b''.join(map(read_file, files)))
+    except OSError:
         return ''
 
 

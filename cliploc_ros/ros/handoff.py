@@ -44,8 +44,6 @@ _MIN_VARIANCES = (1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5)
 _MAX_ODOM_AGE_S = 2.0
 # How long to wait for odometry that has a publisher: discovery takes its time, too.
 _ODOM_PATIENCE_S = 2.0
-# How long to wait for a localizer; discovery of a running one takes less.
-_LOCALIZER_PATIENCE_S = 2.0
 _POLL_S = 0.1
 # AMCL shows a new pose after its next scan. One that it does not show by then was lost.
 _REPEAT_S = 1.0
@@ -79,6 +77,7 @@ class HandOff:
         self._stopped = threading.Event()
         # What the localizer shows since the pose was last published.
         self._shown: PoseWithCovarianceStamped | None = None
+        self._shown_at = -math.inf  # when it was heard (monotonic clock) [s]
         self._pose_topic = ''
         self._listeners: list[Callable[[PoseWithCovarianceStamped], None]] = []
         self._subscription: qos.AdaptiveSubscription | None = None
@@ -116,18 +115,19 @@ class HandOff:
     def missing(self) -> str:
         """Return that there is no localizer, and what to do; empty if there is one."""
         if not self._publisher.get_subscription_count():
-            return (f'nobody subscribes {self._publisher.topic_name}: start the localizer (AMCL), '
-                    'or set require_localizer: false')
+            return (f'nobody subscribes {self._publisher.topic_name}: start the localizer (AMCL); '
+                    'if it has just started, ask again; without one set require_localizer: false')
         if self._subscription is not None and not self._node.count_publishers(self._pose_topic):
-            return (f'nobody publishes {self._pose_topic}: start the localizer (AMCL), or name '
-                    'the topic of its pose by localizer_pose')
+            return (f'nobody publishes {self._pose_topic}: start the localizer (AMCL); if it has '
+                    'just started, ask again; name the topic of its pose by localizer_pose')
         return ''
 
     def hand_over(self, pose: PoseWithCovarianceStamped, parameters: RelocalizerParameters,
                   deadline: float, received_at: float, jumps: TimeJumps) -> None:
         """Publish a pose on `initialpose` until the localizer shows it, and let it settle.
 
-        A localizer that shows the pose is not reset again.
+        A localizer that shows the pose is not reset again. It still has to live when it has
+        settled: it answers each update, or shows another pose, and is there at the end.
 
         Parameters
         ----------
@@ -144,7 +144,7 @@ class HandOff:
         HandOffError
             The robot moves or may do so, or has moved since its image.
         NoLocalizerError
-            There is no localizer, or it does not show the pose.
+            There is no localizer, it does not show the pose, or it has died since.
         TimeJumpError
             Time has jumped back since.
         """
@@ -167,9 +167,16 @@ class HandOff:
             given, times = usable_pose(pose, self._node.get_clock().now()), times + 1
             self._shown = None
             self._publisher.publish(given)
-        self._settle(parameters.nomotion_updates, deadline)
+        silent = self._settle(parameters.nomotion_updates, deadline)
+        if must_show and (gone := silent or self.missing()):
+            raise NoLocalizerError(f'the localizer took the pose and has ended or hangs since: '
+                                   f'{gone}: see its log, ask again')
         if must_show and not is_taken(given, self._shown):
             raise NoLocalizerError(self._not_taken(given, times, begun_at))
+        if silent:
+            self._node.get_logger().warning(
+                f'{silent}: the localizer has the pose, but may not settle while the robot rests',
+                throttle_duration_sec=5.0)
 
     def _wake(self) -> None:
         with self._changed:
@@ -177,14 +184,17 @@ class HandOff:
 
     def _hear(self, shown: PoseWithCovarianceStamped) -> None:
         with self._changed:
-            self._shown = shown
+            self._shown, self._shown_at = shown, time.monotonic()
             self._changed.notify_all()
         for listener in self._listeners:
             listener(shown)
 
     def _wait_for_localizer(self, deadline: float) -> None:
-        """Raise unless there is a localizer, or soon is."""
-        until = min(time.monotonic() + _LOCALIZER_PATIENCE_S, deadline)
+        """Raise unless there is a localizer, or one is found while there is time to use it.
+
+        One that has just started is found after up to three seconds.
+        """
+        until = deadline - _LEAST_S
         while (missing := self.missing()) and not self._stopped.is_set():
             if not _left_s(until):
                 raise NoLocalizerError(missing)
@@ -264,26 +274,26 @@ class HandOff:
                                f'degrees since its image (limits {SAME_SPOT.distance_m:g} and '
                                f'{SAME_SPOT.angle_deg:g}): ask again while it stands')
 
-    def _settle(self, updates: int, deadline: float) -> None:
+    def _settle(self, updates: int, deadline: float) -> str:
         """Have AMCL take in some scans though the robot rests, as far as time allows.
 
-        The pose is delivered: what fails here is not worth an error.
+        Return which call was answered neither by the service nor by a pose that is shown; '' if
+        none was.
         """
         for _ in range(updates):
-            if not self._updater.service_is_ready() or _left_s(deadline) < _UPDATE_PERIOD_S:
-                return
-            timeout_s, answered = min(_UPDATE_PATIENCE_S, _left_s(deadline)), threading.Event()
+            timeout_s = min(_UPDATE_PATIENCE_S, _left_s(deadline))
+            if not self._updater.service_is_ready() or timeout_s < _LEAST_S:
+                return ''
+            called_at, answered = time.monotonic(), threading.Event()
             future = self._updater.call_async(Empty.Request())
             future.add_done_callback(lambda _, answered=answered: answered.set())
             if not answered.wait(timeout_s):
                 self._updater.remove_pending_request(future)
-                self._node.get_logger().warning(
-                    f'{self._updater.service_name} did not answer within {timeout_s:.1f} s: the '
-                    'localizer has the pose, but may not settle while the robot rests',
-                    throttle_duration_sec=5.0)
-                return
+                return '' if self._shown_at > called_at else \
+                    f'{self._updater.service_name} did not answer within {timeout_s:.1f} s'
             if self._stopped.wait(_UPDATE_PERIOD_S):
-                return
+                return ''
+        return ''
 
 
 def _left_s(deadline: float) -> float:

@@ -148,9 +148,9 @@ class RelocalizerParameters(CommonParameters):
         'IoU above which a detection matches a landmark.', low=0.0, high=1.0)
     random_seed: int = parameter(0, 'Equal seeds repeat results; below 0, every search differs.')
     time_budget_ms: float = parameter(50.0,
-        'Limit of search and refinement with auto, for each camera. The other algorithms have '
-        'half of timeout_s; a search that is cut short is refused.', unit='ms', low=1.0,
-        high=3.6e6)
+        'Limit of search and refinement with auto, for each camera, in processor time. The other '
+        'algorithms have half of timeout_s; a search that is cut short is refused.', unit='ms',
+        low=1.0, high=3.6e6)
     gravity: str = parameter('none',
         'Source of the vertical: base_frame (the robot stands upright) or the topic imu. auto '
         'then needs two objects instead of three.', choices=VERTICAL_SOURCES, read_only=True)

@@ -102,6 +102,8 @@ class Watcher:
         # What became of a robot that is lost, and whether it stands.
         self._reaction, self._is_at_rest = '', False
         self._rest_stamp: Time | None = None
+        # The image of the look that began last, and whether the localizer had a pose at one.
+        self._image_stamp, self._had_pose = Time(), False
         self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
         if self.is_on:
             handoff.on_shown(self._pose.hear)
@@ -180,6 +182,8 @@ class Watcher:
                 self._miss(stopped, str(error), time.monotonic() - _STALE_S)
             except CliplocError as error:
                 self._miss(stopped, str(error))
+                if isinstance(error, PoselessError):
+                    self._wake_up(stopped)
             except Exception as error:
                 self._node.report(traceback.format_exc())
                 self._miss(stopped, f'internal error: {error} (the traceback is in the log)')
@@ -206,6 +210,7 @@ class Watcher:
         if self._requests.is_busy:
             return None
         image = frame.image.header
+        self._image_stamp = image.stamp
         self._jumps.check(image.stamp, frame.received_at)
         # Odometry tells looks apart, whether or not requests fuse frames by it.
         parameters = replace(self._node.settings.snapshot().of_camera(frame.camera),
@@ -213,6 +218,7 @@ class Watcher:
         state = self._robot.at(image, parameters, depth_frame=frame.depth_frame)
         pose = self._pose.at(image, state, parameters, [
             part.landmark_map.frame_id for part in parts_of(localizer.landmark_map)])
+        self._had_pose = True
         report = self._node.worker.run(
             partial(self._score, frame, parameters, state, pose, age), begun_at + _STALE_S)
         if report is not None:
@@ -276,10 +282,19 @@ class Watcher:
 
     def _react(self, stopped: threading.Event, stamp: Time | None) -> None:
         """Relocalize a lost robot that stands, where that is wanted, and not again and again."""
-        parameters = self._node.settings.values
         if self._known.state is not WatchState.LOST or stamp is None:
             self._rest_stamp = None
             return
+        self._relocalize_at_rest(stopped, stamp, 'lost')
+
+    def _wake_up(self, stopped: threading.Event) -> None:
+        """Relocalize for a localizer that started again: it has no pose, and had one before."""
+        is_wanted = self._node.settings.values.on_lost != 'report' and self._had_pose
+        if is_wanted and not self._handoff.missing():
+            self._relocalize_at_rest(stopped, self._image_stamp, 'the localizer has no pose')
+
+    def _relocalize_at_rest(self, stopped: threading.Event, stamp: Time, why: str) -> None:
+        parameters = self._node.settings.values
         self._reaction = self._why_not_at_rest(parameters, stamp)
         self._is_at_rest = not self._reaction
         if not self._is_at_rest:
@@ -290,7 +305,7 @@ class Watcher:
         elif left_s > 0.0:
             self._reaction = f'the robot stands; next request in {left_s:.0f} s'
         else:
-            self._node.get_logger().warning('watch: lost and at rest: relocalizing')
+            self._node.get_logger().warning(f'watch: {why}, and at rest: relocalizing')
             answer = self._relocalize()
             self._next_request_at = time.monotonic() + self._pause_s
             self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
@@ -326,6 +341,10 @@ class LaterError(NoLocalizerPoseError):
     """The next pose of the localizer may do."""
 
 
+class PoselessError(NoLocalizerPoseError):
+    """The localizer shows no pose, as one that has just started."""
+
+
 class _Anchor(NamedTuple):
     """Odometry's coordinate frame in the map (4, 4), by the pose that was shown at a stamp."""
 
@@ -344,15 +363,19 @@ class LocalizerPose:
     def __init__(self, node: Node, robot: RobotStateSource) -> None:
         self._node = node
         self._robot = robot
+        self._topic = ''
         self.forget()
 
     def forget(self) -> None:
         """Forget what was heard: time jumped, or the node is inactive."""
         self._shown: PoseWithCovarianceStamped | None = None
+        self._shown_by: bytes | None = None  # what identifies the publisher; None: unknown
         self._anchor: _Anchor | None = None
 
     def hear(self, shown: PoseWithCovarianceStamped) -> None:
         """Take in a pose that the localizer shows."""
+        publishers = self._node.get_publishers_info_by_topic(self._topic) if self._topic else []
+        self._shown_by = bytes(publishers[0].endpoint_gid) if len(publishers) == 1 else None
         self._shown = shown
 
     def at(self, image: Header, state: RobotState, parameters: RelocalizerParameters,
@@ -385,11 +408,11 @@ class LocalizerPose:
                 raise NoLocalizerPoseError(f"the transform from '{parameters.base_frame}' to "
                                            f"'{frame_id}' is no pose: see the localizer's log")
             return frame_id, map_from_base @ invert_transform(state.camera_from_base)
-        raise NoLocalizerPoseError(str(problem)) from problem
+        raise PoselessError(str(problem)) from problem
 
     def _by_topic(self, image: Header, state: RobotState, parameters: RelocalizerParameters
                   ) -> tuple[str, NDArray[np.float64]]:
-        topic = self._node.resolve_topic_name(parameters.localizer_pose)
+        topic = self._topic = self._node.resolve_topic_name(parameters.localizer_pose)
         publishers = self._node.get_publishers_info_by_topic(topic)
         if not publishers:
             raise NoLocalizerPoseError(f'nobody publishes {topic}: start the localizer (AMCL), or '
@@ -398,10 +421,12 @@ class LocalizerPose:
             names = ', '.join(sorted(one.node_name for one in publishers))
             raise NoLocalizerPoseError(f'{len(publishers)} publishers of {topic} ({names}): stop '
                                        'all but one')
+        if self._shown_by not in (None, bytes(publishers[0].endpoint_gid)):
+            self.forget()  # another process showed it; this one has no pose until it shows one
         shown = self._shown
         if shown is None:
-            raise NoLocalizerPoseError(f'no pose heard on {topic} yet: AMCL shows one once the '
-                                       'robot drives; watch: tf need not wait')
+            raise PoselessError(f'no pose heard on {topic} yet: AMCL shows one once the robot '
+                                'drives; watch: tf need not wait')
         pose, place = _pose_of(shown, topic), state.place
         shown_ns, frame_id = stamp_ns(shown.header.stamp), shown.header.frame_id.lstrip('/')
         if place is None:

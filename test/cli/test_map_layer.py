@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from cliploc_ros.cli.build_map import make_parser
-from cliploc_ros.cli.map_layer import make_layer, write_layer
+from cliploc_ros.cli.map_layer import make_layer
 from cliploc_ros.cli.sources import read_frames
 from cliploc_ros.core.keyframes.layer import load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.datasets.map_recording import MapRecording
+from cliploc_ros.offline.make_map import MadeMap, write_made_map
 
 ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 WALK = ['--tum', str(ASSETS / 'mapping')]
@@ -24,7 +26,8 @@ def test_a_walk_gives_a_layer_next_to_its_map(tmp_path):
         *WALK, '--keyframe-layer', '--keyframe-points', '100', '--out', str(tmp_path / 'a.yaml')])
     made, note = make_layer(options, read_frames(options), landmark_map)
     assert not note
-    line = write_layer(options.out, made)
+    line, = write_made_map(options.out, MadeMap(landmark_map, None, layer=made), [],
+                           MapRecording(tmp_path / 'a.npz'))
     layer = load_layer_of_map(tmp_path / 'a.keyframes.npz', landmark_map)
     assert line.startswith(f'keyframes: {len(layer)} with {len(layer.points)} points, ')
     assert len(layer) >= 20

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What each detection may show: by class, label and image, in maps small and large."""
 
-import time
 from dataclasses import replace
 from math import comb
 
@@ -26,7 +25,7 @@ from cliploc_ros.core.map.similarities import (
     nearest_landmarks,
 )
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.options import RelocalizerOptions, used_time_s
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search import frame_search
 from cliploc_ros.core.search.frame_search import (
@@ -232,7 +231,7 @@ def time_budget_is_kept(observation, landmark_map, frames):
     relocalizer = Relocalizer(landmark_map, RelocalizerOptions(iterations=1_000_000,
                                                                time_budget_s=0.05))
     relocalizer.warm_up()
-    earlier = [relocalizer.search(observation, time.perf_counter() + 0.05)] * (frames - 1)
+    earlier = [relocalizer.search(observation, used_time_s() + 0.05)] * (frames - 1)
     took_ms = {}
     for budget_s in (1e-3, 0.05):
         took_ms[budget_s] = []
@@ -240,7 +239,7 @@ def time_budget_is_kept(observation, landmark_map, frames):
             budget = replace(relocalizer.begin(frames), total_s=budget_s)
             newest = relocalizer.search(observation, budget.search_end())
             found = relocalizer.locate([*earlier, newest], budget)
-            took_ms[budget_s].append(budget.elapsed_ms)
+            took_ms[budget_s].append(1e3 * (used_time_s() - budget.start))
     least_ms, took_ms = took_ms.values()
     print(f'\n{len(landmark_map)} landmarks, {frames} frames, 50 ms: took {min(took_ms):.1f} to '
           f'{max(took_ms):.1f} ms, without a budget {min(least_ms):.1f}, {found.tried} '

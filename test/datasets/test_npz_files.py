@@ -103,6 +103,11 @@ def refuse(path, arrays, change, load, message):
     (put('scores', 2, -0.1), 'scores.* in row 2'),
     (put('scores', 2, 1.5), 'scores.* in row 2'),
     (put('map_from_camera', (2, 3, 0), 1.0), 'rigid.* in row 2'),
+    (put('map_from_camera', (2, 0, 3), 1e300), 'beyond any measure'),
+    (put('boxes_xyxy', (1, 2), 1e308), 'beyond any measure.* row 1'),
+    (become('depths', [1.0, np.inf, np.nan]), 'depths is not positive and finite in row 1'),
+    (become('stamps_ns', [0, 1, 2]), 'stamps_ns contradicts timestamps in row 0'),
+    (become('clip_ms', [1.0, -2.0, 3.0]), 'clip_ms is negative'),
     (become('scores', np.array([1, 'a', None], dtype=object)), 'scores cannot be')])
 def test_malformed_arrays_are_named(tmp_path, kind, change, message):
     refuse(tmp_path / 'q.npz', kind[0](), change, kind[1], message)
@@ -238,7 +243,8 @@ def test_what_is_gone_is_none_and_what_is_damaged_is_named(built):
     assert load_recording(path) is None
     for text in ('{', '{"speed": 1}', '{"observations": "m.yaml", "scale": -1}',
                  '{"observations": "m.yaml", "scale": Infinity}', '[]', 9_999 * '[',
-                 '{"observations": "m.yaml", "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]}'):
+                 '{"observations": "m.yaml", "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]}',
+                 '{"observations": "m.yaml", "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}'):
         recording_path(path).write_text(text)
         with pytest.raises(DatasetError, match='recording'):
             load_recording(path)

@@ -18,6 +18,7 @@ from disks import small_disk
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import WorkersError, run_tasks
+from cliploc_ros.files.storage import is_foreign
 
 PROJECT = Path(__file__).resolve().parents[2]
 
@@ -195,3 +196,13 @@ def test_without_dask(monkeypatch):
     monkeypatch.setitem(sys.modules, 'distributed', None)  # as where it is not installed
     with pytest.raises(OptionsError, match='pip install'):
         results(Square(), scheduler='tcp://127.0.0.1:9')
+
+
+@pytest.mark.parametrize(('mode', 'is_own_group', 'foreign'), [
+    (0o755, False, False), (0o775, True, False), (0o775, False, True), (0o777, True, True)])
+def test_what_a_group_of_others_can_write_to_is_foreign(tmp_path, mode, is_own_group, foreign):
+    others = [one for one in os.getgroups() if one not in (0, os.getgid())] or [12345]
+    os.chown(tmp_path, -1, os.getgid() if is_own_group else others[0])
+    tmp_path.chmod(mode)
+    assert is_foreign(tmp_path.stat(), {os.getuid()}) is foreign
+    assert is_foreign(tmp_path.stat(), {os.getuid() + 1})

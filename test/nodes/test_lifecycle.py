@@ -157,8 +157,12 @@ def test_the_manager_hears_by_a_bond_whether_a_node_lives(manage, tester, room_m
         heard.clear()
     manager.do('configure', 'activate')
     tester.wait(lambda: KeyValue(key='relocalizer', value='alive') in heard, 'its heartbeat')
-    assert process.stop(signal.SIGTERM)[0] == 0
+    tester.ask()  # which waits for frames
+    process.send(signal.SIGTERM)
+    begun_at = time.monotonic()
     tester.wait(lambda: KeyValue(key='relocalizer', value='dead') in heard, 'its last word')
+    assert time.monotonic() - begun_at < 1.0, 'the manager misses its heartbeat after 4 s'
+    assert process.stop(signal.SIGTERM)[0] == 0
     assert 'Traceback' not in process.output()
 
 

@@ -3,6 +3,7 @@
 """A relocalizer that searches two floors, and changes of its maps while it runs."""
 
 import importlib
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -86,3 +87,31 @@ def test_a_map_is_loaded_as_nav2_loads_its_own(own_relocalizer, tester, floors, 
     assert load(f'file://{first}') == srv.LoadMap.Response.RESULT_SUCCESS
     assert tester.relocalize(make_frame()).success
     assert not tester.relocalize(make_frame(see_room(other_room()))).success
+
+
+@pytest.mark.full
+@pytest.mark.needs('nav2_msgs')
+def test_no_url_keeps_the_relocalizer_from_answering(own_relocalizer, tester, floors, tmp_path):
+    """Pipes, devices, files with holes, floods, names that no file has: each 50 times."""
+    srv = importlib.import_module('nav2_msgs.srv')
+    first, _ = floors(ROOM, other_room())
+    process = own_relocalizer(map_file=first)
+
+    def load(url):
+        return tester.call(srv.LoadMap, '/relocalizer/load_map',
+                           srv.LoadMap.Request(map_url=url)).result
+    os.mkfifo(tmp_path / 'pipe')
+    with (tmp_path / 'holes').open('wb') as file:
+        file.truncate(3 * 2**30)
+    (tmp_path / 'flood').write_text(f'a: [{"[]," * 1_600_000}1]')
+    for name in ('pipe', 'holes', 'flood', '', 'x' * 300, 'x' * 1_000_000):
+        for _ in range(50):
+            assert load(str(tmp_path / name)) != srv.LoadMap.Response.RESULT_SUCCESS
+    for url in ('/dev/zero', '/dev/stdin', 'package://', 'package://nowhere/map.yaml',
+                f'package://{"x" * 300}/map.yaml'):
+        for _ in range(50):
+            assert load(url) != srv.LoadMap.Response.RESULT_SUCCESS
+    assert load(first) == srv.LoadMap.Response.RESULT_SUCCESS
+    assert tester.relocalize(make_frame()).success
+    assert process.memory_mib('VmHWM') < 1000
+    assert max(map(len, process.output().splitlines())) < 2000

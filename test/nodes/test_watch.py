@@ -139,6 +139,17 @@ def test_a_lost_robot_is_relocalized_once_it_stands(watch):
     assert watched.process.output().count('relocalizing') == 1
 
 
+def test_a_localizer_that_started_again_without_a_pose_is_woken_up(watch, tester):
+    """As AMCL with use_respawn: it publishes and subscribes again, and waits for a pose."""
+    watched = watch(on_lost='relocalize')
+    watched.until_state('localized')
+    watched.robot.speed_m_s, watched.robot.has_localizer = 0.0, False
+    tester.localizer.start_again()
+    watched.until(lambda: tester.poses, 'a request')
+    watched.until_state('localized')
+    assert 'the localizer has no pose' in watched.process.output()
+
+
 def test_a_map_of_another_frame_ends_the_verdict_of_the_one_before(watch, tester, tmp_path):
     """No image comes meanwhile: the verdict falls with its map, not with the next look."""
     watched = watch()

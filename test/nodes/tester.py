@@ -33,10 +33,20 @@ class TakingLocalizer:
 
     def __init__(self, node, namespace=''):
         self.is_on, self.frame = True, None
-        self._publisher = node.create_publisher(
-            PoseWithCovarianceStamped, f'{namespace}amcl_pose', LATCHED)
-        self._subscription = node.create_subscription(
-            PoseWithCovarianceStamped, f'{namespace}initialpose', self._show, RELIABLE)
+        self._node, self._namespace = node, namespace
+        self._start()
+
+    def _start(self):
+        self._publisher = self._node.create_publisher(
+            PoseWithCovarianceStamped, f'{self._namespace}amcl_pose', LATCHED)
+        self._subscription = self._node.create_subscription(
+            PoseWithCovarianceStamped, f'{self._namespace}initialpose', self._show, RELIABLE)
+
+    def start_again(self):
+        """Know no pose any more, as a process that was killed and started again."""
+        self._node.destroy_publisher(self._publisher)
+        self._node.destroy_subscription(self._subscription)
+        self._start()
 
     def _show(self, pose):
         pose.header.frame_id = self.frame or pose.header.frame_id

@@ -43,7 +43,6 @@ class Robot:
     def __init__(self, tester):
         self._tester, self._tick, self.image_every = tester, 0, 2
         self._odom = tester.create_publisher(Odometry, 'odom', RELIABLE)
-        self._pose = tester.localizer._publisher
         self.speed_m_s, self._x, self._sign = 0.3, 0.0, 1.0
         #: (4, 4): where its run of odometry began; another one after it was carried away.
         self.start = MAP_FROM_CAMERA @ aside(-1.5)
@@ -101,4 +100,4 @@ class Robot:
             Header(frame_id=self.frame_id, stamp=stamp(now_s)),
             self.map_from_odom @ odom_from_base, 0.01 * np.eye(6))
         shown.pose.pose.position.x += self.error_m
-        self._pose.publish(shown)
+        self._tester.localizer._publisher.publish(shown)

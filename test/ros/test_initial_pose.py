@@ -21,11 +21,11 @@ from cliploc_ros.ros.inputs.stamps import TimeJumpError
 
 
 @pytest.mark.clock
-def test_without_a_localizer_the_pose_is_withheld(robot):
+def test_without_a_localizer_the_pose_is_withheld_once_time_is_up(robot):
     start = time.monotonic()
-    with pytest.raises(NoLocalizerError, match='/initialpose'):
-        robot.hand_over()
-    assert 1.0 < time.monotonic() - start < 5.0
+    with pytest.raises(NoLocalizerError, match=r'/initialpose.*ask again'):
+        robot.hand_over(4.0)
+    assert 3.0 < time.monotonic() - start < 5.0
     robot.localizer.subscribe()
     robot.meet()
     robot.hand_over()
@@ -34,9 +34,10 @@ def test_without_a_localizer_the_pose_is_withheld(robot):
 
 
 def test_a_localizer_that_starts_meanwhile_is_waited_for(robot):
-    starting = threading.Timer(0.3, robot.localizer.subscribe)
+    """Discovery takes up to three seconds."""
+    starting = threading.Timer(3.0, robot.localizer.subscribe)
     starting.start()
-    assert robot.hand_over() > 0.2
+    assert robot.hand_over() > 2.0
     robot.wait(lambda: robot.localizer.poses, 'the pose')
     starting.join()
 
@@ -129,6 +130,42 @@ def test_a_localizer_has_taken_the_pose_once_it_shows_it(robot, off_m, named):
         robot.hand_over(3.2)
     assert len(robot.localizer.poses) == (3 if named else 1)
     robot.handoff.close()
+
+
+@pytest.fixture
+def showing(served):
+    """A localizer that shows what it is given, and that may stop to do so."""
+    localizer, node = served.localizer, served.localizer.node
+    shows = node.create_publisher(PoseWithCovarianceStamped, 'amcl_pose', 10)
+
+    def show(pose):
+        pose.pose.pose.orientation.w = 1.0
+        shows.publish(pose)
+    node.create_subscription(PoseWithCovarianceStamped, 'initialpose', show, 10)
+    served.handoff.open('amcl_pose')
+    served.wait(lambda: not served.handoff.missing() and shows.get_subscription_count(), 'both')
+    localizer.show = lambda: show(make_pose())
+    yield served
+    served.handoff.close()
+
+
+def test_a_localizer_that_dies_while_it_settles_has_not_taken_the_pose(showing):
+    """It showed the pose, and then answers no update and shows nothing more."""
+    showing.localizer.may_answer.clear()
+    with pytest.raises(NoLocalizerError, match=r'took the pose and has ended or hangs since'):
+        showing.hand_over()
+    assert len(showing.localizer.poses) == 1
+    showing.localizer.may_answer.set()
+
+
+def test_a_localizer_that_answers_no_update_but_shows_its_pose_has_taken_it(showing):
+    showing.localizer.may_answer.clear()
+    with ThreadPoolExecutor(1) as pool:
+        handing_over = pool.submit(showing.hand_over)
+        showing.wait(lambda: showing.localizer.updates, 'an update')
+        showing.localizer.show()
+        handing_over.result()
+    showing.localizer.may_answer.set()
 
 
 @pytest.mark.parametrize(('timeout_s', 'named', 'times'), [

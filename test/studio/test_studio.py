@@ -16,6 +16,7 @@ from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.studio import Studio
+from cliploc_ros.offline.studio.web import once
 
 
 @pytest.fixture
@@ -150,21 +151,27 @@ def opens(host, origin, path='/'):
 
 
 @pytest.mark.needs('viser')
-def test_the_page_is_for_this_machine_only(tmp_path):
-    with open_page(Studio(Document(tmp_path / 'map.yaml'))) as (url, _):
-        assert answer(url) == 200
-        assert answer(url, Host='evil.example') == 403, 'a name that points here'
-        host = url.removeprefix('http://').rstrip('/')
-        assert opens(host, None) is False
-        assert opens(host, 'http://evil.example') is False, 'a foreign page'
-        assert opens(host, f'http://{host}') is True
+@pytest.mark.parametrize('host', ['127.0.0.1', '0.0.0.0'])
+def test_only_who_has_the_token_opens_the_page(tmp_path, host):
+    """Not another user of this machine, nor a page of another site."""
+    with open_page(Studio(Document(tmp_path / 'map.yaml')), host) as (url, _):
+        base, token = url.rstrip('/').rsplit('/', 1)
+        assert len(token) >= 32 and answer(url) == 200
+        for wrong in ('', f'/{token[:-1]}/', '/studio.js'):
+            assert answer(base + wrong) == 403
+        where = base.removeprefix('http://')
+        assert opens(where, base) is False and opens(where, base, f'/{token}') is True
+        assert opens(where, None, f'/{token}') is False
+        assert opens(where, 'http://evil.example', f'/{token}') is False, 'a foreign page'
+        is_named = host == '0.0.0.0'
+        assert answer(url, Host='evil.example') == (200 if is_named else 403), 'it points here'
+        assert answer(url, Host='[') == answer(url, Origin='http://[') == 403, 'no host'
 
 
 @pytest.mark.needs('viser')
-def test_beyond_this_machine_the_url_has_a_token(tmp_path):
-    with open_page(Studio(Document(tmp_path / 'map.yaml')), '0.0.0.0') as (url, _):
-        base, token = url.rstrip('/').rsplit('/', 1)
-        assert len(token) >= 32 and answer(url) == 200
-        assert answer(base) == answer(f'{base}/{token[:-1]}/') == 403
-        host = base.removeprefix('http://')
-        assert opens(host, base) is False and opens(host, base, f'/{token}') is True
+def test_the_address_on_the_command_line_of_a_browser_opens_the_page_once(tmp_path):
+    with open_page(Studio(Document(tmp_path / 'map.yaml'))) as (url, _):
+        shown = once(url)
+        assert url.rstrip('/').rsplit('/', 1)[1] not in shown
+        assert answer(shown) == 200, 'it leads to the page'
+        assert answer(shown) == 403

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The image embeddings next to a map follow their landmarks through edits, undo and a kill."""
 
-import os
 
 import numpy as np
 import pytest
@@ -95,10 +94,11 @@ def test_rows_follow_their_landmarks(path, rows):
     document.close()
 
 
-def test_a_save_that_was_cut_off_between_both_files_is_finished(path, rows):
+def test_a_save_that_was_cut_off_between_both_files_is_finished(path, rows, monkeypatch):
     killed = Document(path)
     change_all(killed)
-    blocker = path.with_name(f'.{os.getpid()}.{path.name}')
+    monkeypatch.setattr('secrets.token_hex', lambda _: 'next')
+    blocker = path.with_name(f'.next.{path.name}')
     blocker.mkdir()
     with pytest.raises(MapError, match='cannot be written'):
         killed.save()

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The best hypotheses of a search: refined, distinct, each with its inliers and covariance."""
 
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     make_transform,
 )
+from cliploc_ros.core.options import used_time_s
 from cliploc_ros.core.search.frame_search import REFINED, SearchedFrame
 from cliploc_ros.core.search.strategies import MAX_DISTINCT
 
@@ -92,7 +92,7 @@ def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, coun
 
     Without refinement no two of them lie at the same place. A place may have several refined
     poses, of different matches: which of them is best, their support tells. At most `count` poses
-    are refined, until a deadline of time.perf_counter [s]; the others, worse ones, stay as found.
+    are refined, until a deadline of used_time_s [s]; the others, worse ones, stay as found.
     """
     found = [one for frame in range(len(frames))
              for one in _leaders_of(frames, rig, frame)[:_SCORED // len(frames)**2]]
@@ -107,7 +107,7 @@ def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, coun
         return found[:MAX_DISTINCT]
     improved: list[Finalist] = []
     for some in batched(found, _REFINED_AT_ONCE):
-        in_time = not improved or time.perf_counter() <= deadline
+        in_time = not improved or used_time_s() <= deadline
         improved += [one._replace(**refine_rig(rig, one.rotation, one.translation)._asdict())
                      for one in some] if in_time else some
     improved.sort(key=lambda one: -one.score)

@@ -14,7 +14,6 @@ import logging
 import os
 import pickle
 import re
-import stat
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -32,7 +31,12 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 from numba.core.types import BaseTuple, Type  # type: ignore[attr-defined]
 
-from cliploc_ros.files.storage import resolve_cache_dir
+from cliploc_ros.files.storage import (
+    is_foreign,
+    read_file,
+    replace_file,
+    resolve_cache_dir,
+)
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 _ROOT = _PACKAGE.name
@@ -115,14 +119,11 @@ class KernelFolders:
     @staticmethod
     def _write(file: Path, content: bytes) -> str:
         """Write a file in one step; return what failed, or ''."""
-        partial = file.with_name(f'.{file.name}.{os.getpid()}.partial')
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            partial.write_bytes(hashlib.sha256(content).digest() + content)
-            partial.replace(file)
+            with replace_file(file) as partial:
+                partial.write_bytes(hashlib.sha256(content).digest() + content)
         except OSError as error:
-            if file.parent.is_dir() and os.access(file.parent, os.W_OK):
-                partial.unlink(missing_ok=True)
             return f'{file.parent}: {error.strerror}'
         return ''
 
@@ -215,7 +216,7 @@ def _hash(value: object) -> str:
 def _read(file: Path) -> bytes | None:
     """Return the content of a file if it is whole, and only trusted users can write to it."""
     try:
-        content = file.read_bytes()
+        content = read_file(file)
     except OSError:
         return None
     if _is_foreign(file):
@@ -234,8 +235,7 @@ def _is_foreign(file: Path) -> bool:
     A forged kernel runs code. Who owns the package can run code anyway.
     """
     trusted = {os.getuid(), 0, Path(__file__).stat().st_uid}
-    return any(each.stat().st_uid not in trusted or each.stat().st_mode & stat.S_IWOTH
-               for each in (file, file.parent))
+    return any(is_foreign(each.stat(), trusted) for each in (file, file.parent))
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -28,8 +28,10 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import are_rigid
 from cliploc_ros.core.keyframes.features import ONLY_SIFT, SIFT, FeatureKind, FeatureKinds
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.parameter_file import check_set
 from cliploc_ros.errors import CameraError, MapError
-from cliploc_ros.files.arrays import ArrayError, Arrays, Check, Field, Offsets, Schema
+from cliploc_ros.files.arrays import FINITE, ArrayError, Arrays, Check, Field, Offsets, Schema
+from cliploc_ros.files.storage import parse_json
 
 # Focal lengths, as shares of the image's width, count as equal within this.
 _SAME_FOCAL = 0.02
@@ -76,6 +78,7 @@ class KeyframeLayer:
     #: (K,): which camera took each keyframe, 0 for the first one; None: the first one took all
     camera_rows: NDArray[np.int64] | None = None
     kind: FeatureKind = SIFT  #: Of the descriptors
+    set_digest: str = ''  #: Of the map that it was written with; '' where it is unknown
 
     def __len__(self) -> int:
         """Return the number of keyframes."""
@@ -182,12 +185,12 @@ def _check_words(name: str, arrays: Arrays) -> None:
 _SCHEMA = Schema('file of keyframes', {
     'header': Field('text'),
     'landmark_ids': Field('text', ('L',)),
-    'landmark_centers': Field('float32', ('L', 3)),
+    'landmark_centers': Field('float32', ('L', 3), (FINITE,)),
     'map_from_camera': Field('float64', ('K', 4, 4), (
-        Check('is no rigid transform', lambda poses: ~are_rigid(poses)),)),
+        FINITE, Check('is no rigid transform', lambda poses: ~are_rigid(poses)))),
     'offsets': Field('int64', ('K+1',), (Offsets('descriptors', 'points'),)),
     'pixels': Field('uint16', ('n', 2), stays=True),
-    'points': Field('float32', ('n', 3), stays=True),
+    'points': Field('float32', ('n', 3), (FINITE,), stays=True),
     'descriptors': Field('uint8', ('n', 'd'), stays=True),
     'words': Field('uint16', ('n',), (_check_words,)),
     'vocabulary': Field('uint8', ('W', 'd')),
@@ -197,13 +200,18 @@ _SCHEMA = Schema('file of keyframes', {
     # only there for several cameras, which the header has
     'camera_rows': Field('int64', ('K',), is_optional=True),
 }, MapError, 'make the layer again with build_map --keyframe-layer, or remove the file',
-    {'K': 'keyframes', 'W': 'keyframes'}, is_stored=True, checks_sums=False,
+    {'K': 'keyframes', 'W': 'keyframes'}, is_stored=True,
     largest_read=256_000_000)
 
 
 def layer_path(map_path: str | os.PathLike[str]) -> Path:
     """Return the file of a map's keyframes: NAME.keyframes.npz next to NAME.yaml."""
     return Path(map_path).with_suffix('.keyframes.npz')
+
+
+def removed_layer(map_path: str | os.PathLike[str]) -> str:
+    """Return that the layer of a map went with it, for the user."""
+    return f'removed {layer_path(map_path)}: its keyframes belonged to the map before'
 
 
 def save_layer(path: Path, layer: KeyframeLayer) -> None:
@@ -214,6 +222,8 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
     header = {'version': VERSION, 'descriptors': layer.kind.name, 'frame_id': layer.frame_id,
               'deviation_per_metre': layer.deviation_per_metre,
               'camera': _numbers_of(layer.camera)}
+    if layer.set_digest:
+        header['set'] = layer.set_digest
     if layer.other_cameras:
         header['other_cameras'] = list(map(_numbers_of, layer.other_cameras))
     names = [name for name in _SCHEMA.fields
@@ -228,22 +238,6 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
 
 def _numbers_of(camera: Camera) -> dict[str, float]:
     return {name: getattr(camera, name) for name in _CAMERA}
-
-
-def remove_layer(map_path: str | os.PathLike[str]) -> str:
-    """Remove the layer of a map that another one has replaced; return a note, '' without one.
-
-    MapError: the file cannot be removed.
-    """
-    path = layer_path(map_path)
-    try:
-        path.unlink()
-    except FileNotFoundError:
-        return ''
-    except OSError as error:
-        raise MapError(f'{path}: belongs to the map before and cannot be removed: '
-                       f'{error.strerror}; remove it') from error
-    return f'removed {path}: its keyframes belonged to the map before'
 
 
 def load_layer_of_map(path: Path, landmark_map: LandmarkMap, kinds: FeatureKinds = ONLY_SIFT
@@ -276,9 +270,9 @@ def _layer_of(arrays: dict[str, NDArray[Any]], kinds: FeatureKinds) -> KeyframeL
     if ('images' in arrays) != ('image_offsets' in arrays):
         raise ArrayError('array images or image_offsets is missing')
     try:
-        header = json.loads(str(arrays.pop('header')))
+        header = parse_json(str(arrays.pop('header')))
         version, name = header.get('version'), str(header.get('descriptors'))
-    except (AttributeError, ValueError, RecursionError) as error:
+    except (AttributeError, ValueError) as error:
         raise ArrayError(f'its header is no JSON object ({error})') from error
     if version != VERSION:
         raise ArrayError(f'is of version {version!r}, expected {VERSION}')
@@ -302,11 +296,16 @@ def _layer_of(arrays: dict[str, NDArray[Any]], kinds: FeatureKinds) -> KeyframeL
     return KeyframeLayer(str(header.get('frame_id', '')),
                          tuple(map(str, arrays.pop('landmark_ids'))),
                          arrays.pop('landmark_centers'), camera, **arrays,
-                         deviation_per_metre=deviation, other_cameras=tuple(others), kind=kind)
+                         deviation_per_metre=deviation, other_cameras=tuple(others), kind=kind,
+                         set_digest=str(header.get('set', '')))
 
 
 def _check_map(layer: KeyframeLayer, landmark_map: LandmarkMap) -> None:
     """Refuse the layer of another map. Landmarks may be new, gone or moved, but not in general."""
+    try:
+        check_set(layer.set_digest, landmark_map.map_set.family)
+    except ValueError as error:
+        raise ArrayError(str(error)) from error
     if layer.frame_id != landmark_map.frame_id:
         raise ArrayError(f"is of a map in frame '{layer.frame_id}', not "
                           f"'{landmark_map.frame_id}'")

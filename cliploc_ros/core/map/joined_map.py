@@ -113,7 +113,7 @@ def join_maps(maps: Sequence[LandmarkMap], sources: Sequence[str]) -> LandmarkMa
         np.concatenate([part.landmark_map.centers + part.shift for part in parts]),
         np.concatenate([one.semi_axes for one in maps]),
         np.concatenate([one.quats_xyzw for one in maps]),
-        tuple(chain.from_iterable(details)), tuple(parts))
+        tuple(chain.from_iterable(details)), parts=tuple(parts))
 
 
 def parts_of(landmark_map: LandmarkMap) -> tuple[MapPart, ...]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.map.parameter_file import NO_SET, MapSet, check_set
 from cliploc_ros.core.map.similarities import LabelEmbeddings
 from cliploc_ros.errors import MapError
 from cliploc_ros.files.arrays import UNIQUE, ArrayError, Arrays, Check, Field, Offsets, Schema
@@ -42,6 +43,7 @@ _SCHEMA = Schema('file of embeddings', {
     'medoid_offsets': Field('integers', ('L+1',), (Offsets('medoids', 'medoids'), Check(
         f'gives a landmark more than {MOST_MEDOIDS} medoids',
         lambda offsets: np.diff(offsets) > MOST_MEDOIDS))),
+    'set': Field('text', is_optional=True),
 }, MapError, 'build the map again, or remove the file')
 
 
@@ -59,6 +61,7 @@ class LandmarkEmbeddings:
     #: (L + 1,): landmark l has the medoids from medoid_offsets[l] up to medoid_offsets[l + 1], at
     #: most five
     medoid_offsets: NDArray[np.int64]
+    set_digest: str = ''  #: Of the map that they were written with; '' where it is unknown
 
     def __len__(self) -> int:
         """Return the number of landmarks."""
@@ -98,18 +101,22 @@ def embeddings_path(map_path: str | os.PathLike[str]) -> Path:
     return Path(map_path).with_suffix('.embeddings.npz')
 
 
-def load_embeddings_of_map(map_path: str | os.PathLike[str], landmark_ids: Sequence[str]
-                           ) -> LandmarkEmbeddings | None:
+def load_embeddings_of_map(map_path: str | os.PathLike[str], landmark_ids: Sequence[str],
+                           map_set: MapSet = NO_SET) -> LandmarkEmbeddings | None:
     """Return the embeddings of a map's landmarks, in its order; None where it has no such file.
 
     Landmarks that were removed from the map are left out, and added ones are unknown.
 
-    MapError: the file is invalid, or it has none of these landmarks.
+    MapError: the file is invalid, of another set, or has none of these landmarks.
     """
     path = embeddings_path(map_path)
     if not path.exists():
         return None
     embeddings = load_landmark_embeddings(path)
+    try:
+        check_set(embeddings.set_digest, map_set.digest)
+    except ValueError as error:
+        raise _SCHEMA.invalid(path, error) from error
     if not set(embeddings.landmark_ids) & set(landmark_ids):
         raise MapError(f'{path}: holds no landmark of {map_path}: it is of another map; remove it')
     return embeddings.in_order(landmark_ids)
@@ -124,7 +131,7 @@ def load_landmark_embeddings(path: str | os.PathLike[str]) -> LandmarkEmbeddings
     return LandmarkEmbeddings(
         str(arrays['encoder_key']), tuple(map(str, arrays['landmark_ids'])),
         arrays['means'].astype(np.float16), arrays['medoids'].astype(np.float16),
-        arrays['medoid_offsets'].astype(np.int64))
+        arrays['medoid_offsets'].astype(np.int64), str(arrays.get('set', '')))
 
 
 def save_landmark_embeddings(path: str | os.PathLike[str], embeddings: LandmarkEmbeddings
@@ -138,7 +145,8 @@ def save_landmark_embeddings(path: str | os.PathLike[str], embeddings: LandmarkE
         'landmark_ids': np.array(embeddings.landmark_ids, dtype=np.str_),
         'means': embeddings.means.astype(np.float16),
         'medoids': embeddings.medoids.astype(np.float16),
-        'medoid_offsets': embeddings.medoid_offsets.astype(np.int64)})
+        'medoid_offsets': embeddings.medoid_offsets.astype(np.int64),
+        'set': np.array(embeddings.set_digest)})
 
 
 def with_images(labels: LabelEmbeddings, images: LandmarkEmbeddings, compare: str

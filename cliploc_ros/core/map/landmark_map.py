@@ -8,6 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,12 +32,16 @@ from cliploc_ros.core.map.landmark_details import (
 )
 from cliploc_ros.core.map.pairs import LandmarkPairs, make_pairs
 from cliploc_ros.core.map.parameter_file import (
+    NO_SET,
+    MapSet,
     WrittenMap,
     parse_parameters,
     parse_written_map,
     read_text,
+    set_of,
 )
 from cliploc_ros.errors import MapError, did_you_mean
+from cliploc_ros.files.storage import finish_set
 
 _UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation')
@@ -197,6 +202,7 @@ class LandmarkMap:
     quats_xyzw: NDArray[np.float64]
     #: Optional fields of each landmark; empty where the map has none
     details: tuple[LandmarkDetails, ...] = ()
+    map_set: MapSet = NO_SET  #: What the files next to the map's own have to be of
 
     def __len__(self) -> int:
         """Return the number of landmarks."""
@@ -339,11 +345,13 @@ class LandmarkMap:
             Names the file, the landmark and the field to correct.
         """
         text = read_text(path)
+        map_set = set_of(text)
+        finish_set(Path(path), map_set.digest)
         if (written := parse_written_map(text)) is not None and _is_valid(written):
-            return LandmarkMap(*written._replace(quats_xyzw=_unit(written.quats_xyzw)))
+            return LandmarkMap(*written._replace(quats_xyzw=_unit(written.quats_xyzw)), map_set)
         tree = parse_parameters(text, path)
         found = tree[find_map_node(tree, path)]['ros__parameters']['map']
-        return LandmarkMap.from_mapping(found, str(path))
+        return replace(LandmarkMap.from_mapping(found, str(path)), map_set=map_set)
 
     @staticmethod
     def from_mapping(tree: Any, source: str) -> 'LandmarkMap':

@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write a map as a ROS 2 parameter file, see LandmarkMap.from_file, and what lies next to it."""
 
+import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,18 +20,19 @@ from cliploc_ros.core.map.landmark_embeddings import (
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError
-from cliploc_ros.files.storage import replace_file
+from cliploc_ros.files.storage import WriteOfSet, replace_file, replace_set
 
 _INDENT = ' ' * 10
 
 
 def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
-              comments: Iterable[str] = (), embeddings: LandmarkEmbeddings | None = None
-              ) -> None:
-    """Write a map file in one step: an existing file is replaced complete, or stays.
+              comments: Iterable[str] = (), embeddings: LandmarkEmbeddings | None = None,
+              besides: Mapping[Path, WriteOfSet | None] | None = None) -> None:
+    """Write a map file and what lies next to it: the old set is replaced complete, or stays.
 
     Comments are lines for the head of the file. Image embeddings are written next to the map;
-    those of a map that is replaced are removed: they are not of the new one.
+    those of a map that is replaced are removed: they are not of the new one. `besides` are further
+    files, see cliploc_ros.files.storage.replace_set.
 
     Raises
     ------
@@ -37,22 +40,33 @@ def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
         A file cannot be written.
     """
     path = Path(path)
-    try:
-        with replace_file(path) as partial, partial.open('w', encoding='utf-8') as file:
+
+    def write(place: Path, digest: str) -> None:
+        family = landmark_map.map_set.family or digest
+        with replace_file(place) as partial, partial.open('w', encoding='utf-8') as file:
             file.writelines(f'# {" ".join(line.split())}\n' for line in comments)
+            file.write(f'# set {family} {digest}\n')
             file.writelines(f'{line}\n' for line in _lines(landmark_map))
+
+    def write_embeddings(place: Path, digest: str) -> None:
+        assert embeddings is not None
+        save_landmark_embeddings(place, replace(embeddings, set_digest=digest))
+
+    try:
+        replace_set(path, set_digest(landmark_map), write, {
+            embeddings_path(path): None if embeddings is None else write_embeddings,
+            **(besides or {})})
     except OSError as error:
         raise MapError(f'{path}: cannot be written: {error.strerror}; nothing was changed'
                        ) from error
-    path = embeddings_path(path)
-    if embeddings is not None:
-        save_landmark_embeddings(path, embeddings)
-        return
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise MapError(f'{path}: is not of the map that was written; it cannot be removed: '
-                       f'{error.strerror}') from error
+
+
+def set_digest(landmark_map: LandmarkMap) -> str:
+    """Return what tells a map and the files that are written with it from other ones."""
+    digest = hashlib.sha256()
+    for line in _lines(landmark_map):
+        digest.update(line.encode())
+    return digest.hexdigest()[:12]
 
 
 def _lines(landmark_map: LandmarkMap) -> Iterator[str]:

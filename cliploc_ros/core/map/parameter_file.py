@@ -17,7 +17,6 @@ import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from stat import S_ISREG
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,9 +25,14 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.errors import MapError
+from cliploc_ros.files.storage import read_file
 
-MAX_FILE_BYTES = 256 * 1024 * 1024
 _MAX_DEPTH = 16
+# Values, keys and collections, which PyYAML reads at 3 us each. A landmark has about 30; larger
+# maps have the layout of write_map.
+_MAX_EVENTS = 6_000_000
+# The labels of a landmark may be a list of mappings; no field has more.
+_MOST_IN_LIST = 1000
 # Words that YAML 1.1, and so ROS, reads as booleans.
 _TRUE = frozenset({'y', 'yes', 'true', 'on'})
 _FALSE = frozenset({'n', 'no', 'false', 'off'})
@@ -47,6 +51,7 @@ _HEAD = re.compile(
     r'(?:#[ -~\u00a0-\ud7ff]*\n)*+/\*\*:\n  ros__parameters:\n    map:\n'
     rf'      frame_id: ({_TEXT})\n'
     r'      landmarks:\n')
+_SET = re.compile(r'(?:#.*\n)*?# set ([0-9a-f]{12}) ([0-9a-f]{12})\n')
 _INDENT = ' ' * 10
 # Groups of _LANDMARK before those of the details.
 _PLAIN = 6
@@ -68,20 +73,11 @@ def read_text(path: str | os.PathLike[str]) -> str:
     """
     path = Path(path)
     try:
-        if not S_ISREG(path.stat().st_mode):
-            # a parameter may name a device or a pipe, which never end
-            raise MapError(f'{path}: not a regular file')
-        with path.open('rb') as file:
-            content = file.read(MAX_FILE_BYTES + 1)
-        if len(content) > MAX_FILE_BYTES:
-            raise MapError(f'{path}: larger than {MAX_FILE_BYTES // 2**20} MiB')
-        return content.decode('utf-8')
+        return read_file(path).decode('utf-8')
     except OSError as error:
         raise MapError(f'{path.absolute()}: {error.strerror}') from error
     except UnicodeDecodeError as error:
         raise MapError(f'{path}: not a text file in UTF-8 (byte {error.start})') from error
-    except ValueError as error:
-        raise MapError(f'{str(path)!r}: names no file: {error}') from error
 
 
 def parse_parameters(text: str, path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -107,8 +103,11 @@ def _build_tree(text: str) -> Any:
     root: list[Any] = []
     # the open collections, innermost last, each with the key that waits for its value
     stack: list[tuple[Any, list[str]]] = [(root, [])]
-    for event in yaml.parse(text, Loader=_LOADER):
+    for number, event in enumerate(yaml.parse(text, Loader=_LOADER)):
         line = event.start_mark.line + 1
+        if number > _MAX_EVENTS:
+            raise _TreeError(f'line {line}: more than {_MAX_EVENTS} values; write the map again '
+                             'with import_map or the studio')
         if isinstance(event, yaml.AliasEvent):
             raise _TreeError(f'line {line}: an alias (*{event.anchor}); write the value out')
         if isinstance(event, yaml.ScalarEvent):
@@ -116,6 +115,9 @@ def _build_tree(text: str) -> Any:
         elif isinstance(event, yaml.MappingStartEvent | yaml.SequenceStartEvent):
             if len(stack) > _MAX_DEPTH:
                 raise _TreeError(f'line {line}: nested deeper than {_MAX_DEPTH} levels')
+            outer = stack[-1][0]
+            if isinstance(outer, list) and len(outer) > _MOST_IN_LIST:
+                raise _TreeError(f'line {line}: a list of more than {_MOST_IN_LIST} collections')
             collection: Any = {} if isinstance(event, yaml.MappingStartEvent) else []
             _add(stack[-1], collection, line)
             stack.append((collection, []))
@@ -176,6 +178,29 @@ _LANDMARK = re.compile(''.join([
       for name in ('position_sigma', 'shared_sigma', 'shared_sigma_deg', 'seen_ratio',
                    'baseline_deg', 'last_seen')),
     rf'(?:{_INDENT}source: ({_TEXT})\n)?+']))
+
+
+class MapSet(NamedTuple):
+    """Which files belong to a map, by what its head says; '' where it says nothing."""
+
+    family: str = ''  #: Of the first map, which updates kept: keyframes hold for all of them
+    digest: str = ''  #: Of this map
+
+
+#: Of a map that does not say it.
+NO_SET = MapSet()
+
+
+def check_set(digest: str, of_map: str) -> None:
+    """Raise ValueError for a file of another set than a map's. An unknown one is accepted."""
+    if digest and of_map and digest != of_map:
+        raise ValueError(f'is of the set {digest}, its map of {of_map}')
+
+
+def set_of(text: str) -> MapSet:
+    """Return the set of a map file by its text, or by the beginning of it."""
+    found = _SET.match(text)
+    return MapSet(found[1], found[2]) if found else NO_SET
 
 
 class WrittenMap(NamedTuple):

@@ -8,7 +8,6 @@ landmarks whose labels are most similar to its crop, *hybrid* samples from clip 
 both.
 """
 
-import time
 from collections.abc import Iterator, Sequence
 from functools import partial
 from math import comb, inf
@@ -23,7 +22,7 @@ from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import ClassIndex, LandmarkMap
 from cliploc_ros.core.map.similarities import Similarities, nearest_landmarks, split_similarities
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.options import RelocalizerOptions, used_time_s
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Constraint, Scene, make_scene
 from cliploc_ros.core.search.strategies import (
     MAX_DISTINCT,
@@ -307,7 +306,7 @@ class SearchedFrame(NamedTuple):
 
 def search_frame(landmark_map: LandmarkMap, observation: Observation,
                  options: RelocalizerOptions, deadline: float) -> SearchedFrame:
-    """Search one frame, until a deadline of time.perf_counter [s].
+    """Search one frame, until a deadline of used_time_s [s].
 
     OptionsError: similarities that the matching type needs are missing or of the wrong shape, or
     the vertical is no unit vector.
@@ -374,6 +373,6 @@ def _run(search: Iterator[Progress], deadline: float) -> Progress:
     progress = Progress(0, 1.0)
     for step in search:
         progress = step
-        if time.perf_counter() > deadline:
+        if used_time_s() > deadline:
             break
     return progress

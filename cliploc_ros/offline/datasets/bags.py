@@ -108,7 +108,7 @@ class BagReader:
 
     def __enter__(self) -> Self:
         """Open the recording."""
-        if not self.path.exists():
+        if not (self.path.is_file() or self.path.is_dir()):
             raise DatasetError(f'{self.path}: no such recording')
         if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
             raise DatasetError(

@@ -14,11 +14,15 @@ from typing import Any
 
 import numpy as np
 
+from cliploc_ros.core.geometry.transforms import is_rigid, make_transform
+from cliploc_ros.core.map.parameter_file import check_set, set_of
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.files.storage import write_text
+from cliploc_ros.files.storage import open_file, parse_json, read_file, write_text
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
+# Comments at the head of a map take fewer bytes.
+_HEAD = 65_536
 _PATHS = ('observations', 'source', 'images')
 
 
@@ -56,14 +60,18 @@ def recording_path(map_file: Path) -> Path:
     return map_file.with_suffix('.recording.json')
 
 
-def save_recording(map_file: Path, recording: MapRecording) -> None:
-    """Write what a map was built from, next to it; CliplocError: the file cannot be written."""
+def save_recording(map_file: Path, recording: MapRecording, place: Path | None = None,
+                   set_digest: str = '') -> None:
+    """Write what a map was built from, next to it or to a place in the same folder.
+
+    CliplocError: the file cannot be written.
+    """
     folder = map_file.resolve().parent
-    values: dict[str, Any] = asdict(recording)
+    values: dict[str, Any] = asdict(recording) | ({'set': set_digest} if set_digest else {})
     for name in _PATHS:
         if values[name] is not None:
             values[name] = os.path.relpath(values[name].resolve(), folder)
-    write_text(recording_path(map_file), json.dumps(values, indent=1))
+    write_text(place or recording_path(map_file), json.dumps(values, indent=1))
 
 
 def load_recording(map_file: Path) -> MapRecording | None:
@@ -75,15 +83,19 @@ def load_recording(map_file: Path) -> MapRecording | None:
     if not path.is_file():
         return None
     try:
-        values = json.loads(path.read_text(encoding='utf-8'))
+        values = parse_json(read_file(path))
+        digest = values.pop('set', '')
+        if digest and map_file.exists():
+            with open_file(map_file) as file:
+                check_set(digest, set_of(file.read(_HEAD).decode(errors='replace')).digest)
         paths = {name: map_file.resolve().parent / values[name] for name in _PATHS
                  if values.get(name) is not None}
         found = MapRecording(**(values | {
             name: one if one.exists() else None for name, one in paths.items()}))
         turn = np.array(found.rotation, dtype=float)
-        is_valid = turn.shape == (3, 3) and 0.0 < found.scale < np.inf and np.allclose(
-            turn @ turn.T, np.eye(3), atol=1e-6)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        is_valid = turn.shape == (3, 3) and 0.0 < found.scale < np.inf and is_rigid(
+            make_transform(turn, np.zeros(3)))
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise DatasetError(f'{path}: cannot be read: {error}; remove it') from error
     if not is_valid:
         raise DatasetError(f'{path}: has no valid scale and rotation; remove it')

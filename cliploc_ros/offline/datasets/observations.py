@@ -24,6 +24,16 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.units import NS_PER_S
 
 _STAGES = ('detector_ms', 'clip_ms')
+_NOT_NEGATIVE = npz.Check('is negative or infinite',
+                          lambda values: (values < 0) | np.isinf(values))
+
+
+def _check_stamps(name: str, arrays: npz.Arrays) -> None:
+    seconds = arrays['timestamps']
+    npz.Check('contradicts timestamps',
+              lambda stamps_ns: np.abs(stamps_ns / NS_PER_S - seconds) > 1e-6)(name, arrays)
+
+
 #: Of files of frames with boxes: F frames, n boxes.
 FRAME_FIELDS = {
     'intrinsics_fx_fy_cx_cy': npz.Field('numbers', (4,), (npz.FINITE,)),
@@ -35,24 +45,19 @@ FRAME_FIELDS = {
     'map_from_camera': npz.Field('numbers', ('F', 4, 4), (npz.FINITE, npz.Check(
         'is no rigid transform', lambda poses: ~are_rigid(poses)))),
     # NaN where unknown [m]
-    'depths': npz.Field('floats', ('n',), (
-        npz.Check('is not positive', lambda depths: depths <= 0.0),), is_optional=True),
+    'depths': npz.Field('floats', ('n',), (npz.Check(
+        'is not positive and finite', lambda depths: (depths <= 0.0) | np.isinf(depths)),),
+        is_optional=True),
     # exact, which a float64 of seconds is not [ns]
-    'stamps_ns': npz.Field('integers', ('F',), is_optional=True),
+    'stamps_ns': npz.Field('integers', ('F',), (_check_stamps,), is_optional=True),
     # time that the networks took [ms], NaN where unknown
-    **dict.fromkeys(_STAGES, npz.Field('numbers', ('F',), is_optional=True)),
+    **dict.fromkeys(_STAGES, npz.Field('numbers', ('F',), (_NOT_NEGATIVE,), is_optional=True)),
 }
 
 
 def _check_truth(name: str, arrays: npz.Arrays) -> None:
     landmarks = len(arrays['landmark_ids'])
     npz.Check('is no landmark', lambda rows: (rows < -1) | (rows >= landmarks))(name, arrays)
-
-
-def _check_stamps(name: str, arrays: npz.Arrays) -> None:
-    seconds = arrays['timestamps']
-    npz.Check('contradicts timestamps',
-              lambda stamps_ns: np.abs(stamps_ns / NS_PER_S - seconds) > 1e-6)(name, arrays)
 
 
 def _check_groups(name: str, arrays: npz.Arrays) -> None:
@@ -80,7 +85,6 @@ _QUERIES = npz.Schema('query file', {
         npz.FINITE, npz.Check('is negative', lambda seconds: seconds < 0))),
     'query_group': npz.Field('integers', ('F',)),
     'is_main': npz.Field('booleans', ('F',), (_check_groups,)),
-    'stamps_ns': npz.Field('integers', ('F',), (_check_stamps,), is_optional=True),
 }, DatasetError, not_empty={'F': 'frames', 'L': 'landmarks'})
 
 
@@ -238,7 +242,7 @@ def _check_cameras(name: str, arrays: npz.Arrays) -> None:
 _OBSERVATIONS = npz.Schema('observation file', {
     **FRAME_FIELDS,
     'image_size': npz.Field('integers', (2,)),
-    'depth_spreads': npz.Field('floats', ('n',), is_optional=True),
+    'depth_spreads': npz.Field('floats', ('n',), (_NOT_NEGATIVE,), is_optional=True),
     'open_edges': npz.Field('booleans', ('n', 4), is_optional=True),
     # large, and few of the rows are in use at once
     'embeddings': npz.Field('floats', ('n', 'd'), (npz.FINITE,), is_optional=True, stays=True),
@@ -247,7 +251,7 @@ _OBSERVATIONS = npz.Schema('observation file', {
     'odom_from_camera': npz.Field('floats', ('F', 4, 4), (npz.Check(
         'is no rigid transform',
         lambda poses: ~np.isnan(poses).all(axis=(1, 2)) & ~are_rigid(poses)),), is_optional=True),
-    'image_counts': npz.Field('integers', (2,), is_optional=True),
+    'image_counts': npz.Field('integers', (2,), (_NOT_NEGATIVE,), is_optional=True),
     # of several cameras: their names, width and height, fx, fy, cx, cy, and the camera of each
     # frame; image_size and intrinsics_fx_fy_cx_cy are the first one's
     'camera_names': npz.Field('text', ('C',), (npz.UNIQUE, _check_cameras), is_optional=True),

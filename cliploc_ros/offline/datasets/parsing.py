@@ -5,7 +5,6 @@
 Whatever a file holds, the error is a DatasetError that names the file and the line or field.
 """
 
-import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.errors import CameraError, DatasetError
+from cliploc_ros.files.storage import parse_json, read_file
 from cliploc_ros.units import NS_PER_S
 
 #: builtin_interfaces/Time holds seconds in an int32.
@@ -42,7 +42,7 @@ def naming(where: object, *kinds: type[Exception], what: str = '') -> Iterator[N
 def read_text(path: Path) -> str:
     """Return the text of a file; DatasetError: it cannot be read."""
     with naming(path, OSError, ValueError, what='cannot be read: '):
-        return path.read_text(encoding='utf-8')
+        return read_file(path).decode('utf-8')
 
 
 def read_lines(path: Path, header: int = 0) -> Iterator[tuple[str, str]]:
@@ -170,8 +170,8 @@ class Fields:
     def of_file(cls, path: Path, read: Callable[[Path], str | bytes] = read_text) -> 'Fields':
         """Return the mapping that a file holds."""
         text = read(path)
-        with naming(path, ValueError, RecursionError, what='is no JSON: '):
-            return cls(json.loads(text, parse_float=WrittenFloat), str(path))
+        with naming(path, ValueError, what='is no JSON: '):
+            return cls(parse_json(text, parse_float=WrittenFloat), str(path))
 
     def __contains__(self, name: str) -> bool:
         """Return whether a field is there."""

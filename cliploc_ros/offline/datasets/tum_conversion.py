@@ -14,6 +14,7 @@ import numpy as np
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.files.storage import read_file
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import BagWriter
 from cliploc_ros.offline.datasets.parsing import Fields, naming, parse_stamp_ns
@@ -129,7 +130,7 @@ def _image_message(stamp_ns: int, frame_id: str, path: Path, camera: Camera, is_
                    ) -> Any:
     """Return an image file as message; DatasetError: it is damaged, or of another size."""
     with naming(path, OSError, what='cannot be read: '):
-        data = path.read_bytes()
+        data = read_file(path)
     # Compressed images are decoded too: this refuses a damaged file before a node receives it.
     try:
         pixels_bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)

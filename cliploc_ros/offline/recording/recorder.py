@@ -27,6 +27,7 @@ from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
+from cliploc_ros.files.storage import parse_json
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets.frames import Frames, RawFrame
@@ -250,7 +251,7 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log)
 
 def _parse_entry(line: bytes) -> Any:
     """Return what run it is, which the first entry says, or the frame of any other entry."""
-    entry = json.loads(line)
+    entry = parse_json(line)
     return entry if 'run' in entry else SeenFrame.from_bytes(base64.b64decode(entry['frame']))
 
 

@@ -6,7 +6,6 @@ All threads share one document. Each method holds its lock; a caller that needs 
 once holds it, too.
 """
 
-import json
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError, DatasetError, MapError
 from cliploc_ros.files.log import Log
+from cliploc_ros.files.storage import parse_json
 from cliploc_ros.offline.studio.edits import Change, EditError, change_from_json
 from cliploc_ros.offline.studio.landmark import (
     KNOWN_FIELDS,
@@ -72,7 +72,7 @@ class Document:
         # digest of its next content: replay starts at the right edit with either content.
         self._journal = Log(self.path.with_name(f'.{self.path.name}.studio'), DatasetError,
                             "make room, and the map's folder writable",
-                            lambda line: dict(json.loads(line)))
+                            lambda line: dict(parse_json(line)))
         try:
             entries, is_damaged = self._journal.read()
             if is_damaged:
@@ -148,7 +148,8 @@ class Document:
 
     def to_map(self) -> LandmarkMap:
         """Return the map as the relocalizer knows it; MapError where it has no landmarks."""
-        return map_of(self.landmarks, self.frame_id, self.path.name)
+        return replace(map_of(self.landmarks, self.frame_id, self.path.name),
+                       map_set=self._file.map_set)
 
     # ---- edits ----------------------------------------------------------------------------------
 
@@ -298,7 +299,7 @@ class Document:
                            'relocalizer refuses a map with unknown fields',)
 
     def _read_looks(self) -> LookFile:
-        found, fault = read_look_file(self.path)
+        found, fault = read_look_file(self._file)
         self.notes += (fault,) if fault else ()
         return found
 

@@ -29,9 +29,15 @@ from cliploc_ros.core.map.landmark_embeddings import (
 )
 from cliploc_ros.core.map.landmark_map import find_map_node
 from cliploc_ros.core.map.map_file import quoted
-from cliploc_ros.core.map.parameter_file import parse_parameters, read_text
+from cliploc_ros.core.map.parameter_file import (
+    MapSet,
+    check_set,
+    parse_parameters,
+    read_text,
+    set_of,
+)
 from cliploc_ros.errors import MapError
-from cliploc_ros.files.storage import replace_file
+from cliploc_ros.files.storage import finish_set, read_file, replace_file
 from cliploc_ros.offline.studio.landmark import (
     KNOWN_FIELDS,
     Encoded,
@@ -65,6 +71,11 @@ class MapFile:
     def digest(self) -> str:
         """The digest of the text; NO_FILE where there is none."""
         return _digest_of(self.text.encode()) if self.text else NO_FILE
+
+    @property
+    def map_set(self) -> MapSet:
+        """What the files next to the map have to be of."""
+        return set_of(self.text)
 
     @property
     def frame_id(self) -> str:
@@ -116,7 +127,7 @@ class MapFile:
     def digest_on_disk(self) -> str:
         """Return the digest of the file as it is now, NO_FILE where there is none."""
         try:
-            return _digest_of(self.path.read_bytes())
+            return _digest_of(read_file(self.path))
         except FileNotFoundError:
             return NO_FILE
         except OSError as error:
@@ -133,6 +144,7 @@ def read_map_file(path: Path) -> MapFile:
         return MapFile(path, '', '/**', {'/**': {_PARAMETERS: {'map': {
             'frame_id': 'map', 'landmarks': {}}}}})
     text = read_text(path)
+    finish_set(path, set_of(text).digest)
     tree = parse_parameters(text, path)
     node = find_map_node(tree, path)
     found = tree[node][_PARAMETERS]['map']
@@ -269,6 +281,7 @@ class LookFile(NamedTuple):
     encoder_key: str
     looks: Mapping[str, Encoded]
     state: tuple[int, int] | None
+    set_digest: str = ''  #: As in the head of the map, which an edit keeps
 
     def write(self, landmarks: Landmarks) -> tuple['LookFile', str]:
         """Write the looks of all landmarks of the map in one step.
@@ -290,21 +303,25 @@ class LookFile(NamedTuple):
         save_landmark_embeddings(self.path, LandmarkEmbeddings(
             self.encoder_key, tuple(landmarks), np.array([one.mean for one in rows]),
             np.concatenate([one.medoids for one in rows]),
-            np.cumsum([0, *(len(one.medoids) for one in rows)])))
+            np.cumsum([0, *(len(one.medoids) for one in rows)]), self.set_digest))
         return self._replace(looks=known, state=_state_of(self.path)), ''
 
 
-def read_look_file(map_path: Path) -> tuple[LookFile, str]:
+def read_look_file(file: MapFile) -> tuple[LookFile, str]:
     """Return the image embeddings next to a map, and what is wrong with them, or ''."""
-    path = embeddings_path(map_path)
+    path = embeddings_path(file.path)
     nothing = LookFile(path, '', {}, _state_of(path))
     if nothing.state is None:
         return nothing, ''
     try:
         embeddings = load_landmark_embeddings(path)
+        check_set(embeddings.set_digest, file.map_set.digest)
     except MapError as error:
         return nothing, f'{error}. The studio leaves this file as it is'
-    return nothing._replace(encoder_key=embeddings.encoder_key, looks=looks_of(embeddings)), ''
+    except ValueError as error:
+        return nothing, f'{path}: {error}. The studio leaves this file as it is'
+    return nothing._replace(encoder_key=embeddings.encoder_key, looks=looks_of(embeddings),
+                            set_digest=embeddings.set_digest), ''
 
 
 def _state_of(path: Path) -> tuple[int, int] | None:

@@ -208,8 +208,8 @@ def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | 
                  ) -> Iterator[tuple[str, viser.ViserServer]]:
     """Serve the page of a studio for as long as the block lasts; yield the URL and the server.
 
-    The port is the next free one from this on; 0: any. Beyond the loopback interface, the URL
-    holds a token. ``live`` is the running relocalizer, to show it, too.
+    The port is the next free one from this on; 0: any. The URL holds a token. ``live`` is the
+    running relocalizer, to show it, too.
     """
     gate, pages = Gate(host), list[Page]()
 

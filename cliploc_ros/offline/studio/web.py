@@ -2,16 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Who may open the page, and what its port answers: our page, its images, and viser's scene.
 
-viser 1.1 lets everyone in who reaches its port. On the loopback interface these include every
-page that this machine's browsers show, since a browser opens WebSockets to any host. So a request
-needs a loopback name as its host, a WebSocket needs the studio's own page as its origin, and
-beyond the loopback interface each request needs the token that the studio prints.
+viser 1.1 lets everyone in who reaches its port. On the loopback interface these include all users
+of this machine, and every page that its browsers show, since a browser opens WebSockets to any
+host. So each request needs the token that the studio prints, a request to this machine needs a
+loopback name as its host, and a WebSocket needs the studio's own page as its origin.
 
 Below the token, ``/`` is the page, ``/scene/PERSON`` is viser's, ``/socket/PERSON`` is the page's
 WebSocket, and ``/image`` and ``/crop`` are pictures. PERSON is a word that each page makes up.
 """
 
 import asyncio
+import hashlib
 import hmac
 import http
 import json
@@ -26,6 +27,8 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
+
+from cliploc_ros.files.storage import parse_json
 
 LOOPBACK_NAMES = ('127.0.0.1', 'localhost', '::1')
 _FILES = Path(__file__).parent / 'web'
@@ -84,14 +87,27 @@ class Board:
         sender = asyncio.create_task(send())
         try:
             async for text in connection:
-                message = json.loads(text)
+                message = parse_json(text)
                 if isinstance(message, dict):
                     await asyncio.to_thread(do, message)
-        except (ConnectionClosed, ValueError, RecursionError):
+        except (ConnectionClosed, ValueError):
             pass
         finally:
             self._pages.discard(event)
             sender.cancel()
+
+
+def once(url: str) -> str:
+    """Return an address that leads to the page of an address a single time.
+
+    It is for the command line of a browser, which all users of the machine can read.
+    """
+    base, token = url.rstrip('/').rsplit('/', 1)
+    return f'{base}/{_ticket(token)}'
+
+
+def _ticket(token: str) -> str:
+    return hashlib.sha256(token.encode()).hexdigest()
 
 
 class Gate:
@@ -99,27 +115,29 @@ class Gate:
 
     def __init__(self, host: str):
         self.is_local = host in LOOPBACK_NAMES
-        self.token = '' if self.is_local else secrets.token_urlsafe(24)
+        self.token = secrets.token_urlsafe(24)
+        self._tickets = [_ticket(self.token)]
 
     @property
     def path(self) -> str:
-        """The path of the page: the token, if one is needed."""
-        return f'/{self.token}/' if self.token else '/'
+        """The path of the page."""
+        return f'/{self.token}/'
 
     def admit(self, request: Request) -> str | None:
-        """Return the path below the token; None where the request is refused."""
-        host = request.headers.get('Host', '')
-        origin = request.headers.get('Origin')
-        if self.is_local and urlsplit(f'//{host}').hostname not in LOOPBACK_NAMES:
+        """Return the path below the token, '' for a ticket; None where the request is refused."""
+        try:
+            host, origin = request.headers.get('Host', ''), request.headers.get('Origin')
+            name, their_host = urlsplit(f'//{host}').hostname, urlsplit(origin or '').netloc
+            is_socket = request.headers.get('Upgrade', '').lower() == 'websocket'
+        except (LookupError, ValueError):  # a header comes twice, or names no host
             return None
-        if origin is not None and urlsplit(origin).netloc != host:
+        if ((self.is_local and name not in LOOPBACK_NAMES)
+                or (origin is not None and their_host != host) or (is_socket and origin is None)):
             return None
-        if request.headers.get('Upgrade', '').lower() == 'websocket' and origin is None:
-            return None
-        path = request.path.partition('?')[0]
-        if not self.token:
-            return path
-        first, _, rest = path.lstrip('/').partition('/')
+        first, _, rest = request.path.partition('?')[0].lstrip('/').partition('/')
+        if first in self._tickets and not is_socket:
+            self._tickets.remove(first)
+            return ''
         is_known = hmac.compare_digest(first.encode(), self.token.encode())
         return f'/{rest}' if is_known else None
 
@@ -145,6 +163,9 @@ class Gate:
                 if path is None:
                     return _response(http.HTTPStatus.FORBIDDEN, Content(
                         b'refused: use the address that the studio printed\n', '', False))
+                if not path:
+                    return Response(http.HTTPStatus.FOUND, 'Found', Headers({
+                        'Location': self.path, 'Content-Length': '0'}))
                 request.path = path
                 if request.headers.get('Upgrade', '').lower() == 'websocket':
                     return None

@@ -25,7 +25,7 @@ from std_msgs.msg import Header
 from cliploc_ros.core.geometry.transforms import SAME_SPOT, is_rigid
 from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Region, check_planar
 from cliploc_ros.errors import CliplocError, OptionsError
-from cliploc_ros.files.storage import write_text
+from cliploc_ros.files.storage import parse_json, read_file, write_text
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_from_msg, pose_with_covariance_msg
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
@@ -137,7 +137,7 @@ class PriorSource:
     def _read(self, path: Path) -> tuple[PoseWithCovarianceStamped, str] | None:
         """Return the last pose and the hash of its map; None without a valid file."""
         try:
-            fields: dict[str, Any] = json.loads(path.read_text(encoding='utf-8'))
+            fields: dict[str, Any] = parse_json(read_file(path))
             pose = np.array(fields['map_from_robot'], dtype=np.float64)
             if not is_rigid(pose):
                 raise ValueError('map_from_robot is no pose')
@@ -148,8 +148,7 @@ class PriorSource:
             return msg, str(fields['map_hash'])
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError,
-                CliplocError) as error:
+        except (OSError, ValueError, TypeError, KeyError, OverflowError, CliplocError) as error:
             self._node.get_logger().warning(f'last_pose_file {path}: not used: {error}')
             return None
 

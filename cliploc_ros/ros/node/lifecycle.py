@@ -25,6 +25,7 @@ import rclpy
 from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState
 from rclpy.lifecycle import TransitionCallbackReturn as Outcome
@@ -42,6 +43,8 @@ from cliploc_ros.units import NS_PER_S
 # Nav2's defaults (nav2_util::LifecycleNode and its parameter bond_heartbeat_period).
 _HEARTBEAT_PERIOD_S = 0.1
 _HEARTBEAT_TIMEOUT_S = 4.0
+# How long the last message of a bond may take to a manager that hangs.
+_LAST_WORD_S = 0.2
 # A transition may load weights for seconds; meanwhile clients can ask for the state.
 _MAX_TRANSITION_REQUESTS = 3
 # Between attempts of a node to bring itself up; the pause doubles each time.
@@ -179,11 +182,14 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
     def end_bond(self) -> None:
         """Tell the manager that the node ends its work; a bond needs the node to do so.
 
-        bondpy destroys its publisher and subscription, but leaves them to the node: its executor
-        would come upon them for ever, and do nothing else.
+        bondpy destroys its publisher as soon as it has said so, and the message with it. And it
+        destroys publisher and subscription, but leaves them to the node: its executor would come
+        upon them for ever, and do nothing else.
         """
         bond, self._bond = self._bond, None
         if bond is not None:
+            bond.break_bond()
+            bond.pub.wait_for_all_acked(Duration(seconds=_LAST_WORD_S))
             bond.shutdown()
             self.destroy_publisher(bond.pub)
             self.destroy_subscription(bond.sub)
@@ -410,12 +416,12 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoR
             raise
     finally:
         if node is not None:
+            node.end_bond()
             node.release()
             node.worker.stop()
             # A callback that runs on in a destroyed node causes a segmentation fault. rclpy's
             # own shutdown should wait for callbacks, but does not.
             executor._work_tracker.wait(_GRACE_S)
-            node.end_bond()
             # The executor's pending handlers keep references to all entities it waited for.
             executor.shutdown(0.0)
             # Without this, other nodes take it for alive for 20 s, and requests to it are lost.

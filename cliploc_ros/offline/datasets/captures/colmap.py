@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.files.storage import open_file
 from cliploc_ros.offline.datasets import parsing
 from cliploc_ros.offline.datasets.captures import capture
 from cliploc_ros.offline.datasets.frames import NO_STAMP, ImageFile
@@ -186,7 +187,7 @@ class _Bytes:
         self._path, self._place = path, 0
         # ValueError: it is empty
         with (parsing.naming(path, OSError, ValueError, what='cannot be read: '),
-              path.open('rb') as file):
+              open_file(path) as file):
             self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
     def __enter__(self) -> '_Bytes':

@@ -9,7 +9,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from stat import S_ISREG
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, MappingError
+from cliploc_ros.files.storage import read_file
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.parsing import FieldError, Fields, naming, unit_quaternion
 from cliploc_ros.offline.mapping.refit import refit_map
@@ -186,12 +186,7 @@ def read_bytes(path: Path) -> bytes:
     DatasetError: the message names the file and what is wrong with it.
     """
     with naming(path, OSError, what='cannot be read: '):
-        if not S_ISREG(path.stat().st_mode):
-            raise DatasetError(f'{path}: is no file; name the file of the map')
-        with path.open('rb') as file:
-            content = file.read(MAX_FILE_BYTES + 1)
-    if len(content) > MAX_FILE_BYTES:
-        raise DatasetError(f'{path}: is larger than {MAX_FILE_BYTES // 2**20} MiB; split it')
+        content = read_file(path, MAX_FILE_BYTES)
     if not content:
         raise DatasetError(f'{path}: is empty')
     return content

@@ -8,11 +8,10 @@ The message is a KeyValue, whose fields check their types, in place of bond/msg/
 import threading
 
 from diagnostic_msgs.msg import KeyValue
-from rclpy.duration import Duration
 
 
 class Bond:
-    """Says that a node is alive until shutdown says that it is not."""
+    """Says that a node is alive until the bond is broken."""
 
     def __init__(self, node, topic, id, on_broken=None, on_formed=None):
         self.id = id
@@ -38,11 +37,16 @@ class Bond:
     def _publish(self, state):
         self.pub.publish(KeyValue(key=self.id, value=state))
 
-    def shutdown(self):
-        """Destroy what was created, behind the node's back like the real one."""
-        self.sub.destroy()
+    def break_bond(self):
         self._ended.set()
         self._publish('dead')
-        # the real one may lose this message; its peer then misses the heartbeat instead
-        self.pub.wait_for_all_acked(Duration(seconds=5))
+
+    def shutdown(self):
+        """Destroy what was created, behind the node's back and at once, like the real one.
+
+        A message that is under way is lost then; the peer of the real one misses the heartbeat.
+        """
+        self.sub.destroy()
+        if not self._ended.is_set():
+            self.break_bond()
         self.pub.destroy()

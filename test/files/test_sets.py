@@ -1,0 +1,170 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Files that belong together, written by processes that are killed or that share a folder."""
+
+import multiprocessing
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from disks import own_numbers
+from whole_sets import ROOM, made_map, write_set
+
+from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
+from cliploc_ros.core.map.landmark_embeddings import (
+    embeddings_path,
+    load_embeddings_of_map,
+    load_landmark_embeddings,
+)
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.map.map_file import write_map
+from cliploc_ros.errors import DatasetError, MapError
+from cliploc_ros.offline.datasets.map_recording import (
+    MapRecording,
+    load_recording,
+    recording_path,
+)
+from cliploc_ros.offline.make_map import write_made_map
+from cliploc_ros.offline.studio.document import Document
+
+PROJECT = Path(__file__).resolve().parents[2]
+
+def read(path):
+    """The numbers that the files of a map tell: one for each of them."""
+    landmark_map = LandmarkMap.from_file(path)
+    embeddings = load_embeddings_of_map(path, landmark_map.landmark_ids, landmark_map.map_set)
+    number = round(float((landmark_map.centers - ROOM.centers)[0, 0]) / 0.01)
+    return number, {number % 8 == int(np.argmax(embeddings.means[0])),
+                    number == load_layer_of_map(layer_path(path), landmark_map).points[0, 0],
+                    number == load_recording(path).scale - 1.0}
+
+
+@pytest.fixture
+def path(tmp_path):
+    (tmp_path / 'seen.npz').touch()
+    write_set(tmp_path / 'a.yaml', 0)
+    return tmp_path / 'a.yaml'
+
+
+def write_again_and_again(path, first, begun):
+    begun.set()
+    for number in range(first, first + 1000):
+        write_set(path, number)
+
+
+def test_a_kill_leaves_one_whole_set(path):
+    """At 150 random times of the writes of build_map."""
+    draw, seen, fork = random.Random(0), set(), multiprocessing.get_context('fork')
+    for kill in range(150):
+        begun = fork.Event()
+        writer = fork.Process(target=write_again_and_again,
+                              args=(path, 1000 * kill + 1, begun), daemon=True)
+        writer.start()
+        assert begun.wait(60.0)
+        time.sleep(draw.uniform(0.0, 0.06))
+        os.kill(writer.pid, signal.SIGKILL)
+        writer.join()
+        number, agree = read(path)
+        assert agree == {True}
+        seen.add(number)
+    print(f'150 kills, {len(seen)} sets')
+    assert len(seen) > 10, 'the kills come during writes'
+
+
+def test_files_of_another_set_are_refused(path):
+    """As a copy of a part of a folder leaves them."""
+    others = [path.with_name('b.yaml')]
+    write_set(others[0], 5)
+    for of in (embeddings_path, layer_path, recording_path):
+        of(others[0]).replace(of(path))
+    landmark_map = LandmarkMap.from_file(path)
+    with pytest.raises(MapError, match='is of the set'):
+        load_embeddings_of_map(path, landmark_map.landmark_ids, landmark_map.map_set)
+    with pytest.raises(MapError, match='is of the set'):
+        load_layer_of_map(layer_path(path), landmark_map)
+    with pytest.raises(DatasetError, match='is of the set'):
+        load_recording(path)
+    document = Document(path)
+    document.close()
+    assert 'is of the set' in document.notes[0]
+    assert all(one.look is None for one in document.landmarks.values())
+
+
+def test_the_studio_finishes_what_a_killed_writer_left(path):
+    others = embeddings_path(path)
+    digest = LandmarkMap.from_file(path).map_set.digest
+    others.rename(others.with_name(f'.{digest}.{others.name}'))
+    document = Document(path)
+    document.close()
+    assert others.exists() and document.encoder_key == 'key'
+
+
+def test_an_update_keeps_the_keyframes_and_no_embeddings(path):
+    before = LandmarkMap.from_file(path)
+    updated = replace(made_map(1), layer=None, embeddings=None)
+    assert write_made_map(path, updated, [], MapRecording(path.with_name('seen.npz')), path) == []
+    after = LandmarkMap.from_file(path)
+    assert after.map_set.family == before.map_set.family != after.map_set.digest
+    assert load_layer_of_map(layer_path(path), after).points[0, 0] == 0
+    assert not embeddings_path(path).exists()
+
+
+def test_a_map_by_hand_takes_any_files(path):
+    """One without a set, as those of earlier versions."""
+    path.write_text(''.join(line for line in path.read_text().splitlines(keepends=True)
+                            if not line.startswith('# set ')))
+    landmark_map = LandmarkMap.from_file(path)
+    assert load_layer_of_map(layer_path(path), landmark_map).points[0, 0] == 0
+    assert load_recording(path).scale == 1.0
+
+
+def test_a_set_that_cannot_be_written_changes_nothing(path):
+    blocker = path.with_name(f'.{"x" * 250}')
+    with pytest.raises((MapError, DatasetError)):
+        write_map(path, made_map(3).landmark_map, besides={blocker: lambda place, digest:
+                                                          place.write_text(digest)})
+    assert read(path) == (0, {True})
+    assert not [one for one in path.parent.iterdir() if one.name.startswith('.')]
+
+
+SHARED = """
+import sys
+from pathlib import Path
+sys.path[:0] = {paths!r}
+import numpy as np
+from cliploc_ros.core.map.landmark_embeddings import *
+rows = np.zeros((400, 64), np.float16)
+rows[:, int(sys.argv[2])] = 1.0
+made = LandmarkEmbeddings(sys.argv[2], tuple(map(str, range(400))), rows,
+                          np.empty((0, 64), np.float16), np.zeros(401, np.int64))
+import os
+print(os.getpid(), flush=True)
+for _ in range(300):
+    save_landmark_embeddings(sys.argv[1], made)
+"""
+
+
+def test_two_processes_of_one_number_share_a_folder(tmp_path):
+    """As those of two containers: no torn file, no refused write, nothing left."""
+    path = tmp_path / 'a.embeddings.npz'
+    code = SHARED.format(paths=[str(PROJECT)])
+    writers = [subprocess.Popen([*own_numbers(), sys.executable, '-c', code,
+                                 str(path), str(number)], stdout=subprocess.PIPE, text=True)
+               for number in range(2)]
+    assert len({one.stdout.readline() for one in writers}) == 1, 'they have one number'
+    reads = 0
+    while any(one.poll() is None for one in writers):
+        if path.exists():
+            found = load_landmark_embeddings(path)
+            assert found.means[0, int(found.encoder_key)] == 1.0
+            reads += 1
+    assert reads > 50
+    assert [one.wait() for one in writers] == [0, 0]
+    assert [one.name for one in tmp_path.iterdir()] == [path.name]

@@ -1,0 +1,37 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A small map with all that lies next to it: embeddings, keyframes, what it was built from."""
+
+from dataclasses import replace
+
+import numpy as np
+from scene import CAMERA, make_room
+
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
+from cliploc_ros.offline.datasets.map_recording import MapRecording
+from cliploc_ros.offline.make_map import MadeMap, write_made_map
+
+ROOM = make_room()
+
+
+def made_map(number):
+    """A map whose files all tell its number: the room a little further on."""
+    landmark_map = replace(ROOM, centers=ROOM.centers + np.array([0.01, 0.0, 0.0]) * number)
+    count = len(ROOM)
+    row = np.zeros((1, 8), dtype=np.float16)
+    row[0, number % 8] = 1.0
+    layer = KeyframeLayer(
+        'map', ROOM.landmark_ids, landmark_map.centers.astype(np.float32), CAMERA,
+        np.tile(np.eye(4), (1, 1, 1)), np.array([0, 5]), np.zeros((5, 2), np.uint16),
+        np.full((5, 3), number, dtype=np.float32), np.zeros((5, 128), np.uint8),
+        np.zeros(5, np.uint16), np.ones((1, 128), np.uint8))
+    return MadeMap(landmark_map, None, LandmarkEmbeddings(
+        'key', ROOM.landmark_ids, np.repeat(row, count, axis=0), np.empty((0, 8), np.float16),
+        np.zeros(count + 1, dtype=np.int64)), layer)
+
+
+def write_set(path, number):
+    """Write a map of a number, and all that lies next to it."""
+    return write_made_map(path, made_map(number), ['a test'],
+                          MapRecording(path.with_name('seen.npz'), scale=1.0 + number))
