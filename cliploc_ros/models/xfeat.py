@@ -23,7 +23,7 @@ from cliploc_ros.core.keyframes.features import (
     compact,
 )
 from cliploc_ros.errors import ModelError
-from cliploc_ros.files.storage import replace_file, resolve_cache_dir
+from cliploc_ros.files.storage import read_file, replace_file, resolve_cache_dir
 from cliploc_ros.models.devices import import_openvino
 from cliploc_ros.models.files import download, first_line
 
@@ -68,7 +68,7 @@ def load_xfeat(cache_dir: str = '') -> FeatureKind:
         from urllib.request import urlopen
 
         with urlopen(_URL, timeout=_PATIENCE_S) as answer:
-            content = answer.read()
+            content = answer.read(2**26)  # a server may send without end
         if not _is_published(content):
             raise ValueError('another file came')
         with replace_file(file) as partial_file:
@@ -95,7 +95,7 @@ def _network(file: Path) -> 'Network':
     if import_openvino() is None:
         raise ModelError(f'{file} needs OpenVINO: pip install openvino, {WITHOUT_XFEAT}')
     try:
-        is_published = _is_published(file.read_bytes())
+        is_published = _is_published(read_file(file))
     except OSError as error:
         raise ModelError(f'{file} cannot be read: {error.strerror}, {WITHOUT_XFEAT}') from error
     if not is_published:
