@@ -39,7 +39,6 @@ _SEVEN_SCENES_DEPTH = DepthCamera(
     transforms.make_transform(np.eye(3), np.array([-0.025, 0.0, 0.0])))
 _SEVEN_SCENES_NAME = re.compile(r'frame-(\d+)\.color\.(?:jpe?g|png)')
 _SEVEN_SCENES_HZ = 30
-_MAX_DEPTH_DELAY_NS = 20_000_000
 _NO_OPTIONS = FolderOptions()
 
 
@@ -145,9 +144,14 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
         notes.append(f'levelled: the vertical of the cameras was {found[1]:.1f} degrees off z')
     elif not capture.up:
         notes.append(tilt_note(poses))
-    frames = folder_frames(folder, files, replace(
-        capture.depth, unit_m=options.depth.unit_m or capture.depth.unit_m,
-        camera=options.depth.camera or capture.depth.camera))
+    form = replace(capture.depth, unit_m=options.depth.unit_m or capture.depth.unit_m,
+                   camera=options.depth.camera or capture.depth.camera)
+    if not capture.is_metric:  # its depth is in the unit of its poses
+        form = replace(form, scale=1.0 if options.depth.unit_m else form.scale * (scale or 1.0))
+    frames = folder_frames(folder, files, form)
+    flat = sum(one.depth is None for one in files)
+    if 0 < flat < len(files):
+        notes.append(f'{flat} of {len(files)} images have no depth image')
     known = [(one.color.name, one.camera, np.round(one.pose, 6).tolist())
              for one in files if one.pose is not None]
     return replace(frames, digest=hashlib.sha256(repr(known).encode()).hexdigest()[:12],
@@ -184,11 +188,12 @@ def _tum(folder: Path, options: FolderOptions, with_depth: bool = True) -> Captu
         times = np.array(stamps, dtype=np.int64)
         for stamp in sequence.stamps_ns:
             nearest = int(np.argmin(np.abs(times - stamp)))
-            if abs(stamps[nearest] - stamp) <= _MAX_DEPTH_DELAY_NS:
+            if abs(stamps[nearest] - stamp) <= options.tolerance_ns:
                 depths[stamp] = paths[nearest]
     trajectory = replace(
         sequence.trajectory if options.trajectory is None else options.trajectory,
-        max_gap_ns=options.max_gap_ns, body_from_camera=options.body_from_camera)
+        max_gap_ns=options.max_gap_ns, body_from_camera=options.body_from_camera,
+        tolerance_ns=options.tolerance_ns)
     return Capture(_tum_files(sequence, camera, trajectory, depths), depth=DepthFormat(TUM_UNIT),
                    trajectory=trajectory)
 
