@@ -71,9 +71,9 @@ class Capture:
     def of(cls, files: Sequence[ImageFile], where: object, axes: str,
            depth: DepthFormat = _AS_USUAL, up: str = '', is_metric: bool = True,
            notes: Sequence[str] = (), images: int = 0) -> 'Capture':
-        """Return the capture of the images that a list names, see arrange; notes say what is missing.
+        """Return the capture of the images that a list names, see arrange.
 
-        Of depth images, too.
+        Notes say which of them and of their depth images are missing.
         """
         arranged = arrange(files, where)
         missing = [[one.color for one in files if beside(one.color) is None],

@@ -259,9 +259,9 @@ def read_nerf(folder: Path, options: capture.FolderOptions) -> capture.Capture:
         files.append(ImageFile(NO_STAMP, color, cameras[shown], full,
                                _file_of(path.parent, depth, None) if depth else None))
     # depth is in the unit of the poses, which no field tells: in metres, or as COLMAP chose it
-    units = [meta.number(name) for name in ('depth_unit_scale_factor', 'integer_depth_scale')
-             if name in meta]
-    return capture.Capture.of(files, path, 'opengl', DepthFormat(*units[:1], scale=1.0 / scale),
+    unit = next((meta.number(name) for name in ('depth_unit_scale_factor', 'integer_depth_scale')
+                 if name in meta), None)
+    return capture.Capture.of(files, path, 'opengl', DepthFormat(unit, scale=1.0 / scale),
                               is_metric=False)
 
 
