@@ -179,7 +179,7 @@ def test_odometry_and_covariance_with_a_mount(tmp_path):
     frame, = bag_frames(bag, BagTopics(), poses_of_topic('/amcl_pose', 200 * MS, mount)).read()
     np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.05, 0.3, 0.5], atol=1e-9)
     # they are of 'base', as child_frame_id says
-    with pytest.raises(DatasetError, match="of 'base' .*`mount`"):
+    with pytest.raises(DatasetError, match=r"of 'base' .*`mount`"):
         bag_frames(bag, BagTopics(), poses_of_topic('/odom', 200 * MS))
     known = write_bag(tmp_path / 'with_tf', [50], [*odometry, (
         0, '/tf_static', TF, make(TF, transforms=[transform_message(

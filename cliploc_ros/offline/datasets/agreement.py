@@ -65,8 +65,10 @@ class Reading(NamedTuple):
     camera: Callable[[Camera], Camera] = lambda camera: camera
     upright: bool = False  #: Images are turned by their EXIF orientation
     shift_ns: int = 0  #: Poses are those of this much later
-    #: Median error of the given way beyond which this one may be meant [px]
+    #: Median error of the given way beyond which this one may be meant [px], and the share of it
+    #: that this one may have
     least_px: float = _WRONG_PX
+    better: float = _BETTER
 
 
 def w_first(pose: _Pose) -> _Pose:
@@ -101,12 +103,12 @@ def check_agreement(views: Sequence[View], readings: Mapping[str, Reading], wher
     errors = {name: float(np.median(values)) for name, values in found.items()
               if len(values) == len(found[given])}
     best = min(errors, key=lambda name: errors[name])
-    if errors[given] < readings[best].least_px:
-        return ''
-    if errors[best] < min(_GOOD_PX, _BETTER * errors[given]):
+    reading = readings[best]
+    if errors[given] > reading.least_px and errors[best] < min(_GOOD_PX,
+                                                               reading.better * errors[given]):
         raise DatasetError(f'{where}: the images do not fit the poses as {given} (median epipolar '
                            f'error {errors[given]:.1f} px), but do as {best} ({errors[best]:.1f} '
-                           f'px): {readings[best].remedy}')
+                           f'px): {reading.remedy}')
     if errors[given] < _WRONG_PX:
         return ''
     return (f'the images do not fit the poses: median epipolar error {errors[given]:.1f} px, '

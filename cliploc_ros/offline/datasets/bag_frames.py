@@ -357,8 +357,10 @@ _COMPRESSED = '/compressed'
 # Images that wait for their depth. A depth image is recorded at most this many images later.
 _MAX_WAITING = 15
 # Images that are compared with poses: parts of a recording, images of a part, its length [s].
-# Then by how much stamps may be off [s], and an error that rectified images have, taken for raw.
-_SHIFTS_S, _RECTIFIED_PX = (-0.5, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.5), 1.2
+# Then by how much stamps may be off [s], and the error that rectified images have, taken for raw,
+# or the reverse [px], with the share of it that is left without this fault.
+_SHIFTS_S = (-0.5, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.5)
+_RECTIFIED_PX, _RECTIFIED_BETTER = 0.6, 0.6
 _COMPARED_PARTS, _COMPARED_OF_PART, _PART_S = 12, 8, 4.0
 
 
@@ -592,7 +594,8 @@ def _readings(cameras: _Cameras, rectified: bool) -> dict[str, Reading]:
             readings['raw' if rectified else 'rectified'] = Reading(
                 'the images are not rectified: leave `rectified` out' if rectified else
                 'the images are rectified: give `rectified`',
-                camera=lambda camera: other, least_px=_RECTIFIED_PX)
+                camera=lambda camera: other, least_px=_RECTIFIED_PX,
+                better=_RECTIFIED_BETTER)
     numbers = {'opengl': '0 0 0 1 0 0 0', 'ros': '0 0 0 -0.5 0.5 -0.5 0.5'}
     return readings | {name: Reading(mount.format(numbers.get(name, '')) if name in numbers else
                                      'the poses are inverse: record the camera in the map',

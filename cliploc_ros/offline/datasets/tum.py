@@ -129,7 +129,7 @@ def _named_columns(path: Path) -> tuple[list[int] | None, Decimal | None, float,
 
 def _role(name: str) -> str:
     """Return which column of TUM's a name stands for; '' for none."""
-    word = re.sub(r'[\[(].*', '', name).strip().lower()
+    word = re.sub(r'[\[(].*|_([nuµm]?s|[cm]?m)$', '', name.strip().lower()).strip()
     if word.startswith(('time', 'stamp', '#time')) or word == 't':
         return 'timestamp'
     kind = next((kind for kind, starts in (
