@@ -85,6 +85,8 @@ def make_parser() -> argparse.ArgumentParser:
     limits = parser.add_argument_group('which landmarks belong into the map')
     option(limits, '--min-viewpoints N', '10 cm or 5 degrees apart (%(default)s)',
            command.positive_int, 3)
+    option(limits, '--moving CLASSES', "classes that move and never become landmarks, as 'person, "
+           "cat'; '' for none (persons, animals, balls and vehicles of COCO)")
     option(limits, '--min-baseline DEG', 'angle between two of its directions (%(default)s)',
            command.within(0.0, 180.0), 20.0)
     return parser
@@ -112,7 +114,9 @@ def build(options: argparse.Namespace) -> int:
         odometry_errors=OdometryErrors(*options.odometry_noise or ()),
         refine_mount=options.refine_mount, min_viewpoints=options.min_viewpoints,
         min_baseline_deg=options.min_baseline, frame_id=options.frame_id,
-        source=f'build_map {name}', random_seed=options.seed)
+        source=f'build_map {name}', random_seed=options.seed,
+        **({} if options.moving is None else {'moving_classes': tuple(
+            filter(None, map(str.strip, options.moving.split(','))))}))
     source = sources.read_source(options)
     detections, scale, rotation = _placed(source.recorded.detections, options, mapping)
     if without := source.recorded.without_pose:

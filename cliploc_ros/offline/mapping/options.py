@@ -69,10 +69,18 @@ class OdometryErrors:
 _ODOMETRY_ERRORS = OdometryErrors()
 
 
+#: Classes of COCO that leave their place by themselves, or are thrown and driven.
+MOVING_CLASSES = (
+    'person', 'bird', 'cat', 'dog', 'horse', 'sheep', 'cow', 'elephant', 'bear', 'zebra',
+    'giraffe', 'sports ball', 'frisbee', 'kite', 'skateboard', 'car', 'motorcycle', 'airplane',
+    'bus', 'train', 'truck', 'boat')
+
+
 @dataclass(frozen=True)
 class MappingOptions:
     """Options of mapping."""
 
+    moving_classes: tuple[str, ...] = MOVING_CLASSES  #: These never become landmarks
     min_viewpoints: int = 3  #: A landmark needs support from this number of viewpoints
     #: Share of the frames showing a landmark's place in which it must be detected. Chance
     #: arrangements of boxes are seen rarely, but so are objects that others hide.

@@ -24,7 +24,7 @@ from cliploc_ros.offline.mapping.evidence import (
 )
 from cliploc_ros.offline.mapping.fitting import fit_landmarks
 from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of, landmarks_of_map
-from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.options import MOVING_CLASSES, MappingOptions
 from cliploc_ros.offline.mapping.views import Views
 from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
 
@@ -148,6 +148,8 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
                           if witness is None else
                           (1.6, f"has the class '{classes[row]}', which the detector does not "
                                 f'have{hint}: correct its class_id'))
+        if classes[row] in MOVING_CLASSES:
+            faults.append((1.3, f'is a {classes[row]}, which moves: delete it'))
         if not faults:
             faults += _support_faults(check, float(np.linalg.norm(semi_axes)))
         faults += [(0.4, f'lies in {ids[other]} of class {classes[other]}: one object under two '
