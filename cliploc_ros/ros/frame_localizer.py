@@ -215,7 +215,7 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
     landmark_map, map_hash = load_hashed_map(node, files)
     relocalizer = Relocalizer(landmark_map, options)  # before what takes long
     observer, device = None, 'cpu'
-    if options.needs_similarities:
+    if options.needs_similarities and len(landmark_map):
         from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
         from cliploc_ros.models.observer import Observer
         asked = (clip_options_of(parameters), landmark_map, files, parameters.landmark_embeddings)

@@ -318,9 +318,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
         none = np.empty(0, dtype=np.int64)
         observation = replace(
             observation, detections=observation.detections.select(none), compared=none,
-            similarities=np.empty((0, 0), dtype=np.float32),
-            **{name: None if getattr(observation, name) is None else np.empty(0)
-               for name in ('depths', 'depth_deviations')})
+            similarities=np.empty((0, 0), dtype=np.float32), depths=None, depth_deviations=None)
     scene, left_out = match_frame(landmark_map, observation, options)
     frame = SearchedFrame(
         observation, scene, vertical_of(observation, options),

@@ -113,12 +113,23 @@ class MappingReport:
     left_out: tuple[LeftOut, ...]  #: The one with the greatest support first
     notes: tuple[str, ...]  #: What is wrong with the input, and what to do about it
 
+    @staticmethod
+    def of_nothing(detections: PosedDetections, error: MappingError) -> 'MappingReport':
+        """Return the report of a recording that shows no landmarks."""
+        return MappingReport(
+            len(detections), 0, len(detections.classes), 0, 0.0, 0.0, 0.0, 0.0, 0.0,
+            error.left_out if isinstance(error, NothingFoundError) else (), (str(error),))
+
     def as_dict(self) -> dict[str, Any]:
         """Return the report as plain values, for JSON."""
         return asdict(self)
 
     def lines(self) -> list[str]:
         """Return the report as text."""
+        if not self.landmarks:
+            return [f'keyframes only: no landmark from {self.frames} frames with {self.boxes} '
+                    'boxes; a robot is localized by keyframes alone, near the recorded views',
+                    *(f'note: {note}' for note in self.notes), *left_out_lines(self.left_out)]
         rows = [f'{self.landmarks} landmarks from {self.frames} frames of {self.viewpoints} '
                 f'viewpoints with {self.boxes} boxes',
                 f'explained boxes: {self.explained:.1%}, median IoU {self.median_iou:.3f} '
