@@ -93,6 +93,7 @@ def _add_thresholds(parser: argparse.ArgumentParser) -> None:
             ('min_accepted', share, 'share of recorded frames that are accepted'),
             ('max_misled', share, 'share of views in which a wrong pose is accepted'),
             ('min_positions', share, 'share of grid positions with an accepted heading'),
+            ('min_by_objects', share, 'the same by objects alone, beside keyframes'),
             ('max_faulty', share, 'share of landmarks with a serious fault'),
             ('max_duplicates', count, 'pairs of landmarks that are one object'),
             ('max_look_alikes', count, 'pairs of places that look alike')):
@@ -145,13 +146,14 @@ def check(options: argparse.Namespace) -> int:
                            layer, image_of)
         page.write_report(out, options.map.name, report, draw_pictures(landmark_map, report),
                           views)
-    print('\n'.join(page.summary_lines(report)))
+    print('\n'.join([f'verdict: {report.verdict}', *map(str, report.carried),
+                     *page.summary_lines(report)]))
     print('what to do:')
     print('\n'.join(f'  {command.printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
     for failure in report.failures:
         print(f'fails: {failure}')
     print(f'wrote {out / page.PAGE} in {time.monotonic() - begin:.1f} s: '
-          f'{"passed" if report.passed else "failed"}')
+          f'{report.verdict}')
     return 0 if report.passed else 1
 
 

@@ -151,6 +151,8 @@ class Thresholds:
     max_misled: float = 0.01
     #: Share of the grid positions near the recording in which it accepts some heading
     min_positions: float = 0.4
+    #: The same by objects alone, where keyframes carry the rest; below, it is a map of keyframes
+    min_by_objects: float = 0.1
     #: Share of the landmarks with a serious fault, each counted as often as it was seen
     max_faulty: float = 0.15
     max_duplicates: int = 0  #: Pairs of landmarks that are one object
