@@ -35,7 +35,8 @@ _NUMBERS = ('no', 'one', 'two', 'three', 'four', 'five', 'six', 'seven', 'eight'
 
 def give_advice(report: CheckReport) -> list[Advice]:
     """Return what to do, one sentence or two each."""
-    advice = [*_on_scale(report), *_on_look_alikes(report), *_on_landmarks(report), *_on_corrections(report),
+    advice = [*_on_scale(report), *_on_look_alikes(report), *_on_landmarks(report),
+              *_on_corrections(report),
               *_on_misled(report), *_on_spans(report), *_on_grid(report)]
     return advice or [Advice('nothing to do: the map reaches all thresholds that were checked')]
 
