@@ -10,6 +10,7 @@ import numpy as np
 import yaml
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.offline.mapping.options import MappingOptions
 
 # The scale of a map is told by as many classes as this. A whole map is off by more than this
 # factor before it is named: ellipsoids enclose objects loosely, or show parts of them. Guesses.
@@ -38,12 +39,15 @@ def sizes_of_classes() -> dict[str, Size]:
 def scale_by_sizes(landmark_map: LandmarkMap) -> float | None:
     """Return how many times too large a map is by the sizes of its objects.
 
-    The median over classes of the median over their landmarks counts. None: too few tell, or they
-    fit.
+    The median over classes of the median over their landmarks counts. Those that were seen from
+    one side are longer towards the camera than their objects, and do not count. None: too few
+    tell, or they fit.
     """
     sizes, ratios = sizes_of_classes(), dict[str, list[float]]()
-    for name, semi_axes in zip(landmark_map.class_ids, landmark_map.semi_axes, strict=True):
-        if name in sizes:
+    sides = [one.baseline_deg for one in landmark_map.details] or [None] * len(landmark_map)
+    for name, semi_axes, seen_deg in zip(landmark_map.class_ids, landmark_map.semi_axes, sides,
+                                         strict=True):
+        if name in sizes and (seen_deg is None or seen_deg >= MappingOptions.min_baseline_deg):
             ratios.setdefault(name, []).append(2.0 * semi_axes.max() / sizes[name].extent_m)
     if len(ratios) < _LEAST_CLASSES:
         return None
