@@ -116,8 +116,8 @@ def build(options: argparse.Namespace) -> int:
     begin = time.monotonic()
     path, update, name = options.out, options.update, sources.source_of(options).name
     _check(options)
-    if update is not None:
-        LandmarkMap.from_file(update)
+    if update is not None and not len(LandmarkMap.from_file(update)):
+        raise OptionsError(f'--update {update}: is a map of keyframes alone: build it anew')
     mapping = MappingOptions(
         pose_errors=_pose_errors(options), estimate_pose_errors=options.joint is None,
         odometry_errors=OdometryErrors(*options.odometry_noise or ()),
