@@ -116,7 +116,11 @@ def _decoded(msg: CompressedImageMessage) -> NDArray[np.uint8]:
                          ) from error
     if image is None:
         raise ImageError(f"compressed image ('{msg.format}', {len(data)} bytes) does not decode")
-    return np.ascontiguousarray(image[:, :, ::-1])
+    # 'rgb8; jpeg compressed bgr8': the encoding of the pixels that were compressed. Where it is
+    # rgb8, red went in the place of blue, as for compressed_image_transport
+    _, _, packed = msg.format.partition('compressed')
+    is_red_first = packed.strip().startswith('rgb')
+    return np.ascontiguousarray(image if is_red_first else image[:, :, ::-1])
 
 
 def declared_size(data: bytes, stated_format: str) -> tuple[int, int]:

@@ -23,8 +23,13 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from cliploc_ros.core.keyframes.layer import KeyframeLayer
+    from cliploc_ros.offline.datasets.frames import Frames
+    from cliploc_ros.offline.make_map import Labeller, MadeMap
+    from cliploc_ros.offline.mapping.building import MappingReport
     from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+    from cliploc_ros.offline.mapping.update.updating import UpdateReport
 
 # A check at the end of a build: it takes seconds, not the minute of all views.
 _QUICK = ('--positions', '25', '--headings', '6', '--frames', '30')
@@ -85,6 +90,8 @@ def make_parser() -> argparse.ArgumentParser:
     limits = parser.add_argument_group('which landmarks belong into the map')
     option(limits, '--min-viewpoints N', '10 cm or 5 degrees apart (%(default)s)',
            command.positive_int, 3)
+    option(limits, '--moving CLASSES', "classes that move and never become landmarks, as 'person, "
+           "cat'; '' for none (persons, animals, balls and vehicles of COCO)")
     option(limits, '--min-baseline DEG', 'angle between two of its directions (%(default)s)',
            command.within(0.0, 180.0), 20.0)
     return parser
@@ -96,20 +103,26 @@ def build(options: argparse.Namespace) -> int:
     from cliploc_ros.cli import sources
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.datasets.frames import move_frames
-    from cliploc_ros.offline.make_map import find_labeller, make_map, update_map, write_made_map
-    from cliploc_ros.offline.mapping.options import MappingOptions, OdometryErrors
+    from cliploc_ros.offline.make_map import find_labeller, update_map, write_made_map
+    from cliploc_ros.offline.mapping.options import (
+        MOVING_CLASSES,
+        MappingOptions,
+        OdometryErrors,
+    )
 
     begin = time.monotonic()
     path, update, name = options.out, options.update, sources.source_of(options).name
     _check(options)
-    if update is not None:
-        LandmarkMap.from_file(update)
+    if update is not None and not len(LandmarkMap.from_file(update)):
+        raise OptionsError(f'--update {update}: is a map of keyframes alone: build it anew')
     mapping = MappingOptions(
         pose_errors=_pose_errors(options), estimate_pose_errors=options.joint is None,
         odometry_errors=OdometryErrors(*options.odometry_noise or ()),
         refine_mount=options.refine_mount, min_viewpoints=options.min_viewpoints,
         min_baseline_deg=options.min_baseline, frame_id=options.frame_id,
-        source=f'build_map {name}', random_seed=options.seed)
+        source=f'build_map {name}', random_seed=options.seed,
+        moving_classes=MOVING_CLASSES if options.moving is None else tuple(
+            filter(None, map(str.strip, options.moving.split(',')))))
     source = sources.read_source(options)
     detections, scale, rotation = _placed(source.recorded.detections, options, mapping)
     if without := source.recorded.without_pose:
@@ -118,13 +131,11 @@ def build(options: argparse.Namespace) -> int:
         detections = detections.select_frames(range(0, len(detections), options.every))
     clip = partial(sources.clip_options, options) if options.clip else None
     labeller = find_labeller(detections, clip, options.vocabulary)
-    layer, note = None, ''
+    layer, note, is_poor = None, '', False
     if update is None:
-        with command.StageBar() as bar, _reporting_failure(options.report):
-            made = make_map(detections, labeller, mapping, progress=bar.show)
-        _write_report(options.report, made.report.as_dict())
         frames = source.frames and move_frames(source.frames, scale, rotation)
-        layer, note = map_layer.make_layer(options, frames, made.landmark_map)
+        made, layer, note = _make(options, detections, labeller, mapping, frames)
+        path, is_poor = _place_of(options.out, made.report)
         lines = made.report.lines()
         head = [f'built by build_map from {name}', *lines[:2]]
         if made.mount is not None:
@@ -141,7 +152,54 @@ def build(options: argparse.Namespace) -> int:
     for text in filter(None, (labeller.note, note)):
         print(f'note: {text}')
     print(f'wrote {path} in {time.monotonic() - begin:.1f} s', flush=True)
-    return _check_map(path, options.check)
+    _check_map(path, options.check)
+    return _refuse(options.out, path) if is_poor else 0
+
+
+def _refuse(out: Path, written: Path) -> int:
+    """Say that a map is too poor; return the exit code."""
+    print(f'refused: the map explains too few of the boxes of its classes: {out} is not written; '
+          f'look at {written.name}; check the camera first, then stamps, then poses, then the '
+          'objects')
+    return 1
+
+
+def _make(options: argparse.Namespace, detections: 'PosedDetections', labeller: 'Labeller',
+          mapping: 'MappingOptions', frames: 'Frames | None'
+          ) -> 'tuple[MadeMap, KeyframeLayer | None, str]':
+    """Return a new map, its keyframes, and a note where it has none.
+
+    Where no landmark is found, keyframes alone make a map. MappingError: there are none, either.
+    """
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
+    from cliploc_ros.offline.make_map import MadeMap, make_map
+    from cliploc_ros.offline.mapping.building import MappingReport
+
+    failure = None
+    with command.StageBar() as bar, _reporting_failure(options.report):
+        try:
+            made = make_map(detections, labeller, mapping, progress=bar.show)
+        except MappingError as error:
+            failure = error
+            made = MadeMap(LandmarkMap.empty(options.frame_id),
+                           MappingReport.of_nothing(detections, error))
+            if frames is None or options.keyframe_layer is False:
+                raise
+        layer, note = map_layer.make_layer(options, frames, made.landmark_map)
+        if failure is not None and layer is None:
+            raise failure
+    _write_report(options.report, made.report.as_dict())
+    return made, layer, note
+
+
+def _place_of(path: Path, report: 'MappingReport | UpdateReport') -> tuple[Path, bool]:
+    """Return where a map is written, and whether it is too poor to take the place of another."""
+    from cliploc_ros.offline.mapping.building import MappingReport
+    from cliploc_ros.offline.mapping.refit import LEAST_EXPLAINED
+
+    is_poor = isinstance(report, MappingReport) and report.landmarks > 0 and (
+        report.explained_of_classes < LEAST_EXPLAINED)
+    return path.with_name(f'{path.stem}.refused{path.suffix}') if is_poor else path, is_poor
 
 
 @contextmanager
@@ -166,15 +224,14 @@ def _write_report(path: Path | None, report: dict[str, Any]) -> None:
         print(f'report: {path}', flush=True)
 
 
-def _check_map(path: Path, wanted: bool) -> int:
-    """Check the map that was written; one that cannot be checked stays. Return 0."""
+def _check_map(path: Path, wanted: bool) -> None:
+    """Check the map that was written; one that cannot be checked stays."""
     try:
         if wanted:
             check_map.check(check_map.make_parser().parse_args([str(path), *_QUICK]))
     except CliplocError as error:
         print(f'note: not checked: {error}')
     print(f'to correct it: studio {path}')
-    return 0
 
 
 def _check(options: argparse.Namespace) -> None:

@@ -21,7 +21,7 @@ from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
-
+    from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.offline.datasets.images import Images
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
@@ -93,6 +93,7 @@ def _add_thresholds(parser: argparse.ArgumentParser) -> None:
             ('min_accepted', share, 'share of recorded frames that are accepted'),
             ('max_misled', share, 'share of views in which a wrong pose is accepted'),
             ('min_positions', share, 'share of grid positions with an accepted heading'),
+            ('min_by_objects', share, 'the same by objects alone, beside keyframes'),
             ('max_faulty', share, 'share of landmarks with a serious fault'),
             ('max_duplicates', count, 'pairs of landmarks that are one object'),
             ('max_look_alikes', count, 'pairs of places that look alike')):
@@ -131,11 +132,13 @@ def check(options: argparse.Namespace) -> int:
             image_of = partial(images.of, detections)
     if detections is not None and (note := tilt_note(detections.map_from_camera)):
         print(f'note: {note}', flush=True)
+    layer = read_layer(options.map, landmark_map, options.keyframes)
+    if not len(landmark_map):
+        return _check_keyframes(layer, detections)
     queries = [PosedObservation(one.observation, one.map_from_camera,
                                 one.observation.stamp_ns / NS_PER_S)
                for one in make_queries(load_queries(options.queries, landmark_map.landmark_ids),
                                        landmark_map)] if options.queries else []
-    layer = read_layer(options.map, landmark_map, options.keyframes)
     out = options.out or options.map.with_name(f'{options.map.stem}_check')
     make_folder(out)
     with command.StageBar() as bar:
@@ -143,14 +146,34 @@ def check(options: argparse.Namespace) -> int:
                            layer, image_of)
         page.write_report(out, options.map.name, report, draw_pictures(landmark_map, report),
                           views)
-    print('\n'.join(page.summary_lines(report)))
+    print('\n'.join([f'verdict: {report.verdict}', *map(str, report.carried),
+                     *page.summary_lines(report)]))
     print('what to do:')
     print('\n'.join(f'  {command.printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
     for failure in report.failures:
         print(f'fails: {failure}')
     print(f'wrote {out / page.PAGE} in {time.monotonic() - begin:.1f} s: '
-          f'{"passed" if report.passed else "failed"}')
+          f'{report.verdict}')
     return 0 if report.passed else 1
+
+
+def _check_keyframes(layer: 'KeyframeLayer | None', detections: 'PosedDetections | None') -> int:
+    """Say what a map without landmarks does; return the exit code of one that did not pass."""
+    from cliploc_ros.offline.mapping.check.report import in_reach
+
+    if layer is None:
+        print('fails: the map has neither landmarks nor keyframes')
+        return 1
+    print(f'keyframes only: no landmark; {len(layer)} keyframes with {int(layer.offsets[-1])} '
+          'points localize a robot near their views')
+    if detections is not None:
+        poses = detections.map_from_camera
+        reached = in_reach(layer, poses[:, :3, 3], poses[:, :3, 2])
+        print(f'recorded frames within reach of a keyframe: {reached.mean():.0%} of '
+              f'{len(reached)}')
+    print('what to do:\n  record objects from several sides, so that a robot is localized by them '
+          'elsewhere, too, and when the place has changed')
+    return 1
 
 
 def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Images | None] | None':

@@ -57,12 +57,16 @@ def add_reading_options(parser: argparse.ArgumentParser) -> None:
            '(map, where the bag has no /ground_truth and nothing else is named)')
     option(group, '--camera-frame FRAME', "the camera's optical coordinate frame in /tf (that of "
            'the images)')
+    option(group, '--tf TOPIC', '(/tf, or the only one under the name of a robot; the static '
+           'one is its name with _static)')
     option(group, '--trajectory FILE', 'take poses from a file in TUM format')
     option(group, '--mount --body-from-camera V', 'x y z qx qy qz qw of the camera (z forward) on '
            'what the poses of a topic or file are of; 7 numbers for each of --cameras, in their '
            'order', finite, nargs='+')
     option(group, '--max-gap SECONDS', 'interpolate between poses at most so far apart '
            '(%(default)s)', not_negative, 0.5)
+    option(group, '--stamp-tolerance SECONDS', 'a pose or depth image belongs to an image at most '
+           'so far away (%(default)s)', not_negative, 0.02)
     group = parser.add_argument_group('poses of --folder, --colmap and --nerf')
     option(group, '--images DIR', 'where the images of --colmap or --nerf are, if not beside them')
     option(group, '--scale METRES', 'of a unit of the poses', positive)
@@ -71,12 +75,13 @@ def add_reading_options(parser: argparse.ArgumentParser) -> None:
     option(group, '--level', 'turn z up, by the tilt of the cameras; of --bag and --observations, '
            'too')
     option(group, '--axes', 'what the poses are: of cameras with these axes, or inverse (the '
-           "layout's own)", choices=('opencv', 'opengl', 'opencv-inverse', 'opengl-inverse'))
+           "layout's own)", choices=(
+               'opencv', 'opengl', 'opencv-inverse', 'opengl-inverse', 'ros'))
     group = parser.add_argument_group('images and depth of --bag and folders')
     add_topic_options(group)
     option(group, '--depth TOPIC', 'depth registered to the images of --bag')
     option(group, '--intrinsics fr1|fr2|fr3|FILE', 'camera of TUM RGB-D and 7-Scenes, where the '
-           'folder does not say it')
+           'folder does not say it; of --bag, a camera.json instead of camera_info')
     option(group, '--depth-unit METRES', 'one count of a depth image (0.001; 0.0002 for TUM; 1 '
            'for floats)', positive)
     option(group, '--depth-intrinsics FX FY CX CY', 'of a depth camera that is not registered to '

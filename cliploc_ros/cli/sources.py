@@ -35,6 +35,8 @@ from cliploc_ros.units import NS_PER_S
 _READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'max_gap', 'image',
             'camera_info', 'rectified', 'depth', 'depth_unit', 'depth_intrinsics',
             'depth_baseline', 'intrinsics')
+# These do, too, and came later: where they are not given, observation files of before serve.
+_READING_MORE = {'tf': None, 'stamp_tolerance': 0.02}
 
 
 def detector_options(options: argparse.Namespace, **more: Any) -> DetectorOptions:
@@ -68,6 +70,8 @@ def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
 
     DatasetError: the bag has none, or several.
     """
+    if options.intrinsics is not None:  # no camera_info is needed
+        options.camera_info = options.camera_info or bag_frames.BagTopics.camera_info
     open_topics = [name for name in ('image', 'camera_info') if getattr(options, name) is None]
     if bag is None or options.cameras != ['']:
         options.image = options.image or bag_frames.BagTopics.image
@@ -113,7 +117,9 @@ def recording_options(options: argparse.Namespace, keyframes: recorder.KeyframeO
     another observation file.
     """
     reading = [*(str(getattr(options, name)) for name in _READING),
-               *(options.cameras if options.cameras != [''] else []), *map(str, more)]
+               *(options.cameras if options.cameras != [''] else []), *map(str, more),
+               *(f'{name} {getattr(options, name)}' for name, usual in _READING_MORE.items()
+                 if getattr(options, name) != usual)]
     conf = {'conf': options.conf} if 'conf' in options else {}
     return recorder.RecordingOptions(
         detector_options(options, **conf), clip_options(options) if options.clip else None,
@@ -127,7 +133,7 @@ def recording_of(options: argparse.Namespace, file: Path, scale: float,
     source, layout = folder or (options.bag, '')
     if options.bag is not None:
         return MapRecording(file, source, options.image, options.camera_info, options.rectified,
-                            scale=scale, rotation=rotation.tolist())
+                            intrinsics=options.intrinsics, scale=scale, rotation=rotation.tolist())
     # --rgbd finds its layout itself
     return MapRecording(file, source, layout='' if layout == 'rgbd' else layout,
                         intrinsics=options.intrinsics, images=options.images, scale=scale,
@@ -168,7 +174,8 @@ def read_cameras(options: argparse.Namespace, gap_s: float | None = None) -> dic
     folder = FolderOptions(
         options.intrinsics, options.trajectory and read_tum_trajectory(options.trajectory), gap_ns,
         mounts[''], _depth_format(options), key, options.images, options.axes, options.scale,
-        distance, getattr(options, 'object_size', None) is not None, options.level)
+        distance, getattr(options, 'object_size', None) is not None, options.level,
+        round(options.stamp_tolerance * NS_PER_S))
     return {'': rgbd_frames(path, folder) if key == 'rgbd' else read_folder(path, folder)}
 
 
@@ -201,7 +208,8 @@ def _frames_of(options: argparse.Namespace, name: str, mount: NDArray[np.float64
                gap_ns: int) -> Frames:
     """Return the images of one camera of a bag; its name is '' where it is the only one."""
     topics = bag_frames.BagTopics(options.image, options.camera_info, options.rectified,
-                                  options.depth or '')
+                                  options.depth or '', options.intrinsics,
+                                  round(options.stamp_tolerance * NS_PER_S))
     read = _read_poses(options, name, mount, gap_ns)
     try:
         return bag_frames.bag_frames(options.bag, topics.of_camera(name), read,
@@ -212,11 +220,12 @@ def _frames_of(options: argparse.Namespace, name: str, mount: NDArray[np.float64
         raise DatasetError(f"camera '{name}': {error}") from error
 
 
-def _poses_of_topic(topic: str, camera: str, mount: NDArray[np.float64] | None, gap_ns: int
-                    ) -> bag_frames.ReadPoses:
+def _poses_of_topic(options: argparse.Namespace, topic: str, camera: str,
+                    mount: NDArray[np.float64] | None, gap_ns: int) -> bag_frames.ReadPoses:
     """Return what reads a topic, which without a mount is the camera's own, in its namespace."""
     return bag_frames.poses_of_topic(
-        topic if mount is not None else bag_frames.topic_of(camera, topic), gap_ns, mount)
+        topic if mount is not None else bag_frames.topic_of(camera, topic), gap_ns, mount,
+        round(options.stamp_tolerance * NS_PER_S), options.tf)
 
 
 def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.float64] | None,
@@ -232,21 +241,23 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.floa
         if mount is not None:
             raise OptionsError('--mount is for --pose-topic and --trajectory: name one of them')
         truth = bag_frames.topic_of(camera, bag_frames.GROUND_TRUTH)
-        return bag_frames.find_poses(max_gap_ns, truth, options.camera_frame, gap_ns)
+        return bag_frames.find_poses(max_gap_ns, truth, options.camera_frame, gap_ns,
+                                     round(options.stamp_tolerance * NS_PER_S), options.tf)
     if options.pose_topic is not None:
-        return _poses_of_topic(options.pose_topic, camera, mount, gap_ns)
+        return _poses_of_topic(options, options.pose_topic, camera, mount, gap_ns)
     if options.trajectory is not None:
         if mount is None and len(options.cameras) > 1:
             raise OptionsError('--trajectory of several cameras: give the --mount of each')
         poses = replace(read_tum_trajectory(options.trajectory), max_gap_ns=max_gap_ns,
-                        body_from_camera=mount)
+                        body_from_camera=mount,
+                        tolerance_ns=round(options.stamp_tolerance * NS_PER_S))
         return lambda reader, camera_frame: poses
     if mount is not None:
         raise OptionsError('--mount is not for --map-frame: tf knows the mount')
     if options.camera_frame is not None and len(options.cameras) > 1:
         raise OptionsError('--camera-frame is of one camera: several have the frames of their '
                            'images')
-    return bag_frames.poses_of_tf(options.map_frame, options.camera_frame, max_gap_ns)
+    return bag_frames.poses_of_tf(options.map_frame, options.camera_frame, max_gap_ns, options.tf)
 
 
 def _odometry(options: argparse.Namespace) -> dict[str, Poses] | None:
@@ -259,9 +270,9 @@ def _odometry(options: argparse.Namespace) -> dict[str, Poses] | None:
                            '--odometry-frame')
     return {name: bag_frames.bag_odometry(
         options.bag, bag_frames.topic_of(name, options.image),
-        _poses_of_topic(options.odometry_topic, name, mount, max_gap_ns)
+        _poses_of_topic(options, options.odometry_topic, name, mount, max_gap_ns)
         if options.odometry_frame is None else bag_frames.poses_of_tf(
-            options.odometry_frame, options.camera_frame, max_gap_ns))
+            options.odometry_frame, options.camera_frame, max_gap_ns, options.tf))
         for name, mount in _mounts(options).items()}
 
 

@@ -216,8 +216,11 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
     files = map_files(parameters)
     landmark_map, map_hash = load_hashed_map(node, files)
     relocalizer = Relocalizer(landmark_map, options)  # before what takes long
+    keyframes = load_keyframes(parameters, landmark_map)
+    if not len(landmark_map) and keyframes is None:
+        raise MapError('the map has no landmarks, and no keyframes lie next to it: build it again')
     observer, device = None, 'cpu'
-    if options.needs_similarities:
+    if options.needs_similarities and len(landmark_map):
         from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
         from cliploc_ros.models.observer import Observer
         asked = (clip_options_of(parameters), landmark_map, files, parameters.landmark_embeddings)
@@ -228,7 +231,7 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
             observer, device = Observer(encoder, embeddings), encoder.device
             observer.measure()
     return FrameLocalizer(landmark_map, observer, relocalizer, options, device, map_hash,
-                          load_keyframes(parameters, landmark_map))
+                          keyframes)
 
 
 def clip_options_of(parameters: RelocalizerParameters) -> 'ClipOptions':

@@ -236,7 +236,7 @@ def test_bad_fields_are_named_with_file_and_landmark(tmp_path, change, message):
     ('[' * 1_000_000, 'nest'),
     (b'\x7fELF\xff\xfe\x00', 'not a text file'),
     ('/**:\n  ros__parameters:\n    map:\n', 'frame_id, landmarks'),
-    (file_of({}), 'the map is empty'), (file_of({'a.b': WITH_LABEL}), 'without dots'),
+    (file_of(None), 'the map is empty'), (file_of({'a.b': WITH_LABEL}), 'without dots'),
     (file_of({'a': {'centre': 0, **WITH_LABEL}}), "mean 'center'"),
     (file_of({'a': WITH_LABEL}) | {'/x': {'ros__parameters': {'map': {}}}}, 'more than one map'),
     ('!!python/object/apply:os.system [echo]', 'no YAML mapping')])

@@ -11,16 +11,19 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.captures import placing
+from cliploc_ros.offline.datasets import agreement
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.captures.placing import AXES, check_axes
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder
 from cliploc_ros.offline.mapping.tilt import find_vertical
 
 pytestmark = pytest.mark.needs('pycolmap')
+# of a camera in a body with x forward, y left, z up
+ROS_FROM_CAMERA = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
 STORED = {'opencv': lambda pose: pose, 'opengl': lambda pose: pose @ FLIP,
           'opencv-inverse': invert_transform,
-          'opengl-inverse': lambda pose: invert_transform(pose @ FLIP)}
+          'opengl-inverse': lambda pose: invert_transform(pose @ FLIP),
+          'ros': lambda pose: pose @ ROS_FROM_CAMERA}
 
 
 @pytest.fixture(scope='module')
@@ -35,7 +38,7 @@ def test_real_images_tell_the_axes(folder, shared_data, monkeypatch):
     folder = shared_data / folder
     capture = find_layout(folder).read(folder, FolderOptions())
     # each image is looked at once; looking is most of the time
-    monkeypatch.setattr(placing, 'extract', lru_by_pixels(placing.extract))
+    monkeypatch.setattr(agreement, 'extract', lru_by_pixels(agreement.extract))
     for stored_as, given in itertools.product(AXES, AXES):
         stored = [file._replace(pose=STORED[stored_as](file.pose)) for file in capture.files
                   if file.pose is not None]

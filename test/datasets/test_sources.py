@@ -178,8 +178,14 @@ def test_odometry_and_covariance_with_a_mount(tmp_path):
     mount = mount_from_numbers([0.3, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0])
     frame, = bag_frames(bag, BagTopics(), poses_of_topic('/amcl_pose', 200 * MS, mount)).read()
     np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.05, 0.3, 0.5], atol=1e-9)
-    frame, = bag_frames(bag, BagTopics(), poses_of_topic('/odom', 200 * MS)).read()
-    np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.1, 0.0, 0.0], atol=1e-9)
+    # they are of 'base', as child_frame_id says
+    with pytest.raises(DatasetError, match=r"of 'base' .*`mount`"):
+        bag_frames(bag, BagTopics(), poses_of_topic('/odom', 200 * MS))
+    known = write_bag(tmp_path / 'with_tf', [50], [*odometry, (
+        0, '/tf_static', TF, make(TF, transforms=[transform_message(
+            START, 'base', 'camera', pose_at(0.2))]))])
+    frame, = bag_frames(known, BagTopics(), poses_of_topic('/odom', 200 * MS)).read()
+    np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.3, 0.0, 0.0], atol=1e-9)
 
 
 def tf_messages(*, static=True, parent='odom'):

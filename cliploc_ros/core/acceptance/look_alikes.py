@@ -95,8 +95,9 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
     """
     # those matched, then those around, the nearest first
     ranks = [*range(1, min(int(_TERMS.around), len(landmark_map)) + 1)]
-    distances, rows = landmark_map.tree.query(position, ranks,
-                                              distance_upper_bound=_TERMS.radius_m)
+    distances, rows = landmark_map.tree.query(
+        position, ranks, distance_upper_bound=_TERMS.radius_m) if ranks else (
+        np.empty(0), np.empty(0, dtype=np.int64))
     rows = rows[np.isfinite(distances)]
     rows = np.concatenate([matched, rows[~np.isin(rows, matched)]])
     rows = rows[:int(_TERMS.most_landmarks)]

@@ -231,7 +231,7 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
     arrays: dict[str, NDArray[Any]] = {'header': np.array(json.dumps(header))} | {
         name: np.asarray(getattr(layer, name)) for name in names}
     _SCHEMA.write(path, {
-        name: array if _SCHEMA.fields[name].type == 'text'
+        name: array.astype(np.str_) if _SCHEMA.fields[name].type == 'text'
         else array.astype(_SCHEMA.fields[name].type, copy=False)
         for name, array in arrays.items()})
 
@@ -309,6 +309,8 @@ def _check_map(layer: KeyframeLayer, landmark_map: LandmarkMap) -> None:
     if layer.frame_id != landmark_map.frame_id:
         raise ArrayError(f"is of a map in frame '{layer.frame_id}', not "
                           f"'{landmark_map.frame_id}'")
+    if not layer.landmark_ids and not landmark_map.landmark_ids:
+        return  # of keyframes alone
     rows = {name: row for row, name in enumerate(layer.landmark_ids)}
     shared = [(rows[name], row) for row, name in enumerate(landmark_map.landmark_ids)
               if name in rows]

@@ -141,7 +141,7 @@ class ClassIndex:
 
     def sizes_of(self, classes: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return how many landmarks each class (n,) has; 0 for classes below 0."""
-        return np.where(classes >= 0, np.diff(self.starts)[classes], 0)
+        return np.append(np.diff(self.starts), 0)[classes]  # the last for -1
 
     def pairs(self, classes: NDArray[np.int64], order: NDArray[np.int64],
               limit: int | None = None) -> NDArray[np.int64]:
@@ -189,7 +189,7 @@ def objects_of(centers: NDArray[np.float64], shapes: NDArray[np.float64],
 
 @dataclass(frozen=True)
 class LandmarkMap:
-    """Landmarks of one map frame. L is their number, at least 1."""
+    """Landmarks of one map frame. L is their number; 0 of a map of keyframes alone."""
 
     frame_id: str  #: The coordinate frame of centres and orientations
     #: Name, description in natural language and detector class of each landmark
@@ -354,6 +354,12 @@ class LandmarkMap:
         return replace(LandmarkMap.from_mapping(found, str(path)), map_set=map_set)
 
     @staticmethod
+    def empty(frame_id: str) -> 'LandmarkMap':
+        """Return the map of a place that is known by keyframes alone."""
+        return LandmarkMap(frame_id, (), (), (), np.empty((0, 3)), np.empty((0, 3)),
+                           np.empty((0, 4)))
+
+    @staticmethod
     def from_mapping(tree: Any, source: str) -> 'LandmarkMap':
         """Build a map from a tree with the keys frame_id and landmarks.
 
@@ -365,8 +371,11 @@ class LandmarkMap:
         _check_keys(tree, ('frame_id', 'landmarks'), f'{source}: map')
         frame_id = _text(tree['frame_id'], f'{source}: map: frame_id')
         landmarks = tree['landmarks']
-        if not isinstance(landmarks, Mapping) or not landmarks:
-            raise MapError(f'{source}: map: landmarks: the map is empty')
+        if not isinstance(landmarks, Mapping):
+            raise MapError(f'{source}: map: landmarks: the map is empty; one of keyframes alone '
+                           'has {}')
+        if not landmarks:
+            return LandmarkMap.empty(frame_id)
         rows = [_landmark(landmark_id, fields, source)
                 for landmark_id, fields in landmarks.items()]
         labels, class_ids, centers, semi_axes, quats, details = zip(*rows, strict=True)

@@ -64,7 +64,7 @@ def make_pairs(centers: NDArray[np.float64], classes: NDArray[np.int64], tree: c
                ) -> LandmarkPairs:
     """Return the pairs of landmarks (L, 3) of some classes (L,), whose tree is given."""
     count = len(centers)
-    columns = max(_LEAST_NEIGHBOURS, min(_NEIGHBOURS, _MOST_PAIRS // count))
+    columns = max(_LEAST_NEIGHBOURS, min(_NEIGHBOURS, _MOST_PAIRS // max(count, 1)))
     neighbours = np.full((count, columns), count, dtype=np.int32)
     ranks = np.arange(2, min(columns + 1, count) + 1)
     if len(ranks):

@@ -9,6 +9,7 @@ both.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from math import comb, inf
 from typing import NamedTuple
@@ -104,8 +105,8 @@ def class_candidates(index: ClassIndex, classes: NDArray[np.int64], limit: int |
 
 
 def check_k(k: int, landmark_count: int) -> None:
-    """Refuse a k that exceeds the map with an OptionsError."""
-    if not 1 <= k <= landmark_count:
+    """Refuse a k that exceeds the map with an OptionsError; a map of keyframes alone takes any."""
+    if landmark_count and not 1 <= k <= landmark_count:
         raise OptionsError(f'k = {k}, but the map has {landmark_count} landmarks: '
                            f'set k to {landmark_count} or less')
 
@@ -117,6 +118,7 @@ def nearest_candidates(similarities: Similarities, k: int) -> Candidates:
     """
     detection_count, landmark_count = similarities.shape
     check_k(k, landmark_count)
+    k = min(k, landmark_count)
     landmarks, values = nearest_landmarks(similarities, k)
     return Candidates(np.repeat(np.arange(detection_count), k), landmarks.ravel(),
                       np.tile(np.arange(k), detection_count), values.ravel().astype(np.float64))
@@ -311,6 +313,11 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
     OptionsError: similarities that the matching type needs are missing or of the wrong shape, or
     the vertical is no unit vector.
     """
+    if not len(landmark_map):  # of keyframes alone: boxes tell nothing
+        none = np.empty(0, dtype=np.int64)
+        observation = replace(
+            observation, detections=observation.detections.select(none), compared=none,
+            similarities=np.empty((0, 0), dtype=np.float32), depths=None, depth_deviations=None)
     scene, left_out = match_frame(landmark_map, observation, options)
     frame = SearchedFrame(
         observation, scene, vertical_of(observation, options),

@@ -39,6 +39,8 @@ _VISION_MSGS = ('Point2D', 'Pose2D', 'BoundingBox2D', 'ObjectHypothesis',
 STORAGES: Mapping[str, StoragePlugin] = {'sqlite3': StoragePlugin.SQLITE3,
                                          'mcap': StoragePlugin.MCAP}
 
+#: A share of a topic's messages that may be left out where they cannot be used.
+MOST_LEFT_OUT = 0.2
 _INFINITE = QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
 
 #: The default of rclcpp, as camera drivers and detectors offer it; matches best-effort and
@@ -105,6 +107,9 @@ class BagReader:
         self.path = Path(path)
         self._reader: Reader | None = None
         self._topics: dict[str, BagTopic] = {}
+        #: Messages that cannot be used, by topic: why, and when
+        self.left_out: dict[str, dict[str, None]] = {}
+        self.notes: list[str] = []  #: What the user should know of what was read
 
     def __enter__(self) -> Self:
         """Open the recording."""
@@ -192,6 +197,22 @@ class BagReader:
             except Exception as error:  # the library's own, sqlite's, the operating system's
                 raise self._unreadable(error) from error
             yield BagMessage(connection.topic, stamp_ns, bytes(data))
+
+    def leave_out(self, topic: str, reason: str) -> None:
+        """Count a message that cannot be used; the same one again counts once.
+
+        DatasetError: too many cannot, so that the fault is no accident.
+        """
+        reasons = self.left_out.setdefault(topic, {})
+        reasons[reason] = None
+        if len(reasons) > MOST_LEFT_OUT * self.topic(topic).message_count:
+            raise DatasetError(f'{self.path}: {topic}: {len(reasons)} messages cannot be used: '
+                               f'{next(iter(reasons))}')
+
+    def left_out_notes(self) -> list[str]:
+        """Return what was left out, topic by topic, in words."""
+        return [f'{len(reasons)} of {self.topic(topic).message_count} messages of {topic} left '
+                f'out: {next(iter(reasons))}' for topic, reasons in self.left_out.items()]
 
     def deserialize(self, message: BagMessage) -> Any:
         """Turn a message's bytes into an object with the fields of its type.

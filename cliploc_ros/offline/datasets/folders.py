@@ -39,8 +39,19 @@ _SEVEN_SCENES_DEPTH = DepthCamera(
     transforms.make_transform(np.eye(3), np.array([-0.025, 0.0, 0.0])))
 _SEVEN_SCENES_NAME = re.compile(r'frame-(\d+)\.color\.(?:jpe?g|png)')
 _SEVEN_SCENES_HZ = 30
-_MAX_DEPTH_DELAY_NS = 20_000_000
 _NO_OPTIONS = FolderOptions()
+# Layouts that are read: a part of one that is here, and the part that lacks.
+_NEARLY = (('TUM RGB-D', 'groundtruth.txt', 'rgb.txt'), ('TUM RGB-D', 'depth.txt', 'rgb.txt'),
+           ('Stray Scanner', 'camera_matrix.csv', 'odometry.csv'),
+           ('ARKitScenes', 'lowres_wide', 'lowres_wide.traj'),
+           ('7-Scenes', 'frame-*.pose.txt', 'frame-000000.color.jpg'),
+           ('Record3D', 'rgbd', 'metadata.json'), ('Polycam', 'mesh_info.json', 'keyframes'),
+           ('COLMAP', 'database.db', 'sparse/0 (run its mapper)'))
+# Layouts that are not read, by files of theirs.
+_OTHERS = {'EuRoC': ('mav0',), 'KITTI': ('image_[0-3]', 'times.txt'),
+           'ScanNet': ('color', 'pose', 'intrinsic'), 'Replica': ('results', 'traj.txt'),
+           'ScanNet++': ('iphone', 'dslr'), 'nuScenes': ('samples', 'sweeps'),
+           'Matterport3D': ('matterport_color_images',), 'ROS 1': ('*.bag',)}
 
 
 class Layout(NamedTuple):
@@ -68,8 +79,8 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
     layout = find_layout(folder, options.layout)
     if layout is None:
         remedy = ('it is a recording: give it as `bag`' if (folder / 'metadata.yaml').is_file()
-                  else 'unpack it' if folder.suffix in ('.r3d', '.zip')
-                  else 'images alone need poses, as COLMAP makes them')
+                  else 'unpack it' if folder.suffix in ('.r3d', '.zip') else _unread(folder)
+                  or 'images alone need poses, as COLMAP makes them')
         raise DatasetError(f'{folder}: has the files of no known layout: '
                            f'{", ".join(sorted({one.name for one in LAYOUTS}))}; {remedy}')
     given = {'intrinsics': options.intrinsics, 'trajectory': options.trajectory,
@@ -81,6 +92,17 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
                                f'{" and ".join(able)}')
     with naming(folder, OSError, what='cannot be read: '):
         return _placed(folder, layout, layout.read(folder, options), options)
+
+
+def _unread(folder: Path) -> str:
+    """Return which layout a folder nearly has, or that it is one that is not read; '' for none."""
+    for name, mark, lacking in _NEARLY:
+        if any(folder.glob(mark)) and not (folder / lacking).exists():
+            return f'it has {mark} as {name} does, but lacks {lacking}'
+    other = next((name for name, marks in _OTHERS.items()
+                  if all(any(folder.glob(mark)) for mark in marks)), '')
+    return other and (f'it is of {other}: write rgb.txt, groundtruth.txt and camera.json as TUM '
+                      'RGB-D has them beside its images, or a transforms.json')
 
 
 def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Camera, str]:
@@ -145,9 +167,14 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
         notes.append(f'levelled: the vertical of the cameras was {found[1]:.1f} degrees off z')
     elif not capture.up:
         notes.append(tilt_note(poses))
-    frames = folder_frames(folder, files, replace(
-        capture.depth, unit_m=options.depth.unit_m or capture.depth.unit_m,
-        camera=options.depth.camera or capture.depth.camera))
+    form = replace(capture.depth, unit_m=options.depth.unit_m or capture.depth.unit_m,
+                   camera=options.depth.camera or capture.depth.camera)
+    if not capture.is_metric:  # its depth is in the unit of its poses
+        form = replace(form, scale=1.0 if options.depth.unit_m else form.scale * (scale or 1.0))
+    frames = folder_frames(folder, files, form)
+    flat = sum(one.depth is None for one in files)
+    if 0 < flat < len(files):
+        notes.append(f'{flat} of {len(files)} images have no depth image')
     known = [(one.color.name, one.camera, np.round(one.pose, 6).tolist())
              for one in files if one.pose is not None]
     return replace(frames, digest=hashlib.sha256(repr(known).encode()).hexdigest()[:12],
@@ -184,11 +211,12 @@ def _tum(folder: Path, options: FolderOptions, with_depth: bool = True) -> Captu
         times = np.array(stamps, dtype=np.int64)
         for stamp in sequence.stamps_ns:
             nearest = int(np.argmin(np.abs(times - stamp)))
-            if abs(stamps[nearest] - stamp) <= _MAX_DEPTH_DELAY_NS:
+            if abs(stamps[nearest] - stamp) <= options.tolerance_ns:
                 depths[stamp] = paths[nearest]
     trajectory = replace(
         sequence.trajectory if options.trajectory is None else options.trajectory,
-        max_gap_ns=options.max_gap_ns, body_from_camera=options.body_from_camera)
+        max_gap_ns=options.max_gap_ns, body_from_camera=options.body_from_camera,
+        tolerance_ns=options.tolerance_ns)
     return Capture(_tum_files(sequence, camera, trajectory, depths), depth=DepthFormat(TUM_UNIT),
                    trajectory=trajectory)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -161,6 +161,7 @@ class DepthFormat:
     #: Metres of one count. None: 1 mm for 16-bit integers, 1 m for floats.
     unit_m: float | None = None
     camera: DepthCamera | None = None  #: None: registered to the colour image
+    scale: float = 1.0  #: Metres of what unit_m counts, where that is the unit of the poses
 
 
 def folder_frames(folder: Path, files: Sequence[ImageFile], depth: DepthFormat | None = None
@@ -180,17 +181,23 @@ def folder_frames(folder: Path, files: Sequence[ImageFile], depth: DepthFormat |
                   notes=tuple(notes)[:_MOST_NOTES])
 
 
-def read_color(file: ImageFile) -> tuple[NDArray[np.uint8], Camera]:
+def read_color(file: ImageFile, upright: bool = False) -> tuple[NDArray[np.uint8], Camera]:
     """Return the image (h, w, 3) of a file, red first, and its camera.
 
-    DatasetError: the image cannot be decoded, or is not of the camera's size.
+    It is turned by its EXIF orientation where `upright` says so, or the camera's size does: width
+    and height are those of the turned image alone. DatasetError: the image cannot be decoded, or
+    is not of the camera's size.
     """
     path, camera = file.color, file.camera
-    image = (cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-             if file.number is None else _open_video(path).image(file.number))
+    image = (_read_image(path, upright) if file.number is None
+             else _open_video(path).image(file.number))
     if image is None:
         of = '' if file.number is None else f': image {file.number} of the video'
         raise DatasetError(f'{path}{of} cannot be read as an image')
+    if file.number is None and image.shape[:2] == (camera.width, camera.height) and (
+            camera.width != camera.height):
+        image = _read_image(path, not upright)
+        assert image is not None
     if image.shape[:2] != (camera.height, camera.width):
         turned = image.shape[:2] == (camera.width, camera.height)
         raise DatasetError(
@@ -199,6 +206,12 @@ def read_color(file: ImageFile) -> tuple[NDArray[np.uint8], Camera]:
                 '; is it turned by its EXIF orientation? turn the pixels, as with mogrify '
                 '-auto-orient' if turned else ''))
     return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8), camera
+
+
+def _read_image(path: Path, upright: bool) -> Any:
+    """Return an image (h, w, 3), blue first; None where it cannot be read."""
+    return cv2.imread(str(path), cv2.IMREAD_COLOR | (0 if upright
+                                                     else cv2.IMREAD_IGNORE_ORIENTATION))
 
 
 class _Video:
@@ -235,6 +248,8 @@ def read_depth(file: ImageFile, form: DepthFormat) -> DepthImage:
     if counts is None:
         raise DatasetError(f'{file.depth} cannot be read as a depth image')
     depths_m = depth_from_counts(counts, form.unit_m, str(file.depth))
+    if form.scale != 1.0:
+        depths_m *= np.float32(form.scale)
     if file.confidence is not None:
         certain = cv2.imread(str(file.confidence), cv2.IMREAD_UNCHANGED)
         if certain is None or certain.shape != depths_m.shape:

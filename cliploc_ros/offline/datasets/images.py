@@ -88,7 +88,8 @@ def images_of_recording(recording: MapRecording, cameras: Sequence[str]) -> Imag
     if recording.source is None:
         return None
     return open_images(recording.source, BagTopics(
-        recording.image, recording.camera_info, recording.rectified), cameras, FolderOptions(
+        recording.image, recording.camera_info, recording.rectified,
+        intrinsics=recording.intrinsics), cameras, FolderOptions(
         recording.intrinsics, images=recording.images, layout=recording.layout))
 
 

@@ -90,22 +90,27 @@ def parse_all[T](cells: Sequence[str], kind: Callable[[str], T], where: str) -> 
     return numbers
 
 
-def parse_stamp_ns(text: str, where: str) -> int:
-    """Convert decimal seconds to nanoseconds exactly, without a float.
+def parse_stamp_ns(text: str, where: str, unit_s: Decimal | None = Decimal(1)) -> int:
+    """Convert a decimal time to nanoseconds exactly, without a float.
 
     DatasetError: the text is no number, or outside the range of a ROS time.
 
     Parameters
     ----------
     text : str
-        Seconds, as ``1341847980.722988`` or ``1.341847980722988e9``.
+        As ``1341847980.722988`` or ``1.341847980722988e9``.
     where : str
         File and line, for the message.
+    unit_s : Decimal, optional
+        Seconds of a unit. None: seconds where they can be, else the greatest of ms, us and ns.
     """
     try:
-        seconds = Decimal(text)
+        number = Decimal(text)
     except InvalidOperation:
         raise DatasetError(f'{where}: {text!r} is no timestamp in seconds') from None
+    units = [Decimal(10) ** -power for power in (0, 3, 6, 9)] if unit_s is None else [unit_s]
+    seconds = next((number * unit for unit in units
+                    if number.is_finite() and number * unit <= MAX_STAMP_S), number)
     if not seconds.is_finite() or not 0 <= seconds <= MAX_STAMP_S:
         raise DatasetError(f'{where}: timestamp {text} is outside 0 to {MAX_STAMP_S} s')
     return int((seconds * NS_PER_S).to_integral_value())

@@ -14,11 +14,15 @@ from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.parsing import unit_quaternion
 from cliploc_ros.units import NS_PER_S
 
-# A stamp has a pose only if a sample lies this close to it.
-_MAX_SAMPLE_DISTANCE_NS = 20_000_000
-_MAX_NORM_ERROR = 0.01
+#: A stamp has a pose only if a sample lies this close to it, unless the user says otherwise.
+STAMP_TOLERANCE_NS = 20_000_000
+#: Of a quaternion that is taken for a unit one.
+MAX_NORM_ERROR = 0.01
 # A clock that is off by less than this is a late start of the recording, not another clock.
 _OTHER_CLOCK_S = 60.0
+# Messages are recorded late, and out of order, by less than this; a clock that begins again is
+# not [s].
+_BACK_S = 1.0
 
 
 class Poses(Protocol):
@@ -40,15 +44,16 @@ class TimedPoses:
     stamps_ns: NDArray[np.int64]
     positions_xyz: NDArray[np.float64]  #: (t, 3): in the map [m]
     quats_xyzw: NDArray[np.float64]  #: (t, 4): rotation into map axes, unit norm
-    #: Greatest gap between two samples to interpolate over [ns]. One sample within 20 ms is always
-    #: enough.
+    #: Greatest gap between two samples to interpolate over [ns]. One sample within the tolerance
+    #: is always enough.
     max_gap_ns: int = 0
     #: (4, 4): the mount of the camera; None: the poses are the camera's own
     body_from_camera: NDArray[np.float64] | None = None
+    tolerance_ns: int = STAMP_TOLERANCE_NS
 
     @classmethod
     def from_samples(cls, stamps_ns: Sequence[int], rows: Sequence[Sequence[float]], where: str,
-                     tolerance: float = _MAX_NORM_ERROR) -> 'TimedPoses':
+                     tolerance: float = MAX_NORM_ERROR) -> 'TimedPoses':
         """Return the poses of unsorted samples (x, y, z, qx, qy, qz, qw).
 
         Of equal stamps the first counts. DatasetError: a sample is not finite or has no unit
@@ -86,7 +91,7 @@ class TimedPoses:
         gap_before = abs(stamp_ns - int(self.stamps_ns[low]))
         gap_after = abs(int(self.stamps_ns[high]) - stamp_ns)
         is_between = self.stamps_ns[low] <= stamp_ns <= self.stamps_ns[high]
-        if (min(gap_before, gap_after) > _MAX_SAMPLE_DISTANCE_NS
+        if (min(gap_before, gap_after) > self.tolerance_ns
                 and not (is_between and gap_before + gap_after <= self.max_gap_ns)):
             return None
         fraction = 0.0 if low == high else gap_before / (gap_before + gap_after)
@@ -122,7 +127,22 @@ def mount_from_numbers(numbers: Sequence[float]) -> NDArray[np.float64]:
         raise DatasetError(f'mount {list(numbers)}: needs x y z and a unit quaternion '
                            'qx qy qz qw')
     return transform_from_pose(np.array(numbers[:3]), unit_quaternion(
-        numbers[3:], f'mount {list(numbers)}', _MAX_NORM_ERROR))
+        numbers[3:], f'mount {list(numbers)}', MAX_NORM_ERROR))
+
+
+def check_forward(stamps_ns: Sequence[int], where: str) -> None:
+    """Refuse stamps, in the order of recording, that begin again: of two runs in one recording.
+
+    DatasetError: they do; says where.
+    """
+    stamps = np.array(stamps_ns, dtype=np.int64)
+    latest = np.maximum.accumulate(stamps)
+    again = np.nonzero(latest - stamps > _BACK_S * NS_PER_S)[0]
+    if len(again):
+        raise DatasetError(
+            f'{where}: the stamps begin again: {stamps[again[0]] / NS_PER_S:.3f} s comes after '
+            f'{latest[again[0]] / NS_PER_S:.3f} s; poses of two runs would be mixed: record each '
+            'run on its own, or cut them by `ros2 bag convert`')
 
 
 def check_clock(poses: Poses, first_ns: int, last_ns: int, where: str) -> None:

@@ -2,16 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read TUM RGB-D folders (Sturm et al. 2012): rgb.txt, rgb/, groundtruth.txt."""
 
+import re
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry.transforms import is_rigid, quaternion_from_transform
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets import parsing
 from cliploc_ros.offline.datasets.poses import TimedPoses
 
+_COLUMNS = 'timestamp tx ty tz qx qy qz qw'
+_SECONDS = {'s': Decimal(1), 'ms': Decimal('1e-3'), 'us': Decimal('1e-6'), 'µs': Decimal('1e-6'),
+            'ns': Decimal('1e-9')}
+_METRES = {'mm': 0.001, 'cm': 0.01}
 # Files of the dataset round their quaternions to four decimals.
 _MAX_NORM_ERROR = 0.05
 
@@ -64,12 +71,80 @@ def read_tum(folder: str | Path) -> TumSequence:
 def read_tum_trajectory(path: str | Path) -> TimedPoses:
     """Read a trajectory in TUM format: ``timestamp tx ty tz qx qy qz qw`` a line.
 
-    Lines may have any order; of equal stamps the first counts. ``#`` begins a comment.
-    DatasetError: a line does not hold eight numbers, or its quaternion is far from unit norm; the
-    message names file and line.
+    A first line that names the columns, as EuRoC's does, says another order and units: names that
+    are not of a pose are ignored. Without names, a line may also have a stamp and a matrix of 3 or
+    4 rows. Stamps beyond any second are in ms, us or ns. Lines may have any order; of equal stamps
+    the first counts. ``#`` begins a comment. DatasetError: a line holds something else, or its
+    quaternion is far from unit norm; the message names file and line.
     """
-    stamps_ns, rows = read_stamped(Path(path), 'tx ty tz qx qy qz qw')
+    path = Path(path)
+    order, stamp_s, metres, header = _named_columns(path)
+    table = list(parsing.read_cells(path, 'timestamp ...', header))
+    widths = {len(cells) for _, cells in table}
+    if order is None and widths == {12}:
+        raise DatasetError(f'{path}: has matrices without stamps, as KITTI has: put the stamp of '
+                           'each image before them')
+    if order is None and widths == {7}:
+        raise DatasetError(f'{path}: has poses without stamps: expected {_COLUMNS}')
+    matrix = order is None and widths <= {13, 17} and bool(widths)
+    stamps_ns, rows = [], []
+    for where, cells in table:
+        if order is not None and len(cells) > max(order):
+            cells = [cells[number] for number in order]
+        if len(cells) != 8 and not matrix:
+            raise DatasetError(f'{where}: expected {_COLUMNS}, got {len(cells)} fields: '
+                               f'{" ".join(cells)[:60]!r}; name other columns in the first line')
+        numbers = parsing.parse_all(cells[1:], float, where)
+        if not np.all(np.isfinite(numbers)):
+            raise DatasetError(f'{where}: {" ".join(cells[1:])!r} is not finite')
+        if matrix:
+            numbers = _pose_of_matrix(numbers, where)
+        parsing.unit_quaternion(numbers[3:], where, _MAX_NORM_ERROR)
+        stamps_ns.append(parsing.parse_stamp_ns(cells[0], where, stamp_s))
+        rows.append([*(metres * number for number in numbers[:3]), *numbers[3:]])
     return TimedPoses.from_samples(stamps_ns, rows, str(path), _MAX_NORM_ERROR)
+
+
+def _named_columns(path: Path) -> tuple[list[int] | None, Decimal | None, float, int]:
+    """Return the columns of a pose, seconds of a stamp, metres of a length, and lines to skip.
+
+    None: the file does not say it.
+    """
+    for number, line in enumerate(parsing.read_text(path).splitlines()):
+        text = line.strip().lstrip('#').strip()
+        is_comment = line.strip().startswith('#')
+        if not is_comment and text and not text[0].isalpha():
+            break
+        names = text.split(',') if ',' in text else re.sub(r'\s+([\[(])', r'\1', text).split()
+        roles = [_role(name) for name in names]
+        if all(role in roles for role in _COLUMNS.split()):
+            order = [roles.index(role) for role in _COLUMNS.split()]
+            units = [re.search(r'[\[(_](ns|us|µs|ms|s|m|cm|mm)\b', names[column].lower())
+                     for column in order[:2]]
+            stamp, length = (unit[1] if unit else '' for unit in units)
+            return (order, _SECONDS.get(stamp), _METRES.get(length, 1.0),
+                    0 if is_comment else number + 1)
+    return None, None, 1.0, 0
+
+
+def _role(name: str) -> str:
+    """Return which column of TUM's a name stands for; '' for none."""
+    word = re.sub(r'[\[(].*|_([nuµm]?s|[cm]?m)$', '', name.strip().lower()).strip()
+    if word.startswith(('time', 'stamp', '#time')) or word == 't':
+        return 'timestamp'
+    kind = next((kind for kind, starts in (
+        ('q', ('q', 'rot', 'orientation')), ('t', ('t', 'p', 'x', 'y', 'z', 'trans')))
+        if word.startswith(starts)), '')
+    return f'{kind}{word[-1]}' if kind and word[-1] in 'xyzw' else ''
+
+
+def _pose_of_matrix(numbers: list[float], where: str) -> list[float]:
+    """Return position and quaternion of 12 or 16 numbers of a matrix, row after row."""
+    pose = np.array([*numbers[:12], 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
+    if numbers[12:] not in ([], [0.0, 0.0, 0.0, 1.0]) or not is_rigid(pose, 1e-2):
+        raise DatasetError(f'{where}: {len(numbers)} numbers are no matrix of a pose; expected '
+                           f'{_COLUMNS}, or name the columns in the first line')
+    return [*pose[:3, 3].tolist(), *quaternion_from_transform(pose).tolist()]
 
 
 def read_tum_accelerometer(path: str | Path) -> tuple[list[int], NDArray[np.float64]]:
@@ -84,8 +159,8 @@ def read_tum_accelerometer(path: str | Path) -> tuple[list[int], NDArray[np.floa
 def read_stamped(path: Path, names: str) -> tuple[list[int], list[list[float]]]:
     """Return the stamps [ns] and the named numbers of the lines of a file.
 
-    DatasetError: a line holds others, numbers that are not finite, or a quaternion, as the last
-    four of seven, that is far from unit norm; the message names file and line.
+    DatasetError: a line holds others, or numbers that are not finite; the message names file and
+    line.
     """
     stamps_ns, rows = [], []
     for where, (stamp, *cells) in parsing.read_cells(path, f'timestamp {names}'):
@@ -93,8 +168,6 @@ def read_stamped(path: Path, names: str) -> tuple[list[int], list[list[float]]]:
         rows.append(parsing.parse_all(cells, float, where))
         if not np.all(np.isfinite(rows[-1])):
             raise DatasetError(f'{where}: {" ".join(cells)!r} is not finite')
-        if len(cells) == 7:
-            parsing.unit_quaternion(rows[-1][3:], where, _MAX_NORM_ERROR)
     return stamps_ns, rows
 
 

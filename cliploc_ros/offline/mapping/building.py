@@ -105,11 +105,20 @@ class MappingReport:
     explained: float
     #: Of these boxes. Both are measured on the frames that the map was fitted to.
     median_iou: float
+    #: The share of the boxes of the classes that are in the map, as import_map measures it
+    explained_of_classes: float
     #: Root mean square by which joint refinement moved the poses
     pose_change_m: float
     pose_change_deg: float
     left_out: tuple[LeftOut, ...]  #: The one with the greatest support first
     notes: tuple[str, ...]  #: What is wrong with the input, and what to do about it
+
+    @staticmethod
+    def of_nothing(detections: PosedDetections, error: MappingError) -> 'MappingReport':
+        """Return the report of a recording that shows no landmarks."""
+        return MappingReport(
+            len(detections), 0, len(detections.classes), 0, 0.0, 0.0, 0.0, 0.0, 0.0,
+            error.left_out if isinstance(error, NothingFoundError) else (), (str(error),))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as plain values, for JSON."""
@@ -117,6 +126,10 @@ class MappingReport:
 
     def lines(self) -> list[str]:
         """Return the report as text."""
+        if not self.landmarks:
+            return [f'keyframes only: no landmark from {self.frames} frames with {self.boxes} '
+                    'boxes; a robot is localized by keyframes alone, near the recorded views',
+                    *(f'note: {note}' for note in self.notes), *left_out_lines(self.left_out)]
         rows = [f'{self.landmarks} landmarks from {self.frames} frames of {self.viewpoints} '
                 f'viewpoints with {self.boxes} boxes',
                 f'explained boxes: {self.explained:.1%}, median IoU {self.median_iou:.3f} '
@@ -176,6 +189,11 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     views, draft, errors, pose_notes = builder.with_poses(given, odometry, draft)
     builder.tell('done', 1.0)
     left_out = tuple(sorted(draft.left_out, key=lambda one: -one.support))
+    moving = Counter(name for name in np.array(detections.class_names)[detections.classes].tolist()
+                     if name in options.moving_classes)
+    if moving:
+        notes.append(f'{moving.total()} boxes of {", ".join(sorted(moving))} are no landmarks: '
+                     'they move')
     if len(draft.landmarks.centers) == 0:
         why = ('no boxes of one class meet in space; check that poses and stamps belong to these '
                'images, that the poses are of the camera (z forward), and the intrinsics')
@@ -190,7 +208,9 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     quality = explained_boxes(views, landmarks, shown)
     report = MappingReport(
         len(detections), int(views.viewpoints.max()) + 1, quality.boxes, len(landmarks.centers),
-        quality.explained, quality.median_iou, *pose_changes(given, views), left_out,
+        quality.explained, quality.median_iou,
+        quality.explained / float(np.isin(views.classes, landmarks.classes).mean()),
+        *pose_changes(given, views), left_out,
         tuple(notes + pose_notes))
     landmark_map = builder.map_of(landmarks, shown, given, views, errors)
     return BuiltMap(landmark_map, report, shown, views.poses, mount)
@@ -236,7 +256,10 @@ class _Builder(NamedTuple):
         Landmarks that a window of time has found explain boxes of the next one, so that the work
         grows with the length of the recording only.
         """
+        moving = [number for number, name in enumerate(self.detections.class_names)
+                  if name in self.options.moving_classes]
         free = free & thin_out(views, _FRAMES_PER_VIEWPOINT)[views.frames]
+        free &= ~np.isin(views.classes, moving)
         found = [Landmarks.none()]
         for first, last in _windows(views.stamps_s):
             self.tell('finding landmarks', first / len(views.stamps_s))

@@ -69,10 +69,18 @@ class OdometryErrors:
 _ODOMETRY_ERRORS = OdometryErrors()
 
 
+#: Classes of COCO that leave their place by themselves, or are thrown and driven.
+MOVING_CLASSES = (
+    'person', 'bird', 'cat', 'dog', 'horse', 'sheep', 'cow', 'elephant', 'bear', 'zebra',
+    'giraffe', 'sports ball', 'frisbee', 'kite', 'skateboard', 'car', 'motorcycle', 'airplane',
+    'bus', 'train', 'truck', 'boat')
+
+
 @dataclass(frozen=True)
 class MappingOptions:
     """Options of mapping."""
 
+    moving_classes: tuple[str, ...] = MOVING_CLASSES  #: These never become landmarks
     min_viewpoints: int = 3  #: A landmark needs support from this number of viewpoints
     #: Share of the frames showing a landmark's place in which it must be detected. Chance
     #: arrangements of boxes are seen rarely, but so are objects that others hide.
@@ -143,6 +151,8 @@ class Thresholds:
     max_misled: float = 0.01
     #: Share of the grid positions near the recording in which it accepts some heading
     min_positions: float = 0.4
+    #: The same by objects alone, where keyframes carry the rest; below, it is a map of keyframes
+    min_by_objects: float = 0.1
     #: Share of the landmarks with a serious fault, each counted as often as it was seen
     max_faulty: float = 0.15
     max_duplicates: int = 0  #: Pairs of landmarks that are one object

@@ -23,7 +23,7 @@ from cliploc_ros.core.keyframes.layer import (
     nearest_words,
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import MappingError, OptionsError
+from cliploc_ros.errors import DatasetError, MappingError, OptionsError
 from cliploc_ros.offline.datasets.frames import Frames, PosedImage, undistorted
 
 # Features that are found in an image, before those without a point are left out.
@@ -156,7 +156,11 @@ def _chosen(frames: Frames, options: LayerOptions) -> Iterator[PosedImage]:
         cells.setdefault(tuple(cell.tolist()), []).append(pose)
         return True
     for raw in frames.read_raw(is_new):
-        yield raw.decode()
+        try:
+            frame = raw.decode()
+        except DatasetError:  # the recorder says which images cannot be used
+            continue
+        yield frame
 
 
 def _look(frame: PosedImage, options: LayerOptions) -> _Keyframe:

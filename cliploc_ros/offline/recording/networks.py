@@ -6,6 +6,7 @@ import io
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.depth_image import depths_of_boxes
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.observation import Detections
+from cliploc_ros.errors import DatasetError
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.devices import set_threads
@@ -80,7 +82,7 @@ class LoadNetworks:
     clip: ClipOptions | None  #: None: classes and boxes only
     threads: int = 0  #: Of a network on a CPU; 0 leaves its own choice
 
-    def __call__(self) -> Callable[[RawFrame], SeenFrame]:
+    def __call__(self) -> Callable[[RawFrame], SeenFrame | str]:
         """Return the function that looks at a frame.
 
         ModelError or OptionsError: from loading.
@@ -89,7 +91,16 @@ class LoadNetworks:
             set_threads(self.threads)
         encoder = (None if self.clip is None
                    else ClipEncoder(resolve_clip_weights(self.clip), self.clip))
-        return RunNetworks(load_detector(self.detector).detect, encoder)
+        return partial(_look_if_readable,
+                       RunNetworks(load_detector(self.detector).detect, encoder))
+
+
+def _look_if_readable(look: 'RunNetworks', raw: RawFrame) -> SeenFrame | str:
+    """Return what networks say about a frame; why not, where its images cannot be used."""
+    try:
+        return look(raw)
+    except DatasetError as error:
+        return str(error)
 
 
 @dataclass(frozen=True)

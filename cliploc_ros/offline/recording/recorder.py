@@ -30,6 +30,7 @@ from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.files.storage import parse_json
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.offline.datasets.bags import MOST_LEFT_OUT
 from cliploc_ros.offline.datasets.frames import Frames, RawFrame
 from cliploc_ros.offline.datasets.observations import Recorded, load_recorded, save_recorded
 from cliploc_ros.offline.datasets.poses import Poses
@@ -220,6 +221,7 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log)
         seen = {one.place: one for one in entries[1:] if isinstance(one, SeenFrame)}
     else:
         log.restart([run])
+    unusable: list[str] = []
     if seen:
         logger.warning('going on after %d frames of an unfinished run', len(seen))
     try:
@@ -227,7 +229,11 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log)
             tasks = (raw for raw in raws if raw.place not in seen)
             for _, result in run_tasks(options.networks, tasks, workers=options.workers,
                                        scheduler=options.scheduler):
-                if result is not None:
+                if isinstance(result, str):
+                    unusable.append(result)
+                    if len(unusable) > MOST_LEFT_OUT * frames.count:
+                        break
+                elif result is not None:
                     log.append({'frame': base64.b64encode(result.to_bytes()).decode()})
                     seen[result.place] = result
                     # an implausible unit is refused early, before the work of hours is done
@@ -241,6 +247,12 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log)
         else:
             log.remove()
         raise
+    if unusable:
+        if len(unusable) > MOST_LEFT_OUT * (len(seen) + len(unusable)):
+            log.remove()
+            raise DatasetError(unusable[0])
+        logger.warning('left out: %d images that cannot be used, such as %s', len(unusable),
+                       unusable[0])
     encoder_key = '' if options.clip is None else resolve_clip_weights(options.clip).key
     try:
         return _assemble(list(seen.values()), frames, filters, encoder_key, described)

@@ -16,7 +16,7 @@ from cliploc_ros.core.geometry.transforms import is_rigid
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.frames import NO_STAMP, DepthFormat, ImageFile
 from cliploc_ros.offline.datasets.parsing import MAX_STAMP_S
-from cliploc_ros.offline.datasets.poses import TimedPoses
+from cliploc_ros.offline.datasets.poses import STAMP_TOLERANCE_NS, TimedPoses
 from cliploc_ros.units import NS_PER_S
 
 #: Endings of image files.
@@ -46,6 +46,8 @@ class FolderOptions:
     known_distance: tuple[str, str, float] | None = None
     any_unit: bool = False  #: Take an unknown unit for the metre
     level: bool = False  #: Turn the map so that z is up, by the tilt of the cameras
+    #: A pose or depth image of TUM RGB-D belongs to an image at most this far away [ns]
+    tolerance_ns: int = STAMP_TOLERANCE_NS
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,25 @@ class Capture:
     #: What the poses were looked up in: it must have some, of the time of the images. Images
     #: alone may do without
     trajectory: TimedPoses | None = None
+
+    @classmethod
+    def of(cls, files: Sequence[ImageFile], where: object, axes: str,
+           depth: DepthFormat = _AS_USUAL, up: str = '', is_metric: bool = True,
+           notes: Sequence[str] = (), images: int = 0) -> 'Capture':
+        """Return the capture of the images that a list names, see arrange.
+
+        Notes say which of them and of their depth images are missing.
+        """
+        arranged = arrange(files, where)
+        missing = [[one.color for one in files if beside(one.color) is None],
+                   [one.depth for one in files if one.depth is not None
+                    and beside(one.depth) is None]]
+        left_out = [f'{len(paths)} of {len(files)} {what} that are listed are missing, such as '
+                    f'{paths[0]}' for what, paths in zip(('images', 'depth images'), missing,
+                                                         strict=True) if paths]
+        return cls(tuple(one if one.depth is None else one._replace(depth=beside(one.depth))
+                         for one in arranged), axes, depth, up, is_metric,
+                   (*notes, *left_out), images)
 
 
 def arrange(files: Sequence[ImageFile], where: object) -> tuple[ImageFile, ...]:

@@ -4,8 +4,8 @@
 
 import mmap
 import struct
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path, PureWindowsPath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,9 @@ from cliploc_ros.offline.datasets import parsing
 from cliploc_ros.offline.datasets.captures import capture
 from cliploc_ros.offline.datasets.frames import NO_STAMP, ImageFile
 
-_PLACES = ('.', 'sparse', 'sparse/0', 'sparse/1', 'colmap/sparse/0', 'model', 'colmap')
+_PLACES = ('.', 'sparse', 'sparse/0', 'sparse/1', 'colmap/sparse/0', 'model', 'colmap',
+           'distorted/sparse', 'distorted/sparse/0')  # the last two of 3D Gaussian splatting
+_PARTS = ('cameras', 'images')
 _MOST_NAME = 4096
 _REMEDY = 'undistort the images with colmap image_undistorter, and give its output folder'
 
@@ -73,47 +75,72 @@ def read_colmap(folder: Path, options: capture.FolderOptions) -> capture.Capture
     if not models:
         raise DatasetError(f'{folder}: no COLMAP model here: it has cameras.bin and images.bin, '
                            'or .txt; run the mapper of COLMAP first')
+    whole = [one for one in models if _has(one, 'bin') or _has(one, 'txt')]
+    if not whole:
+        lacking = [part for part in _PARTS if not any(
+            (models[0] / f'{part}.{end}').is_file() for end in ('bin', 'txt'))]
+        missing = f'{lacking[0]}.bin' if lacking else 'cameras and images of one ending'
+        raise DatasetError(f'{models[0]}: the COLMAP model lacks {missing}: export it again')
+    models = [one for one in whole if 'distorted' not in one.parts] or whole
     found = {model: list(_images(model)) for model in models}
     model = max(models, key=lambda one: len(found[one]))
-    cameras = dict(_cameras(model))
-    notes = []
+    cameras, notes = dict(_cameras(model)), []
+    if _has(model, 'bin') and _has(model, 'txt'):
+        _check_same(model, cameras, found[model])
     if len(models) > 1:
         rest = sum(map(len, found.values())) - len(found[model])
         notes.append(f'the model is in {len(models)} pieces: {model.name} with '
                      f'{len(found[model])} images is used, {rest} images of the others are not')
-    root = options.images or next((one / 'images' for one in (folder, *model.resolve().parents[:3])
-                                   if (one / 'images').is_dir()), folder)
+    first = found[model][0].name if found[model] else ''
+    beside = ('input', 'images') if 'distorted' in model.parts else ('images', 'input')
+    roots = [options.images] if options.images else [
+        *(above / name for above in (folder, *model.resolve().parents[:3]) for name in beside),
+        folder]
+    root = next((one for one in roots if capture.beside(one / first)),
+                next((one for one in roots if one.is_dir()), folder))
     files = []
     for one in found[model]:
         if one.camera_id not in cameras:
             raise DatasetError(f'{model}: image {one.name} is of camera {one.camera_id}, which '
                                'the model does not have')
-        files.append(ImageFile(NO_STAMP, root / one.name, cameras[one.camera_id], one.pose))
-    arranged = capture.arrange(files, model)
-    if len(arranged) < len(files):
-        notes.append(f'{len(files) - len(arranged)} of {len(files)} images of the model are not '
-                     f'in {root}')
+        color = root / one.name
+        if capture.beside(color) is None:  # named on another system
+            color = next(filter(None, (capture.beside(root / name) for name in (
+                one.name.replace('\\', '/'), PureWindowsPath(one.name).name))), color)
+        files.append(ImageFile(NO_STAMP, color, cameras[one.camera_id], one.pose))
     there = sum(one.suffix.lower() in capture.IMAGES for one in root.rglob('*'))
-    return capture.Capture(arranged, is_metric=False, notes=tuple(notes), images=there)
+    return capture.Capture.of(files, model, 'opencv', is_metric=False, notes=notes, images=there)
+
+
+def _check_same(model: Path, cameras: Mapping[int, Camera], images: Sequence[_Posed]) -> None:
+    """Refuse a model whose text and binary files say different things."""
+    text = dict(_cameras(model, 'txt'))
+    poses = {one.name: one.pose for one in _images(model, 'txt')}
+    if any(not np.allclose(camera.matrix, text[number].matrix, rtol=1e-3)
+           for number, camera in cameras.items() if number in text) or any(
+               one.pose is not None and (other := poses.get(one.name)) is not None
+               and not np.allclose(one.pose, other, atol=1e-3) for one in images):
+        raise DatasetError(f'{model}: the .bin and .txt files of the model say different cameras '
+                           'or poses: remove those that are old')
 
 
 def models_of(folder: Path) -> list[Path]:
-    """Return the folders of models in a folder."""
+    """Return the folders of models in a folder, also of those that lack a file."""
     places = [folder / place for place in _PLACES]
     sparse = folder / 'sparse'
     places += sorted(sparse.iterdir()) if sparse.is_dir() else []
-    return [place for place in dict.fromkeys(places)
-            if _has(place, 'bin') or _has(place, 'txt')]
+    return [place for place in dict.fromkeys(places) if any(
+        (place / f'{part}.{end}').is_file() for part in _PARTS for end in ('bin', 'txt'))]
 
 
 def _has(model: Path, end: str) -> bool:
     return (model / f'cameras.{end}').is_file() and (model / f'images.{end}').is_file()
 
 
-def _cameras(model: Path) -> Iterator[tuple[int, Camera]]:
-    """Yield the cameras of a model by their ids."""
+def _cameras(model: Path, kind: str = '') -> Iterator[tuple[int, Camera]]:
+    """Yield the cameras of a model by their ids; the kind is txt, or '' for what is there."""
     binary = model / 'cameras.bin'
-    if not _has(model, 'bin'):
+    if kind == 'txt' or not _has(model, 'bin'):
         lines = parsing.read_cells(model / 'cameras.txt', 'CAMERA_ID MODEL WIDTH HEIGHT ...')
         for where, (camera_id, name, *cells) in lines:
             number, width, height = parsing.parse_all([camera_id, *cells[:2]], int, where)
@@ -144,10 +171,10 @@ def _camera(where: str, number: int, name: str, size: tuple[int, int], values: S
                              tuple(distortion.tolist()))
 
 
-def _images(model: Path) -> Iterator[_Posed]:
-    """Yield the images of a model."""
+def _images(model: Path, kind: str = '') -> Iterator[_Posed]:
+    """Yield the images of a model, see _cameras."""
     binary = model / 'images.bin'
-    if not _has(model, 'bin'):
+    if kind == 'txt' or not _has(model, 'bin'):
         yield from _text_images(model / 'images.txt')
         return
     with _Bytes(binary) as data:

@@ -9,7 +9,7 @@ right, y up, z back. Fields that are not used here are ignored.
 
 import math
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PureWindowsPath
 
 import cv2
 import numpy as np
@@ -53,8 +53,7 @@ def read_polycam(folder: Path, options: capture.FolderOptions) -> capture.Captur
                       root / f'{kind}images' / f'{path.stem}.jpg', camera, pose),
             root / 'depth', root / 'confidence', path.stem))
     notes = () if kind else ('its poses are not optimized: they drift as ARKit does',)
-    return capture.Capture(capture.arrange(files, root), 'opengl', _IN_MILLIMETRES, 'y',
-                           notes=notes)
+    return capture.Capture.of(files, root, 'opengl', _IN_MILLIMETRES, 'y', notes=notes)
 
 
 def _with_depth(image: ImageFile, depths: Path, confidences: Path, stem: str) -> ImageFile:
@@ -88,7 +87,7 @@ def read_record3d(folder: Path, options: capture.FolderOptions) -> capture.Captu
             capture.first_image(images, str(place)) or images / f'{place}.jpg',
             parsing.camera_of(where, *size, *intrinsics.tolist()),
             parsing.pose_of(pose[4:], pose[:4], where)))
-    return capture.Capture(capture.arrange(files, path), 'opengl', up='y', notes=(
+    return capture.Capture.of(files, path, 'opengl', up='y', notes=(
         'the depth of Record3D is not read: it is compressed by LZFSE or EXR',))
 
 
@@ -122,7 +121,7 @@ def read_stray(folder: Path, options: capture.FolderOptions) -> capture.Capture:
                       parsing.pose_of(numbers[:3], numbers[3:7], where),
                       number=place if image is None and video is not None else None),
             folder / 'depth', folder / 'confidence', stem))
-    return capture.Capture(capture.arrange(files, path), 'opencv', _IN_MILLIMETRES, 'y')
+    return capture.Capture.of(files, path, 'opencv', _IN_MILLIMETRES, 'y')
 
 
 def _size_of(folder: Path, video: Path | None) -> tuple[int, int]:
@@ -154,17 +153,21 @@ def read_arkitscenes(folder: Path, options: capture.FolderOptions) -> capture.Ca
         str(path))
     known = replace(known, max_gap_ns=_MAX_GAP_NS)
     kind = 'vga_wide' if (folder / 'vga_wide').is_dir() else 'lowres_wide'
-    files = []
+    files, without = [], list[Path]()
     for color in sorted((folder / kind).glob('*.png')):
         scan, _, time = color.stem.rpartition('_')
         if not time.replace('.', '', 1).isdecimal():
             continue
         stamp = _stamp_ns(float(time))
         camera = _pincam(folder / f'{kind}_intrinsics', scan, float(time))
-        if stamp != NO_STAMP and camera is not None:
+        if camera is None:
+            without.append(color)
+        elif stamp != NO_STAMP:
             files.append(_with_depth(ImageFile(stamp, color, camera, known.pose_at(stamp)),
                                      folder / 'lowres_depth', folder / 'confidence', color.stem))
-    return capture.Capture(capture.arrange(files, folder), 'opencv', _IN_MILLIMETRES, 'z')
+    return capture.Capture.of(files, folder, 'opencv', _IN_MILLIMETRES, 'z', notes=(
+        [f'{len(without)} images have no file of intrinsics and are left out, such as '
+         f'{without[0]}'] if without else []))
 
 
 def _pincam(folder: Path, scan: str, time_s: float) -> Camera | None:
@@ -203,7 +206,7 @@ def read_hololens(folder: Path, options: capture.FolderOptions) -> capture.Captu
             _TICK_NS * (int(time) - _TICKS_TO_1970), images / f'{time}.png',
             parsing.camera_of(where, round(width), round(height), row[0], row[1], cx, cy),
             pose if pose.any() else None))
-    return capture.Capture(capture.arrange(files, path), 'opengl', up='y', notes=(
+    return capture.Capture.of(files, path, 'opengl', up='y', notes=(
         'the depth of the HoloLens is not read: it needs its table of rays',))
 
 
@@ -213,10 +216,12 @@ def _stamp_ns(time_s: float) -> int:
 
 
 TRANSFORMS = 'transforms.json'
+_SAME_FOCAL = 1.02  # two fields that say it are rounded
 _PERSPECTIVE = ('PINHOLE', 'SIMPLE_PINHOLE', 'SIMPLE_RADIAL', 'RADIAL', 'OPENCV', 'PERSPECTIVE')
 _FISHEYE = ('OPENCV_FISHEYE', 'FISHEYE')
 _INTRINSICS = ('w', 'h', 'fl_x', 'fl_y', 'cx', 'cy', 'camera_angle_x', 'k1', 'k2', 'k3', 'k4',
                'p1', 'p2', 'camera_model', 'is_fisheye')
+_IMAGE_FOLDERS = ('images', 'input', '.')
 _ENDINGS = ('.png', '.jpg', '.jpeg', '.JPG', '.PNG')
 
 
@@ -241,10 +246,7 @@ def read_nerf(folder: Path, options: capture.FolderOptions) -> capture.Capture:
         frame = parsing.Fields(values, f'{path}: frame {place}')
         both = parsing.Fields({**meta.values, 'frames': None, **frame.values}, frame.where)
         name = frame.text('file_path')
-        color = path.parent / name if images is None else images / PurePosixPath(name).name
-        # the original NeRF leaves the ending of an image away
-        endings = [color.with_name(color.name + end) for end in ('', *_ENDINGS)]
-        color = next(filter(None, map(capture.beside, endings)), color)
+        color = _file_of(path.parent, name, images)
         shown = repr([both.values.get(name) for name in _INTRINSICS])
         if shown not in cameras:
             cameras[shown] = _camera(both, color)
@@ -253,12 +255,30 @@ def read_nerf(folder: Path, options: capture.FolderOptions) -> capture.Capture:
             raise DatasetError(f'{frame.where}: transform_matrix has {pose.shape[0]} rows')
         full = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])[:4]
         full[:3, 3] /= scale
-        depth = frame.text('depth_file_path', '')
+        depth = frame.text('depth_file_path', frame.text('depth_path', ''))
         files.append(ImageFile(NO_STAMP, color, cameras[shown], full,
-                               capture.beside(path.parent / depth) if depth else None))
-    arranged = capture.arrange(files, path)
-    # depth is in metres, and so are the poses that it goes with
-    return capture.Capture(arranged, 'opengl', is_metric=all(one.depth for one in arranged))
+                               _file_of(path.parent, depth, None) if depth else None))
+    # depth is in the unit of the poses, which no field tells: in metres, or as COLMAP chose it
+    unit = next((meta.number(name) for name in ('depth_unit_scale_factor', 'integer_depth_scale')
+                 if name in meta), None)
+    return capture.Capture.of(files, path, 'opengl', DepthFormat(unit, scale=1.0 / scale),
+                              is_metric=False)
+
+
+def _file_of(folder: Path, name: str, images: Path | None) -> Path:
+    """Return the file of a name in a transforms.json, as the systems of others write them, too.
+
+    It is in a folder of images by its name alone where one is given, or where the whole path leads
+    nowhere.
+    """
+    alone = PureWindowsPath(name).name  # of / and \\ alike
+    within = name.replace('\\', '/')
+    paths = [folder / name, folder / within, *(folder / one / alone for one in _IMAGE_FOLDERS)]
+    if images is not None:
+        paths = [images / within, images / alone]
+    # the original NeRF leaves the ending of an image away
+    endings = [path.with_name(path.name + end) for path in paths for end in ('', *_ENDINGS)]
+    return next(filter(None, map(capture.beside, endings)), paths[0])
 
 
 def _camera(values: parsing.Fields, image: Path) -> Camera:
@@ -278,6 +298,13 @@ def _camera(values: parsing.Fields, image: Path) -> Camera:
         fx = 0.5 * width / math.tan(0.5 * values.number('camera_angle_x') or math.nan)
     else:
         raise DatasetError(f'{where}: has no intrinsics: neither fl_x nor camera_angle_x')
+    for name, side, focal_px in (('camera_angle_x', width, fx), (
+            'camera_angle_y', height, values.number('fl_y', fx))):
+        by_angle = 0.5 * side / math.tan(0.5 * values.number(name, 0.0)) if values.values.get(
+            name) else focal_px
+        if not 1.0 / _SAME_FOCAL < by_angle / focal_px < _SAME_FOCAL:
+            raise DatasetError(f'{where}: says two focal lengths: {focal_px:.5g} px, and '
+                               f'{by_angle:.5g} px by {name}: correct or remove the wrong one')
     fy = values.number('fl_y', fx)
     cx, cy = values.number('cx', 0.5 * width) - 0.5, values.number('cy', 0.5 * height) - 0.5
     k1, k2, k3, k4, p1, p2 = (values.number(name, 0.0)

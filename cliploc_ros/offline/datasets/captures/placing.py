@@ -2,44 +2,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """From stored poses to poses in a map: camera axes, unit and vertical.
 
-A wrong choice of axes is found by the images: what two of them both show lies on epipolar lines.
+A wrong choice of axes is found by the images, see agreement.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.geometry.transforms import (
-    invert_transform,
-    move_poses,
-    rotation_angle_deg,
-)
-from cliploc_ros.core.keyframes.features import Features, extract, match, unit_rows
+from cliploc_ros.core.geometry.transforms import move_poses
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.agreement import (
+    AXES,
+    Reading,
+    View,
+    check_agreement,
+    w_first,
+)
 from cliploc_ros.offline.datasets.frames import ImageFile, read_color
 
 _Pose = NDArray[np.float64]
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-#: What a stored pose may be, and map_from_camera of OpenCV's axes from it.
-AXES: Mapping[str, Callable[[_Pose], _Pose]] = {
-    'opencv': lambda pose: pose,
-    'opengl': lambda pose: pose @ _FLIP,
-    'opencv-inverse': invert_transform,
-    'opengl-inverse': lambda pose: invert_transform(pose) @ _FLIP}
 #: Rotations that turn an axis up.
 UP: Mapping[str, _Pose] = {
     'z': np.eye(3), 'y': np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
 
 # A map reaches no further [m].
 _MOST_M = 1e7
-# Pairs of images that tell the axes: with this much of a turn, which an error of axes turns round.
-_PAIRS, _TRIED, _REACH = 4, 12, 20
-_TURN_DEG = (4.0, 30.0)
-_FEATURES, _LONGEST_PX = 500, 480
-_LEAST_MATCHES = 25
-# Median epipolar errors at an image _LONGEST_PX wide [px]: a true choice has 0.3 to 2 of them.
-_GOOD_PX, _WRONG_PX, _BETTER = 3.0, 4.0, 0.35
+# Images that are asked for their EXIF orientation.
+_TRIED = 3
 
 
 def place_images(files: Sequence[ImageFile], axes: str, scale: float = 1.0,
@@ -92,68 +83,20 @@ def find_scale(files: Sequence[ImageFile], first: str, second: str, metres: floa
 def check_axes(files: Sequence[ImageFile], axes: str, where: object) -> str:
     """Return a note where images and stored poses do not fit; '' where they do, or do not tell.
 
-    DatasetError: they fit well with other axes; says which.
+    DatasetError: they fit well if read in another way; says which.
     """
-    found: dict[str, list[float]] = {name: [] for name in AXES}
-    for first, second in _pairs([one for one in files if one.pose is not None], axes):
-        for name, error_px in _epipolar_errors(first, second).items():
-            found[name].append(error_px)
-        if len(found[axes]) == _PAIRS:
-            break
-    if len(found[axes]) < _PAIRS // 2:
-        return ''
-    errors = {name: float(np.median(values)) for name, values in found.items()}
-    best = min(errors, key=lambda name: errors[name])
-    if errors[axes] < _WRONG_PX:
-        return ''
-    if errors[best] < min(_GOOD_PX, _BETTER * errors[axes]):
-        raise DatasetError(f'{where}: the images do not fit the poses as {axes} (median epipolar '
-                           f'error {errors[axes]:.1f} px), but do as {best} ({errors[best]:.1f} '
-                           f'px): give `axes` {best}')
-    return (f'the images do not fit the poses: median epipolar error {errors[axes]:.1f} px, '
-            f'{errors[best]:.1f} px at best ({best})')
-
-
-def _pairs(files: Sequence[ImageFile], axes: str) -> Iterator[tuple[ImageFile, ImageFile]]:
-    """Yield pairs of images with poses that are near each other in order, and turned."""
-    turns = [np.array(AXES[axes](one.pose))[:3, :3] for one in files if one.pose is not None]
-    last = len(files) - 1
-    for start in np.unique(np.linspace(0, max(0, last - 1), _TRIED).astype(int)).tolist():
-        angles = [rotation_angle_deg(turns[start].T @ turn)
-                  for turn in turns[start + 1:start + 1 + _REACH]]
-        fit = [place for place, angle in enumerate(angles)
-               if _TURN_DEG[0] < angle < _TURN_DEG[1]]
-        if fit:
-            yield files[start], files[start + 1 + fit[0]]
-
-
-def _epipolar_errors(first: ImageFile, second: ImageFile) -> dict[str, float]:
-    """Return the median epipolar error of two images by the name of the axes [px].
-
-    Empty where too few features match.
-    """
-    looks = []
-    for file in (first, second):
-        image, camera = read_color(file)
-        features: Features = extract(image, _FEATURES, _LONGEST_PX)
-        looks.append((camera.normalize_points(features.pixels), unit_rows(features.descriptors)))
-    rows, _ = match(looks[0][1], looks[1][1])
-    points = [np.column_stack([look[0][rows[:, side]], np.ones(len(rows))])
-              for side, look in enumerate(looks)]
-    known = np.isfinite(points[0]).all(axis=1) & np.isfinite(points[1]).all(axis=1)
-    if known.sum() < _LEAST_MATCHES:
-        return {}
-    ours, theirs = points[0][known], points[1][known]
-    assert first.pose is not None and second.pose is not None
-    focal_px = first.camera.fx * _LONGEST_PX / max(first.camera.width, first.camera.height)
-    errors = {}
-    for name, convert in AXES.items():
-        step = invert_transform(convert(second.pose)) @ convert(first.pose)
-        x, y, z = step[:3, 3] / max(float(np.linalg.norm(step[:3, 3])), 1e-12)
-        essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ step[:3, :3]
-        lines, back = ours @ essential.T, theirs @ essential
-        with np.errstate(divide='ignore', invalid='ignore'):
-            sampson = np.abs(np.sum(theirs * lines, axis=1)) / np.sqrt(
-                lines[:, 0]**2 + lines[:, 1]**2 + back[:, 0]**2 + back[:, 1]**2)
-        errors[name] = focal_px * float(np.median(np.nan_to_num(sampson, nan=0.0)))
-    return errors
+    readings = {name: Reading(f'give `axes` {name}', AXES[name])
+                for name in sorted(AXES, key=lambda name: name != axes)}
+    readings['quaternions w x y z'] = Reading(
+        'name the columns in the first line, as `# timestamp tx ty tz qw qx qy qz`',
+        lambda pose: AXES[axes](w_first(pose)))
+    stored = [one for one in files if one.number is None][::max(1, len(files) // _TRIED)]
+    ask_to_turn = any(not np.array_equal(read_color(one)[0], read_color(one, True)[0])
+                      for one in stored)
+    if ask_to_turn:
+        readings['turned by EXIF'] = Reading(
+            'turn the pixels, as with mogrify -auto-orient', AXES[axes], upright=True)
+    note = check_agreement([View(one.pose, partial(read_color, one)) for one in files],
+                           readings, where)
+    return note or ('images ask by EXIF to be turned, and are read as stored: poses and '
+                    'intrinsics must be of stored pixels' if ask_to_turn else '')

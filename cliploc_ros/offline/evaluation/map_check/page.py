@@ -73,8 +73,11 @@ def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, byt
           views: ViewPainter | None) -> str:
     missed = len(report.failures)
     said = html.verdict('The map reaches all thresholds.' if report.passed else
+                        'Keyframes only: objects carry nothing.'
+                        if report.verdict == 'keyframes only' else
                         f'The map misses {missed} of {len(report.measures)} thresholds.',
                         report.passed)
+    said += html.items(f'Localized {one}' for one in report.carried)
     told = [one for name in _TELLING for one in report.measures if one.name.startswith(name)
             ][:_NUMBERS]
     first, *others = (html.figure(png, caption, picture) for picture, caption, png in pictures)

@@ -35,9 +35,18 @@ _NUMBERS = ('no', 'one', 'two', 'three', 'four', 'five', 'six', 'seven', 'eight'
 
 def give_advice(report: CheckReport) -> list[Advice]:
     """Return what to do, one sentence or two each."""
-    advice = [*_on_look_alikes(report), *_on_landmarks(report), *_on_corrections(report),
+    advice = [*_on_scale(report), *_on_look_alikes(report), *_on_landmarks(report),
+              *_on_corrections(report),
               *_on_misled(report), *_on_spans(report), *_on_grid(report)]
     return advice or [Advice('nothing to do: the map reaches all thresholds that were checked')]
+
+
+def _on_scale(report: CheckReport) -> Iterator[Advice]:
+    if report.scale is not None:
+        too = 'large' if report.scale > 1.0 else 'small'
+        yield Advice(f'the map is about {max(report.scale, 1.0 / report.scale):.1f} times too '
+                     f'{too} by the sizes of its objects: check the unit of the poses, then the '
+                     'intrinsics')
 
 
 def _some(advice: Sequence[Advice], what: str) -> list[Advice]:

@@ -48,6 +48,7 @@ from cliploc_ros.offline.mapping.systematic import find_corrections
 from cliploc_ros.offline.mapping.tilt import tilt_note
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views
 from cliploc_ros.offline.simulation import DetectorModel, guess_detector
+from cliploc_ros.offline.vocabulary.sizes import scale_by_sizes
 
 _NOTES = (
     'similarities of crops and labels are simulated, except for queries: labels of equal text '
@@ -123,7 +124,8 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         queries=tuple(_told(try_observations(landmark_map, queries, options), len(queries),
                             partial(tell, 'relocalizing queries'))),
         notes=tuple(notes), map_ids=landmark_map.landmark_ids,
-        keyframes=None if layer is None else check_keyframes(layer, grid, recorded))
+        keyframes=None if layer is None else check_keyframes(layer, grid, recorded),
+        scale=scale_by_sizes(landmark_map))
     tell('done', 1.0)
     return replace(report, to_do=tuple(give_advice(report)),
                    measures=tuple(find_measures(report, thresholds or Thresholds())))

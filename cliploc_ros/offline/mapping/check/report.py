@@ -22,6 +22,8 @@ from cliploc_ros.offline.mapping.evidence import BoxQuality
 from cliploc_ros.offline.mapping.options import Thresholds
 from cliploc_ros.offline.mapping.systematic import Correction
 
+#: A map whose objects alone are accepted at fewer of the positions is one of keyframes.
+BY_OBJECTS = 'positions with a heading accepted by objects alone'
 #: A landmark of this severity has a serious fault.
 SERIOUS = 1.0
 
@@ -187,6 +189,20 @@ class KeyframeCheck:
             'positions_without': self.grid.positions[self.without].round(3).tolist()}
 
 
+class Carried(NamedTuple):
+    """Of recorded frames or places: where a robot can be localized, and by which evidence."""
+
+    what: str
+    by_objects: int
+    by_keyframes: int  #: By these only
+    not_at_all: int
+
+    def __str__(self) -> str:
+        """Return them in words."""
+        return (f'by objects {self.by_objects}, only by keyframes {self.by_keyframes}, not at all '
+                f'{self.not_at_all} of {sum(self[1:])} {self.what}')
+
+
 @dataclass(frozen=True)
 class CheckReport:
     """The result of a check."""
@@ -204,6 +220,30 @@ class CheckReport:
     #: What the keyframes next to the map reach; None without any
     keyframes: KeyframeCheck | None = None
     map_ids: tuple[str, ...] = ()  #: Ids in the map's order, which overlaps refer to
+    #: How many times too large the map is by the sizes of its objects; None where they fit
+    scale: float | None = None
+
+    @property
+    def verdict(self) -> str:
+        """Return passed, failed, or keyframes only: all is well but that objects carry nothing."""
+        missed = [one.name for one in self.measures if one.is_missed]
+        return 'passed' if not missed else 'keyframes only' if missed == [BY_OBJECTS] else 'failed'
+
+    @property
+    def carried(self) -> tuple[Carried, ...]:
+        """Return where a robot can be localized, and by which evidence."""
+        near = self.grid.is_near
+        by_objects = self.grid.accepted[near] > 0
+        reached = np.zeros(len(by_objects), dtype=np.bool_) if self.keyframes is None else (
+            self.keyframes.headings[near] > 0)
+        found = [Carried('positions', int(by_objects.sum()), int((reached & ~by_objects).sum()),
+                         int((~reached & ~by_objects).sum()))]
+        if self.recording is not None and (judged := self.recording.judged):
+            objects = count_by_objects(judged)['accepted']
+            accepted = count_verdicts(judged)['accepted']
+            found.insert(0, Carried('recorded frames', objects, max(0, accepted - objects),
+                                    len(judged) - max(accepted, objects)))
+        return tuple(found)
 
     @property
     def failures(self) -> tuple[str, ...]:
@@ -264,7 +304,9 @@ class CheckReport:
     def as_dict(self) -> dict[str, Any]:
         """Return the report as plain values, for JSON."""
         return {
-            'passed': self.passed, 'failures': list(self.failures), 'advice': list(self.advice),
+            'passed': self.passed, 'verdict': self.verdict,
+            'carried': [one._asdict() for one in self.carried], 'scale_by_sizes': self.scale,
+            'failures': list(self.failures), 'advice': list(self.advice),
             'notes': list(self.notes), 'faulty_landmarks': self.faulty,
             'duplicates': self.duplicates,
             'landmarks': [asdict(one) for one in self.landmarks],
@@ -298,6 +340,9 @@ def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
                        ('with simulated boxes', recording.simulated))
         measures.append(Measure(f'recorded frames accepted {how}', share(trials, 'accepted'),
                                 limits.min_accepted, False))
+    if report.keyframes is not None and report.evidence != 'by objects':
+        measures.append(Measure(BY_OBJECTS, report.grid.accepted_positions,
+                                limits.min_by_objects, False))
     return [*measures,
             Measure(f'positions with a heading accepted {report.evidence}',
                     report.accepted_positions, limits.min_positions, False),

@@ -1,0 +1,188 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether images and poses of a recording agree, and if not, which other reading of them does.
+
+What two images both show lies on epipolar lines. Only pairs count whose matches some epipolar
+geometry explains, whatever the poses are: images that do not overlap tell nothing.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import (
+    invert_transform,
+    make_transform,
+    quaternion_from_transform,
+    rotation_angle_deg,
+    transform_from_pose,
+)
+from cliploc_ros.core.keyframes.features import extract, match, unit_rows
+from cliploc_ros.errors import DatasetError
+
+_Pose = NDArray[np.float64]
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+# of a body whose axes are forward, left, up (REP 103), and a camera that looks forward
+_BODY_FROM_CAMERA = make_transform(
+    np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+#: What a stored pose may be, and map_from_camera of OpenCV's axes from it.
+AXES: Mapping[str, Callable[[_Pose], _Pose]] = {
+    'opencv': lambda pose: pose,
+    'opengl': lambda pose: pose @ _FLIP,
+    'opencv-inverse': invert_transform,
+    'opengl-inverse': lambda pose: invert_transform(pose) @ _FLIP,
+    'ros': lambda pose: pose @ _BODY_FROM_CAMERA}
+
+# Pairs of images that tell the axes: with this much of a turn, which an error of axes turns round.
+_PAIRS, _TRIED, _REACH = 4, 12, 20
+_TURN_DEG = (4.0, 30.0)
+_FEATURES, _LONGEST_PX = 500, 480
+# Matches that one epipolar geometry explains to within so many pixels, and their least share.
+_LEAST_MATCHES, _LEAST_SHARE, _GATE_PX = 25, 0.5, 2.0
+# Median epipolar errors at an image _LONGEST_PX wide [px]: a true choice has 0.3 to 2 of them.
+_GOOD_PX, _WRONG_PX, _BETTER = 3.0, 4.0, 0.35
+
+
+class View(NamedTuple):
+    """An image and its pose, as a recording has them."""
+
+    pose: _Pose | None
+    #: Returns image and camera; given whether to turn the image by its EXIF orientation
+    look: Callable[[bool], tuple[NDArray[np.uint8], Camera]]
+    #: Returns the pose this much later than the image [ns]
+    pose_after: Callable[[int], _Pose | None] | None = None
+
+
+class Reading(NamedTuple):
+    """A way to read a recording."""
+
+    remedy: str  #: What to do where it fits, and the given one does not
+    pose: Callable[[_Pose], _Pose] = AXES['opencv']
+    camera: Callable[[Camera], Camera] = lambda camera: camera
+    upright: bool = False  #: Images are turned by their EXIF orientation
+    shift_ns: int = 0  #: Poses are those of this much later
+    #: Median error of the given way beyond which this one may be meant [px], and the share of it
+    #: that this one may have
+    least_px: float = _WRONG_PX
+    better: float = _BETTER
+
+
+def w_first(pose: _Pose) -> _Pose:
+    """Return the pose of a quaternion that was read as x y z w, and is w x y z."""
+    return transform_from_pose(pose[:3, 3], np.roll(quaternion_from_transform(pose), -1))
+
+
+def check_agreement(views: Sequence[View], readings: Mapping[str, Reading], where: object) -> str:
+    """Return a note where images and poses do not fit; '' where they do, or do not tell.
+
+    Parameters
+    ----------
+    views : sequence
+        In an order in which neighbours may overlap.
+    readings : mapping
+        The ways to read them by name; the first is the given one. Of equal ones the first counts.
+
+    Raises
+    ------
+    DatasetError
+        They fit well if read in another way; says which.
+    """
+    given, first = next(iter(readings.items()))
+    found: dict[str, list[float]] = {name: [] for name in readings}
+    for pair in _pairs([one for one in views if one.pose is not None], first):
+        for name, error_px in _epipolar_errors(pair, readings).items():
+            found[name].append(error_px)
+        if len(found[given]) == _PAIRS:
+            break
+    if len(found[given]) < _PAIRS // 2:
+        return ''
+    errors = {name: float(np.median(values)) for name, values in found.items()
+              if len(values) == len(found[given])}
+    best = min(errors, key=lambda name: errors[name])
+    reading = readings[best]
+    if errors[given] > reading.least_px and errors[best] < min(_GOOD_PX,
+                                                               reading.better * errors[given]):
+        raise DatasetError(f'{where}: the images do not fit the poses as {given} (median epipolar '
+                           f'error {errors[given]:.1f} px), but do as {best} ({errors[best]:.1f} '
+                           f'px): {reading.remedy}')
+    if errors[given] < _WRONG_PX:
+        return ''
+    return (f'the images do not fit the poses: median epipolar error {errors[given]:.1f} px, '
+            f'{errors[best]:.1f} px at best ({best})')
+
+
+def _pairs(views: Sequence[View], given: Reading) -> Iterator[tuple[View, View]]:
+    """Yield pairs of views that are near each other in order, and turned."""
+    turns = [given.pose(one.pose)[:3, :3] for one in views if one.pose is not None]
+    last = len(views) - 1
+    for start in np.unique(np.linspace(0, max(0, last - 1), _TRIED).astype(int)).tolist():
+        angles = [rotation_angle_deg(turns[start].T @ turn)
+                  for turn in turns[start + 1:start + 1 + _REACH]]
+        fit = [place for place, angle in enumerate(angles)
+               if _TURN_DEG[0] < angle < _TURN_DEG[1]]
+        if fit:
+            yield views[start], views[start + 1 + fit[0]]
+
+
+def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]
+                     ) -> dict[str, float]:
+    """Return the median epipolar error of two images by the name of the reading [px].
+
+    Empty where no epipolar geometry explains enough matches, as those of images without overlap.
+    """
+    errors = {}
+    ways = dict.fromkeys((one.camera, one.upright) for one in readings.values())
+    try:
+        kept = {way: _overlapping(pair, *way) for way in ways}
+    except DatasetError:  # whoever reads the images says so
+        return {}
+    for name, reading in readings.items():
+        points, focal_px = kept[reading.camera, reading.upright]
+        first, second = (one.pose if one.pose_after is None or not reading.shift_ns
+                         else one.pose_after(reading.shift_ns) for one in pair)
+        if len(points[0]) and first is not None and second is not None:
+            step = invert_transform(reading.pose(second)) @ reading.pose(first)
+            errors[name] = focal_px * float(np.median(_sampson(points[0], points[1], step)))
+    return errors
+
+
+def _overlapping(pair: tuple[View, View], change: Callable[[Camera], Camera], upright: bool
+                 ) -> tuple[NDArray[np.float64], float]:
+    """Return points (2, n, 2) at z = 1 that both images show, and their focal length [px].
+
+    They are those that an epipolar geometry explains, whatever the poses are; none where these are
+    too few.
+    """
+    looks = [one.look(upright) for one in pair]
+    features = [extract(image, _FEATURES, _LONGEST_PX) for image, _ in looks]
+    ours, theirs = (unit_rows(one.descriptors) for one in features)
+    rows, _ = match(ours, theirs)
+    points = np.array([change(camera).normalize_points(one.pixels[rows[:, side]])
+                       for side, ((_, camera), one) in enumerate(zip(looks, features,
+                                                                     strict=True))])
+    points, camera = points[:, np.isfinite(points).all(axis=(0, 2))], looks[0][1]
+    focal_px = camera.fx * _LONGEST_PX / max(camera.width, camera.height)
+    if points.shape[1] < _LEAST_MATCHES:
+        return points[:, :0], focal_px
+    _, inside = cv2.findEssentialMat(points[0], points[1], np.eye(3),
+                                     threshold=_GATE_PX / focal_px)
+    kept = np.zeros(points.shape[1], dtype=np.bool_) if inside is None else inside[:, 0] > 0
+    if kept.sum() < max(_LEAST_MATCHES, _LEAST_SHARE * len(kept)):
+        kept[:] = False
+    return points[:, kept], focal_px
+
+
+def _sampson(ours: NDArray[np.float64], theirs: NDArray[np.float64], step: _Pose
+             ) -> NDArray[np.float64]:
+    """Return how far points (n, 2) at z = 1 are from their epipolar lines, to first order."""
+    x, y, z = step[:3, 3] / max(float(np.linalg.norm(step[:3, 3])), 1e-12)
+    essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ step[:3, :3]
+    first, second = (np.column_stack([one, np.ones(len(one))]) for one in (ours, theirs))
+    lines, back = first @ essential.T, second @ essential
+    with np.errstate(divide='ignore', invalid='ignore'):
+        return np.nan_to_num(np.abs(np.sum(second * lines, axis=1)) / np.sqrt(
+            lines[:, 0]**2 + lines[:, 1]**2 + back[:, 0]**2 + back[:, 1]**2), nan=0.0)

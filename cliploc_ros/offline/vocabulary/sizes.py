@@ -1,0 +1,55 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""How large objects of a class are: evidence on landmarks, and on the scale of a map."""
+
+from functools import cache
+from importlib.resources import files
+from typing import NamedTuple
+
+import numpy as np
+import yaml
+
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.offline.mapping.options import MappingOptions
+
+# The scale of a map is told by as many classes as this. A whole map is off by more than this
+# factor before it is named: ellipsoids enclose objects loosely, or show parts of them. Guesses.
+_LEAST_CLASSES, _OFF = 3, 1.8
+
+
+class Size(NamedTuple):
+    """The longest extent of objects of a class [m], and the factor within which it lies."""
+
+    extent_m: float
+    factor: float
+
+    @property
+    def most_m(self) -> float:
+        """Return the extent that nearly no object exceeds [m]."""
+        return self.extent_m * self.factor
+
+
+@cache
+def sizes_of_classes() -> dict[str, Size]:
+    """Return the sizes of classes that have one; sizes.yaml has them."""
+    text = (files('cliploc_ros.offline.vocabulary') / 'sizes.yaml').read_text(encoding='utf-8')
+    return {name: Size(*values) for name, values in yaml.safe_load(text).items()}
+
+
+def scale_by_sizes(landmark_map: LandmarkMap) -> float | None:
+    """Return how many times too large a map is by the sizes of its objects.
+
+    The median over classes of the median over their landmarks counts. Those that were seen from
+    one side are longer towards the camera than their objects, and do not count. None: too few
+    tell, or they fit.
+    """
+    sizes, ratios = sizes_of_classes(), dict[str, list[float]]()
+    sides = [one.baseline_deg for one in landmark_map.details] or [None] * len(landmark_map)
+    for name, semi_axes, seen_deg in zip(landmark_map.class_ids, landmark_map.semi_axes, sides,
+                                         strict=True):
+        if name in sizes and (seen_deg is None or seen_deg >= MappingOptions.min_baseline_deg):
+            ratios.setdefault(name, []).append(2.0 * semi_axes.max() / sizes[name].extent_m)
+    if len(ratios) < _LEAST_CLASSES:
+        return None
+    scale = float(np.median([np.median(of_class) for of_class in ratios.values()]))
+    return scale if not 1.0 / _OFF <= scale <= _OFF else None

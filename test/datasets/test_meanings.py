@@ -1,0 +1,455 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Fields that say what a value means are read, or contradict the images and are named.
+
+Recordings are real images and poses, or the demo's walk, with one field altered.
+"""
+
+import json
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from capture_folders import shots_of, write_colmap, write_nerf
+from scipy.spatial.transform import Rotation
+
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.messages import image_from_msg
+from cliploc_ros.offline.datasets import bag_messages
+from cliploc_ros.offline.datasets.bag_frames import (
+    BagTopics,
+    bag_frames,
+    find_poses,
+    poses_of_tf,
+    poses_of_topic,
+)
+from cliploc_ros.offline.datasets.bags import BagWriter, typestore
+from cliploc_ros.offline.datasets.captures.capture import FolderOptions
+from cliploc_ros.offline.datasets.folders import read_folder
+from cliploc_ros.offline.datasets.tum import read_tum_trajectory
+
+pytestmark = pytest.mark.needs('pycolmap')
+METRES = FolderOptions(scale=1.0)
+START, MS = 1_700_000_000 * 10**9, 10**6
+TF = 'tf2_msgs/msg/TFMessage'
+ODOMETRY = 'nav_msgs/msg/Odometry'
+
+
+@pytest.fixture(scope='module')
+def shots():
+    return shots_of()
+
+
+@pytest.fixture(scope='module')
+def room(shared_data):
+    """Real images (48 of them) with their poses and camera, as (stamp, image, pose, camera)."""
+    frames = read_folder(shared_data / 'rooms/hololens_office', FolderOptions(layout='tum'))
+    return [(START + 100 * MS * place, one.image_rgb, one.map_from_camera, one.camera)
+            for place, one in enumerate(frames.select(range(48)).read())]
+
+
+def make(name, **fields):
+    return typestore().types[name](**fields)
+
+
+def transform_message(stamp, parent, child, pose):
+    field = bag_messages.pose_message(stamp, parent, pose)
+    position = field.pose.position
+    return make(TF, transforms=[make(
+        'geometry_msgs/msg/TransformStamped', header=field.header, child_frame_id=child,
+        transform=make('geometry_msgs/msg/Transform', rotation=field.pose.orientation,
+                       translation=make('geometry_msgs/msg/Vector3', x=position.x, y=position.y,
+                                        z=position.z)))])
+
+
+def odometry_message(stamp, child, pose):
+    field, zeros = bag_messages.pose_message(stamp, 'map', pose), np.zeros(36)
+    zero = make('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0)
+    return make(ODOMETRY, header=field.header, child_frame_id=child,
+                pose=make('geometry_msgs/msg/PoseWithCovariance', pose=field.pose,
+                          covariance=zeros),
+                twist=make('geometry_msgs/msg/TwistWithCovariance', covariance=zeros,
+                           twist=make('geometry_msgs/msg/Twist', linear=zero, angular=zero)))
+
+
+def write_bag(path, room, *, frame='camera', pose=lambda pose: pose, info=lambda message: message,
+              image=lambda pixels: pixels, stamp=lambda stamp: stamp, more=(), poses=True):
+    """Images, camera_info and /ground_truth of a room, each changed by a function."""
+    recorded = [*more]
+    for at, pixels, true_pose, camera in room:
+        recorded += [
+            (at, '/image', bag_messages.IMAGE,
+             bag_messages.image_message(stamp(at), frame, image(pixels))),
+            (at, '/camera_info', bag_messages.CAMERA_INFO,
+             info(bag_messages.camera_info_message(stamp(at), frame, camera)))]
+        if poses:
+            recorded.append((at, '/ground_truth', bag_messages.POSE,
+                             bag_messages.pose_message(stamp(at), 'map', pose(true_pose))))
+    with BagWriter(path) as bag:
+        for topic, kind in dict.fromkeys((topic, kind) for _, topic, kind, _ in recorded):
+            bag.add_topic(topic, kind)
+        for at, topic, _, message in sorted(recorded, key=lambda one: one[0]):
+            bag.write(topic, at, message)
+    return path
+
+
+def reads(bag, topics=None, poses=None, depth=None):
+    return bag_frames(bag, topics or BagTopics(), poses or find_poses(0), depth)
+
+
+def refuses(expected, bag, *more):
+    with pytest.raises(DatasetError, match=expected):
+        list(reads(bag, *more).read())
+
+
+def edited(folder, edit):
+    path = folder / 'transforms.json'
+    values = json.loads(path.read_text())
+    edit(values)
+    path.write_text(json.dumps(values))
+    return folder
+
+
+def test_depth_of_transforms_json_is_in_the_unit_of_its_poses(shots, tmp_path):
+    folder = write_nerf(tmp_path, [shot._replace(pose=shot.pose) for shot in shots])
+    (folder / 'depth').mkdir()
+    for shot in shots:
+        cv2.imwrite(str(folder / f'depth/{shot.path.stem}.png'),
+                    np.full((48, 64), 1000, dtype=np.uint16))
+    edited(folder, lambda values: [one.update(
+        depth_file_path=f'depth/{shot.path.stem}.png')
+        for one, shot in zip(values['frames'], shots, strict=True)])
+    with pytest.raises(DatasetError, match='`scale`'):
+        read_folder(folder)
+    for fields, options, expected_m in (
+            ({}, METRES, 1.0), ({}, FolderOptions(scale=2.7), 2.7),
+            ({'depth_unit_scale_factor': 0.002}, METRES, 2.0),
+            ({'integer_depth_scale': 0.0005}, METRES, 0.5)):
+        edited(folder, lambda values, fields=fields: values.update(fields))
+        frame = next(read_folder(folder, options).read())
+        assert frame.depth.depths_m[0, 0] == pytest.approx(expected_m)
+        edited(folder, lambda values: [values.pop(name, None) for name in (
+            'depth_unit_scale_factor', 'integer_depth_scale')])
+    (folder / f'depth/{shots[0].path.stem}.png').unlink()
+    notes = read_folder(folder, METRES).notes
+    assert any('depth images that are listed are missing' in note for note in notes)
+
+
+@pytest.mark.parametrize(('text', 'red_first'), [
+    ('rgb8; jpeg compressed bgr8', False), ('rgb8; jpeg compressed rgb8', True),
+    ('bgr8; png compressed rgb8', True), ('jpeg', False), ('bgr8; jpeg compressed bgr8', False),
+    ('mono8; jpeg compressed ', False)])
+def test_the_order_of_colours_of_compressed_images(text, red_first):
+    pixels = np.zeros((8, 8, 3), dtype=np.uint8)
+    pixels[..., 0] = 200  # red
+    stored = pixels if red_first else pixels[..., ::-1]  # what OpenCV takes for blue, green, red
+    data = cv2.imencode('.png', np.ascontiguousarray(stored))[1].tobytes()
+    message = replace(bag_messages.compressed_image_message(START, 'camera', data, 'png'),
+                      format=text)
+    assert image_from_msg(message)[0, 0].tolist() == [200, 0, 0]
+
+
+def test_each_image_has_the_camera_info_of_its_time(room, tmp_path):
+    """A zoom; the same without stamps."""
+    half = room[len(room) // 2][0]
+
+    def zoomed(message):
+        at = bag_messages.stamp_ns(message)
+        if at >= half:
+            for matrix, places in ((message.k, (0, 4)), (message.p, (0, 5))):
+                matrix[list(places)] *= 1.5
+        return message
+    for name, by_stamp in (('a', True), ('b', False)):
+        def info(message, by_stamp=by_stamp):
+            zoomed(message)
+            if not by_stamp:
+                message.header.stamp.sec = message.header.stamp.nanosec = 0
+            return message
+        frames = reads(write_bag(tmp_path / name, room, info=info))
+        assert frames.varies
+        focal_px = [raw.decode().camera.fx for raw in frames.read_raw(
+            lambda place, *_: place in (0, len(room) - 1))]
+        assert focal_px == pytest.approx([room[0][3].fx, 1.5 * room[0][3].fx])
+
+
+def test_a_few_bad_messages_are_left_out_and_counted(room, tmp_path):
+    def info(message):
+        if bag_messages.stamp_ns(message) in bad:
+            message.k[:] = 0.0
+        return message
+
+    poses = [(at, '/ground_truth', bag_messages.POSE, bag_messages.pose_message(at, 'map', pose))
+             for at, _, pose, _ in room]
+    poses[3][3].pose.position.x = np.nan
+    bad = {room[place][0] for place in (0, 1, 7)}
+    bag = write_bag(tmp_path / 'bag', room, info=info, more=poses, poses=False)
+    frames = reads(bag)
+    notes = ' '.join(frames.notes)
+    assert '3 of 48 messages of /camera_info left out' in notes
+    assert '1 of 48 messages of /ground_truth left out' in notes
+    assert sum(frame.map_from_camera is not None for frame in frames.read()) == 47
+    bad = {one[0] for one in room[:20]}
+    refuses('/camera_info: 10 messages', write_bag(tmp_path / 'many', room, info=info))
+
+
+def test_rectified_images_beside_a_distortion(room, tmp_path):
+    """Found by the images, whatever the topic is called."""
+    camera = room[0][3]
+    lens = replace(camera, fx=camera.fx / 0.95, fy=camera.fy / 0.95, cx=camera.cx + 4.0,
+                   distortion_model='plumb_bob', distortion=(-0.3, 0.1, 0.0, 0.0, 0.0))
+
+    def info(message):
+        made = bag_messages.camera_info_message(bag_messages.stamp_ns(message), 'camera', lens)
+        made.p[:] = message.p
+        return made
+    bag = write_bag(tmp_path / 'bag', room, info=info)
+    refuses('do as rectified .*`rectified`', bag)
+    assert not [note for note in reads(bag, BagTopics(rectified=True)).notes if 'fit' in note]
+    raw = [(at, distorted(pixels, camera, lens), pose, camera) for at, pixels, pose, _ in room]
+    bag = write_bag(tmp_path / 'raw', raw, info=info)
+    assert not [note for note in reads(bag).notes if 'fit' in note]
+    refuses('do as raw .*leave `rectified`', bag, BagTopics(rectified=True))
+
+
+def distorted(pixels, pinhole, lens):
+    """Return the image that a lens makes of what a pinhole shows."""
+    grid = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1)
+    places = cv2.undistortPoints(grid.reshape(-1, 1, 2).astype(np.float32), lens.matrix,
+                                 np.array(lens.distortion), P=pinhole.matrix)
+    places = places.reshape(lens.height, lens.width, 2).astype(np.float32)
+    return cv2.remap(pixels, places[..., 0], places[..., 1], cv2.INTER_LINEAR)
+
+
+def test_whose_poses_they_are_and_in_which_frame_depth_is(room, tmp_path):
+    mount = make_transform(Rotation.from_euler('xyz', [-90, 0, -90], degrees=True).as_matrix(),
+                           np.array([0.2, 0.0, 1.0]))
+    odometry = [(at, '/ground_truth', ODOMETRY, odometry_message(
+        at, 'base_footprint', pose @ invert_transform(mount))) for at, _, pose, _ in room]
+    static = [(START, '/tf_static', TF, transform_message(START, 'base_footprint', 'camera',
+                                                          mount))]
+    refuses('base_footprint.*`mount`', write_bag(tmp_path / 'a', room, more=odometry, poses=False))
+    bag = write_bag(tmp_path / 'b', room, more=[*odometry, *static], poses=False)
+    frame = next(reads(bag).read())
+    np.testing.assert_allclose(frame.map_from_camera, room[0][2], atol=1e-6)
+    # the frame of the images is the camera's body: x forward
+    body = make_transform(Rotation.from_euler('xyz', [-90, 0, -90], degrees=True).as_matrix(),
+                          np.zeros(3))
+    refuses('do as ros .*`mount` 0 0 0 -0.5 0.5 -0.5 0.5', write_bag(
+        tmp_path / 'c', room, pose=lambda pose: pose @ invert_transform(body)))
+    # depth of another camera: by its camera_info and tf, or not at all
+    depth_from = make_transform(np.eye(3), np.array([0.05, 0.0, 0.0]))
+    depths = [(at, '/depth/image', bag_messages.IMAGE, depth_message(at, 'depth'))
+              for at, *_ in room]
+    topics = BagTopics(depth='/depth/image')
+    refuses("frame 'depth'.*/depth/camera_info is missing", write_bag(
+        tmp_path / 'd', room, more=depths), topics)
+    infos = [(START, '/depth/camera_info', bag_messages.CAMERA_INFO,
+              bag_messages.camera_info_message(START, 'depth', room[0][3])),
+             (START, '/tf_static', TF, transform_message(START, 'camera', 'depth', depth_from))]
+    frame = next(reads(write_bag(tmp_path / 'e', room, more=[*depths, *infos]), topics).read())
+    np.testing.assert_allclose(frame.depth.camera.color_from_depth, depth_from, atol=1e-9)
+
+
+def depth_message(stamp, frame):
+    message = bag_messages.image_message(stamp, frame, np.zeros((48, 64, 3), dtype=np.uint8))
+    values = np.full((48, 64), 2000, dtype=np.uint16)
+    return replace(message, encoding='16UC1', step=128,
+                   data=np.frombuffer(values.tobytes(), dtype=np.uint8))
+
+
+@pytest.mark.parametrize(('header', 'row'), [
+    ('', '1700000000.5 1 2 3 0.1 0.2 0.3 0.927362'),
+    ('', '1700000000500000000 1 2 3 0.1 0.2 0.3 0.927362'),
+    ('', '1700000000500 1 2 3 0.1 0.2 0.3 0.927362'),
+    ('# timestamp tx ty tz qw qx qy qz', '1700000000.5 1 2 3 0.927362 0.1 0.2 0.3'),
+    ('#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], '
+     'q_RS_y [], q_RS_z [], v_RS_R_x [m s^-1]',
+     '1700000000500000000, 1, 2, 3, 0.927362, 0.1, 0.2, 0.3, 9'),
+    ('index,time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw',
+     '7,1700000000.5,1000,2000,3000,0.1,0.2,0.3,0.927362'),
+    ('', '1700000000.5 0.74 -0.516377 0.430945 1 0.596377 0.8 -0.065472 2 -0.310945 '
+         '0.305472 0.9 3')])
+def test_columns_of_trajectories(header, row, tmp_path):
+    path = tmp_path / 'poses.txt'
+    path.write_text(f'{header}\n{row}\n')
+    poses = read_tum_trajectory(path)
+    assert poses.stamps_ns.tolist() == [1_700_000_000_500_000_000]
+    np.testing.assert_allclose(poses.positions_xyz, [[1, 2, 3]])
+    np.testing.assert_allclose(poses.quats_xyzw, [[0.1, 0.2, 0.3, 0.927362]], atol=1e-4)
+
+
+@pytest.mark.parametrize(('row', 'expected'), [
+    ('1 0 0 0 0 1 0 0 0 0 1 0', 'KITTI'), ('0 0 0 0 0 0 1', 'without stamps'),
+    ('1 2 3 0 0 0 1 0 9', 'name other columns')])
+def test_columns_that_are_no_trajectory(row, expected, tmp_path):
+    (tmp_path / 'poses.txt').write_text(f'{row}\n')
+    with pytest.raises(DatasetError, match=expected):
+        read_tum_trajectory(tmp_path / 'poses.txt')
+
+
+def test_another_order_of_a_quaternion_is_seen_in_the_images(shared_data, tmp_path):
+    """Without a line that names the columns; with it, it is read."""
+    folder = shared_data / 'rooms/bonsai_room'
+    for name in ('rgb.txt', 'camera.json', 'images'):
+        (tmp_path / name).symlink_to(folder / name)
+    lines = [line.split() for line in (folder / 'groundtruth.txt').read_text().splitlines()
+             if not line.startswith('#')]
+    other = '\n'.join(' '.join([*cells[:4], cells[7], *cells[4:7]]) for cells in lines)
+    (tmp_path / 'groundtruth.txt').write_text(other)
+    with pytest.raises(DatasetError, match=r'quaternions w x y z .*name the columns'):
+        read_folder(tmp_path)
+    (tmp_path / 'groundtruth.txt').write_text(f'# timestamp tx ty tz qw qx qy qz\n{other}')
+    ours, theirs = (next(read_folder(one).read_raw(lambda *_: True)).map_from_camera
+                    for one in (tmp_path, folder))
+    np.testing.assert_allclose(ours, theirs, atol=1e-9)
+
+
+def test_exif_orientation(shared_data, tmp_path):
+    """A camera of the turned size: read. Of the same size: the images contradict, and say so."""
+    folder = shared_data / 'rooms/bonsai_room'
+    for name in ('rgb.txt', 'groundtruth.txt'):
+        shutil.copy(folder / name, tmp_path)
+    shutil.copytree(folder / 'images', tmp_path / 'images')
+    given = json.loads((folder / 'camera.json').read_text())
+    for orientation, turn, expected in ((3, cv2.ROTATE_180, 'turned by EXIF .*auto-orient'),
+                                        (6, cv2.ROTATE_90_COUNTERCLOCKWISE, None)):
+        for path in sorted((folder / 'images').iterdir()):
+            # as a phone stores it: the sensor's pixels, and how to turn them
+            stored = cv2.rotate(cv2.imread(str(path)), turn)
+            data = cv2.imencode('.jpg', stored, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+            exif = b'Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01' + bytes(
+                [0, orientation, 0, 0]) + bytes(4)
+            block = b'\xff\xe1' + (len(exif) + 2).to_bytes(2, 'big') + exif
+            (tmp_path / 'images' / path.name).write_bytes(data[:2] + block + data[2:])
+        (tmp_path / 'camera.json').write_text(json.dumps(given))
+        if expected is None:
+            frame = next(read_folder(tmp_path).read())
+            assert frame.image_rgb.shape[:2] == (given['height'], given['width'])
+        else:
+            with pytest.raises(DatasetError, match=expected):
+                read_folder(tmp_path)
+
+
+def test_stamps_that_begin_again(room, tmp_path):
+    half = room[len(room) // 2][0]
+    bag = write_bag(tmp_path / 'bag', room,
+                    stamp=lambda at: at - (half - START if at >= half else 0))
+    refuses('the stamps begin again: .*ros2 bag convert', bag)
+    # images alone, as of a camera whose clock starts again
+    later = [(at + 10**9, '/ground_truth', bag_messages.POSE,
+              bag_messages.pose_message(at, 'map', pose)) for at, _, pose, _ in room]
+    bag = write_bag(tmp_path / 'images', room, more=later, poses=False,
+                    stamp=lambda at: at - (half - START if at >= half else 0))
+    refuses('/camera_info: the stamps begin again', bag)
+
+
+def test_what_a_list_names_is_counted(shots, tmp_path):
+    folder = write_nerf(tmp_path / 'nerf', shots)
+    (folder / 'images' / shots[2].path.name).unlink()
+    assert any(f'1 of {len(shots)} images that are listed are missing, such as' in note
+               for note in read_folder(folder, METRES).notes)
+
+
+def test_two_sources_of_one_value(room, shots, tmp_path):
+    folder = write_nerf(tmp_path / 'nerf', shots)
+    edited(folder, lambda values: values.update(camera_angle_x=1.0))
+    with pytest.raises(DatasetError, match='two focal lengths'):
+        read_folder(folder, METRES)
+    folder = write_colmap(tmp_path / 'c', shots)
+    other = write_colmap(tmp_path / 'd', shots, text=True, camera_of=lambda _: (
+        'PINHOLE', shots[0].camera.width, shots[0].camera.height, [400, 400, 320, 240]))
+    for name in ('cameras.txt', 'images.txt'):
+        shutil.copy(other / 'sparse/0' / name, folder / 'sparse/0')
+    with pytest.raises(DatasetError, match=r'\.bin and \.txt .* different cameras'):
+        read_folder(folder, METRES)
+    # a topic and tf
+    beside = make_transform(np.eye(3), np.array([0.18, 0.0, 0.0]))
+    moving = [(at, '/tf', TF, transform_message(at, 'map', 'camera', beside @ pose))
+              for at, _, pose, _ in room]
+    notes = reads(write_bag(tmp_path / 'bag', room, more=moving)).notes
+    assert any('different poses of the camera: 18 cm' in note for note in notes)
+
+
+def test_paths_of_other_systems_and_folders_of_splatting(shots, tmp_path):
+    folder = write_nerf(tmp_path / 'nerf', shots)
+
+    def absolute(values):
+        for one in values['frames']:
+            one['file_path'] = 'C:\\Users\\me\\scan\\images\\' + one['file_path'].split('/')[-1]
+    edited(folder, absolute)
+    assert read_folder(folder, METRES).count == len(shots)
+    shutil.move(folder / 'images', tmp_path / 'elsewhere')
+    assert read_folder(folder, FolderOptions(scale=1.0, images=tmp_path / 'elsewhere')
+                       ).count == len(shots)
+    project = write_colmap(tmp_path / 'splats', shots)
+    (project / 'distorted').mkdir()
+    shutil.move(project / 'sparse', project / 'distorted/sparse')
+    shutil.move(project / 'images', project / 'input')
+    assert read_folder(project, METRES).count == len(shots)
+    (project / 'distorted/sparse/0/images.bin').unlink()
+    with pytest.raises(DatasetError, match=r'lacks images\.bin'):
+        read_folder(project, METRES)
+
+
+@pytest.mark.parametrize(('there', 'expected'), [
+    (('mav0/cam0/data.csv',), 'EuRoC'), (('image_0/000000.png', 'times.txt'), 'KITTI'),
+    (('color/0.jpg', 'pose/0.txt', 'intrinsic/intrinsic_color.txt'), 'ScanNet'),
+    (('results/frame000000.jpg', 'traj.txt'), 'Replica'),
+    (('groundtruth.txt', 'rgb/1.png'), 'lacks rgb.txt'),
+    (('rgb.mp4', 'camera_matrix.csv'), 'lacks odometry.csv'),
+    (('database.db', 'images/1.jpg'), 'mapper')])
+def test_layouts_that_are_not_read_are_named(there, expected, tmp_path):
+    for name in there:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(DatasetError, match=expected):
+        read_folder(tmp_path)
+
+
+def test_tf_under_the_name_of_a_robot_and_a_way_out_of_bad_drivers(room, tmp_path):
+    moving = [(at, '/robot1/tf', TF, transform_message(at, 'map', 'camera', pose))
+              for at, _, pose, _ in room]
+    bag = write_bag(tmp_path / 'bag', room, more=moving, poses=False)
+    np.testing.assert_allclose(next(reads(bag).read()).map_from_camera, room[0][2], atol=1e-6)
+    second = [(at, '/robot2/tf', TF, message) for at, _, _, message in moving]
+    bag = write_bag(tmp_path / 'two', room, more=[*moving, *second], poses=False)
+    refuses('several robots: /robot1/tf, /robot2/tf; give `tf`', bag, None,
+            poses_of_tf('map', None, 0))
+    frames = reads(bag, None, poses_of_tf('map', None, 0, '/robot2/tf'))
+    assert next(frames.read()).map_from_camera is not None
+    # no calibration at all: a file instead
+    bag = write_bag(tmp_path / 'zero', room, info=lambda message: replace(
+        message, k=np.zeros(9), p=np.zeros(12)))
+    refuses('camera_info', bag)
+    (tmp_path / 'camera.json').write_text(json.dumps({
+        name: getattr(room[0][3], name) for name in ('width', 'height', 'fx', 'fy', 'cx', 'cy')}))
+    topics = BagTopics(intrinsics=str(tmp_path / 'camera.json'))
+    assert next(reads(bag, topics).read()).camera.fx == room[0][3].fx
+    # stamps that are 60 ms apart
+    apart = [(at, '/late', bag_messages.POSE, bag_messages.pose_message(at + 60 * MS, 'map', pose))
+             for at, _, pose, _ in room[:3]]
+    bag = write_bag(tmp_path / 'apart', room[:3], more=apart)
+    for tolerance_ns, known in ((20 * MS, False), (100 * MS, True)):
+        frame = next(reads(bag, None, poses_of_topic('/late', 0, None, tolerance_ns)).read())
+        assert (frame.map_from_camera is not None) == known
+
+
+def test_names_tell_nothing_of_the_order_of_images(shots, tmp_path):
+    """Folders and umlauts mix the order of the images: no alarm where they do not overlap."""
+    folder = write_colmap(tmp_path, shots)
+    model = folder / 'sparse/0'
+    import pycolmap
+    known = pycolmap.Reconstruction(str(model))
+    rng = np.random.default_rng(0)
+    for number in known.images:
+        old = known.images[number].name
+        new = f'{"küche/bild ä" if rng.random() < 0.5 else "Flur Süd/"} {rng.integers(1e6)}.jpg'
+        (folder / 'images' / new).parent.mkdir(parents=True, exist_ok=True)
+        shutil.move(folder / 'images' / old, folder / 'images' / new)
+        known.images[number].name = new
+    known.write_binary(str(model))
+    notes = read_folder(folder, METRES).notes
+    assert not [note for note in notes if 'fit' in note]

@@ -1,0 +1,73 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Sizes of classes, the scale of a map, and verdicts that tell objects from keyframes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.offline.mapping.check.checking import check_map
+from cliploc_ros.offline.mapping.check.report import BY_OBJECTS, Measure
+from cliploc_ros.offline.mapping.options import CheckOptions
+from cliploc_ros.offline.vocabulary.sizes import scale_by_sizes, sizes_of_classes
+
+QUICK = CheckOptions(max_positions=4, headings=4)
+
+
+@pytest.fixture(scope='module')
+def office(shared_data):
+    return LandmarkMap.from_file(shared_data / 'tum_fr3_office/map.yaml')
+
+
+def scaled(landmark_map, scale):
+    return replace(landmark_map, centers=scale * landmark_map.centers,
+                   semi_axes=scale * landmark_map.semi_axes)
+
+
+@pytest.mark.parametrize('scale', [0.3, 1.0, 2.6])
+def test_the_scale_of_a_map_by_the_sizes_of_its_objects(office, scale):
+    found = scale_by_sizes(scaled(office, scale))
+    if scale == 1.0:
+        assert found is None
+        return
+    assert found == pytest.approx(scale, rel=0.5)
+    advice = check_map(scaled(office, scale), options=QUICK).advice
+    assert 'times too ' + ('large' if scale > 1.0 else 'small') in advice[0]
+
+
+def test_few_classes_and_views_of_one_side_tell_no_scale(office):
+    cups = [row for row, name in enumerate(office.class_ids) if name == 'cup']
+    assert scale_by_sizes(scaled(office.select(cups), 3.0)) is None
+    one_sided = replace(office, details=tuple(
+        replace(one, baseline_deg=5.0) for one in office.details))
+    assert not office.details or scale_by_sizes(scaled(one_sided, 3.0)) is None
+
+
+def test_a_landmark_that_is_too_large_has_a_serious_fault(office):
+    row = office.class_ids.index('chair')
+    semi_axes = office.semi_axes.copy()
+    semi_axes[row] = np.array([0.26, 0.4, 1.61])
+    report = check_map(replace(office, semi_axes=semi_axes), options=QUICK)
+    found, = (one for one in report.landmarks if one.landmark_id == office.landmark_ids[row])
+    assert found.severity >= 1.0 and 'is 3.2 m long, and no chair' in found.faults[0]
+    assert 'unknown thing' not in sizes_of_classes()
+
+
+def test_a_map_whose_objects_carry_nothing_is_keyframes_only(office):
+    report = check_map(office, options=QUICK)
+    missed = Measure(BY_OBJECTS, 0.0, 0.1, False)
+    met = Measure('landmarks with a serious fault', 0.0, 0.15, True)
+    for measures, verdict in (((met,), 'passed'), ((met, missed), 'keyframes only'),
+                              ((replace_value(met, 0.8), missed), 'failed')):
+        told = replace(report, measures=measures)
+        assert told.verdict == told.as_dict()['verdict'] == verdict
+        assert told.passed == (verdict == 'passed')
+    positions, = report.carried
+    assert positions.by_objects == int((report.grid.accepted[report.grid.is_near] > 0).sum())
+    assert positions.by_keyframes == 0 and str(positions).startswith('by objects ')
+
+
+def replace_value(measure, value):
+    return measure._replace(value=value)
