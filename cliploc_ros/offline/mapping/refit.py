@@ -32,10 +32,10 @@ from cliploc_ros.offline.mapping.views import Views, check_input, make_views
 # Boxes overlap less with a landmark that is off than with a fitted one. The first rounds take
 # them from this IoU on.
 _FIRST_IOUS = (0.05, 0.1)
-# A map lies in the recording's coordinate frame if, as given, it explains this share of the boxes
-# that it explains after fitting. On the frames of TUM fr3, maps with errors of 10 cm on each axis
+#: A map lies in the recording's coordinate frame if, as given, it explains this share of the boxes
+#: that it explains after fitting. On the frames of TUM fr3, maps with errors of 10 cm on each axis
 # reach .70; maps that are off by 30 cm, 30 degrees or a scale of .8 reach at most .37.
-_LEAST_EXPLAINED = 0.45
+LEAST_EXPLAINED = 0.45
 # A landmark that moves farther than this, and than twice its greatest semi-axis, shows another
 # object. On the same frames, with errors of 15 cm on each axis, right ones move .49 m at most.
 _MAX_MOVE_M = 0.5
@@ -104,7 +104,7 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
     before = explained_boxes(views, given)
     share_before = before.explained / share_known
     share_settled = explained_boxes(views, settled.select(is_own)).explained / share_known
-    if share_before < _LEAST_EXPLAINED * share_settled:
+    if share_before < LEAST_EXPLAINED * share_settled:
         raise MappingError(
             f'the map does not lie where the boxes are: it explains {share_before:.0%} of them '
             f"as given, and {share_settled:.0%} after fitting; bring it into the recording's "
