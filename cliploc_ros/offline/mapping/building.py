@@ -262,7 +262,6 @@ class _Builder(NamedTuple):
         moving = [number for number, name in enumerate(self.detections.class_names)
                   if name in self.options.moving_classes]
         free = free & thin_out(views, _FRAMES_PER_VIEWPOINT)[views.frames]
-        free &= ~np.isin(views.classes, moving)
         found = [Landmarks.none()]
         for first, last in _windows(views.stamps_s):
             self.tell('finding landmarks', first / len(views.stamps_s))
@@ -273,7 +272,9 @@ class _Builder(NamedTuple):
                 triangulate(window, np.nonzero(left & (window.classes == number))[0],
                             self.options.min_viewpoints, self.rng)
                 for number in np.unique(window.classes[left]))))
-        return Landmarks.joined(*found)
+        all_found = Landmarks.joined(*found)
+        # found and dropped, so that the others draw the same numbers whatever moves
+        return all_found.select(~np.isin(all_found.classes, moving))
 
     def _settle(self, views: Views, landmarks: Landmarks) -> tuple[Landmarks, NDArray[np.int64]]:
         """Associate, merge and fit until landmarks and boxes agree; return both."""
