@@ -194,8 +194,7 @@ def _make(options: argparse.Namespace, detections: 'PosedDetections', labeller: 
 
 def _place_of(path: Path, report: 'MappingReport | UpdateReport') -> tuple[Path, bool]:
     """Return where a map is written, and whether it is too poor to take the place of another."""
-    from cliploc_ros.offline.mapping.building import MappingReport
-    from cliploc_ros.offline.mapping.refit import LEAST_EXPLAINED
+    from cliploc_ros.offline.mapping.building import LEAST_EXPLAINED, MappingReport
 
     is_poor = isinstance(report, MappingReport) and report.landmarks > 0 and (
         report.explained_of_classes < LEAST_EXPLAINED)

@@ -59,7 +59,7 @@ def test_a_poor_map_takes_no_place(office, tmp_path, capsys):
     """Poses that are not of the images: the map is kept beside, and the exit code tells it."""
     rng = np.random.default_rng(0)
     poses = office.map_from_camera.copy()
-    poses[:, :3, 3] += rng.normal(0.0, 0.15, (len(poses), 3))
+    poses[:, :3, 3] += rng.normal(0.0, 1.2, (len(poses), 3))
     save_observations(tmp_path / 'off.npz', replace(office, map_from_camera=poses))
     out = tmp_path / 'office.yaml'
     out.write_text('the map before')
