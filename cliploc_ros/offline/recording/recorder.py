@@ -204,10 +204,13 @@ def _with_odometry(recorded: Recorded, odometry: Mapping[str, Poses] | None) -> 
     return replace(recorded, detections=replace(recorded.detections, odom_from_camera=placed))
 
 
-def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame]) -> Recorded:
-    """Return what networks at hand say of every frame with a pose; nothing is written."""
+def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame | str]) -> Recorded:
+    """Return what networks at hand say of every frame with a pose; nothing is written.
+
+    Frames that cannot be decoded are left out: for these, look returns why.
+    """
     with _read_keyframes(frames, EVERY_FRAME) as (raws, filters):
-        seen = [look(raw) for raw in raws]
+        seen = [found for raw in raws if isinstance(found := look(raw), SeenFrame)]
     return _assemble(seen, frames, filters, '', '')
 
 
