@@ -2,21 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The relocalizer as a process with a layer of keyframes next to its map: the demo's room."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from nav2_msgs.srv import LoadMap
-from scene import make_room, write_map
+from scene import make_room, write_bare_map, write_map
 from tester import class_matching, make_frame, transform_of
 
 from cliploc_ros.cli.evaluate import main as evaluate
+from cliploc_ros.cli.preparation import with_drawn_boxes
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, save_layer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.map.map_file import write_map as write_map_file
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.offline.datasets.folders import tum_frames
 from cliploc_ros.offline.datasets.intrinsics import find_camera
@@ -92,56 +90,46 @@ def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
     assert 'keyframes' not in diagnostics_of(tester)
 
 
-@pytest.fixture
-def bare_map(tmp_path):
-    """A map of keyframes alone, as build_map writes it."""
-    path, known = tmp_path / 'bare.yaml', LandmarkMap.empty('map')
-    layer = build_layer(frames_of('mapping').select(LIKE_QUERY), known,
-                        LayerOptions(0.0, 0.0, 300))
-    save = lambda place, digest: save_layer(place, replace(layer, set_digest=digest))  # noqa: E731
-    write_map_file(path, known, besides={layer_path(path): save})
-    return path
-
-
-def test_a_map_of_keyframes_alone(start, tester, bare_map, room_map, tmp_path, capsys):
-    """With default options: no network is loaded, and all that a map does works."""
-    process = start('nodes.relocalizer', parameters={
-        'map_file': bare_map, 'record_folder': tmp_path / 'cases'})
+def test_a_map_of_keyframes_alone(start, tester, room_map, tmp_path, capsys):
+    """It is a map: with default options, and without CLIP; one with landmarks comes and goes."""
+    bare = tmp_path / 'bare.yaml'
+    write_bare_map(bare, build_layer(frames_of('mapping').select(LIKE_QUERY),
+                                     LandmarkMap.empty('map'), LayerOptions(0.0, 0.0, 300)))
+    process = start('nodes.relocalizer', parameters={'map_file': bare,
+                                                     'record_folder': tmp_path / 'cases'})
     process.wait_for_output('ready after')
-    print(process.output())
     tester.connect()
     seen, frame = query_frame()
     answer = tester.relocalize(frame)
-    print(answer.message)
     assert answer.success, answer.message
-    assert 'pose by keyframes' in answer.message
+    assert pose_error(transform_of(tester.poses[0].pose.pose), seen.map_from_camera)[0] < 0.05
     assert tester.trigger('record').success
     case, = (tmp_path / 'cases').iterdir()
-    assert evaluate(['--bag', str(case), '--map', str(bare_map)]) == 0
-    print(capsys.readouterr().out)
-    print(diagnostics_of(tester))
-    refused = tester.relocalize(make_frame())
-    print(refused.message)
-    assert not refused.success and 'keyframes alone' in refused.message
-    def load(path):
-        return tester.call(LoadMap, '/relocalizer/load_map', LoadMap.Request(map_url=str(path))).result
-    assert tester.set_parameter('matching', 'class').successful
-    assert load(room_map) == LoadMap.Response.RESULT_SUCCESS
-    assert tester.relocalize(make_frame()).success
-    assert load(bare_map) == LoadMap.Response.RESULT_SUCCESS
-    assert tester.relocalize(query_frame()[1]).success
-    assert tester.set_parameter('map_files', [str(bare_map), str(room_map)]).successful
-    print(tester.trigger('reload_map').message)
-    assert tester.set_parameter('map_files', ['']).successful
-    for algorithm in ('bf', 'ransac', 'bprosac', 'auto'):
-        for matching in ('class', 'clip', 'hybrid'):
-            print(algorithm, matching, tester.set_parameter('algorithm', algorithm).reason, tester.set_parameter('matching', matching).reason, tester.set_parameter('k', 5).reason)
-            print(tester.trigger('reload_map').message, tester.relocalize(query_frame()[1]).message)
-    layer_path(bare_map).unlink()
-    answer = tester.trigger('reload_map')
-    print(answer.message)
-    print(process.output())
-    assert 0
+    assert evaluate(['--bag', str(case), '--map', str(bare)]) == 0
+    assert 'the map has keyframes alone, and none fits' in tester.relocalize(make_frame()).message
+    assert 'detector' not in process.output()
+    process.stop()
+    for methods, problem in ((['all'], "'class_bf' uses landmarks only"),
+                             (['auto', '--no-keyframes'], 'has no landmarks')):
+        assert evaluate(['--tum', str(ASSETS / 'sequence'), '--map', str(bare),
+                         '--methods', *methods]) == 1
+        assert problem in capsys.readouterr().err
+    assert len(with_drawn_boxes(UNKNOWN, LandmarkMap.empty('map'), (640, 480))) > 1
+
+    process = start('nodes.relocalizer', parameters=class_matching(room_map))
+    process.wait_for_output('ready after')
+    tester.connect()
+    for path, its in ((bare, frame), (room_map, make_frame()), (bare, frame)):
+        assert tester.set_parameter('map_file', str(path)).successful
+        assert tester.trigger('reload_map').success
+        assert tester.relocalize(its).success
+    assert tester.set_parameter('map_file', '').successful
+    assert tester.set_parameter('map_files', [str(room_map), str(bare)]).successful
+    assert 'is searched alone' in tester.trigger('reload_map').message
+    process.stop()
+    process = start('nodes.relocalizer', '--ros-args', '--params-file', str(bare))
+    process.wait_for_output('is given as map_file')
+    assert 'Traceback' not in process.output()
 
 
 def diagnostics_of(tester):
