@@ -15,7 +15,13 @@ from cliploc_ros.core.geometry.ellipsoid import (
 )
 from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
 from cliploc_ros.core.keyframes.features import DIMENSIONS, unit_rows
-from cliploc_ros.core.keyframes.layer import KeyframeLayer, nearest_words
+from cliploc_ros.core.keyframes.layer import (
+    KeyframeLayer,
+    layer_path,
+    nearest_words,
+    save_layer,
+)
+from cliploc_ros.core.map import map_file
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.offline.recording.keyframe_layer import learn_words
@@ -100,3 +106,10 @@ def write_map(room: LandmarkMap, path) -> None:
         for i, landmark_id in enumerate(room.landmark_ids)}
     path.write_text(yaml.safe_dump({'/**': {'ros__parameters': {
         'map': {'frame_id': room.frame_id, 'landmarks': landmarks}}}}))
+
+
+def write_bare_map(path, layer) -> None:
+    """Write a map of keyframes alone, and its layer, as build_map does."""
+    map_file.write_map(path, LandmarkMap.empty(layer.frame_id), besides={
+        layer_path(path): lambda place, digest: save_layer(place, replace(layer,
+                                                                          set_digest=digest))})

@@ -164,8 +164,10 @@ def evaluate(options: argparse.Namespace) -> int:
         tilt_deviation_deg=options.tilt_deviation,
         vertical_deviation_deg=max(1.0, options.gravity_noise_deg), crops=options.crops)
     methods = parse_methods(options.methods, paper, len(landmark_map))
-    options.clip = _needs_clip(options, methods)
+    options.clip = len(landmark_map) > 0 and _needs_clip(options, methods)
     layer = _read_layer(options, landmark_map, methods)
+    if not len(landmark_map) and layer is None:
+        raise OptionsError(f'{options.map[0]}: has no landmarks, and no keyframes are used')
     make_folder(options.out)
     images = {} if options.queries is not None else _read_images(options)
     of_cameras = {camera: _read_queries(options, landmark_map, camera, images.get(camera))
@@ -277,7 +279,7 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
     from cliploc_ros.models.observer import Observer
 
     case, observer = read_case(options.bag), None
-    if case.options.needs_similarities:
+    if case.options.needs_similarities and len(landmark_map):
         observer = Observer(*load_encoder_for_map(
             clip_options(options), landmark_map, [str(file) for file in options.map],
             options.landmark_embeddings))

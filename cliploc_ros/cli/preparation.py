@@ -15,6 +15,7 @@ from llvmlite.binding import get_host_cpu_name
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.keyframes.layer import layer_path
 from cliploc_ros.core.map.landmark_embeddings import embeddings_path
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
@@ -37,7 +38,8 @@ _BOXES = 12
 _ROWS, _COLUMNS = 3, 4
 _REQUESTS = 3
 # Parameters that name files of the user, which are not copied.
-_FILES = ('model', 'map_file', 'clip_model', 'clip_pretrained', 'clip_checkpoint_path')
+_FILES = ('model', 'map_file', 'keyframes_file', 'clip_model', 'clip_pretrained',
+          'clip_checkpoint_path')
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bo
         parameters = node.settings.snapshot()
         used.append(parameters)
         localizer = load_localizer(node, parameters)
-    if (parameters.options().needs_similarities and localizer.device == 'cpu'
+    if (localizer.observer is not None and localizer.device == 'cpu'
             and parameters.inference != 'pytorch' and import_openvino() is not None):
         with _step("CLIP's text tower, for the labels of other maps"):
             clip = clip_options_of(parameters)
@@ -134,7 +136,7 @@ def with_drawn_boxes(found: Detections, landmark_map: LandmarkMap, size: tuple[i
     cell = np.array(size) / (_COLUMNS, _ROWS)
     corners = np.array([divmod(number, _COLUMNS)[::-1] for number in missing]).reshape(-1, 2)
     drawn = np.concatenate([(corners + 0.25) * cell, (corners + 0.75) * cell], axis=1)
-    classes = landmark_map.class_ids
+    classes = landmark_map.class_ids or ('object',)
     return Detections(np.concatenate([found.bboxes_xyxy.reshape(-1, 4), drawn]),
                       (*found.class_ids, *(classes[number % len(classes)] for number in missing)),
                       np.concatenate([found.scores, np.full(len(missing), 0.5)]))
@@ -167,7 +169,8 @@ def carrying(cache_dir: Path, used: list[CommonParameters]) -> list[str]:
     names = {getattr(one, name, '') for one in used for name in _FILES} - {''}
     maps = {name for one in used if isinstance(one, RelocalizerParameters)
             for name in map_files(one)}
-    names |= maps | {str(embeddings_path(name)) for name in maps}
+    names |= maps | {str(beside(name)) for name in maps
+                     for beside in (embeddings_path, layer_path)}
     files = sorted({Path(name).expanduser().absolute() for name in names})
     files += sorted({file.parent / 'openvino' for file in files})  # networks beside their weights
     return lines + [f'carry as well, for a parameter names it: {file}' for file in files

@@ -52,7 +52,7 @@ class DetectorCheck:
     def __init__(self, landmark_map: LandmarkMap, by_class: bool,
                  frames: int | None = _MOST_FRAMES) -> None:
         self._known = landmark_map.classes.numbers
-        self._by_class = by_class
+        self._by_class = by_class and len(landmark_map) > 0  # of keyframes alone: any class
         self._frames: deque[_Tally] = deque(maxlen=frames)
 
     def add(self, given: Detections, usable: Detections) -> None:

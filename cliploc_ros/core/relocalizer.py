@@ -257,7 +257,7 @@ class Relocalizer:
             coverage=coverage_of(frames), stamp_ns=frames[-1].observation.stamp_ns,
             recognition=compared.recognition)
         if not compared.contenders:
-            kind, reason = _nothing_found(frames)
+            kind, reason = _nothing_found(self.landmark_map, frames)
             return replace(result, reason=reason, refusal_kind=kind, search_ms=budget.elapsed_ms)
         pose, covariance = compared.pose()
         evidence = compared.evidence(covariance)
@@ -305,8 +305,12 @@ class Relocalizer:
             joined.frames, joined.rig, self.options.refine, budget.refinement_end))
 
 
-def _nothing_found(frames: Sequence[SearchedFrame]) -> tuple[RefusalKind, str]:
+def _nothing_found(landmark_map: LandmarkMap, frames: Sequence[SearchedFrame]
+                   ) -> tuple[RefusalKind, str]:
     """Return why there is no pose."""
+    if not len(landmark_map):
+        return RefusalKind.TOO_FEW_OBJECTS, ('the map has keyframes alone, and none fits the '
+                                             'image; turn the camera to a recorded view')
     if any(one.has_samples for one in frames):
         kind, reason = RefusalKind.UNEXPLAINED, 'no pose explains the detections'
     else:

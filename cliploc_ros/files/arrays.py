@@ -74,7 +74,8 @@ class Offsets:
 
 def _is_not_finite(values: NDArray[Any]) -> NDArray[np.bool_]:
     """Look at some rows at once: the array may stay in its file."""
-    return np.concatenate([~(np.abs(rows.astype(float).reshape(len(rows), -1)) <= _MOST).all(1)
+    within_row = tuple(range(1, values.ndim))
+    return np.concatenate([~(np.abs(rows.astype(float)) <= _MOST).all(axis=within_row)
                            for rows in np.array_split(values, len(values) // _ROWS_AT_ONCE + 1)])
 
 

@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from scene import make_room, write_map
+from scene import make_room, write_bare_map, write_map
 from tester import class_matching, make_frame, transform_of
 
 from cliploc_ros.cli.evaluate import main as evaluate
+from cliploc_ros.cli.preparation import with_drawn_boxes
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, save_layer
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.offline.datasets.folders import tum_frames
 from cliploc_ros.offline.datasets.intrinsics import find_camera
@@ -39,6 +41,19 @@ def room_map(tmp_path):
     return path
 
 
+def query_frame(stamp_s=100.0):
+    """Return image 2 of the walk with its pose, and the messages of it."""
+    seen = next(one for number, one in enumerate(frames_of('sequence').read()) if number == QUERY)
+    image, info, detections = make_frame(UNKNOWN, stamp_s)
+    image.width, image.height, image.step = seen.camera.width, seen.camera.height, \
+        3 * seen.camera.width
+    image.data = seen.image_rgb.tobytes()
+    info.width, info.height = seen.camera.width, seen.camera.height
+    info.k = seen.camera.matrix.ravel()
+    info.p = np.c_[seen.camera.matrix, np.zeros(3)].ravel()
+    return seen, (image, info, detections)
+
+
 def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
         start, tester, room_map, tmp_path, capsys):
     process = start('nodes.relocalizer',
@@ -46,14 +61,7 @@ def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
     process.wait_for_output('ready after')
     assert '8 keyframes' in process.output()
     tester.connect()
-    seen = next(one for number, one in enumerate(frames_of('sequence').read()) if number == QUERY)
-    image, info, detections = make_frame(UNKNOWN)
-    image.width, image.height, image.step = seen.camera.width, seen.camera.height, \
-        3 * seen.camera.width
-    image.data = seen.image_rgb.tobytes()
-    info.width, info.height = seen.camera.width, seen.camera.height
-    info.k = seen.camera.matrix.ravel()
-    info.p = np.c_[seen.camera.matrix, np.zeros(3)].ravel()
+    seen, (image, info, detections) = query_frame()
     answer = tester.relocalize((image, info, detections))
     assert answer.success, answer.message
     assert 'pose by keyframes' in answer.message
@@ -80,6 +88,48 @@ def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
     process.wait_for_output('without keyframes')
     assert not tester.relocalize((image, info, detections)).success
     assert 'keyframes' not in diagnostics_of(tester)
+
+
+def test_a_map_of_keyframes_alone(start, tester, room_map, tmp_path, capsys):
+    """It is a map: with default options, and without CLIP; one with landmarks comes and goes."""
+    bare = tmp_path / 'bare.yaml'
+    write_bare_map(bare, build_layer(frames_of('mapping').select(LIKE_QUERY),
+                                     LandmarkMap.empty('map'), LayerOptions(0.0, 0.0, 300)))
+    process = start('nodes.relocalizer', parameters={'map_file': bare,
+                                                     'record_folder': tmp_path / 'cases'})
+    process.wait_for_output('ready after')
+    tester.connect()
+    seen, frame = query_frame()
+    answer = tester.relocalize(frame)
+    assert answer.success, answer.message
+    assert pose_error(transform_of(tester.poses[0].pose.pose), seen.map_from_camera)[0] < 0.05
+    assert tester.trigger('record').success
+    case, = (tmp_path / 'cases').iterdir()
+    assert evaluate(['--bag', str(case), '--map', str(bare)]) == 0
+    assert 'the map has keyframes alone, and none fits' in tester.relocalize(make_frame()).message
+    assert 'detector' not in process.output()
+    process.stop()
+    for methods, problem in ((['all'], "'class_bf' uses landmarks only"),
+                             (['auto', '--no-keyframes'], 'has no landmarks')):
+        assert evaluate(['--tum', str(ASSETS / 'sequence'), '--map', str(bare),
+                         '--methods', *methods]) == 1
+        assert problem in capsys.readouterr().err
+    assert len(with_drawn_boxes(UNKNOWN, LandmarkMap.empty('map'), (640, 480))) > 1
+
+    process = start('nodes.relocalizer', parameters=class_matching(room_map))
+    process.wait_for_output('ready after')
+    tester.connect()
+    for path, its in ((bare, frame), (room_map, make_frame()), (bare, frame)):
+        assert tester.set_parameter('map_file', str(path)).successful
+        assert tester.trigger('reload_map').success
+        assert tester.relocalize(its).success
+    assert tester.set_parameter('map_file', '').successful
+    assert tester.set_parameter('map_files', [str(room_map), str(bare)]).successful
+    assert 'is searched alone' in tester.trigger('reload_map').message
+    process.stop()
+    process = start('nodes.relocalizer', '--ros-args', '--params-file', str(bare))
+    process.wait_for_output('is given as map_file')
+    assert 'Traceback' not in process.output()
 
 
 def diagnostics_of(tester):

@@ -2,18 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The images of a recording, in any order, and the keyframes next to a map."""
 
-
 import numpy as np
 import pytest
-from scene import make_layer, make_room, write_map
+from scene import make_layer, make_room, write_bare_map, write_map
 
 from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import layer_path, save_layer
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bag_frames import BagTopics
 from cliploc_ros.offline.datasets.bags import BagWriter
 from cliploc_ros.offline.datasets.images import open_images
+from cliploc_ros.offline.studio import edits
 
 BAG_CAMERA = Camera(64, 48, 53.0, 53.0, 32.0, 24.0)
 START_NS = 1_700_000_000_000_000_000
@@ -63,3 +64,16 @@ def test_the_layer_comes_with_its_map(tmp_path, capsys):
     layer_path(path).write_bytes(b'no layer')
     assert layer_of(path) is None
     assert 'without keyframes: ' in capsys.readouterr().out
+
+
+def test_a_map_of_keyframes_alone_gets_its_first_landmark(tmp_path, capsys):
+    """The keyframes stay those of the map."""
+    path = tmp_path / 'bare.yaml'
+    write_bare_map(path, make_layer(LandmarkMap.empty('map')))
+    studio = open_studio(make_parser().parse_args([str(path)]))
+    assert len(studio.layer) == 6
+    studio.document.edit(edits.create, 'a lamp', 'lamp', np.ones(3), np.eye(3))
+    studio.document.save()
+    studio.document.close()
+    assert len(LandmarkMap.from_file(path)) == 1 and len(layer_of(path)) == 6
+    assert capsys.readouterr().out == ''

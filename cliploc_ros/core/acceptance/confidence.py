@@ -110,7 +110,7 @@ def compared_frame(landmark_map: LandmarkMap, detections: Detections, scene: Sce
     # a class that is rare in the map may be common in the place where the camera is
     common = np.array([CALIBRATION.common.get(name, 0.0) for name in detections.class_ids])
     rarities = -np.log(np.maximum(
-        np.maximum(index.sizes_of(classes), 1) / len(landmark_map), common))
+        np.maximum(index.sizes_of(classes), 1) / max(len(landmark_map), 1), common))
     means, deviations = np.zeros(len(classes)), np.ones(len(classes))
     compared = similarity_rows >= 0
     if similarities is not None and compared.any():

@@ -309,8 +309,9 @@ def _check_map(layer: KeyframeLayer, landmark_map: LandmarkMap) -> None:
     if layer.frame_id != landmark_map.frame_id:
         raise ArrayError(f"is of a map in frame '{layer.frame_id}', not "
                           f"'{landmark_map.frame_id}'")
-    if not layer.landmark_ids and not landmark_map.landmark_ids:
-        return  # of keyframes alone
+    is_of_set = layer.set_digest != '' and layer.set_digest == landmark_map.map_set.family
+    if not layer.landmark_ids and (is_of_set or not landmark_map.landmark_ids):
+        return  # made of keyframes alone; landmarks may be new
     rows = {name: row for row, name in enumerate(layer.landmark_ids)}
     shared = [(rows[name], row) for row, name in enumerate(landmark_map.landmark_ids)
               if name in rows]

@@ -80,12 +80,16 @@ def join_maps(maps: Sequence[LandmarkMap], sources: Sequence[str]) -> LandmarkMa
     Raises
     ------
     MapError
-        Two maps have the same frame_id, or there are too many maps.
+        Two maps have the same frame_id, one has no landmarks, or there are too many maps.
     """
     if len(maps) == 1:
         return maps[0]
     if len(maps) > MAX_MAPS:
         raise MapError(f'{len(maps)} maps: at most {MAX_MAPS} are searched at once')
+    for one, source in zip(maps, sources, strict=True):
+        if not len(one):
+            raise MapError(f'{source}: is a map of keyframes alone, which is searched alone: '
+                           'take the others away')
     for frame_id, count in Counter(one.frame_id for one in maps).items():
         if count > 1:
             alike = [source for one, source in zip(maps, sources, strict=True)

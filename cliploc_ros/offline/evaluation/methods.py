@@ -50,7 +50,8 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
         Options of the paper's methods besides matching and algorithm. auto takes its seed,
         height range, deviations of vertical and tilt, crops and matching from them.
     landmarks : int
-        Number of landmarks of the map; it limits k.
+        Number of landmarks of the map; it limits k. Without any, all methods have to use
+        keyframes.
     """
     methods: dict[str, Method] = {}
     for word in words:
@@ -71,6 +72,10 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
     if not methods:
         raise OptionsError(f'no method is named: give some of {", ".join(PAPER_METHODS)}, '
                            f'{ALL}, {AUTO}, or a YAML file')
+    for name, method in methods.items():
+        if not landmarks and not method.keyframes:
+            raise OptionsError(f"'{name}' uses landmarks only, and the map has none: give "
+                               f'--methods {AUTO}')
     return tuple(methods.values())
 
 
@@ -88,7 +93,7 @@ def _named(name: str, paper: RelocalizerOptions, landmarks: int) -> Method:
     else:
         raise OptionsError(f"'{name}' is none of {', '.join(PAPER_METHODS)}, {ALL}, {AUTO}, "
                            f'nor a YAML file{did_you_mean(name, [*PAPER_METHODS, ALL, AUTO])}')
-    return Method(name, replace(options, k=min(options.k, landmarks)), name == AUTO)
+    return Method(name, replace(options, k=min(options.k, landmarks or options.k)), name == AUTO)
 
 
 def _made(where: str, name: str, values: Any, paper: RelocalizerOptions, landmarks: int) -> Method:

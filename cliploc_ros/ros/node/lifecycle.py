@@ -33,7 +33,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from cliploc_ros.command import Interruption, split_ros_args
-from cliploc_ros.errors import CliplocError, StoppedError
+from cliploc_ros.errors import CliplocError, OptionsError, StoppedError
 from cliploc_ros.models.devices import free_memory
 from cliploc_ros.ros.node.diagnostics import Diagnostics, Health, Stages
 from cliploc_ros.ros.node.parameters import NodeParameters, Parameters
@@ -123,11 +123,21 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         Parameters of the nodes that may be given the same file.
     options
         Of rclpy's Node.
+
+    Raises
+    ------
+    OptionsError
+        A parameter has no value.
     """
 
     def __init__(self, name: str, parameters: type[P],
                  others: type[Parameters] = Parameters, **options: Any) -> None:
-        Node.__init__(self, name, automatically_declare_parameters_from_overrides=True, **options)
+        try:
+            Node.__init__(self, name, automatically_declare_parameters_from_overrides=True,
+                          **options)
+        except ValueError as error:  # of a parameter that rclpy does not name
+            raise OptionsError('a parameter has no value: correct the parameter file; a map of '
+                               f'keyframes alone is given as map_file ({error})') from error
         LifecycleNodeMixin.__init__(
             self, callback_group=BoundedCallbackGroup(_MAX_TRANSITION_REQUESTS))
         self._log_handler = RosLogHandler(self)
@@ -403,7 +413,10 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoR
     executor = NodeExecutor()
     node = None
     try:
-        node = make_node()
+        try:
+            node = make_node()
+        except OptionsError as error:
+            sys.exit(f'error: {error}')
         node.context.on_shutdown(node.release)
         executor.add_node(node)
         while node.context.ok() and not interrupted.is_set():
