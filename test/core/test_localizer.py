@@ -14,6 +14,7 @@ from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+from cliploc_ros.core.keyframes.features import SIFT
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.localizer import KeptInstant, Localizer, instants_to_fuse
 from cliploc_ros.core.observation import Detections, Observation
@@ -266,7 +267,8 @@ class Says:
 
     def __init__(self, place):
         self._place = place
-        self.layer = SimpleNamespace(map_from_camera=np.empty((0, 4, 4)), deviation_per_metre=0.01)
+        self.layer = SimpleNamespace(map_from_camera=np.empty((0, 4, 4)), kind=SIFT,
+                                     deviation_per_metre=0.01)
 
     def localize_features(self, *_):
         return Recognition((self._place,))

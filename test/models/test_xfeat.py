@@ -18,11 +18,11 @@ import pytest
 
 from cliploc_ros.cli import evaluate
 from cliploc_ros.cli.build_map import make_parser
-from cliploc_ros.cli.map_layer import check_layer_options, make_layer, read_layer, write_layer
+from cliploc_ros.cli.map_layer import check_layer_options, make_layer, read_layer
 from cliploc_ros.cli.sources import read_frames
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.features import SIFT
-from cliploc_ros.core.keyframes.layer import load_layer_of_map, save_layer
+from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map, save_layer
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, query_features
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError, ModelError, OptionsError
@@ -210,7 +210,8 @@ def test_programs_take_the_kind_from_the_layer(cache_dir, tmp_path, monkeypatch,
         '--tum', str(ASSETS / 'mapping'), '--keyframe-features', 'xfeat', '--keyframe-layer',
         '--out', str(tmp_path / 'map.yaml')])
     check_layer_options(options)
-    write_layer(options.out, make_layer(options, read_frames(options), landmark_map)[0])
+    save_layer(layer_path(options.out),
+               make_layer(options, read_frames(options), landmark_map)[0])
     layer = read_layer(options.out, landmark_map, wanted=True)
     assert layer.kind.dimensions == 64
     asked = run_here(evaluate.main, '--tum', ASSETS / 'sequence', '--every', 24, '--map',
