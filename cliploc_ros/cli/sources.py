@@ -70,7 +70,7 @@ def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
 
     DatasetError: the bag has none, or several.
     """
-    if vars(options).get('intrinsics') is not None:  # no camera_info is needed
+    if getattr(options, 'intrinsics', None) is not None:  # no camera_info is needed
         options.camera_info = options.camera_info or bag_frames.BagTopics.camera_info
     open_topics = [name for name in ('image', 'camera_info') if getattr(options, name) is None]
     if bag is None or options.cameras != ['']:

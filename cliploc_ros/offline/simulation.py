@@ -145,11 +145,11 @@ class LabelModel:
         vectors = np.array([
             np.sqrt(CLASS_SHARE) * _direction(f'class {class_id}')
             + np.sqrt(1.0 - CLASS_SHARE) * _label_vector(landmark_map, row)
-            for row, class_id in enumerate(landmark_map.class_ids)])
+            for row, class_id in enumerate(landmark_map.class_ids)]).reshape(-1, _SIZE)
         vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
         biases = [np.sqrt(_SIZE) * _direction(f'crops of {name}')
                   for name in landmark_map.landmark_ids]
-        return LabelModel(vectors, np.array(biases))
+        return LabelModel(vectors, np.reshape(biases, (-1, _SIZE)))
 
     def similarities(self, shown: NDArray[np.int64], class_ids: tuple[str, ...],
                      bboxes_xyxy: NDArray[np.float64], rng: np.random.Generator

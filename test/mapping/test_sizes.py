@@ -10,8 +10,8 @@ import pytest
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.report import BY_OBJECTS, Measure
+from cliploc_ros.offline.mapping.check.sizes import scale_by_sizes, sizes_of_classes
 from cliploc_ros.offline.mapping.options import CheckOptions
-from cliploc_ros.offline.vocabulary.sizes import scale_by_sizes, sizes_of_classes
 
 QUICK = CheckOptions(max_positions=4, headings=4)
 

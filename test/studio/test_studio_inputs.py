@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The images of a recording, in any order, and the keyframes next to a map."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scene import make_layer, make_room, write_bare_map, write_map
@@ -70,8 +72,10 @@ def test_a_map_of_keyframes_alone_gets_its_first_landmark(tmp_path, capsys):
     """The keyframes stay those of the map."""
     path = tmp_path / 'bare.yaml'
     write_bare_map(path, make_layer(LandmarkMap.empty('map')))
-    studio = open_studio(make_parser().parse_args([str(path)]))
+    walk = Path(__file__).parents[2] / 'demo/assets/sequence'
+    studio = open_studio(make_parser().parse_args([str(path), '--images', str(walk)]))
     assert len(studio.layer) == 6
+    assert 'refused; the map has keyframes alone' in studio.relocalize_here()
     studio.document.edit(edits.create, 'a lamp', 'lamp', np.ones(3), np.eye(3))
     studio.document.save()
     studio.document.close()

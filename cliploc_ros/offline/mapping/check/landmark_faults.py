@@ -14,6 +14,7 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import misspelt_classes
 from cliploc_ros.offline.mapping.association import associate
+from cliploc_ros.offline.mapping.check.sizes import sizes_of_classes
 from cliploc_ros.offline.mapping.doubles import close_pairs, find_doubles
 from cliploc_ros.offline.mapping.evidence import (
     MAX_SIGMA_SHARE,
@@ -26,7 +27,6 @@ from cliploc_ros.offline.mapping.fitting import fit_landmarks
 from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of, landmarks_of_map
 from cliploc_ros.offline.mapping.options import MOVING_CLASSES, MappingOptions
 from cliploc_ros.offline.mapping.views import Views
-from cliploc_ros.offline.vocabulary.sizes import sizes_of_classes
 from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
 
 # A class has so many words at most to be looked for in labels.

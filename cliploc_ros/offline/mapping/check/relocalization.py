@@ -311,7 +311,7 @@ def refused_spans(trials: Sequence[Trial]) -> Iterator[list[Trial]]:
 
 def make_relocalizer(landmark_map: LandmarkMap, options: CheckOptions) -> Relocalizer:
     """Return the relocalizer of a check."""
-    k = min(options.relocalizer.k, len(landmark_map))
+    k = min(options.relocalizer.k, len(landmark_map) or options.relocalizer.k)
     return Relocalizer(landmark_map, replace(options.relocalizer, k=k))
 
 
