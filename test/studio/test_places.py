@@ -4,14 +4,20 @@
 
 import re
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scene import make_layer
+from scipy.spatial.transform import Rotation
 from studio_map import write_two_rooms
 
+from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
+from cliploc_ros.offline.studio.landmark import map_of
+from cliploc_ros.offline.studio.layers import tile_colors
 from cliploc_ros.offline.studio.places import find_places
 from cliploc_ros.offline.studio.studio import Studio
 
@@ -51,6 +57,30 @@ def test_the_time_is_bounded(studio):
     assert len(places.check.positions) == 1 < len(places.grid.positions)
     assert len(places.check.trials) == places.check.headings
     assert any(line.startswith('time ran out') for line in places.lines(None))
+
+
+def test_positions_that_only_keyframes_reach_are_told_apart(studio):
+    """In the words of the check, and in a colour of their own."""
+    landmarks = studio.document.landmarks
+    without = find_places(landmarks, None, None, silent)
+    figure = 'where a robot is localized'
+    count, lost = len(without.check.positions), np.nonzero(without.check.accepted == 0)[0]
+    objects = count - len(lost)
+    assert len(lost) > 1
+    assert without.figures[figure] == (
+        f'by objects {objects}, only by keyframes 0, not at all {len(lost)} of {count} positions')
+    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    poses = np.array([make_transform(
+        Rotation.from_euler('z', angle, degrees=True).as_matrix() @ level, place)
+        for place in without.check.positions for angle in range(0, 360, 30)])
+    layer = replace(make_layer(map_of(landmarks), len(poses), points=1), map_from_camera=poses)
+    found = find_places(landmarks, None, None, silent, layer=layer)
+    assert found.figures[figure] == (
+        f'by objects {objects}, only by keyframes {len(lost)}, not at all 0 of {count} positions')
+    was, now = tile_colors(without), tile_colors(found)
+    is_lost = (without.check.accepted == 0) & (without.check.misled == 0)
+    assert (was[~is_lost] == now[~is_lost]).all()
+    assert (now[is_lost] == (0, 150, 136)).all() and (was[is_lost] != (0, 150, 136)).any()
 
 
 def test_a_search_is_stopped_and_grows_old(studio):

@@ -21,7 +21,6 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.offline.evaluation.map_check.page import LOOK_ALIKE
 from cliploc_ros.offline.mapping.check.places import RADIUS_M
 from cliploc_ros.offline.mapping.check.relocalization import Trial
-from cliploc_ros.offline.mapping.check.report import GridCheck
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.page import MISLED
 from cliploc_ros.offline.studio.places import Coverage
@@ -51,6 +50,7 @@ _CIRCLE_POINTS = 48
 LEGEND = (
     ('#003E6B', 'all headings with three landmarks are accepted'), ('#A0D2F0', 'few of them'),
     ('#E69F00', 'none'), ('#787878', 'no heading shows three landmarks'),
+    ('#009688', 'none, but a keyframe is within reach'),
     (MISLED, 'a heading is misled; the line leads to the wrong pose'),
     (LOOK_ALIKE, 'places that look alike'))
 _CURRENT_RGB, _OLD_RGB = (30, 170, 60), (150, 150, 150)
@@ -165,7 +165,7 @@ def draw_coverage(tell: Callable[[str], None]) -> Draw:
         tiles = scene.add_batched_meshes_simple(
             '/coverage/tiles', _TILE * check.spacing_m * _GAP, _TILE_FACES,
             np.tile([1.0, 0.0, 0.0, 0.0], (len(positions), 1)), positions,
-            batched_colors=linear(tile_colors(check)),
+            batched_colors=linear(tile_colors(places)),
             opacity=0.9, material='toon5', side='double', lod='off', **_NO_SHADOW)
 
         @tiles.on_click
@@ -175,7 +175,9 @@ def draw_coverage(tell: Callable[[str], None]) -> Draw:
                 x, y, z = check.positions[row]
                 tell(f'camera at x {x:.1f}, y {y:.1f}, z {z:.1f}: of {check.headings} headings, '
                      f'{check.useful[row]} show 3 landmarks, {check.accepted[row]} are accepted, '
-                     f'{check.misled[row]} misled')
+                     f'{check.misled[row]} misled' + (
+                         '' if places.keyframes is None else
+                         f', {places.keyframes.headings[row]} within reach of a keyframe'))
 
         return [tiles, _lines(scene, '/coverage/misled', [
             (one.position, one.estimate) for one in check.trials if one.verdict == 'misled'],
@@ -198,13 +200,15 @@ def draw_look_alikes(scene: viser.SceneApi, places: Coverage) -> list[Any]:
     return [_lines(scene, '/look_alikes', np.concatenate(segments), _rgb(LOOK_ALIKE), 2.5)]
 
 
-def tile_colors(check: GridCheck) -> NDArray[np.uint8]:
+def tile_colors(places: Coverage) -> NDArray[np.uint8]:
     """Return the colour (P, 3) of each position: how many of its useful headings are accepted."""
-    useful = check.useful
+    check, useful = places.check, places.check.useful
     share = np.clip(check.accepted / np.maximum(useful, 1), 0.0, 1.0)
     colors = np.column_stack([np.interp(share, [0.0, 1.0], channel) for channel in _HEAT.T])
     colors[check.accepted == 0] = _NONE_RGB
     colors[(useful == 0) & (check.accepted == 0)] = _UNSEEN_RGB
+    if places.keyframes is not None:
+        colors[(check.accepted == 0) & (places.keyframes.headings > 0)] = _KEYFRAME_RGB
     colors[check.misled > 0] = _rgb(MISLED)
     return np.asarray(colors.round(), dtype=np.uint8)
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping.check.checking import judge_grid
 from cliploc_ros.offline.mapping.check.places import Grid, LookAlike, find_look_alikes, make_grid
@@ -22,7 +23,12 @@ from cliploc_ros.offline.mapping.check.relocalization import (
     each_pose,
     measure_detector,
 )
-from cliploc_ros.offline.mapping.check.report import GridCheck
+from cliploc_ros.offline.mapping.check.report import (
+    GridCheck,
+    KeyframeCheck,
+    carried_positions,
+    check_keyframes,
+)
 from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.simulation import DetectorModel, guess_detector
 from cliploc_ros.offline.studio.landmark import Landmarks, map_of
@@ -41,15 +47,14 @@ class Coverage(NamedTuple):
     check: GridCheck  #: Of the tried positions
     look_alikes: tuple[LookAlike, ...]
     detector: str  #: The source of the detector's errors, in words
+    keyframes: KeyframeCheck | None  #: Of the tried positions; None without keyframes
 
     @property
     def figures(self) -> dict[str, str]:
         """The figures by name."""
-        count, verdicts = len(self.check.positions), count_verdicts(self.check.trials)
-        views = len(self.check.trials)
-        return {'positions with a heading accepted by objects':
-                f'{int((self.check.accepted > 0).sum())} of {count}',
-                'views accepted': f'{verdicts["accepted"]} of {views}',
+        verdicts, views = count_verdicts(self.check.trials), len(self.check.trials)
+        return {'where a robot is localized': str(carried_positions(self.check, self.keyframes)),
+                'views accepted by objects': f'{verdicts["accepted"]} of {views}',
                 'views misled': f'{verdicts["misled"]} of {views}',
                 'pairs of places that look alike': str(len(self.look_alikes))}
 
@@ -64,7 +69,8 @@ class Coverage(NamedTuple):
 
 
 def find_places(landmarks: Landmarks, recording: Recording | None, before: Coverage | None,
-                tell: Callable[[float], None], limit_s: float = LIMIT_S) -> Coverage:
+                tell: Callable[[float], None], limit_s: float = LIMIT_S,
+                layer: KeyframeLayer | None = None) -> Coverage:
     """Return the places of a map where a robot would be accepted, refused or misled.
 
     The recording gives the camera's height and the detector's errors. The positions of the time
@@ -86,9 +92,9 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Cover
         is_whole = len(trials) % _OPTIONS.headings == 0
         if is_whole and time.monotonic() - begin > limit_s:
             break
-    look_alikes = find_look_alikes(landmark_map)
-    return Coverage(landmarks, grid, judge_grid(grid, model, trials, _OPTIONS.headings),
-                    tuple(look_alikes), detector)
+    check = judge_grid(grid, model, trials, _OPTIONS.headings)
+    return Coverage(landmarks, grid, check, tuple(find_look_alikes(landmark_map)), detector,
+                    None if layer is None else check_keyframes(layer, check, None))
 
 
 def _detector(landmark_map: LandmarkMap, recording: Recording | None

@@ -297,7 +297,8 @@ class Studio:
                 self.share = share
                 self.changed.set()
 
-        found = find_places(self.document.landmarks, self.recording, self.places, tell)
+        found = find_places(self.document.landmarks, self.recording, self.places, tell,
+                            layer=self.layer)
         self.places_before, self.places = self.places, found
 
     def stop_search(self) -> None:

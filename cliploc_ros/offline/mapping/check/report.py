@@ -232,12 +232,7 @@ class CheckReport:
     @property
     def carried(self) -> tuple[Carried, ...]:
         """Return where a robot can be localized, and by which evidence."""
-        near = self.grid.is_near
-        by_objects = self.grid.accepted[near] > 0
-        reached = np.zeros(len(by_objects), dtype=np.bool_) if self.keyframes is None else (
-            self.keyframes.headings[near] > 0)
-        found = [Carried('positions', int(by_objects.sum()), int((reached & ~by_objects).sum()),
-                         int((~reached & ~by_objects).sum()))]
+        found = [carried_positions(self.grid, self.keyframes)]
         if self.recording is not None and (judged := self.recording.judged):
             objects = count_by_objects(judged)['accepted']
             accepted = count_verdicts(judged)['accepted']
@@ -318,6 +313,15 @@ class CheckReport:
             'recording': None if self.recording is None else self.recording.as_dict(),
             'queries': [one.as_dict() for one in self.queries],
             'keyframes': None if self.keyframes is None else self.keyframes.as_dict()}
+
+
+def carried_positions(grid: GridCheck, keyframes: KeyframeCheck | None) -> Carried:
+    """Return where on a grid near the recording a robot can be localized, by which evidence."""
+    by_objects = grid.accepted[grid.is_near] > 0
+    reached = np.zeros(len(by_objects), dtype=np.bool_) if keyframes is None else (
+        keyframes.headings[grid.is_near] > 0)
+    return Carried('positions', int(by_objects.sum()), int((reached & ~by_objects).sum()),
+                   int((~reached & ~by_objects).sum()))
 
 
 def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
