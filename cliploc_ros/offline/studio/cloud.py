@@ -28,7 +28,12 @@ _MOST_DEPTH_M = 8.0
 # One point is kept of each cube of this side, or of a larger one where too many are left [m].
 _LEAST_SIDE_M, _GROWTH = 0.02, 1.25
 _HEADROOM_M = 0.2
-_PALE, _POINT_RGB = 0.25, (110, 120, 135)
+_PALE = 0.25
+# Points without an image, from the floor to the top of the map.
+_HEIGHT_RGB = np.array([(150, 110, 60), (60, 150, 110), (60, 100, 190)], dtype=np.float64)
+# Size of a point, by the side of its cube: those of depth nearly touch, those of keyframes, which
+# lie on edges of objects, leave the landmarks free.
+_DEPTH_SIZE, _KEYFRAME_SIZE = 0.25, 0.15
 
 
 class Cloud(NamedTuple):
@@ -36,7 +41,7 @@ class Cloud(NamedTuple):
 
     points: NDArray[np.float32]  #: (n, 3), in the map [m]
     colors: NDArray[np.uint8]  #: (n, 3)
-    side_m: float  #: One point is left of each cube of this side
+    point_m: float  #: Size of a point
 
 
 def find_cloud(recording: Recording | None, layer: KeyframeLayer | None, extent: Bounds
@@ -47,15 +52,16 @@ def find_cloud(recording: Recording | None, layer: KeyframeLayer | None, extent:
     """
     parts = [] if recording is None or recording.images is None else _points_of_depth(
         recording.detections, recording.images)
+    size = _DEPTH_SIZE if parts else _KEYFRAME_SIZE
     if not parts and layer is not None:
-        parts = [_points_of_keyframe(layer, row) for row in range(len(layer))]
+        parts = [_points_of_keyframe(layer, row, recording, extent) for row in range(len(layer))]
     if not parts:
         return None
     points = np.concatenate([part[0] for part in parts]).astype(np.float32)
     colors = np.concatenate([part[1] for part in parts])
     with np.errstate(invalid='ignore'):  # the edges of a lens have no ray
         is_low = points @ extent.up.astype(np.float32) < extent.top_m + _HEADROOM_M
-    return _thinned(points[is_low], colors[is_low])
+    return _thinned(points[is_low], colors[is_low], size)
 
 
 def _points_of_depth(detections: PosedDetections, images: Images
@@ -78,19 +84,27 @@ def _points_of_depth(detections: PosedDetections, images: Images
     return parts
 
 
-def _points_of_keyframe(layer: KeyframeLayer, keyframe: int
-                        ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def _points_of_keyframe(layer: KeyframeLayer, keyframe: int, recording: Recording | None,
+                        extent: Bounds) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return points and their colours: of the keyframe's image, the recording's, or by height."""
     points, image = layer.points_in_map(keyframe), layer.image_rgb(keyframe)
+    if image is None and recording is not None:
+        image = recording.image_at(layer.map_from_camera[keyframe])
     if image is None:
-        return points, np.full((len(points), 3), _POINT_RGB, dtype=np.uint8)
+        levels = np.linspace(extent.floor_m, extent.top_m, len(_HEIGHT_RGB))
+        return points, np.column_stack([np.interp(points @ extent.up, levels, channel)
+                                        for channel in _HEIGHT_RGB.T]).astype(np.uint8)
     scale = image.shape[1] / layer.camera_of(keyframe).width / PIXEL_SCALE
     places = np.asarray(layer.pixels[layer.rows(keyframe)], dtype=np.float64) * scale
     columns, rows = np.clip(places.astype(np.int64), 0, np.array(image.shape[1::-1]) - 1).T
     return points, image[rows, columns]
 
 
-def _thinned(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> Cloud:
-    """Return one point of each cube, and its colour, a little paler than the landmarks'."""
+def _thinned(points: NDArray[np.float32], colors: NDArray[np.uint8], size: float) -> Cloud:
+    """Return one point of each cube, and its colour, a little paler than the landmarks'.
+
+    ``size`` is that of a point, by the side of its cube.
+    """
     side = _LEAST_SIDE_M / _GROWTH
     rows = np.arange(len(points))
     while side < _LEAST_SIDE_M or len(rows) > MAX_POINTS:
@@ -98,11 +112,11 @@ def _thinned(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> Cloud:
         cubes = np.floor(points / side).astype(np.int64) & 0x1FFFFF
         rows = np.unique(cubes @ np.array([1, 1 << 21, 1 << 42]), return_index=True)[1]
     pale = (1.0 - _PALE) * colors[rows] + _PALE * 255.0
-    return Cloud(points[rows], pale.astype(np.uint8), side)
+    return Cloud(points[rows], pale.astype(np.uint8), size * side)
 
 
 def draw_cloud(scene: viser.SceneApi, cloud: Cloud) -> list[Any]:
-    """Draw the points, so large that they nearly touch."""
+    """Draw the points."""
     return [scene.add_point_cloud('/cloud', cloud.points, cloud.colors, precision='float32',
-                                  point_size=0.25 * cloud.side_m, point_shading='flat',
-                                  point_shape='square')]
+                                  point_size=cloud.point_m, point_shading='flat',
+                                  point_shape='circle')]

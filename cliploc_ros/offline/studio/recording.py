@@ -47,6 +47,8 @@ LEAST_BOXES = 3
 _MARGIN = 0.25
 # Between the pictures of the film [s].
 _PICTURE_S = 0.2
+# Poses of one camera differ by rounding only: entries of their matrices.
+_SAME_POSE = 1e-3
 
 
 class Outline(NamedTuple):
@@ -127,6 +129,12 @@ class Recording:
         if self.images is None or not 0 <= view < len(self.detections):
             return None
         return self.images.of(self.detections, view)
+
+    def image_at(self, map_from_camera: NDArray[np.float64]) -> NDArray[np.uint8] | None:
+        """Return the image of the view with a pose (4, 4); None without one."""
+        poses = self.detections.map_from_camera
+        views = np.nonzero(np.abs(poses - map_from_camera).max(axis=(1, 2)) < _SAME_POSE)[0]
+        return self.image(int(views[0])) if len(views) else None
 
     def crop(self, view: int, box: NDArray[np.float64]) -> NDArray[np.uint8] | None:
         """Return what a box (4,) [px] and a margin around it show.
