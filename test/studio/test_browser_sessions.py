@@ -5,8 +5,8 @@
 
 import pytest
 import yaml
-from browser import wait_for
-from studio_map import ASSETS, person_at
+from browser import Person, wait_for
+from studio_map import ASSETS, person_at, write_two_rooms
 
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.studio import Studio
@@ -43,3 +43,50 @@ def test_a_hostile_map_is_shown_as_text(chromium, path):
         person.picture('hostile')
         assert person.page.evaluate('window.hacked') is None
         assert person.page.locator('img[src=x]').count() == 0
+
+
+def test_without_views_the_scene_has_the_page_and_ids_tell_equal_labels_apart(chromium, path):
+    """The labels of the two rooms' chairs are equal."""
+    write_two_rooms(path)
+    studio = Studio(Document(path))
+    with person_at(chromium, studio, has_scene=True) as (person, server):
+        page = person.page
+        widths = page.evaluate("['scene', 'frame'].map(one => $(one).clientWidth)")
+        assert widths == [page.evaluate("$('scene').parentElement.clientWidth"
+                                        " - document.querySelector('aside').offsetWidth")] * 2
+
+        def labels():
+            return {handle.text for name, handle in server.scene._handle_from_node_name.items()
+                    if name.startswith('/labels/') and handle.visible}
+
+        wait_for(lambda: {'chair_4', 'chair_9'} & labels(), 'the id of a chair')
+        for chair in ('chair_4', 'chair_9'):
+            person.select(studio.document, chair)
+            wait_for(lambda chair=chair: f'{chair}: a chair' in labels(), 'its label, too')
+        assert labels() <= {'chair_9: a chair', *studio.document.landmarks}
+        person.picture('labels')
+
+
+def test_pages_that_share_a_selection_say_so_and_an_old_line_is_told(chromium, studio):
+    first = Person(chromium, studio.url)
+    first.page.get_by_text('pages share').wait_for(state='detached')
+    second = Person(chromium, studio.url)
+    for person in (first, second):
+        person.page.get_by_text('2 pages share the selection and the view').wait_for()
+    second.page.close()
+    first.page.wait_for_function("() => $('people').textContent === ''")
+    first.select(studio.document, 'mug_2')
+    first.page.keyboard.press('l')
+    line = first.page.locator('footer div').first
+    first.page.wait_for_function("() => $('log').firstChild.textContent === 'locked mug_2'")
+    first.select(studio.document, 'mug_3')
+    first.page.wait_for_function("() => $('log').firstChild.textContent === 'earlier: locked mug_2'")
+    assert line.get_attribute('class') == 'past'
+    first.page.close()
+
+
+def test_a_narrow_page_leaves_room_for_the_scene_where_boxes_are_drawn(person):
+    person.page.set_viewport_size({'width': 1100, 'height': 700})
+    person.mode('Create')
+    assert person.page.evaluate("$('scene').clientWidth") >= 360
+    assert person.page.evaluate("$('view').clientWidth") >= 480

@@ -39,6 +39,8 @@ class Desk:
     ----------
     lines : tuple of tuple of str
         The log, the newest line last: done, refused or error, and a text.
+    is_old : bool
+        Whether a person did something after the newest line.
     running : dict of str to Thread
         The actions that take long and go on.
     layers : dict of str to bool
@@ -53,6 +55,7 @@ class Desk:
     def __init__(self, studio: Studio, server: viser.ViserServer):
         self.studio, self.server = studio, server
         self.lines: tuple[tuple[str, str], ...] = ()
+        self.is_old = False
         self.running: dict[str, threading.Thread] = {}
         self.layers: dict[str, bool] = {}
         self.modes: dict[str, str] = {}
@@ -130,7 +133,9 @@ class Desk:
     def ask(self, action: Callable[[], str | None]) -> None:
         """Do something that locks the studio itself, if at all."""
         try:
-            if message := action():
+            message = action()
+            self.is_old = True
+            if message:
                 self.log('done', message)
         except CliplocError as error:
             self.log('refused', str(error))
@@ -143,6 +148,7 @@ class Desk:
         """Add a line to the log."""
         with self._lock:
             self.lines = (*self.lines, (kind, text[:_MAX_TEXT]))[-_MAX_LINES:]
+            self.is_old = False
         self.studio.changed.set()
 
     # ---- the scene ------------------------------------------------------------------------------

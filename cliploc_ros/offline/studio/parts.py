@@ -41,7 +41,8 @@ def parts_of(desk: Desk) -> dict[str, Any]:
                  for key in review.order if (one := document.landmarks.get(key))],
         'selection': {'ids': document.selection, 'one': _selected_part(studio)},
         'review': {**review.counts(), 'running': list(desk.running)},
-        'log': desk.lines,
+        'log': {'lines': desk.lines, 'is_old': desk.is_old},
+        'people': len(desk.modes),
         'layers': desk.layers,
         'test': {
             'share': round(studio.share, 2), 'running': list(desk.running),

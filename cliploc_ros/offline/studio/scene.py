@@ -94,8 +94,9 @@ class Ellipsoids:
 
 
 class Labels:
-    """Labels of the landmarks in the scene; where they overlap, the nearest landmarks keep theirs.
+    """Ids of the landmarks in the scene; where they overlap, the nearest landmarks keep theirs.
 
+    Those of the selection come with their labels: labels may be equal, and are long.
     They fit the window of the browser whose camera moved last.
     """
 
@@ -160,7 +161,8 @@ class Labels:
         tops = np.array([one.center + float(np.linalg.norm(one.basis.T @ self._up)) * self._up
                          for one in landmarks.values()]).reshape(-1, 3)
         keys, texts = list(landmarks), [
-            _shortened(one.label, key in selection) for key, one in landmarks.items()]
+            _shortened(f'{key}: {one.label}', _MAX_LABEL_LENGTH) if key in selection
+            else _shortened(key, _SHORT_LABEL_LENGTH) for key, one in landmarks.items()]
         rows = dict(self._with_room(tops, texts, np.isin(keys, selection)) if keys else ())
         for key in self._handles.keys() - landmarks.keys():
             self._handles.pop(key).remove()
@@ -183,9 +185,8 @@ def _set_props(handle: Any, **props: Any) -> None:
             setattr(handle, name, value)
 
 
-def _shortened(label: str, is_selected: bool) -> str:
-    length = _MAX_LABEL_LENGTH if is_selected else _SHORT_LABEL_LENGTH
-    return label if len(label) <= length else f'{label[:length - 1]}…'
+def _shortened(text: str, length: int) -> str:
+    return text if len(text) <= length else f'{text[:length - 1]}…'
 
 
 class Gizmo:

@@ -15,7 +15,7 @@ const STEPS_M = [0.01, 0.05, 0.1, 0.5];
 const person = Array.from(crypto.getRandomValues(new Uint8Array(12)),
                           byte => byte.toString(16).padStart(2, '0')).join('');
 const base = location.pathname.replace(/[^/]*$/, '');
-const state = {file: {}, rows: [], selection: {ids: [], one: null}, review: {}, log: [], test: {}, layers: {},
+const state = {file: {}, rows: [], selection: {ids: [], one: null}, review: {}, log: {lines: []}, test: {}, layers: {},
                view: null, new: null};
 let mode = 'review', socket = null, followed = null, step = 0.1, gesture = 0, wantsCheck = true, follows = false, film = null, isFlat = false;
 // What the image shows, in its pixels; null: all of it. A goal waits for its view.
@@ -122,6 +122,7 @@ function show(changed) {
   if (has('layers', 'file')) showLayers();
   if (follows && has('view')) send('look_through');
   if (has('log')) showLog();
+  if (has('people')) $('people').textContent = state.people > 1 ? `${state.people} pages share the selection and the view` : '';
   if (has('review')) {
     $('busy').textContent = (state.review.running || []).map(
       name => `${name.replaceAll('_', ' ')} ...`).join(' ');
@@ -148,10 +149,6 @@ function setMode(name) {
 function resize() {
   $('view').style.flex = shares[mode];
   $('scene').style.flex = $('view').hidden ? 1 : 1 - shares[mode];
-  // viser covers a scene that is narrower than this with its panel
-  const scale = Math.min(1, $('scene').clientWidth / 620);
-  Object.assign($('frame').style, {width: `${100 / scale}%`, height: `${100 / scale}%`,
-                                   transform: `scale(${scale})`});
 }
 
 function showFile() {
@@ -549,9 +546,9 @@ function playOrStop() {
 }
 
 function showLog() {
-  const lines = [...state.log].reverse();
+  const lines = [...state.log.lines].reverse(), isOld = lines.length && state.log.is_old;
   fill($('log'), (lines.length ? lines : [['', 'Ready. Press ? for the keys.']]).map(([kind, text], row) => el(
-    'div', {className: `${kind}${row ? ' old' : ''}`, title: text}, text)));
+    'div', {className: row ? `${kind} old` : isOld ? 'past' : kind, title: text}, row || !isOld ? text : `earlier: ${text}`)));
   $('log').scrollTop = 0;
 }
 
@@ -656,7 +653,7 @@ $('frame').onload = () => {
   // the log has what viser's notices would say; its panel has switches for developers. Both cover
   // the scene
   const style = scene.document.createElement('style');
-  style.textContent = '.mantine-Notifications-root, [data-floating-window] { display: none !important }';
+  style.textContent = '.mantine-Notifications-root, .mantine-Paper-root { display: none !important }';
   scene.document.head.append(style);
 };
 $('frame').src = `${base}scene/${person}/`;
