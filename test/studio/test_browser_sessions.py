@@ -75,10 +75,11 @@ def test_pages_that_share_a_selection_say_so_and_an_old_line_is_told(chromium, s
         person.page.get_by_text('2 pages share the selection and the view').wait_for()
     second.page.close()
     first.page.wait_for_function("() => $('people').textContent === ''")
+    first.page.get_by_text('checked 60 landmarks').first.wait_for(state='attached')
     first.select(studio.document, 'mug_2')
-    first.page.keyboard.press('l')
+    first.page.evaluate("send('lock', {ids: ['mug_2']})")
     line = first.page.locator('footer div').first
-    first.page.wait_for_function("() => $('log').firstChild.textContent === 'locked mug_2'")
+    first.page.wait_for_function("() => $('log').firstChild.textContent.endsWith('locked mug_2')")
     first.select(studio.document, 'mug_3')
     first.page.wait_for_function(
         "() => $('log').firstChild.textContent === 'earlier: locked mug_2'")

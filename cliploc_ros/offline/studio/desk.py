@@ -78,7 +78,8 @@ class Desk:
         elif name == 'mode':
             self.show_mode(person, str(values.get('mode')))
         else:
-            self.act(lambda: self._start(name, values))
+            # a page shows the best view of a selection by itself: nobody did anything else
+            self.act(lambda: self._start(name, values), name != 'show_view')
             if name in _BRING_ANOTHER and not values.get('joins'):
                 self.look(self._client_of(person), 'fly')
 
@@ -122,19 +123,19 @@ class Desk:
             self.running = {key: one for key, one in self.running.items() if key != name}
         self.studio.changed.set()
 
-    def act(self, action: Callable[[], str | None]) -> None:
-        """Do something with the studio locked."""
+    def act(self, action: Callable[[], str | None], makes_old: bool = True) -> None:
+        """Do something with the studio locked; the last result is old then, or stays new."""
         def locked() -> str | None:
             with self.studio.document.lock:
                 return action()
 
-        self.ask(locked)
+        self.ask(locked, makes_old)
 
-    def ask(self, action: Callable[[], str | None]) -> None:
+    def ask(self, action: Callable[[], str | None], makes_old: bool = True) -> None:
         """Do something that locks the studio itself, if at all."""
         try:
             message = action()
-            self.is_old = True
+            self.is_old |= makes_old
             if message:
                 self.log('done', message)
         except CliplocError as error:
