@@ -44,7 +44,7 @@ class Watched:
 
     def until(self, condition, what):
         try:
-            wait_for(condition, what, 30.0, self.robot.step)
+            wait_for(condition, what, 60.0, self.robot.step)
         finally:
             print(what, self.states[-8:], self.values.get('watch reason'))
 

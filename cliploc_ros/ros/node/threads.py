@@ -74,7 +74,7 @@ class NodeExecutor(SingleThreadedExecutor):
         """Execute one callback, or begin to. Its exceptions are logged and end nothing."""
         try:
             handler, entity, node = self.wait_for_ready_callbacks(timeout_sec)
-        except TimeoutException:
+        except (TimeoutException, InvalidHandle):  # an entity may be destroyed meanwhile
             return
         if not isinstance(entity, Service | Timer):
             _run(handler, node)
