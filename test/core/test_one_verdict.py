@@ -79,6 +79,14 @@ def test_many_points_accept_what_objects_could_not():
     np.testing.assert_array_equal(found.covariance, FINE)
 
 
+def test_points_of_a_thorough_search_count_less():
+    """It finds several times as many, and so do things that look alike."""
+    fast, thorough = (ask(Says(place(3.0, inliers=50, confirmed=0.5, is_thorough=one)), objects=0)
+                      for one in (False, True))
+    assert fast.accepted and not thorough.accepted
+    assert ask(Says(place(3.0, is_thorough=True)), objects=0).accepted, 'enough of them do'
+
+
 def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
     strong, weak = ask(Says(place(0.05))), ask(Says(place(0.05, inliers=9)))
     assert strong.accepted and weak.accepted

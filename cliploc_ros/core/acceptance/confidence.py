@@ -283,7 +283,8 @@ def none_right(setting: Setting, calibration: Calibration = CALIBRATION) -> floa
 def points_utility(place: RecognizedPlace, calibration: Calibration = CALIBRATION) -> float:
     """Return the evidence of its points for a place: log odds, against a place by chance."""
     terms = calibration.keyframes
-    return min(terms.most, terms.none + terms.inliers * math.log(max(1, place.inliers))
+    count = place.inliers * (terms.thorough if place.is_thorough else 1.0)
+    return min(terms.most, terms.none + terms.inliers * math.log(max(1.0, count))
                + terms.confirmed * place.confirmed)
 
 

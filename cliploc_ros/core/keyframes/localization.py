@@ -209,7 +209,7 @@ class KeyframeLocalizer:
             places[:1] = [self._guided(one, look, descriptors) for one in places[:1]]
         if time.monotonic() > deadline:
             return Recognition(is_complete=False, is_thorough=is_thorough)
-        return Recognition(tuple(self._recognized(one, look) for one in places),
+        return Recognition(tuple(self._recognized(one, look, is_thorough) for one in places),
                            is_thorough=is_thorough)
 
     def _search_fast(self, descriptors: NDArray[np.float32], look: _Look,
@@ -317,7 +317,7 @@ class KeyframeLocalizer:
         near = keyframes_near(self.layer.map_from_camera, map_from_camera)
         return float(self._expects(near, map_from_camera, camera).mean())
 
-    def _recognized(self, place: '_Place', look: '_Look') -> RecognizedPlace:
+    def _recognized(self, place: '_Place', look: '_Look', is_thorough: bool) -> RecognizedPlace:
         """Return a place with the evidence for and against it."""
         used, counts = self._used(place)
         pose, shared = place.map_from_camera, self._shared(place.map_from_camera, counts)
@@ -327,7 +327,8 @@ class KeyframeLocalizer:
             pose, covariance, shared, place.agreed, *evidence,
             look.constraint.tilt_error(pose, covariance), tuple(used.tolist()),
             tuple((counts[used] / counts.sum()).tolist()),
-            look.features.pixels[place.inliers.features], place.inliers.rows, place.inliers.points)
+            look.features.pixels[place.inliers.features], place.inliers.rows, place.inliers.points,
+            is_thorough)
 
     def _choose(self, ranks: Sequence[int], guesses: Sequence[NDArray[np.float64]]) -> list[int]:
         """Return the keyframes to match: similar ones, and those near the guesses."""

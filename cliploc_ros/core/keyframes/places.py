@@ -44,6 +44,7 @@ class RecognizedPlace(NamedTuple):
     #: (k,): which point of the layer that is
     rows: NDArray[np.int64] = np.empty(0, dtype=np.int64)
     points: NDArray[np.float64] = np.empty((0, 3))  #: (k, 3): where it is in the map [m]
+    is_thorough: bool = False  #: Whether the thorough pass found it
 
 
 class Recognition(NamedTuple):
