@@ -3,8 +3,8 @@
 """Does a localizer notice a wrong camera? ``python -m studies.camera --help``.
 
 One localizer gets all images of a recording, or of drives through simulated worlds, in their
-order; another one begins anew at each image. Their boxes or their camera_info are wrong by one of
-some rules. Poses that are accepted are counted, and the looks until the camera is called wrong.
+order; a second one starts over at each image. Their boxes or their camera_info are wrong by one of
+several rules. Poses that are accepted are counted, and the looks until the camera is called wrong.
 """
 
 import argparse

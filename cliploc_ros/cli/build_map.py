@@ -114,7 +114,8 @@ def build(options: argparse.Namespace) -> int:
     path, update, name = options.out, options.update, sources.source_of(options).name
     _check(options)
     if update is not None and not len(LandmarkMap.from_file(update)):
-        raise OptionsError(f'--update {update}: is a map of keyframes alone: build it anew')
+        raise OptionsError(f'--update {update}: is a map of keyframes alone, which cannot be '
+                           'updated; build a new one')
     mapping = MappingOptions(
         pose_errors=_pose_errors(options), estimate_pose_errors=options.joint is None,
         odometry_errors=OdometryErrors(*options.odometry_noise or ()),

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.confidence import counted_points
 from cliploc_ros.core.acceptance.contenders import contenders_of, join_frames, unrefined
 from cliploc_ros.core.acceptance.genuine import Signs
 from cliploc_ros.core.calibration import CALIBRATION
@@ -121,7 +122,7 @@ def place_rows(case: StoredCase) -> list[Row]:
                 unrefined(place.map_from_camera) for place in places], [True] * len(places)),
                 strict=True):
             rows.append(_row(case, record, place.map_from_camera, [
-                np.log(max(1, place.inliers)), place.confirmed,
+                np.log(counted_points(place)), place.confirmed,
                 min(most, one.support.inliers), min(most, one.support.unexplained)]))
     return rows
 

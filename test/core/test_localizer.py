@@ -344,7 +344,7 @@ def test_objects_seen_one_after_the_other_are_as_good_as_at_once(room, walk):
     # of the last frame alone
     assert [match.detection for match in found.matches] == [0, 1]
     assert [match.landmark for match in found.matches] == shares[-1]
-    # two objects tell of their camera where the vertical is known
+    # with a known vertical, two objects suffice to check their camera
     upright = relocalizer.relocalize([knowing_up(*one) for one in zip(frames, walk, strict=True)])
     assert (len(found.cameras), len(upright.cameras)) == (2, 4)
 

@@ -370,7 +370,7 @@ def test_equal_floors_are_refused_and_both_are_named(turned):
 
 
 def test_the_twin_of_a_place_is_given_in_its_own_map():
-    """One map lacks an object: the pose in the other one is likelier, but its place has a twin."""
+    """One of two equal maps lacks an object: the pose in the other map wins, but has a twin."""
     whole = floor('floor_1')
     lacking = replace(whole.select(range(11)), frame_id='floor_2',
                       centers=whole.centers[:11] + np.array([500.0, -3.0, 0.0]))

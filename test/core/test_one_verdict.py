@@ -93,7 +93,8 @@ def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
     assert strong.source == weak.source == 'both'
     assert error_m(strong, 0.05) < 1e-12
     assert error_m(weak) < 0.02, 'a few points hardly move the pose of objects'
-    assert [len(one.cameras) for one in (strong, weak)] == [0, 1], 'boxes tell of their camera'
+    assert [len(one.cameras) for one in (strong, weak)] == [0, 1], \
+        'only a pose that rests on boxes checks their camera'
     points = ask(Says(place(0.05, inliers=9)), objects=0)
     assert weak.evidence.by_points <= points.evidence.by_points, 'objects say no more for points'
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters over the wire: what was dumped starts the same node, and the map is read anew."""
+"""Parameters over the wire: a dump starts the same node, which reads its map again."""
 
 
 import yaml

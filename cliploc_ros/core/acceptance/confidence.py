@@ -280,12 +280,17 @@ def none_right(setting: Setting, calibration: Calibration = CALIBRATION) -> floa
             + terms.vertical * setting.vertical)
 
 
+def counted_points(place: RecognizedPlace, calibration: Calibration = CALIBRATION) -> float:
+    """Return how many of the features that agree with a place count, 1 or more."""
+    share = calibration.keyframes.thorough if place.is_thorough else 1.0
+    return max(1.0, share * place.inliers)
+
+
 def points_utility(place: RecognizedPlace, calibration: Calibration = CALIBRATION) -> float:
     """Return the evidence of its points for a place: log odds, against a place by chance."""
     terms = calibration.keyframes
-    count = place.inliers * (terms.thorough if place.is_thorough else 1.0)
-    return min(terms.most, terms.none + terms.inliers * math.log(max(1.0, count))
-               + terms.confirmed * place.confirmed)
+    return min(terms.most, terms.none + terms.confirmed * place.confirmed
+               + terms.inliers * math.log(counted_points(place, calibration)))
 
 
 def objects_utility(support: Support, calibration: Calibration = CALIBRATION) -> float:

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Local features of an image, and which of two images show the same point.
 
-A FeatureKind finds features and compares them. The one that needs no file is SIFT (Lowe,
-"Distinctive Image Features from Scale-Invariant Keypoints", 2004) with the square root of
-Arandjelovic and Zisserman ("Three things everyone should know to improve object retrieval",
-2012). OpenCV finds the features; a descriptor takes 128 bytes.
+A FeatureKind finds features and compares them. SIFT is built in (Lowe, "Distinctive Image
+Features from Scale-Invariant Keypoints", 2004), with the square root of Arandjelovic and Zisserman
+("Three things everyone should know to improve object retrieval", 2012). OpenCV finds the features;
+a descriptor takes 128 bytes.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,6 +25,8 @@ _DARK = 160.0
 _CONTRAST = 0.02
 # A match is refused if another feature of the other image is nearly as similar (Lowe, 2004).
 _RATIO = 0.85
+# Cosines are as near to equal as this by rounding: of two equal descriptors neither is clearer.
+_SAME = 1e-6
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ def extract(image_rgb: NDArray[np.uint8], most: int, longest_side_px: int = 800)
     return Features(pixels, compact(np.sqrt(shares)), strengths[rows])
 
 
-#: The kind that needs no file.
+#: The built-in kind.
 SIFT = FeatureKind('rootsift-128-uint8', DIMENSIONS, extract)
 ONLY_SIFT: FeatureKinds = {SIFT.name: lambda: SIFT}
 
@@ -144,6 +146,8 @@ def match(ours: NDArray[np.float32], theirs: NDArray[np.float32], ratio: float =
     others = cosines[rows]
     others[np.arange(len(rows)), best[rows]] = -1.0
     # squared distances of unit vectors are 2 - 2 cos
-    shares = (1.0 - first[rows]) / np.maximum(1.0 - others.max(axis=1, initial=-1.0), 1e-9)
+    nearest, second = (np.maximum(1.0 - cosine, 0.0) + _SAME for cosine in (
+        first[rows], others.max(axis=1, initial=-1.0)))
+    shares = nearest / second
     rows, shares = rows[shares < ratio**2], shares[shares < ratio**2]
     return np.stack([rows, best[rows]], axis=1), shares

@@ -41,8 +41,10 @@ _FURTHER, _STRONGEST, _CLEAR = 25, 600, 20
 _THOROUGH_FEATURES, _THOROUGH_PX = 3000, 1600
 _CANDIDATES, _VOTERS, _VOTED = 100, 300, 20
 # Then the points of keyframes near the pose are looked for where it puts them: within this angle
-# (8 px at f = 525 px), by descriptors that are at least so similar.
-_GUIDED_RADIUS, _GUIDED_COSINE, _GUIDED_KEYFRAMES = 8.0 / 525.0, 0.8, 12
+# (8 px at f = 525 px), among so many nearest features: a camera with a long lens has all of them
+# there. Their descriptors are at least so similar.
+_GUIDED_RADIUS, _GUIDED_NEAREST = 8.0 / 525.0, 10
+_GUIDED_COSINE, _GUIDED_KEYFRAMES = 0.8, 12
 # Points nearer to the camera than this are not looked for [m], nor those so far off its axis.
 _GUIDED_LEAST_M, _GUIDED_MOST_BEARING = 0.1, 5.0
 #: With less time left, no pass begins [s]: finding features cannot be stopped.
@@ -275,9 +277,10 @@ class KeyframeLocalizer:
             ahead = np.isfinite(inside).all(axis=1) & (inside[:, 2] > _GUIDED_LEAST_M)
             rows = np.nonzero(ahead & (np.abs(inside[:, :2]) < _GUIDED_MOST_BEARING
                                        * inside[:, 2:]).all(axis=1))[0]
-            found = tree.query_ball_point(inside[rows, :2] / inside[rows, 2:], _GUIDED_RADIUS)
-            of_points = np.repeat(rows, [len(some) for some in found])
-            of_features = np.array([one for some in found for one in some], dtype=np.int64)
+            _, nearest = tree.query(inside[rows, :2] / inside[rows, 2:], [*range(
+                1, _GUIDED_NEAREST + 1)], distance_upper_bound=_GUIDED_RADIUS)
+            of_points, ranks = np.nonzero(nearest < len(look.bearings))
+            of_points, of_features = rows[of_points], nearest[of_points, ranks]
             cosines = np.einsum('kd,kd->k', self.layer.unit_descriptors(keyframe)[of_points],
                                 descriptors[of_features])
             # pairs of which each is the other's most similar one there
@@ -289,6 +292,9 @@ class KeyframeLocalizer:
             matched = matched.join(_Matched(
                 kept, theirs[of_points], np.full(len(kept), keyframe),
                 of_points + self.layer.rows(keyframe).start, np.ones(len(kept), np.float32)))
+        # a match counts once, however it was found
+        _, kept = np.unique([matched.features, matched.rows], axis=1, return_index=True)
+        matched = matched.select(np.sort(kept))
         refined = refine(matched.points, look.bearings[matched.features], camera_from_map)
         return place if refined is None else place._replace(
             map_from_camera=refined.map_from_camera, covariance=refined.covariance,
