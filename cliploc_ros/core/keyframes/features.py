@@ -89,7 +89,8 @@ def extract(image_rgb: NDArray[np.uint8], most: int, longest_side_px: int = 800)
     gray = cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY)
     scale = min(1.0, longest_side_px / max(image_rgb.shape[:2]))
     if scale < 1.0:
-        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        size = [max(1, round(scale * side)) for side in reversed(gray.shape)]
+        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     bright = float(np.percentile(gray, 99))
     if 0.0 < bright < _DARK:
         gray = cv2.convertScaleAbs(gray, alpha=_DARK / bright)
