@@ -10,6 +10,7 @@ import stat
 import subprocess
 import sys
 import time
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from cliploc_ros.core.map.landmark_embeddings import (
     embeddings_path,
     load_embeddings_of_map,
     load_landmark_embeddings,
+    save_landmark_embeddings,
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import set_digest, write_map
@@ -232,3 +234,26 @@ def test_two_processes_of_one_number_share_a_folder(tmp_path):
     assert reads > 50
     assert [one.wait() for one in writers] == [0, 0]
     assert [one.name for one in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_file_whose_names_have_no_ending_misses_its_arrays(path):
+    """Numpy ends each name in .npy; other programs that write zip files may not."""
+    place = embeddings_path(path)
+    with zipfile.ZipFile(place) as archive:
+        contents = {name.removesuffix('.npy'): archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(place, 'w') as archive:
+        for name, content in contents.items():
+            archive.writestr(name, content)
+    with pytest.raises(MapError, match='array encoder_key is missing'):
+        load_landmark_embeddings(place)
+    with pytest.raises(MapError, match='no complete npz file'):
+        load_landmark_embeddings('/proc/self/mem')
+
+
+def test_a_set_without_end_is_not_printed(path):
+    landmark_map, place = LandmarkMap.from_file(path), embeddings_path(path)
+    save_landmark_embeddings(place, replace(load_landmark_embeddings(place),
+                                            set_digest='a' * 1_000_000))
+    with pytest.raises(MapError, match=r'is of the set a{12}, its') as error:
+        load_embeddings_of_map(path, landmark_map.landmark_ids, landmark_map.map_set)
+    assert len(str(error.value)) < 500
