@@ -11,6 +11,7 @@ import os
 import struct
 import zipfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -196,10 +197,11 @@ class Schema:
             try:
                 archive = zipfile.ZipFile(file)
             except Exception as error:  # whatever zipfile meets in a broken file
-                file.seek(0)
-                if file.read(6) == b'\x93NUMPY':
-                    raise ArrayError('is a single array, not an npz file of named arrays'
-                                     ) from error
+                with suppress(OSError):
+                    file.seek(0)
+                    if file.read(6) == b'\x93NUMPY':
+                        raise ArrayError('is a single array, not an npz file of named arrays'
+                                         ) from error
                 raise ArrayError(f'is no complete npz file ({error})') from error
             with archive:
                 try:
@@ -210,20 +212,20 @@ class Schema:
                 return self._arrays_of(file, archive)
 
     def _arrays_of(self, file: BinaryIO, archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
-        names = {name.removesuffix('.npy') for name in archive.namelist()}
+        members = {member.filename.removesuffix('.npy'): member for member in archive.infolist()
+                   if member.filename.endswith('.npy')}
         for name, one in self.fields.items():
-            if name not in names and not one.is_optional:
-                hints = [f' ({what})' for other, what in self.others.items() if other in names]
+            if name not in members and not one.is_optional:
+                hints = [f' ({what})' for other, what in self.others.items() if other in members]
                 raise ArrayError(f'array {name} is missing{"".join(hints)}')
-        size = os.fstat(file.fileno())
-        wanted = {name: (archive.getinfo(f'{name}.npy'), one.stays)
-                  for name, one in self.fields.items() if name in names}
-        wanted = {name: (member, stays and member.compress_type == zipfile.ZIP_STORED)
-                  for name, (member, stays) in wanted.items()}
-        is_large = size.st_size > self.largest_read
-        unpacked = sum(member.file_size for member, stays in wanted.values()
-                       if not (stays and is_large))
-        on_disk = 512 * size.st_blocks or size.st_size  # some network file systems count none
+        status = os.fstat(file.fileno())
+        is_large = status.st_size > self.largest_read
+        # each with whether it stays in the file
+        wanted = {name: (members[name], one.stays and is_large
+                         and members[name].compress_type == zipfile.ZIP_STORED)
+                  for name, one in self.fields.items() if name in members}
+        unpacked = sum(member.file_size for member, stays in wanted.values() if not stays)
+        on_disk = 512 * status.st_blocks or status.st_size  # some network file systems count none
         if unpacked > max(_MOST_BYTES, _MOST_GROWTH * on_disk):
             raise ArrayError(f'unpacks to {unpacked >> 20} MiB, much more than the file takes')
         arrays = {}
@@ -231,8 +233,8 @@ class Schema:
             if self.is_stored and member.compress_type != zipfile.ZIP_STORED:
                 raise ArrayError(f'array {name} is compressed')
             try:
-                mapped = _mapped(file, archive, member) if stays and is_large else None
-                arrays[name] = _array(archive, member) if mapped is None else mapped
+                arrays[name] = (_mapped(file, archive, member) if stays
+                                else _array(archive, member))
             except Exception as error:  # whatever numpy and zipfile meet in a broken file
                 raise ArrayError(f'array {name} cannot be read: {error}') from error
         return arrays

@@ -4,6 +4,7 @@
 
 import atexit
 import errno
+import fcntl
 import glob
 import json
 import logging
@@ -100,12 +101,18 @@ def replace_file(path: Path) -> Iterator[Path]:
         yield partial
         with partial.open('rb+') as file:
             os.fsync(file.fileno())
-        with suppress(OSError):  # there is no file yet, or the file system has no modes
-            partial.chmod(stat.S_IMODE(path.stat().st_mode))
-        partial.replace(path)
+        _take_place(partial, path)
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+def _take_place(partial: Path, path: Path) -> None:
+    """Let a file replace another one, whose mode it takes; a symbolic link is followed."""
+    path = Path(os.path.realpath(path))
+    with suppress(OSError):  # there is no file yet, or the file system has no modes
+        partial.chmod(stat.S_IMODE(path.stat().st_mode))
+    partial.replace(path)
 
 
 #: Writes a file to a path, with the digest of its set in it.
@@ -118,7 +125,7 @@ def replace_set(path: Path, digest: str, write: WriteOfSet,
 
     Those beside are written under other names first. The file itself takes its place in one step,
     and from then on its set is the new one: finish_set does what a kill leaves. Files that are not
-    of its set have another digest.
+    of its set have another digest. Two writers of one folder do this one after the other.
 
     Parameters
     ----------
@@ -128,33 +135,50 @@ def replace_set(path: Path, digest: str, write: WriteOfSet,
     OSError, and what the callables raise: nothing was changed. OptionsError: the set was written,
     and a file that is not of it cannot be removed.
     """
-    staged = {other: _staged(other, digest) for other, make in besides.items() if make is not None}
-    try:
+    staged = {other: _staged(Path(os.path.realpath(other)), digest) for other in besides}
+    with _alone_in(path.parent):
+        try:
+            for other, make in besides.items():
+                if make is None:
+                    staged[other].unlink(missing_ok=True)  # of a writer that was killed
+                else:
+                    make(staged[other], digest)
+            write(path, digest)
+        except BaseException:
+            for one in staged.values():
+                with suppress(OSError):
+                    one.unlink(missing_ok=True)
+            raise
         for other, make in besides.items():
-            if make is not None:
-                make(staged[other], digest)
-        write(path, digest)
-    except BaseException:
-        for one in staged.values():
-            with suppress(OSError):
-                one.unlink(missing_ok=True)
-        raise
-    for other in besides:
-        if other not in staged:
             try:
-                other.unlink(missing_ok=True)
+                if make is None:
+                    other.unlink(missing_ok=True)
+                else:
+                    with suppress(FileNotFoundError):  # a reader has done it
+                        _take_place(staged[other], other)
             except OSError as error:
                 raise OptionsError(f'{other}: is not of {path.name} that was written; it cannot '
                                    f'be removed: {error.strerror}; remove it') from error
-    finish_set(path, digest)
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Keep other writers of sets out of a folder meanwhile, where its file system can."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        with suppress(OSError):  # some network file systems lock no folder
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def finish_set(path: Path, digest: str) -> None:
     """Put in place what a killed writer left of the set of a file, where that is allowed."""
-    pattern = _staged(path, digest).with_suffix('').name
-    for staged in path.parent.glob(f'{glob.escape(pattern)}.*') if digest else ():
+    pattern = f'{glob.escape(_staged(path.with_suffix(""), digest).name)}.*'
+    for staged in path.parent.glob(pattern) if digest else ():
         with suppress(OSError):  # the writer has done it meanwhile, or the folder is read-only
-            staged.replace(staged.with_name(staged.name.removeprefix(f'.{digest}.')))
+            _take_place(staged, staged.with_name(staged.name.removeprefix(f'.{digest}.')))
 
 
 def _staged(path: Path, digest: str) -> Path:

@@ -173,8 +173,13 @@ class Watcher:
         while not stopped.is_set():
             begun_at, stamp = time.monotonic(), None
             try:
-                stamp = self._look(stopped)
-                self._react(stopped, stamp)
+                try:
+                    stamp = self._look(stopped)
+                except PoselessError as error:
+                    self._miss(stopped, str(error))
+                    self._wake_up(stopped)
+                else:
+                    self._react(stopped, stamp)
             except StoppedError:
                 return
             except (NoFrameError, NoTransformError, LaterError, TimeJumpError, TimeUpError
@@ -182,8 +187,6 @@ class Watcher:
                 self._miss(stopped, str(error), time.monotonic() - _STALE_S)
             except CliplocError as error:
                 self._miss(stopped, str(error))
-                if isinstance(error, PoselessError):
-                    self._wake_up(stopped)
             except Exception as error:
                 self._node.report(traceback.format_exc())
                 self._miss(stopped, f'internal error: {error} (the traceback is in the log)')

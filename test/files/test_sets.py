@@ -6,9 +6,11 @@ import multiprocessing
 import os
 import random
 import signal
+import stat
 import subprocess
 import sys
 import time
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,16 +24,17 @@ from cliploc_ros.core.map.landmark_embeddings import (
     embeddings_path,
     load_embeddings_of_map,
     load_landmark_embeddings,
+    save_landmark_embeddings,
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.errors import DatasetError, MapError
+from cliploc_ros.core.map.map_file import set_digest, write_map
+from cliploc_ros.errors import DatasetError, MapError, OptionsError
 from cliploc_ros.offline.datasets.map_recording import (
     MapRecording,
     load_recording,
     recording_path,
 )
-from cliploc_ros.offline.make_map import write_made_map
+from cliploc_ros.offline.make_map import MadeMap, write_made_map
 from cliploc_ros.offline.studio.document import Document
 
 PROJECT = Path(__file__).resolve().parents[2]
@@ -134,6 +137,69 @@ def test_a_set_that_cannot_be_written_changes_nothing(path):
     assert not [one for one in path.parent.iterdir() if one.name.startswith('.')]
 
 
+def test_two_writers_at_once_leave_one_whole_set(path):
+    """As build_map in two terminals: the last one wins with all of its files."""
+    fork = multiprocessing.get_context('fork')
+    for turn in range(20):
+        writers = [fork.Process(target=lambda numbers: [write_set(path, one) for one in numbers],
+                                args=(range(100 * turn + 10 * one, 100 * turn + 10 * one + 10),))
+                   for one in range(2)]
+        for one in writers:
+            one.start()
+        for one in writers:
+            one.join()
+        assert [one.exitcode for one in writers] == [0, 0]
+        assert read(path)[1] == {True}
+    assert not [one for one in path.parent.iterdir() if one.name.startswith('.')]
+
+
+def test_what_a_killed_writer_left_comes_not_into_a_later_set_without_it(path):
+    """As build_map, killed and run again with --no-keyframe-layer: it makes the same landmarks."""
+    digest = set_digest(made_map(1).landmark_map)
+    layer_path(path).rename(path.with_name(f'.{digest}.{layer_path(path).name}'))
+    write_made_map(path, replace(made_map(1), layer=None), [],
+                   MapRecording(path.with_name('seen.npz')))
+    LandmarkMap.from_file(path)
+    assert not layer_path(path).exists()
+    assert not [one for one in path.parent.iterdir() if one.name.startswith('.')]
+
+
+def test_files_of_a_set_stay_private_and_links_stay_links(path, tmp_path):
+    """As replace_file does it: images of keyframes are not for everyone."""
+    layer_path(path).chmod(0o600)
+    (tmp_path / 'store').mkdir()
+    stored = tmp_path / 'store' / 'embeddings.npz'
+    embeddings_path(path).rename(stored)
+    embeddings_path(path).symlink_to(stored)
+    write_set(path, 1)
+    assert read(path) == (1, {True})
+    assert stat.S_IMODE(layer_path(path).stat().st_mode) == 0o600
+    assert embeddings_path(path).is_symlink() and not stored.is_symlink()
+
+
+def test_a_folder_in_the_place_of_a_file_of_a_set_is_named(path):
+    layer_path(path).unlink()
+    layer_path(path).mkdir()
+    with pytest.raises(OptionsError, match=r'a\.keyframes\.npz: '):
+        write_set(path, 1)
+
+
+def test_sets_of_keyframes_alone_are_told_apart(path):
+    """Their maps say the same: nothing. Objects may be drawn into one later."""
+    empty, digests = LandmarkMap.empty('map'), set()
+    layer = replace(made_map(0).layer, landmark_ids=(), landmark_centers=np.empty((0, 3), 'f4'))
+    for name in ('a', 'b'):
+        place = path.with_name(f'{name}.yaml')
+        write_made_map(place, MadeMap(empty, None, layer=layer), [],
+                       MapRecording(path.with_name('seen.npz')))
+        load_layer_of_map(layer_path(place), LandmarkMap.from_file(place))
+        digests.add(LandmarkMap.from_file(place).map_set.digest)
+    assert len(digests) == 2
+    layer_path(path).replace(layer_path(place))
+    with pytest.raises(MapError, match='is of the set'):
+        load_layer_of_map(layer_path(place), LandmarkMap.from_file(place))
+
+
 SHARED = """
 import sys
 from pathlib import Path
@@ -168,3 +234,26 @@ def test_two_processes_of_one_number_share_a_folder(tmp_path):
     assert reads > 50
     assert [one.wait() for one in writers] == [0, 0]
     assert [one.name for one in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_file_whose_names_have_no_ending_misses_its_arrays(path):
+    """Numpy ends each name in .npy; other programs that write zip files may not."""
+    place = embeddings_path(path)
+    with zipfile.ZipFile(place) as archive:
+        contents = {name.removesuffix('.npy'): archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(place, 'w') as archive:
+        for name, content in contents.items():
+            archive.writestr(name, content)
+    with pytest.raises(MapError, match='array encoder_key is missing'):
+        load_landmark_embeddings(place)
+    with pytest.raises(MapError, match='no complete npz file'):
+        load_landmark_embeddings('/proc/self/mem')
+
+
+def test_a_set_without_end_is_not_printed(path):
+    landmark_map, place = LandmarkMap.from_file(path), embeddings_path(path)
+    save_landmark_embeddings(place, replace(load_landmark_embeddings(place),
+                                            set_digest='a' * 1_000_000))
+    with pytest.raises(MapError, match=r'is of the set a{12}, its') as error:
+        load_embeddings_of_map(path, landmark_map.landmark_ids, landmark_map.map_set)
+    assert len(str(error.value)) < 500

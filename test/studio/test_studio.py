@@ -10,13 +10,15 @@ import cv2
 import numpy as np
 import pytest
 from studio_map import demo_studio, open_page
+from websockets.datastructures import Headers
+from websockets.http11 import Request
 
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.studio import Studio
-from cliploc_ros.offline.studio.web import once
+from cliploc_ros.offline.studio.web import Gate, once
 
 
 @pytest.fixture
@@ -175,3 +177,10 @@ def test_the_address_on_the_command_line_of_a_browser_opens_the_page_once(tmp_pa
         assert url.rstrip('/').rsplit('/', 1)[1] not in shown
         assert answer(shown) == 200, 'it leads to the page'
         assert answer(shown) == 403
+
+
+def test_an_address_beyond_ascii_is_refused():
+    """As websockets reads it: an error here would be answered as one of the server."""
+    gate = Gate('127.0.0.1')
+    assert gate.admit(Request('/\udcff\udcfe/', Headers({'Host': '127.0.0.1'}))) is None
+    assert gate.admit(Request(f'{gate.path}\udcff', Headers({'Host': '127.0.0.1'})))

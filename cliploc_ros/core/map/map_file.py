@@ -5,6 +5,7 @@
 import hashlib
 import json
 import os
+import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -62,7 +63,12 @@ def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
 
 
 def set_digest(landmark_map: LandmarkMap) -> str:
-    """Return what tells a map and the files that are written with it from other ones."""
+    """Return what tells a map and the files that are written with it from other ones.
+
+    Maps of keyframes alone say the same: they get a random one.
+    """
+    if not len(landmark_map):
+        return secrets.token_hex(6)
     digest = hashlib.sha256()
     for line in _lines(landmark_map):
         digest.update(line.encode())

@@ -194,7 +194,7 @@ NO_SET = MapSet()
 def check_set(digest: str, of_map: str) -> None:
     """Raise ValueError for a file of another set than a map's. An unknown one is accepted."""
     if digest and of_map and digest != of_map:
-        raise ValueError(f'is of the set {digest}, its map of {of_map}')
+        raise ValueError(f'is of the set {digest[:12]}, its map of {of_map}')
 
 
 def set_of(text: str) -> MapSet:

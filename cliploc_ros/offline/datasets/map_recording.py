@@ -84,7 +84,7 @@ def load_recording(map_file: Path) -> MapRecording | None:
         return None
     try:
         values = parse_json(read_file(path))
-        digest = values.pop('set', '')
+        digest = str(values.pop('set', ''))
         if digest and map_file.exists():
             with open_file(map_file) as file:
                 check_set(digest, set_of(file.read(_HEAD).decode(errors='replace')).digest)

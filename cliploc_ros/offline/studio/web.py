@@ -138,7 +138,8 @@ class Gate:
         if first in self._tickets and not is_socket:
             self._tickets.remove(first)
             return ''
-        is_known = hmac.compare_digest(first.encode(), self.token.encode())
+        # websockets reads bytes beyond ASCII as surrogates
+        is_known = hmac.compare_digest(first.encode(errors='surrogateescape'), self.token.encode())
         return f'/{rest}' if is_known else None
 
     @contextmanager
