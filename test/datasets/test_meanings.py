@@ -19,13 +19,8 @@ from cliploc_ros.core.geometry.transforms import invert_transform, make_transfor
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.messages import image_from_msg
 from cliploc_ros.offline.datasets import bag_messages
-from cliploc_ros.offline.datasets.bag_frames import (
-    BagTopics,
-    bag_frames,
-    find_poses,
-    poses_of_tf,
-    poses_of_topic,
-)
+from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
+from cliploc_ros.offline.datasets.bag_poses import find_poses, poses_of_tf, poses_of_topic
 from cliploc_ros.offline.datasets.bags import BagWriter, typestore
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder
