@@ -209,7 +209,7 @@ def _frames_of(options: argparse.Namespace, name: str, mount: NDArray[np.float64
     """Return the images of one camera of a bag; its name is '' where it is the only one."""
     topics = bag_frames.BagTopics(options.image, options.camera_info, options.rectified,
                                   options.depth or '', options.intrinsics,
-                                  round(options.stamp_tolerance * NS_PER_S))
+                                  round(options.stamp_tolerance * NS_PER_S), options.tf)
     read = _read_poses(options, name, mount, gap_ns)
     try:
         return bag_frames.bag_frames(options.bag, topics.of_camera(name), read,

@@ -4,12 +4,12 @@
 
 import struct
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +70,7 @@ class BagTopics:
     intrinsics: str | None = None  #: What is used instead of camera_info, see find_camera
     #: A depth image belongs to a colour image at most this far away in time [ns]
     tolerance_ns: int = STAMP_TOLERANCE_NS
+    tf: str | None = None  #: That leads from depth to image, see poses_of_tf
 
     def of_camera(self, name: str) -> 'BagTopics':
         """Return the topics of one of several cameras; '' changes nothing."""
@@ -173,18 +174,20 @@ class _Cameras(NamedTuple):
             infos.setdefault(content, one.data)
             found.append((stamp_ns, one.stamp_ns, content))
         sound = {content: data for content, data in infos.items()
-                 if _is_calibrated(data, topics.rectified)} or dict([*infos.items()][:1])
+                 if _says_calibration(data, topics.rectified)} or dict([*infos.items()][:1])
+        _check_one_camera(map(_frame_of, sound.values()), f'{reader.path}: {topics.camera_info}')
         for stamp_ns, _, content in found:
             if content not in sound and len(sound) < len(infos):
                 reader.leave_out(topics.camera_info, f'that at {stamp_ns / NS_PER_S:.6f} s has no '
                                  'calibration')
-        kept, numbers = [one for one in found if one[2] in sound], [*sound]
+        kept = [one for one in found if one[2] in sound]
+        rows = {content: row for row, content in enumerate(sound)}
         by_stamp = all(one[0] for one in kept)
         if by_stamp:
             check_forward([one[0] for one in kept], f'{reader.path}: {topics.camera_info}')
         return cls(where, msgtype, topics.rectified, tuple(sound.values()),
                    np.array([one[not by_stamp] for one in kept], dtype=np.int64),
-                   np.array([numbers.index(one[2]) for one in kept], dtype=np.int64), by_stamp)
+                   np.array([rows[one[2]] for one in kept], dtype=np.int64), by_stamp)
 
     def decoder(self, stamp_ns: int, recorded_ns: int, data: bytes
                 ) -> Callable[[], tuple[NDArray[np.uint8], Camera]]:
@@ -198,10 +201,25 @@ class _Cameras(NamedTuple):
         return partial(_decode_color, self.where, info, self.rectified, self.msgtype, data)
 
 
-def _is_calibrated(data: bytes, rectified: bool) -> bool:
-    info = deserialize(data, bag_messages.CAMERA_INFO, 'camera_info')
+def _says_calibration(data: bytes, rectified: bool) -> bool:
+    try:
+        info = deserialize(data, bag_messages.CAMERA_INFO, 'camera_info')
+    except DatasetError:
+        return False
+    return _is_calibrated(info, rectified)
+
+
+def _is_calibrated(info: Any, rectified: bool) -> bool:
     focal_px = np.diag(np.reshape(info.p, (3, 4)) if rectified else np.reshape(info.k, (3, 3)))[:2]
     return bool(np.isfinite(focal_px).all() and (focal_px > 0.0).all())
+
+
+def _check_one_camera(frame_ids: Iterable[str], where: str) -> None:
+    """Refuse messages of several cameras on one topic; DatasetError: they are, and which."""
+    names = sorted({*frame_ids} - {''})
+    if len(names) > 1:
+        raise DatasetError(f'{where} is of several coordinate frames, {", ".join(names)}: record '
+                           'each camera under topics of its own')
 
 
 def _depth_of_its_camera(reader: BagReader, topics: BagTopics, form: DepthFormat) -> DepthFormat:
@@ -219,7 +237,9 @@ def _depth_of_its_camera(reader: BagReader, topics: BagTopics, form: DepthFormat
         info = reader.first(beside)
         (fx, _, cx), (_, fy, cy), _ = np.reshape(info.k, (3, 3)).tolist()
         try:
-            way = poses_of_tf(image, depth, 10 * NS_PER_S)(reader, depth)
+            if not _is_calibrated(info, rectified=False):
+                raise DatasetError(f'{beside} has no calibration')
+            way = poses_of_tf(image, depth, 10 * NS_PER_S, topics.tf)(reader, depth)
             pose = way.pose_at(bag_messages.stamp_ns(reader.first(topics.depth)))
             if pose is not None:
                 return replace(form, camera=DepthCamera(fx, fy, cx, cy, pose))
@@ -362,13 +382,15 @@ def _paired(reader: BagReader, topics: BagTopics, poses: Poses, is_wanted: Wante
         if nearest is None or abs(nearest[0] - selected.stamp_ns) > topics.tolerance_ns:
             return selected
         return selected._replace(depth=nearest[1])
-    place, before = 0, 0
+    place, before, frame = 0, 0, ''
     for recorded in reader.messages([topics.image, *([topics.depth] if topics.depth else [])]):
         stamp_ns = _peek_stamp_ns(recorded)
         if topics.depth and recorded.topic == topics.depth:
             depths.append((stamp_ns, recorded.data))
         else:
             check_forward([before, stamp_ns], f'{reader.path}: {topics.image}')
+            frame, earlier = _frame_of(recorded.data), frame
+            _check_one_camera([earlier, frame], f'{reader.path}: {topics.image}')
             pose, before = poses.pose_at(stamp_ns), stamp_ns
             if is_wanted(place, stamp_ns, pose):
                 waiting.append(_Selected(place, stamp_ns, recorded.stamp_ns, pose, recorded.data))
@@ -381,13 +403,26 @@ def _paired(reader: BagReader, topics: BagTopics, poses: Poses, is_wanted: Wante
 
 def _peek_stamp_ns(recorded: BagMessage) -> int:
     """Return the header stamp of a serialized message [ns], without reading the rest of it."""
-    order = '<' if recorded.data[1] & 1 else '>'
     try:
-        seconds, nanoseconds = struct.unpack_from(f'{order}iI', recorded.data, 4)
-    except struct.error as error:
+        seconds, nanoseconds = struct.unpack_from(f'{_order(recorded.data)}iI', recorded.data, 4)
+    except (struct.error, IndexError) as error:
         raise DatasetError(f'{recorded.topic}: a message of {len(recorded.data)} bytes has no '
                            'header') from error
     return int(seconds) * NS_PER_S + int(nanoseconds)
+
+
+def _frame_of(data: bytes) -> str:
+    """Return the coordinate frame of a serialized message; '' where it has no header."""
+    try:
+        length, = struct.unpack_from(f'{_order(data)}I', data, 12)
+    except (struct.error, IndexError):
+        return ''
+    return plain_name(data[16:16 + length].rstrip(b'\0').decode(errors='replace'))
+
+
+def _order(data: bytes) -> str:
+    """Return the byte order of a serialized message, as struct has it."""
+    return '<' if data[1] & 1 else '>'
 
 
 def _decode_color(where: str, info: bytes | Camera, rectified: bool, msgtype: str, data: bytes

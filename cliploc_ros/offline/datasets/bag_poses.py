@@ -59,18 +59,23 @@ def poses_of_topic(name: str, max_gap_ns: int = 0,
         if pose_of is None:
             raise DatasetError(f'{reader.path}: {name} is of type {reader.topic(name).msgtype}, '
                                f'not {" or ".join(_POSE_TYPES)}')
-        stamps, rows, child = [], [], ''
+        stamps, rows, children = [], [], set[str]()
         for _, message in reader.readable([name]):
             pose = pose_of(message)
             numbers = _sound(reader, name, message, pose.position, pose.orientation)
             if numbers is not None:
                 stamps.append(bag_messages.stamp_ns(message))
                 rows.append(numbers)
-                child = plain_name(getattr(message, 'child_frame_id', ''))
+                children.add(plain_name(getattr(message, 'child_frame_id', '')))
         check_forward(stamps, f'{reader.path}: {name}')
         poses = replace(TimedPoses.from_samples(stamps, rows, f'{reader.path}: {name}'),
                         max_gap_ns=max_gap_ns, body_from_camera=body_from_camera,
                         tolerance_ns=tolerance_ns)
+        if len(children) > 1:
+            raise DatasetError(f'{reader.path}: {name} has the poses of several coordinate '
+                               f'frames, {", ".join(sorted(children))} (child_frame_id): record '
+                               'those of one')
+        child = ''.join(children)
         if body_from_camera is not None or child in ('', plain_name(camera_frame)):
             return poses
         try:
@@ -209,8 +214,8 @@ def poses_of_tf(map_frame: str, camera_frame: str | None, max_gap_ns: int,
         if not topics:
             raise DatasetError(f'{reader.path}: has neither {_TF} nor {_TF_STATIC}; record them, '
                                'or name a topic or file of poses')
-        parents, up, down = _find_way(reader, topics, map_frame,
-                                      camera_frame or plain_name(image_frame))
+        parents, up, down = _find_way(reader, topics, plain_name(map_frame),
+                                      plain_name(camera_frame or image_frame))
         links = _read_links(reader, topics, {*up, *down}, parents, max_gap_ns)
         return TransformChain(tuple(links[child] for child in up),
                               tuple(links[child] for child in down))
