@@ -17,7 +17,7 @@ from cliploc_ros import command
 from cliploc_ros.cli import check_map, map_layer
 from cliploc_ros.cli.options import add_source_options, folder_of
 from cliploc_ros.command import option
-from cliploc_ros.errors import CliplocError, MappingError, OptionsError
+from cliploc_ros.errors import CliplocError, MappingError, OptionsError, misspelt_classes
 
 if TYPE_CHECKING:
     import numpy as np
@@ -125,6 +125,7 @@ def build(options: argparse.Namespace) -> int:
         moving_classes=MOVING_CLASSES if options.moving is None else tuple(
             filter(None, map(str.strip, options.moving.split(',')))))
     source = sources.read_source(options)
+    _tell_misspelt(mapping.moving_classes, source.recorded.detections.class_names)
     detections, scale, rotation = _placed(source.recorded.detections, options, mapping)
     if without := source.recorded.without_pose:
         print(f'no pose: {without} of {source.recorded.images} images', flush=True)
@@ -155,6 +156,15 @@ def build(options: argparse.Namespace) -> int:
     print(f'wrote {path} in {time.monotonic() - begin:.1f} s', flush=True)
     _check_map(path, options.check)
     return _refuse(options.out, path) if is_poor else 0
+
+
+def _tell_misspelt(moving: Sequence[str], seen: Sequence[str]) -> None:
+    """Say which names of --moving look misspelt: what they mean becomes landmarks."""
+    from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
+
+    known = {name.lower() for name in (*seen, *shipped_classes())}
+    for name, hint in misspelt_classes(map(str.lower, moving), known, all_known=True).items():
+        print(f"note: --moving: no box is of class '{name}'{hint}", flush=True)
 
 
 def _refuse(out: Path, written: Path) -> int:

@@ -20,7 +20,7 @@ from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.open_vocabulary import prompts_of_map, prompts_of_names
 from cliploc_ros.models.profiles import with_detector, with_encoder
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.offline.datasets import bag_frames
+from cliploc_ros.offline.datasets import bag_frames, bag_poses
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
 from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, join_frames
@@ -209,7 +209,7 @@ def _frames_of(options: argparse.Namespace, name: str, mount: NDArray[np.float64
     """Return the images of one camera of a bag; its name is '' where it is the only one."""
     topics = bag_frames.BagTopics(options.image, options.camera_info, options.rectified,
                                   options.depth or '', options.intrinsics,
-                                  round(options.stamp_tolerance * NS_PER_S))
+                                  round(options.stamp_tolerance * NS_PER_S), options.tf)
     read = _read_poses(options, name, mount, gap_ns)
     try:
         return bag_frames.bag_frames(options.bag, topics.of_camera(name), read,
@@ -221,15 +221,15 @@ def _frames_of(options: argparse.Namespace, name: str, mount: NDArray[np.float64
 
 
 def _poses_of_topic(options: argparse.Namespace, topic: str, camera: str,
-                    mount: NDArray[np.float64] | None, gap_ns: int) -> bag_frames.ReadPoses:
+                    mount: NDArray[np.float64] | None, gap_ns: int) -> bag_poses.ReadPoses:
     """Return what reads a topic, which without a mount is the camera's own, in its namespace."""
-    return bag_frames.poses_of_topic(
+    return bag_poses.poses_of_topic(
         topic if mount is not None else bag_frames.topic_of(camera, topic), gap_ns, mount,
         round(options.stamp_tolerance * NS_PER_S), options.tf)
 
 
 def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.float64] | None,
-                gap_ns: int) -> bag_frames.ReadPoses:
+                gap_ns: int) -> bag_poses.ReadPoses:
     """Return what reads the poses of a camera of a bag; the gap [ns] is that of a topic."""
     given = [name for name in ('pose_topic', 'map_frame', 'trajectory')
              if getattr(options, name) is not None]
@@ -240,8 +240,8 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.floa
     if not given:
         if mount is not None:
             raise OptionsError('--mount is for --pose-topic and --trajectory: name one of them')
-        truth = bag_frames.topic_of(camera, bag_frames.GROUND_TRUTH)
-        return bag_frames.find_poses(max_gap_ns, truth, options.camera_frame, gap_ns,
+        truth = bag_frames.topic_of(camera, bag_poses.GROUND_TRUTH)
+        return bag_poses.find_poses(max_gap_ns, truth, options.camera_frame, gap_ns,
                                      round(options.stamp_tolerance * NS_PER_S), options.tf)
     if options.pose_topic is not None:
         return _poses_of_topic(options, options.pose_topic, camera, mount, gap_ns)
@@ -257,7 +257,7 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.floa
     if options.camera_frame is not None and len(options.cameras) > 1:
         raise OptionsError('--camera-frame is of one camera: several have the frames of their '
                            'images')
-    return bag_frames.poses_of_tf(options.map_frame, options.camera_frame, max_gap_ns, options.tf)
+    return bag_poses.poses_of_tf(options.map_frame, options.camera_frame, max_gap_ns, options.tf)
 
 
 def _odometry(options: argparse.Namespace) -> dict[str, Poses] | None:
@@ -268,10 +268,10 @@ def _odometry(options: argparse.Namespace) -> dict[str, Poses] | None:
     if options.odometry_topic is not None and options.map_frame is not None:
         raise OptionsError('--odometry-topic needs a --mount, which --map-frame has from tf: give '
                            '--odometry-frame')
-    return {name: bag_frames.bag_odometry(
+    return {name: bag_poses.bag_odometry(
         options.bag, bag_frames.topic_of(name, options.image),
         _poses_of_topic(options, options.odometry_topic, name, mount, max_gap_ns)
-        if options.odometry_frame is None else bag_frames.poses_of_tf(
+        if options.odometry_frame is None else bag_poses.poses_of_tf(
             options.odometry_frame, options.camera_frame, max_gap_ns, options.tf))
         for name, mount in _mounts(options).items()}
 

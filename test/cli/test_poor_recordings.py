@@ -70,7 +70,7 @@ def test_a_poor_map_takes_no_place(office, tmp_path, capsys):
     assert len(LandmarkMap.from_file(tmp_path / 'office.refused.yaml')) > 0
 
 
-def test_what_moves_is_no_landmark(office, tmp_path):
+def test_what_moves_is_no_landmark(office, tmp_path, capsys):
     """The bottles are persons now: none is mapped, unless the list says otherwise."""
     names = tuple('person' if name == 'bottle' else name for name in office.class_names)
     crowded = replace(office, class_names=names)
@@ -85,6 +85,8 @@ def test_what_moves_is_no_landmark(office, tmp_path):
         plain.landmark_ids, plain.class_ids, strict=True) if kind == 'person')
     save_observations(tmp_path / 'office.npz', office)
     assert build_map.main(['--observations', str(tmp_path / 'office.npz'), '--no-clip',
-                           '--no-check', '--moving', 'bottle, cup', '--out',
+                           '--no-check', '--moving', 'Bottle, cup, persn', '--out',
                            str(tmp_path / 'office.yaml')]) == 0
     assert not {'bottle', 'cup'} & {*LandmarkMap.from_file(tmp_path / 'office.yaml').class_ids}
+    told = capsys.readouterr().out
+    assert "no box is of class 'persn' (did you mean 'person'?)" in told and 'Bottle' not in told

@@ -47,6 +47,27 @@ def edited(folder, edit, name='transforms.json'):
     return folder
 
 
+@pytest.mark.parametrize(('fields', 'expected'), [
+    ({'fl_x': 0}, 'fx=0 .* focal lengths must be positive'),
+    ({'fl_y': 0}, 'fy=0 .* focal lengths must be positive'),
+    ({'depth_unit_scale_factor': -1}, 'unit of depth is -1'),
+    ({'applied_scale': 1e-300}, 'm from the origin')])
+def test_numbers_of_transforms_json_that_cannot_be(fields, expected, shots, tmp_path):
+    refuses(edited(write_nerf(tmp_path, shots), lambda values: values.update(fields)), expected)
+
+
+@pytest.mark.parametrize('name', ['/', '\\', '..', 'C:\\', 'a\0b'])
+def test_names_of_no_file_are_counted(name, shots, tmp_path):
+    folder = edited(write_nerf(tmp_path, shots), lambda values: values['frames'][0].update(
+        file_path=name))
+    assert any('1 of 4 images that are listed are missing' in note
+               for note in read_folder(folder, METRES).notes)
+
+
+def test_a_scale_that_no_map_has(shots, tmp_path):
+    refuses(write_nerf(tmp_path, shots), 'm from the origin', FolderOptions(scale=1e9))
+
+
 def test_folders_without_poses_or_images(shots, tmp_path):
     refuses(tmp_path / 'gone', 'no such folder')
     refuses(tmp_path / ('x' * 300), 'no such folder')

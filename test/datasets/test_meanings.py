@@ -19,13 +19,8 @@ from cliploc_ros.core.geometry.transforms import invert_transform, make_transfor
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.messages import image_from_msg
 from cliploc_ros.offline.datasets import bag_messages
-from cliploc_ros.offline.datasets.bag_frames import (
-    BagTopics,
-    bag_frames,
-    find_poses,
-    poses_of_tf,
-    poses_of_topic,
-)
+from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
+from cliploc_ros.offline.datasets.bag_poses import find_poses, poses_of_tf, poses_of_topic
 from cliploc_ros.offline.datasets.bags import BagWriter, typestore
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder
@@ -281,7 +276,15 @@ def test_columns_of_trajectories(header, row, tmp_path):
     np.testing.assert_allclose(poses.quats_xyzw, [[0.1, 0.2, 0.3, 0.927362]], atol=1e-4)
 
 
+def test_all_stamps_of_a_trajectory_have_one_unit(tmp_path):
+    """Those of a clock that begins at 0 would be seconds, milliseconds and microseconds alone."""
+    path, stamps = tmp_path / 'poses.txt', [0, 10**9, 10**12, 10**16]
+    path.write_text(''.join(f'{stamp} 0 0 0 0 0 0 1\n' for stamp in stamps))
+    assert read_tum_trajectory(path).stamps_ns.tolist() == stamps
+
+
 @pytest.mark.parametrize(('row', 'expected'), [
+    ('1e999999999 0 0 0 0 0 0 1', 'timestamp 1e999999999 is outside'),
     ('1 0 0 0 0 1 0 0 0 0 1 0', 'KITTI'), ('0 0 0 0 0 0 1', 'without stamps'),
     ('1 2 3 0 0 0 1 0 9', 'name other columns')])
 def test_columns_that_are_no_trajectory(row, expected, tmp_path):
@@ -331,6 +334,59 @@ def test_exif_orientation(shared_data, tmp_path):
         else:
             with pytest.raises(DatasetError, match=expected):
                 read_folder(tmp_path)
+
+
+def test_messages_of_two_cameras_or_bodies_on_one_topic(room, tmp_path):
+    few, camera = room[:3], room[0][3]
+    wider = replace(camera, fx=1.5 * camera.fx, fy=1.5 * camera.fy)
+    for name, topic, kind, message in (
+            ('infos', '/camera_info', bag_messages.CAMERA_INFO,
+             lambda at: bag_messages.camera_info_message(at, 'right', wider)),
+            ('images', '/image', bag_messages.IMAGE,
+             lambda at: bag_messages.image_message(at, '/right', few[0][1]))):
+        more = [(at, topic, kind, message(at)) for at, *_ in few]
+        refuses(f'{topic} is of several coordinate frames, camera, right',
+                write_bag(tmp_path / name, few, more=more))
+    odometry = [(at, '/ground_truth', ODOMETRY, odometry_message(at, child, pose))
+                for at, _, pose, _ in few for child in ('camera', 'gripper')]
+    refuses(r'frames, camera, gripper \(child_frame_id\)',
+            write_bag(tmp_path / 'odometry', few, more=odometry, poses=False))
+
+
+def test_models_of_splatting_are_those_below_the_folder(shots, tmp_path):
+    """Not those of a folder that itself lies in one called distorted."""
+    folder = write_colmap(tmp_path / 'distorted/scan', shots)
+    shutil.copytree(folder / 'images', folder / 'input')
+    first = next(read_folder(folder, METRES).read_raw(lambda *_: True))
+    (folder / 'input').rename(folder / 'elsewhere')
+    assert first.color()[0].shape
+
+
+def test_coordinate_frames_with_a_slash(room, tmp_path):
+    """Of recordings that come from ROS 1; tf has them without."""
+    odometry = [(at, '/ground_truth', ODOMETRY, odometry_message(at, '/base', pose))
+                for at, _, pose, _ in room]
+    static = [(START, '/tf_static', TF, transform_message(START, 'base', 'camera', np.eye(4)))]
+    bag = write_bag(tmp_path / 'bag', room, more=[*odometry, *static], poses=False,
+                    frame='/camera')
+    np.testing.assert_allclose(next(reads(bag).read()).map_from_camera, room[0][2], atol=1e-6)
+
+
+def test_depth_of_a_camera_without_calibration_and_of_one_of_several_robots(room, tmp_path):
+    few, topics = room[:3], BagTopics(depth='/depth/image', tf='/robot2/tf')
+    info = bag_messages.camera_info_message(START, 'depth', room[0][3])
+    more = [(at, '/depth/image', bag_messages.IMAGE, depth_message(at, 'depth')) for at, *_ in few]
+    more += [(START, '/depth/camera_info', bag_messages.CAMERA_INFO, info)]
+    for robot in ('/robot1', '/robot2'):
+        more += [(START, f'{robot}/tf_static', TF, transform_message(
+            START, 'camera', 'depth', np.eye(4)))]
+        more += [(at, f'{robot}/tf', TF, transform_message(at, 'map', 'camera', pose))
+                 for at, _, pose, _ in few]
+    frame = next(reads(write_bag(tmp_path / 'a', few, more=more), topics).read())
+    assert frame.depth.camera.fx == room[0][3].fx
+    info.k[:] = np.nan
+    refuses('/depth/camera_info has no calibration', write_bag(tmp_path / 'b', few, more=more),
+            topics)
 
 
 def test_stamps_that_begin_again(room, tmp_path):

@@ -18,9 +18,11 @@ from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bag_frames import (
     BagTopics,
     bag_frames,
+    find_topics,
+)
+from cliploc_ros.offline.datasets.bag_poses import (
     bag_odometry,
     find_poses,
-    find_topics,
     poses_of_tf,
     poses_of_topic,
 )

@@ -10,7 +10,7 @@ import pytest
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.report import BY_OBJECTS, Measure
-from cliploc_ros.offline.mapping.check.sizes import scale_by_sizes, sizes_of_classes
+from cliploc_ros.offline.mapping.check.sizes import scale_by_sizes, size_of_class
 from cliploc_ros.offline.mapping.options import CheckOptions
 
 QUICK = CheckOptions(max_positions=4, headings=4)
@@ -52,7 +52,8 @@ def test_a_landmark_that_is_too_large_has_a_serious_fault(office):
     report = check_map(replace(office, semi_axes=semi_axes), options=QUICK)
     found, = (one for one in report.landmarks if one.landmark_id == office.landmark_ids[row])
     assert found.severity >= 1.0 and 'is 3.2 m long, and no chair' in found.faults[0]
-    assert 'unknown thing' not in sizes_of_classes()
+    assert size_of_class('unknown thing') is None
+    assert size_of_class('Chair') == size_of_class('chair') is not None
 
 
 def test_a_map_whose_objects_carry_nothing_is_keyframes_only(office):

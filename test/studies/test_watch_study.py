@@ -11,13 +11,9 @@ import pytest
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.offline.datasets.bag_frames import (
-    BagTopics,
-    bag_frames,
-    bag_odometry,
-    poses_of_topic,
-)
+from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
 from cliploc_ros.offline.datasets.bag_messages import pose_message, stamp_ns
+from cliploc_ros.offline.datasets.bag_poses import bag_odometry, poses_of_topic
 from cliploc_ros.offline.datasets.bags import BagReader, BagWriter
 from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum

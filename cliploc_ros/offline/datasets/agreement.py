@@ -135,13 +135,14 @@ def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]
     Empty where no epipolar geometry explains enough matches, as those of images without overlap.
     """
     errors = {}
-    ways = dict.fromkeys((one.camera, one.upright) for one in readings.values())
+    ways = dict.fromkeys((one.upright, one.camera) for one in readings.values())
     try:
-        kept = {way: _overlapping(pair, *way) for way in ways}
+        seen = {upright: _match(pair, upright) for upright, _ in ways}
+        kept = {way: _overlapping(*seen[way[0]], way[1]) for way in ways}
     except DatasetError:  # whoever reads the images says so
         return {}
     for name, reading in readings.items():
-        points, focal_px = kept[reading.camera, reading.upright]
+        points, focal_px = kept[reading.upright, reading.camera]
         first, second = (one.pose if one.pose_after is None or not reading.shift_ns
                          else one.pose_after(reading.shift_ns) for one in pair)
         if len(points[0]) and first is not None and second is not None:
@@ -150,21 +151,27 @@ def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]
     return errors
 
 
-def _overlapping(pair: tuple[View, View], change: Callable[[Camera], Camera], upright: bool
-                 ) -> tuple[NDArray[np.float64], float]:
+def _match(pair: tuple[View, View], upright: bool
+           ) -> tuple[list[Camera], list[NDArray[np.float64]]]:
+    """Return the cameras of two images, and the pixels (n, 2) of what matches in them."""
+    looks = [one.look(upright) for one in pair]
+    features = [extract(image, _FEATURES, _LONGEST_PX) for image, _ in looks]
+    ours, theirs = (unit_rows(one.descriptors) for one in features)
+    rows, _ = match(ours, theirs)
+    return ([camera for _, camera in looks],
+            [one.pixels[rows[:, side]] for side, one in enumerate(features)])
+
+
+def _overlapping(cameras: Sequence[Camera], pixels: Sequence[NDArray[np.float64]],
+                 change: Callable[[Camera], Camera]) -> tuple[NDArray[np.float64], float]:
     """Return points (2, n, 2) at z = 1 that both images show, and their focal length [px].
 
     They are those that an epipolar geometry explains, whatever the poses are; none where these are
     too few.
     """
-    looks = [one.look(upright) for one in pair]
-    features = [extract(image, _FEATURES, _LONGEST_PX) for image, _ in looks]
-    ours, theirs = (unit_rows(one.descriptors) for one in features)
-    rows, _ = match(ours, theirs)
-    points = np.array([change(camera).normalize_points(one.pixels[rows[:, side]])
-                       for side, ((_, camera), one) in enumerate(zip(looks, features,
-                                                                     strict=True))])
-    points, camera = points[:, np.isfinite(points).all(axis=(0, 2))], looks[0][1]
+    points = np.array([change(camera).normalize_points(one)
+                       for camera, one in zip(cameras, pixels, strict=True)])
+    points, camera = points[:, np.isfinite(points).all(axis=(0, 2))], cameras[0]
     focal_px = camera.fx * _LONGEST_PX / max(camera.width, camera.height)
     if points.shape[1] < _LEAST_MATCHES:
         return points[:, :0], focal_px

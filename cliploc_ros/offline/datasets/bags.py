@@ -198,6 +198,23 @@ class BagReader:
                 raise self._unreadable(error) from error
             yield BagMessage(connection.topic, stamp_ns, bytes(data))
 
+    def readable(self, topics: Collection[str]) -> Iterator[tuple[str, Any]]:
+        """Yield topic and message of topics; those that cannot be read are left out."""
+        for recorded in self.messages(topics):
+            try:
+                message = self.deserialize(recorded)
+            except DatasetError as error:
+                self.leave_out(recorded.topic, str(error).removeprefix(f'{self.path}: '))
+            else:
+                yield recorded.topic, message
+
+    def first(self, topic: str) -> Any:
+        """Return the first message of a topic that can be read; DatasetError: there is none."""
+        found = next(self.readable([topic]), None)
+        if found is None:
+            raise DatasetError(f'{self.path}: {topic} has no message that can be read')
+        return found[1]
+
     def leave_out(self, topic: str, reason: str) -> None:
         """Count a message that cannot be used; the same one again counts once.
 

@@ -6,9 +6,9 @@ Whatever a file holds, the error is a DatasetError that names the file and the l
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from decimal import Decimal, InvalidOperation
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from decimal import Decimal, InvalidOperation, Overflow
 from pathlib import Path
 from typing import Any, Self
 
@@ -90,7 +90,20 @@ def parse_all[T](cells: Sequence[str], kind: Callable[[str], T], where: str) -> 
     return numbers
 
 
-def parse_stamp_ns(text: str, where: str, unit_s: Decimal | None = Decimal(1)) -> int:
+def unit_of_stamps(texts: Iterable[str]) -> Decimal:
+    """Return the unit of the times of a file [s]: seconds where all can be, else ms, us or ns.
+
+    Texts that are no numbers are passed over.
+    """
+    greatest = 0.0
+    for text in texts:
+        with suppress(ValueError):
+            greatest = max(greatest, float(text))
+    powers = (power for power in (0, 3, 6, 9) if greatest * 10.0**-power <= MAX_STAMP_S)
+    return Decimal(10) ** -next(powers, 0)
+
+
+def parse_stamp_ns(text: str, where: str, unit_s: Decimal = Decimal(1)) -> int:
     """Convert a decimal time to nanoseconds exactly, without a float.
 
     DatasetError: the text is no number, or outside the range of a ROS time.
@@ -102,15 +115,14 @@ def parse_stamp_ns(text: str, where: str, unit_s: Decimal | None = Decimal(1)) -
     where : str
         File and line, for the message.
     unit_s : Decimal, optional
-        Seconds of a unit. None: seconds where they can be, else the greatest of ms, us and ns.
+        Seconds of a unit.
     """
     try:
-        number = Decimal(text)
+        seconds = Decimal(text) * unit_s
+    except Overflow:
+        seconds = Decimal('inf')
     except InvalidOperation:
         raise DatasetError(f'{where}: {text!r} is no timestamp in seconds') from None
-    units = [Decimal(10) ** -power for power in (0, 3, 6, 9)] if unit_s is None else [unit_s]
-    seconds = next((number * unit for unit in units
-                    if number.is_finite() and number * unit <= MAX_STAMP_S), number)
     if not seconds.is_finite() or not 0 <= seconds <= MAX_STAMP_S:
         raise DatasetError(f'{where}: timestamp {text} is outside 0 to {MAX_STAMP_S} s')
     return int((seconds * NS_PER_S).to_integral_value())

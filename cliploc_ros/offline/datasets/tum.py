@@ -73,9 +73,9 @@ def read_tum_trajectory(path: str | Path) -> TimedPoses:
 
     A first line that names the columns, as EuRoC's does, says another order and units: names that
     are not of a pose are ignored. Without names, a line may also have a stamp and a matrix of 3 or
-    4 rows. Stamps beyond any second are in ms, us or ns. Lines may have any order; of equal stamps
-    the first counts. ``#`` begins a comment. DatasetError: a line holds something else, or its
-    quaternion is far from unit norm; the message names file and line.
+    4 rows. Where a stamp is beyond any second, all of the file are in ms, us or ns. Lines may have
+    any order; of equal stamps the first counts. ``#`` begins a comment. DatasetError: a line holds
+    something else, or its quaternion is far from unit norm; the message names file and line.
     """
     path = Path(path)
     order, stamp_s, metres, header = _named_columns(path)
@@ -86,6 +86,10 @@ def read_tum_trajectory(path: str | Path) -> TimedPoses:
                            'each image before them')
     if order is None and widths == {7}:
         raise DatasetError(f'{path}: has poses without stamps: expected {_COLUMNS}')
+    if stamp_s is None:
+        column = 0 if order is None else order[0]
+        stamp_s = parsing.unit_of_stamps(cells[column] for _, cells in table
+                                         if len(cells) > column)
     matrix = order is None and widths <= {13, 17} and bool(widths)
     stamps_ns, rows = [], []
     for where, cells in table:

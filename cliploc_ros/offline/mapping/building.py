@@ -193,7 +193,7 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     builder.tell('done', 1.0)
     left_out = tuple(sorted(draft.left_out, key=lambda one: -one.support))
     moving = Counter(name for name in np.array(detections.class_names)[detections.classes].tolist()
-                     if name in options.moving_classes)
+                     if options.moves(name))
     if moving:
         notes.append(f'{moving.total()} boxes of {", ".join(sorted(moving))} are no landmarks: '
                      'they move')
@@ -260,7 +260,7 @@ class _Builder(NamedTuple):
         grows with the length of the recording only.
         """
         moving = [number for number, name in enumerate(self.detections.class_names)
-                  if name in self.options.moving_classes]
+                  if self.options.moves(name)]
         free = free & thin_out(views, _FRAMES_PER_VIEWPOINT)[views.frames]
         found = [Landmarks.none()]
         for first, last in _windows(views.stamps_s):

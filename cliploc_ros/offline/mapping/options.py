@@ -100,6 +100,10 @@ class MappingOptions:
     source: str = 'build_map'
     random_seed: int = 0  #: Equal seed and input give equal output
 
+    def moves(self, name: str) -> bool:
+        """Return whether objects of a class move; detectors write some of them with capitals."""
+        return name.lower() in map(str.lower, self.moving_classes)
+
 
 @dataclass(frozen=True)
 class CheckOptions:

@@ -81,7 +81,7 @@ def read_colmap(folder: Path, options: capture.FolderOptions) -> capture.Capture
             (models[0] / f'{part}.{end}').is_file() for end in ('bin', 'txt'))]
         missing = f'{lacking[0]}.bin' if lacking else 'cameras and images of one ending'
         raise DatasetError(f'{models[0]}: the COLMAP model lacks {missing}: export it again')
-    models = [one for one in whole if 'distorted' not in one.parts] or whole
+    models = [one for one in whole if not _is_distorted(one, folder)] or whole
     found = {model: list(_images(model)) for model in models}
     model = max(models, key=lambda one: len(found[one]))
     cameras, notes = dict(_cameras(model)), []
@@ -92,7 +92,7 @@ def read_colmap(folder: Path, options: capture.FolderOptions) -> capture.Capture
         notes.append(f'the model is in {len(models)} pieces: {model.name} with '
                      f'{len(found[model])} images is used, {rest} images of the others are not')
     first = found[model][0].name if found[model] else ''
-    beside = ('input', 'images') if 'distorted' in model.parts else ('images', 'input')
+    beside = ('input', 'images') if _is_distorted(model, folder) else ('images', 'input')
     roots = [options.images] if options.images else [
         *(above / name for above in (folder, *model.resolve().parents[:3]) for name in beside),
         folder]
@@ -131,6 +131,11 @@ def models_of(folder: Path) -> list[Path]:
     places += sorted(sparse.iterdir()) if sparse.is_dir() else []
     return [place for place in dict.fromkeys(places) if any(
         (place / f'{part}.{end}').is_file() for part in _PARTS for end in ('bin', 'txt'))]
+
+
+def _is_distorted(model: Path, folder: Path) -> bool:
+    """Return whether a model is of the images as they were taken, in a project of splatting."""
+    return 'distorted' in model.relative_to(folder).parts
 
 
 def _has(model: Path, end: str) -> bool:

@@ -261,6 +261,8 @@ def read_nerf(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     # depth is in the unit of the poses, which no field tells: in metres, or as COLMAP chose it
     unit = next((meta.number(name) for name in ('depth_unit_scale_factor', 'integer_depth_scale')
                  if name in meta), None)
+    if unit is not None and unit <= 0.0:
+        raise DatasetError(f'{path}: the unit of depth is {unit:g}, not above 0')
     return capture.Capture.of(files, path, 'opengl', DepthFormat(unit, scale=1.0 / scale),
                               is_metric=False)
 
@@ -277,7 +279,7 @@ def _file_of(folder: Path, name: str, images: Path | None) -> Path:
     if images is not None:
         paths = [images / within, images / alone]
     # the original NeRF leaves the ending of an image away
-    endings = [path.with_name(path.name + end) for path in paths for end in ('', *_ENDINGS)]
+    endings = [Path(f'{path}{end}') for path in paths for end in ('', *_ENDINGS)]
     return next(filter(None, map(capture.beside, endings)), paths[0])
 
 
@@ -298,14 +300,13 @@ def _camera(values: parsing.Fields, image: Path) -> Camera:
         fx = 0.5 * width / math.tan(0.5 * values.number('camera_angle_x') or math.nan)
     else:
         raise DatasetError(f'{where}: has no intrinsics: neither fl_x nor camera_angle_x')
-    for name, side, focal_px in (('camera_angle_x', width, fx), (
-            'camera_angle_y', height, values.number('fl_y', fx))):
-        by_angle = 0.5 * side / math.tan(0.5 * values.number(name, 0.0)) if values.values.get(
-            name) else focal_px
-        if not 1.0 / _SAME_FOCAL < by_angle / focal_px < _SAME_FOCAL:
+    fy = values.number('fl_y', fx) if math.isfinite(fx) else fx
+    for name, side, focal_px in (('camera_angle_x', width, fx), ('camera_angle_y', height, fy)):
+        angle = values.number(name, 0.0)
+        by_angle = 0.5 * side / math.tan(0.5 * angle) if angle else focal_px
+        if focal_px > 0.0 and not 1.0 / _SAME_FOCAL < by_angle / focal_px < _SAME_FOCAL:
             raise DatasetError(f'{where}: says two focal lengths: {focal_px:.5g} px, and '
                                f'{by_angle:.5g} px by {name}: correct or remove the wrong one')
-    fy = values.number('fl_y', fx)
     cx, cy = values.number('cx', 0.5 * width) - 0.5, values.number('cy', 0.5 * height) - 0.5
     k1, k2, k3, k4, p1, p2 = (values.number(name, 0.0)
                               for name in ('k1', 'k2', 'k3', 'k4', 'p1', 'p2'))

@@ -50,11 +50,12 @@ def place_images(files: Sequence[ImageFile], axes: str, scale: float = 1.0,
     DatasetError
         A pose is too far from the origin; names its image.
     """
-    for one in files:
+    placed = tuple(one if one.pose is None else one._replace(pose=move_poses(
+        np.array(AXES[axes](one.pose))[None], scale, map_from_stored)[0]) for one in files)
+    for one in placed:
         if one.pose is not None and (far := np.abs(one.pose[:3, 3]).max()) > _MOST_M:
             raise DatasetError(f'pose of {one.color} is {far:.3g} m from the origin')
-    return tuple(one if one.pose is None else one._replace(pose=move_poses(
-        np.array(AXES[axes](one.pose))[None], scale, map_from_stored)[0]) for one in files)
+    return placed
 
 
 def find_scale(files: Sequence[ImageFile], first: str, second: str, metres: float, where: object

@@ -14,7 +14,7 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import misspelt_classes
 from cliploc_ros.offline.mapping.association import associate
-from cliploc_ros.offline.mapping.check.sizes import sizes_of_classes
+from cliploc_ros.offline.mapping.check.sizes import size_of_class
 from cliploc_ros.offline.mapping.doubles import close_pairs, find_doubles
 from cliploc_ros.offline.mapping.evidence import (
     MAX_SIGMA_SHARE,
@@ -25,7 +25,7 @@ from cliploc_ros.offline.mapping.evidence import (
 )
 from cliploc_ros.offline.mapping.fitting import fit_landmarks
 from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of, landmarks_of_map
-from cliploc_ros.offline.mapping.options import MOVING_CLASSES, MappingOptions
+from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.views import Views
 from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
 
@@ -149,14 +149,14 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
                           if witness is None else
                           (1.6, f"has the class '{classes[row]}', which the detector does not "
                                 f'have{hint}: correct its class_id'))
-        if classes[row] in MOVING_CLASSES:
+        if MappingOptions().moves(classes[row]):
             faults.append((1.3, f'is a {classes[row]}, which moves: delete it'))
         if not faults:
             faults += _support_faults(check, float(np.linalg.norm(semi_axes)))
         faults += [(0.4, f'lies in {ids[other]} of class {classes[other]}: one object under two '
                          'classes, or one on the other; keep one if it is one object')
                    for other, one in others if witness is None and not one.is_duplicate]
-        size, extent_m = sizes_of_classes().get(classes[row]), 2.0 * float(semi_axes.max())
+        size, extent_m = size_of_class(classes[row]), 2.0 * float(semi_axes.max())
         if size is not None and extent_m > size.most_m:
             faults.append((1.2, f'is {extent_m:.2g} m long, and no {classes[row]} is longer than '
                                 f'about {size.most_m:.2g} m: record it from more sides, or '

@@ -29,9 +29,14 @@ class Size(NamedTuple):
         return self.extent_m * self.factor
 
 
+def size_of_class(name: str) -> Size | None:
+    """Return the size of objects of a class, which may have capitals; None: it has no size."""
+    return _sizes().get(name.lower())
+
+
 @cache
-def sizes_of_classes() -> dict[str, Size]:
-    """Return the sizes of classes that have one; sizes.yaml has them."""
+def _sizes() -> dict[str, Size]:
+    """Return the sizes of sizes.yaml by their classes."""
     text = (files('cliploc_ros.offline.vocabulary') / 'sizes.yaml').read_text(encoding='utf-8')
     return {name: Size(*values) for name, values in yaml.safe_load(text).items()}
 
@@ -43,12 +48,13 @@ def scale_by_sizes(landmark_map: LandmarkMap) -> float | None:
     one side are longer towards the camera than their objects, and do not count. None: too few
     tell, or they fit.
     """
-    sizes, ratios = sizes_of_classes(), dict[str, list[float]]()
+    ratios: dict[str, list[float]] = {}
     sides = [one.baseline_deg for one in landmark_map.details] or [None] * len(landmark_map)
     for name, semi_axes, seen_deg in zip(landmark_map.class_ids, landmark_map.semi_axes, sides,
                                          strict=True):
-        if name in sizes and (seen_deg is None or seen_deg >= MappingOptions.min_baseline_deg):
-            ratios.setdefault(name, []).append(2.0 * semi_axes.max() / sizes[name].extent_m)
+        size = size_of_class(name)
+        if size is not None and (seen_deg is None or seen_deg >= MappingOptions.min_baseline_deg):
+            ratios.setdefault(name, []).append(2.0 * semi_axes.max() / size.extent_m)
     if len(ratios) < _LEAST_CLASSES:
         return None
     scale = float(np.median([np.median(of_class) for of_class in ratios.values()]))
