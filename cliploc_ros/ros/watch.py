@@ -372,7 +372,7 @@ class LocalizerPose:
     def forget(self) -> None:
         """Forget what was heard: time jumped, or the node is inactive."""
         self._shown: PoseWithCovarianceStamped | None = None
-        self._shown_by: bytes | None = None  # what identifies the publisher; None: unknown
+        self._shown_by: bytes | None = None  # what identifies the publisher; None: until a look
         self._anchor: _Anchor | None = None
 
     def hear(self, shown: PoseWithCovarianceStamped) -> None:
@@ -424,7 +424,9 @@ class LocalizerPose:
             names = ', '.join(sorted(one.node_name for one in publishers))
             raise NoLocalizerPoseError(f'{len(publishers)} publishers of {topic} ({names}): stop '
                                        'all but one')
-        if self._shown_by not in (None, bytes(publishers[0].endpoint_gid)):
+        publisher = bytes(publishers[0].endpoint_gid)
+        self._shown_by = self._shown_by or publisher
+        if self._shown_by != publisher:
             self.forget()  # another process showed it; this one has no pose until it shows one
         shown = self._shown
         if shown is None:

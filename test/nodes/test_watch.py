@@ -144,6 +144,7 @@ def test_a_localizer_that_started_again_without_a_pose_is_woken_up(watch, tester
     watched = watch(on_lost='relocalize')
     watched.until_state('localized')
     watched.robot.speed_m_s, watched.robot.has_localizer = 0.0, False
+    watched.looks(1)  # a process takes its time to start: what the one before showed is heard
     tester.localizer.start_again()
     watched.until(lambda: tester.poses, 'a request')
     watched.until_state('localized')
