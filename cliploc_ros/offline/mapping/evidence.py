@@ -82,7 +82,8 @@ class Evidence(NamedTuple):
 
 def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> Evidence:
     """Return the evidence for each landmark from the boxes that show it."""
-    cameras = views.centers
+    # what the size of its class does to a landmark that contradicts it makes it no more certain
+    cameras, sizeless = views.centers, views.without_sizes
     columns: list[tuple[float, ...]] = []
     for center, basis, rows in zip(landmarks.centers, landmarks.bases,
                                    group_boxes(shown, len(landmarks.centers)), strict=True):
@@ -93,7 +94,7 @@ def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
         offsets = center - cameras[frames]
         distances = np.linalg.norm(offsets, axis=1)
         information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
-        accumulate(views, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
+        accumulate(sizeless, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
         try:
             variance = np.linalg.eigvalsh(np.linalg.inv(information)[:3, :3])[-1]
         except np.linalg.LinAlgError:  # boxes that the image cuts on all sides leave it open

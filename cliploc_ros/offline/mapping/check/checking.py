@@ -41,10 +41,10 @@ from cliploc_ros.offline.mapping.check.report import (
     check_keyframes,
     find_measures,
 )
-from cliploc_ros.offline.mapping.check.sizes import scale_by_sizes
 from cliploc_ros.offline.mapping.evidence import BoxQuality, best_ious, explained_boxes
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.sizes import scale_by_sizes
 from cliploc_ros.offline.mapping.systematic import find_corrections
 from cliploc_ros.offline.mapping.tilt import tilt_note
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views

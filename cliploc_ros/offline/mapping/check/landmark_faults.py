@@ -14,7 +14,6 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import misspelt_classes
 from cliploc_ros.offline.mapping.association import associate
-from cliploc_ros.offline.mapping.check.sizes import size_of_class
 from cliploc_ros.offline.mapping.doubles import close_pairs, find_doubles
 from cliploc_ros.offline.mapping.evidence import (
     MAX_SIGMA_SHARE,
@@ -26,6 +25,7 @@ from cliploc_ros.offline.mapping.evidence import (
 from cliploc_ros.offline.mapping.fitting import fit_landmarks
 from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of, landmarks_of_map
 from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.sizes import size_of_class
 from cliploc_ros.offline.mapping.views import Views
 from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
 
