@@ -209,7 +209,7 @@ def _decoded(image_png: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
 
 
 def _numbers(value: Any, *shape: int | None, nan: bool = False) -> NDArray[np.float64]:
-    """Return numbers of a shape; None for any length. ValueError, TypeError: they are no such."""
+    """Return numbers of a shape, None for any length. ValueError, TypeError: they differ."""
     found = np.array(value, dtype=np.float64)
     if None not in shape:
         _expect(found.shape == shape, 'the shape of numbers')

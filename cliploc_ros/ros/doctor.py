@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check all that a request needs, one after another: what works, what fails, and what to do.
 
-It listens to what the relocalizer listens to, and localizes once. It hands no pose over.
+It subscribes to the relocalizer's inputs and localizes once. It delivers no pose.
 """
 
 import math

@@ -112,7 +112,7 @@ class ClassIndex:
 
     def have(self, landmarks: NDArray[np.int64], classes: NDArray[np.int64]
              ) -> NDArray[np.bool_]:
-        """Return whether landmarks (p,) are members of classes (p,); below 0 is no class."""
+        """Return whether landmarks (p,) are members of classes (p,); no class below 0."""
         # a class below 0 gets a key below 0, which no member has
         keys = np.where(classes < 0, -1, landmarks * (len(self.starts) - 1) + classes)
         return np.asarray((self.of_landmarks[landmarks] == classes)

@@ -76,7 +76,7 @@ def look_at(landmark_map: LandmarkMap, observation: Observation, options: Reloca
             ) -> JoinedFrames:
     """Return an observation as a frame that poses are compared on.
 
-    Its vertical comes by the stated mount, which may be wrong, so it must not bend the fit.
+    Its vertical depends on the given mount, which may be wrong, so it must not bias the fit.
     """
     if observation.similarities is None:
         options = replace(options, matching='class')

@@ -66,7 +66,7 @@ def typestore() -> Typestore:
 
 
 def deserialize(data: bytes, msgtype: str, where: str) -> Any:
-    """Return a message of its bytes; DatasetError: they are no such message."""
+    """Return a message of its bytes. DatasetError: they are not such a message."""
     try:
         return typestore().deserialize_cdr(data, msgtype)
     except Exception as error:  # the library raises what the bytes happen to cause

@@ -363,7 +363,7 @@ def _windows(stamps_s: NDArray[np.float64]) -> list[tuple[int, int]]:
 
 def _keep(landmarks: Landmarks, into: NDArray[np.int64], shown: NDArray[np.int64]
           ) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Return the landmarks that are no part of another, and the landmark of each box."""
+    """Return the landmarks that are not part of another, and the landmark of each box."""
     is_kept = into == np.arange(len(into))
     numbers = np.append((np.cumsum(is_kept) - 1)[into], -1)
     return landmarks.select(is_kept), numbers[shown]

@@ -126,7 +126,7 @@ def observation_file(frames: Frames, options: RecordingOptions) -> Path:
 
 
 def source_of(observations: Path) -> Path | None:
-    """Return the source that an observation file lies beside, see observation_file; else None."""
+    """Return the source beside an observation file, see observation_file; None without one."""
     name, _, rest = observations.name.partition(_BESIDE)
     source = observations.with_name(name or observations.name)
     return source if rest and source.exists() else None

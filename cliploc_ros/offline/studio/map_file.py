@@ -286,9 +286,9 @@ class LookFile(NamedTuple):
     def write(self, landmarks: Landmarks) -> tuple['LookFile', str]:
         """Write the looks of all landmarks of the map in one step.
 
-        Those of another encoder are left out. Nothing is written where nothing changed, and
-        nothing over the content of another program. Return the file as it is then, and why it
-        does not hold these looks, '' if it does. MapError: it cannot be written.
+        Looks of another encoder are left out. An unchanged file is not written, and the content
+        of another program is not overwritten. Return the file after that, and the reason if it
+        does not hold these looks, otherwise ''. MapError: it cannot be written.
         """
         known = {key: one.look for key, one in landmarks.items()
                  if one.look is not None and one.look.encoder_key == self.encoder_key}

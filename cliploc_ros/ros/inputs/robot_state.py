@@ -95,13 +95,13 @@ def sample_from_msg(msg: Imu) -> Sample | None:
 
 
 class VerticalSource(qos.Listener):
-    """Knows the vertical in the camera's coordinate frame.
+    """The vertical in the camera's coordinate frame.
 
-    An IMU's orientation counts more than its acceleration: its filter knows how the robot moves.
-    But many drivers leave the orientation at its default, or fill it wrongly. It has to agree
-    with the acceleration at rest, where the IMU measures both.
+    An IMU's orientation is preferred to its acceleration, because its filter removes the robot's
+    motion. But many drivers leave the orientation at its default or fill it wrongly. It has to
+    agree with the acceleration at rest, where the IMU measures both.
 
-    `transforms` knows how the camera and the IMU are mounted.
+    `transforms` has the mounts of the camera and the IMU.
     """
 
     def __init__(self, node: Node, transforms: CoordinateFrames) -> None:
@@ -294,7 +294,7 @@ class RobotStateSource:
         self.odometry.forget()
 
     def examine(self, health: Health) -> None:
-        """Report stamps of odometry and of the IMU that are no time."""
+        """Report invalid stamps of odometry and of the IMU."""
         for problem in (self.odometry.problem, self.vertical.problem):
             if problem:
                 health.warn(problem)

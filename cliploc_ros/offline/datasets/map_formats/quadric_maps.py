@@ -38,7 +38,7 @@ _MAX_VARINT_BYTES = 10
 
 
 class QuadricError(Exception):
-    """Why a dual quadric is no ellipsoid."""
+    """Why a dual quadric is not an ellipsoid."""
 
 
 class WireError(Exception):
@@ -128,7 +128,7 @@ def _read_saved_map(path: Path, class_names: Sequence[str]) -> given_map.GivenMa
 
 def _add(given: given_map.GivenMap, name: str, number: int, quadric: list[float],
          details: LandmarkDetails = _NO_DETAILS, shown: str = '') -> None:
-    """Append an object to the content of a file; one that is no ellipsoid is left out."""
+    """Append an object to the content of a file, unless it is not an ellipsoid."""
     landmark_id = given_map.make_id(name, number)
     try:
         ellipsoid = decompose(quadric)

@@ -195,7 +195,7 @@ def _misled(report: CheckReport) -> list[Trial]:
 
 
 def _takes_for(trial: Trial, pair: LookAlike) -> bool:
-    """Return whether a wrong pose takes one of two places that look alike for the other."""
+    """Return whether a wrong pose confuses two places that look alike."""
     if trial.estimate is None:
         return False
     for here, there, turn_deg in ((pair.first, pair.second, pair.turn_deg),
