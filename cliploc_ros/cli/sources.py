@@ -62,7 +62,7 @@ def metres_of(text: str, option: str) -> float:
     try:
         return positive(text)
     except (ValueError, argparse.ArgumentTypeError):
-        raise OptionsError(f'{option}: {text} is no length above 0 m') from None
+        raise OptionsError(f'{option}: {text} is not a length above 0 m') from None
 
 
 def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
@@ -182,7 +182,7 @@ def read_cameras(options: argparse.Namespace, gap_s: float | None = None) -> dic
 def camera_names(options: argparse.Namespace) -> list[str]:
     """Return the names of the cameras of a bag; [''] for one without a name.
 
-    OptionsError: a name is given twice, or the source is no bag.
+    OptionsError: a name is given twice, or the source is not a bag.
     """
     names: list[str] = options.cameras
     if len(set(names)) < len(names):

@@ -202,7 +202,7 @@ class Schema:
                     if file.read(6) == b'\x93NUMPY':
                         raise ArrayError('is a single array, not an npz file of named arrays'
                                          ) from error
-                raise ArrayError(f'is no complete npz file ({error})') from error
+                raise ArrayError(f'is not a complete npz file ({error})') from error
             with archive:
                 try:
                     for member in archive.infolist():

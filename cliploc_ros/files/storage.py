@@ -65,7 +65,7 @@ def read_file(path: str | os.PathLike[str], most_bytes: int = MOST_BYTES) -> byt
 def parse_json(text: str | bytes, **options: Any) -> Any:
     """Return the value of a JSON text, see json.loads.
 
-    ValueError: it is no JSON, or nested so deeply, so long, or with such numbers that no file of
+    ValueError: it is not JSON, or nested so deeply, so long, or with such numbers that no file of
     this package or of the programs that it reads is.
     """
     marks = (b',', b'[', b'{') if isinstance(text, bytes) else (',', '[', '{')

@@ -73,7 +73,7 @@ class CommonParameters(Parameters):
             raise OptionsError(f'cameras: {len(names)} are more than {MAX_FRAMES}')
         for name in names:
             if not re.fullmatch('[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*', name):
-                raise OptionsError(f"cameras: '{name}' is no namespace of topics")
+                raise OptionsError(f"cameras: '{name}' is not a namespace of topics")
 
 
 @dataclass(frozen=True)

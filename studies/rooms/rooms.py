@@ -54,7 +54,7 @@ _VERTICAL_DEG = 1.0
 _USUAL_VIEW_DEG = 65.0
 # What the robot's camera shows of an image, and the width of its own.
 _ROBOT_SHARE, _ROBOT_PX = 0.8, 424
-# Parts with fewer images are no map, or no question.
+# Parts with fewer images are not a map, or no question.
 _LEAST_IMAGES = 15
 
 
@@ -202,7 +202,7 @@ def open_folder(where: str) -> tuple[Path, Frames, bool]:
     try:
         unit = positive(text) if text else None
     except (ValueError, ArgumentTypeError):
-        raise OptionsError(f'{where}: {text!r} is no unit of depth in metres') from None
+        raise OptionsError(f'{where}: {text!r} is not a unit of depth in metres') from None
     if find_layout(folder) is None and (folder / 'images').is_dir():
         return folder, _without_poses(folder / 'images'), False
     is_tum = (folder / 'rgb.txt').exists()

@@ -246,7 +246,7 @@ def test_a_file_whose_names_have_no_ending_misses_its_arrays(path):
             archive.writestr(name, content)
     with pytest.raises(MapError, match='array encoder_key is missing'):
         load_landmark_embeddings(place)
-    with pytest.raises(MapError, match='no complete npz file'):
+    with pytest.raises(MapError, match='not a complete npz file'):
         load_landmark_embeddings('/proc/self/mem')
 
 

@@ -56,5 +56,5 @@ def test_an_image_that_is_cut_short_is_refused(tmp_path, suffix):
     data = (tmp_path / f'walls.{suffix}').read_bytes()
     for length in (0, 2, 5, len(data) - 5):
         (tmp_path / f'walls.{suffix}').write_bytes(data[:length])
-        with pytest.raises(MapError, match=r'no image, or damaged'):
+        with pytest.raises(MapError, match=r'not an image, or damaged'):
             read_walls(file)

@@ -117,7 +117,7 @@ class Evidence:
     #: That the place is there and no picture of it; None where keyframes do not propose it
     signs: Signs | None = None
     motion: Motion | None = None  #: Since an earlier look by keyframes
-    #: Probability that the image is no mirror image, see cliploc_ros.core.acceptance.comparison
+    #: Probability that the image is not a mirror image, see cliploc_ros.core.acceptance.comparison
     not_mirrored: float = 1.0
     #: Probability that keyframes are wrong which recognize another place only
     uncontradicted: float = 1.0

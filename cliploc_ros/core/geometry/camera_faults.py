@@ -135,7 +135,7 @@ def _doubts(rotation: NDArray[np.float64], projection: NDArray[np.float64], rect
     """Return what is unusual about R (3, 3) and P (3, 4); zeros stand for none."""
     if np.any(rotation):
         if not is_rigid(make_transform(rotation, np.zeros(3)), _ROTATION_TOLERANCE):
-            yield 'R is no rotation: set it to the identity'
+            yield 'R is not a rotation: set it to the identity'
         elif (turn_deg := rotation_angle_deg(rotation)) > _MOST_TURN_DEG and not rectified:
             yield (f'R turns rectified images by {turn_deg:.3g} degrees, and the coordinate frame '
                    'is theirs: use them, with rectified true')

@@ -162,7 +162,7 @@ def log_odds(evidence: LookEvidence, is_full: bool, calibration: Calibration = C
              ) -> float:
     """Return the log odds of a look by its objects that the given pose is right.
 
-    A place that the map does not show is no wrong pose, nor is a view without objects: a look that
+    Neither a place that the map lacks nor a view without objects makes the pose wrong: a look that
     is not full says little against a pose.
     """
     terms = calibration.watch

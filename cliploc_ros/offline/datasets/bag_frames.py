@@ -87,7 +87,7 @@ def topic_of(camera: str, topic: str) -> str:
 def find_topics(bag: Path, image: str | None, camera_info: str | None) -> tuple[str, str]:
     """Return the topics of image and camera_info; None is found where there is one candidate.
 
-    Depth and debug images are no candidates; raw images go before compressed ones of the same
+    Depth and debug images are not candidates; raw images go before compressed ones of the same
     camera. DatasetError: there is none, or there are several; names them and the parameter.
     """
     with BagReader(bag) as reader:

@@ -117,8 +117,8 @@ class BagReader:
             raise DatasetError(f'{self.path}: no such recording')
         if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
             raise DatasetError(
-                f'{self.path}: has no metadata.yaml; it is no rosbag2 recording, or an incomplete '
-                f'one that `ros2 bag reindex {self.path}` rebuilds'
+                f'{self.path}: has no metadata.yaml; it is not a rosbag2 recording, or an '
+                f'incomplete one that `ros2 bag reindex {self.path}` rebuilds'
             )
         try:
             reader = Reader(self.path)
@@ -218,7 +218,7 @@ class BagReader:
     def leave_out(self, topic: str, reason: str) -> None:
         """Count a message that cannot be used; the same one again counts once.
 
-        DatasetError: too many cannot, so that the fault is no accident.
+        DatasetError: too many cannot, so that the fault is not an accident.
         """
         reasons = self.left_out.setdefault(topic, {})
         reasons[reason] = None

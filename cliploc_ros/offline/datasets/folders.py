@@ -277,7 +277,7 @@ def _read_pose(path: Path) -> NDArray[np.float64] | None:
     if not np.isfinite(pose).all():
         return None
     if not transforms.is_rigid(pose, tolerance=1e-3):
-        raise DatasetError(f'{path}: is no rigid transform (rotation and translation [m])')
+        raise DatasetError(f'{path}: is not a rigid transform (rotation and translation [m])')
     return pose
 
 

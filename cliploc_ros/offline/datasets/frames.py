@@ -253,7 +253,7 @@ def read_depth(file: ImageFile, form: DepthFormat) -> DepthImage:
     if file.confidence is not None:
         certain = cv2.imread(str(file.confidence), cv2.IMREAD_UNCHANGED)
         if certain is None or certain.shape != depths_m.shape:
-            raise DatasetError(f'{file.confidence} is no image of the size of {file.depth}')
+            raise DatasetError(f'{file.confidence} is not an image of the size of {file.depth}')
         depths_m[certain == 0] = np.nan
     return DepthImage(depths_m, form.camera)
 

@@ -195,7 +195,7 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     moving = Counter(name for name in np.array(detections.class_names)[detections.classes].tolist()
                      if options.moves(name))
     if moving:
-        notes.append(f'{moving.total()} boxes of {", ".join(sorted(moving))} are no landmarks: '
+        notes.append(f'{moving.total()} boxes of {", ".join(sorted(moving))} are not landmarks: '
                      'they move')
     if len(draft.landmarks.centers) == 0:
         why = ('no boxes of one class meet in space; check that poses and stamps belong to these '

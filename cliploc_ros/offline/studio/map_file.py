@@ -137,7 +137,7 @@ class MapFile:
 def read_map_file(path: Path) -> MapFile:
     """Return a map file; an empty map where there is none.
 
-    MapError: it is no map, or a landmark is invalid. Unknown fields of landmarks are accepted.
+    MapError: it is not a map, or a landmark is invalid. Unknown fields of landmarks are accepted.
     """
     path = path.resolve()
     if not os.path.exists(path):  # noqa: PTH110 - never raises

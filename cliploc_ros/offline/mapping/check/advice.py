@@ -18,7 +18,7 @@ from cliploc_ros.offline.mapping.check.relocalization import Trial, refused_span
 from cliploc_ros.offline.mapping.check.report import SERIOUS, Advice, CheckReport, GridCheck
 
 _MOST_OF_A_KIND, _MOST_MISLED = 5, 3
-# A shorter run of refused frames is no side of a room.
+# A shorter run of refused frames is not a side of a room.
 _MIN_SPAN = 2
 # Cosine of the angle between views of one side: 45 degrees, a guess.
 _ONE_SIDE = 0.7

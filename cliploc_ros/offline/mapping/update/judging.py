@@ -182,7 +182,7 @@ def _probability_there(known: OldMap, sight: Sight) -> NDArray[np.float64]:
     certainty, rows = _PRIOR_VIEWS, seen & (sight.expected >= _FEW_VIEWS)
     if np.count_nonzero(rows) >= _FEW_LANDMARKS:
         shares, usual = sight.seen[rows] / sight.expected[rows], ratios[rows]
-        # the median, since objects that are gone are no scatter
+        # the median, since objects that are gone are not scatter
         scatter = np.median(np.square(shares - usual) / (usual * (1.0 - usual))) / _MEDIAN_SQUARE
         certainty = float(np.clip(1.0 / max(float(scatter), 1e-3) - 1.0, _LEAST_WORTH,
                                   _PRIOR_VIEWS))
