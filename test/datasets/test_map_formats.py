@@ -166,8 +166,9 @@ def test_what_no_map_can_hold_is_left_out_with_the_reason(tmp_path):
     assert imported.landmark_map.landmark_ids == ('cup_0',)
     reasons = dict(imported.left_out)
     for name, reason in {
-            'object 1': 'not an ellipsoid: squared semi-axes -0.04', 'object 2': 'not an ellipsoid',
-            'object 3': 'no finite centre', 'object 4': 'not finite',
+            'object 1': 'not an ellipsoid: squared semi-axes -0.04',
+            'object 2': 'not an ellipsoid', 'object 3': 'no finite centre',
+            'object 4': 'not finite',
             'object 5': 'has 9 numbers, not 16', 'object 6': '0 categories',
             'object 7': 'not symmetric', 'cup_8': 'semi-axes are 1 1 200 m',
             'cup_0': 'its id occurs before'}.items():
