@@ -3,26 +3,26 @@
 """Whether the boxes of a camera agree with its image, its camera_info, its mount and the map.
 
 A wrong camera_info, or boxes in other pixels, displace all boxes by one rule. One image hardly
-shows it: the pose gives way. Many images do, since poses differ and the rule does not. A look is
-what one frame says of the errors of its camera, whatever its pose, see
-cliploc_ros.core.fit.camera_fit: an information and a vector, which add up over looks. Looks from
-one view share the errors of their boxes, so they count as one, with their mean.
+shows it, because the pose adapts. Many images do, because their poses differ and the rule stays. A
+look is the evidence of one frame about the errors of its camera, with the pose eliminated, see
+cliploc_ros.core.fit.camera_fit: an information matrix and a vector, which add up over looks.
+Looks from one view share the errors of their boxes, so they count as one, with their mean.
 
 A camera is right, with the small errors of any calibration, or wrong in one of a few ways (kinds),
 with large errors. The Bayes factor of wrong against right is a mean of likelihood ratios. With a
 right camera it ever exceeds N with a probability of at most 1 / N, however often it is computed
-(Ville, "Etude critique de la notion de collectif", 1939). So of cameras that are right, one of
-1000 at most is called wrong at odds of 1000, if the looks of different views are independent. No
-single view counts more than e^3: its boxes may be matched by mistake.
+(Ville, "Etude critique de la notion de collectif", 1939). At odds of 1000, at most one right
+camera in 1000 is therefore called wrong, if the looks of different views are independent. No
+single view counts more than e^3, because its boxes may be matched by mistake.
 
-Until the odds are clear, a pose counts as far as it is right under each kind. A pose of a few far
-objects needs a camera that looks have verified; one of many objects at different distances does
-not.
+Until the odds are clear, the confidence of a pose is weighted by the probability that it is right
+under each kind. A pose from a few far objects needs a camera that looks have verified; a pose from
+many objects at different distances does not.
 
 A detector's boxes end at the border of the image that it sees. Where many end at one line inside
 of the image, and none beyond, they are in the pixels of another image. This counts as evidence for
-some kinds of errors, at most as e^8: a border within the image itself, such as black bars, looks
-alike, and the looks then say so.
+some kinds of errors, at most as e^8, because a border within the image itself, such as black bars,
+looks the same; then the looks decide.
 """
 
 import math

@@ -169,8 +169,8 @@ def objects_of(centers: NDArray[np.float64], shapes: NDArray[np.float64],
                neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the number of each landmark's object (L,): duplicates share one.
 
-    Landmarks of one class are duplicates if they stand in one another. So books side by side are
-    none.
+    Landmarks of one class are duplicates if they stand in one another. Books side by side are not
+    duplicates.
 
     Parameters
     ----------

@@ -116,7 +116,7 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
                depth: DepthFormat | None = None) -> Frames:
     """Return the frames of a recording, a rosbag2 folder or file.
 
-    DatasetError: a topic is missing, of another type, or empty, or the poses are of another time.
+    DatasetError: a topic is missing, empty or of another type, or no pose is near the images.
     """
     if topics.depth == topics.image:
         raise DatasetError(f'{bag}: {topics.image} cannot be both the image and its depth')

@@ -259,7 +259,7 @@ def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
 
 
 def _least_extents(views: Views, last_class: int) -> NDArray[np.float64]:
-    """Return from which size on boxes are detected, by class, on the plane z = 1.
+    """Return the least size of detected boxes, by class, on the plane z = 1.
 
     The last entry is that of all classes together.
     """

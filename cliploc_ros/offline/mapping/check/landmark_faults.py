@@ -78,7 +78,7 @@ class LandmarkCheck:
 
 
 class Witness(NamedTuple):
-    """What a recording says of a map."""
+    """The evidence of a recording about a map."""
 
     class_names: tuple[str, ...]  #: Of the recording
     landmarks: Landmarks  #: Of the map, with the recording's classes

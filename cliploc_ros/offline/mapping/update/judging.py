@@ -258,7 +258,7 @@ def _without_copies(views: Views, finds: Finds, old: Landmarks, known: OldMap,
                     shown: NDArray[np.int64], sight: Sight, majority: float) -> Finds:
     """Return the new landmarks without those that are an old one in its place.
 
-    An old landmark is in its place if it has a box, and a majority for each of the new one's. Of
+    An old landmark is in its place if it has a box, and a majority for each box of the new. Of
     two landmarks that lie in one another, the boxes are those of one object: parts of it, or
     another name for it. If they only touch, frames that show both tell them apart.
     """
