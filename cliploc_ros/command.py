@@ -80,7 +80,7 @@ def run_command(command: Callable[[], int], failure: int = 1) -> int:
 
 
 def _extra_with(package: str) -> str:
-    """Return what brings a package: an extra of this one, in its installed metadata."""
+    """Return the extra of this package that installs another, from the installed metadata."""
     try:
         requirements = metadata.requires('cliploc_ros') or []
     except metadata.PackageNotFoundError:  # it runs from its sources

@@ -224,7 +224,7 @@ def camera_from_msg(msg: CameraInfoMessage, image_size: tuple[int, int], rectifi
 
 def faults_of_camera_info(msg: CameraInfoMessage, camera: Camera, rectified: bool
                           ) -> list[Fault]:
-    """Return what contradicts itself in a message, or is implausible; the certain faults first.
+    """Return contradictory or implausible fields of a message; the certain faults first.
 
     `camera` is the camera of the image that camera_from_msg makes of the message.
     """

@@ -159,7 +159,7 @@ def cost_table(requests: list[Request]) -> str:
 
 
 def carrying(cache_dir: Path, used: list[CommonParameters]) -> list[str]:
-    """Return what to do with a folder to carry, in lines."""
+    """Return instructions for a folder to carry, in lines."""
     size = sum(file.stat().st_size for file in cache_dir.rglob('*') if file.is_file()
                and not file.is_symlink())
     lines = [f'carry {cache_dir} ({size / 1e6:.0f} MB) to the robot, and set cache_dir to its '

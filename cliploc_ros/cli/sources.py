@@ -128,7 +128,7 @@ def recording_options(options: argparse.Namespace, keyframes: recorder.KeyframeO
 
 def recording_of(options: argparse.Namespace, file: Path, scale: float,
                  rotation: NDArray[np.float64]) -> MapRecording:
-    """Return what a map is built from; its poses are those of a file, scaled and turned."""
+    """Return the input of a map; its poses are those of a file, scaled and turned."""
     folder = folder_of(options)
     source, layout = folder or (options.bag, '')
     if options.bag is not None:
@@ -222,7 +222,7 @@ def _frames_of(options: argparse.Namespace, name: str, mount: NDArray[np.float64
 
 def _poses_of_topic(options: argparse.Namespace, topic: str, camera: str,
                     mount: NDArray[np.float64] | None, gap_ns: int) -> bag_poses.ReadPoses:
-    """Return what reads a topic, which without a mount is the camera's own, in its namespace."""
+    """Return a reader of a topic, which without a mount is the camera's own, in its namespace."""
     return bag_poses.poses_of_topic(
         topic if mount is not None else bag_frames.topic_of(camera, topic), gap_ns, mount,
         round(options.stamp_tolerance * NS_PER_S), options.tf)
@@ -230,7 +230,7 @@ def _poses_of_topic(options: argparse.Namespace, topic: str, camera: str,
 
 def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.float64] | None,
                 gap_ns: int) -> bag_poses.ReadPoses:
-    """Return what reads the poses of a camera of a bag; the gap [ns] is that of a topic."""
+    """Return a reader of the poses of a camera of a bag; the gap [ns] is that of a topic."""
     given = [name for name in ('pose_topic', 'map_frame', 'trajectory')
              if getattr(options, name) is not None]
     max_gap_ns = round(options.max_gap * NS_PER_S)

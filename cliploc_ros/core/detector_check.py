@@ -71,7 +71,7 @@ class DetectorCheck:
 
     @property
     def faults(self) -> list[Fault]:
-        """Return what is wrong with the detections of the last frames."""
+        """Return the faults of the detections of the last frames."""
         pooled = self._pooled
         found = self._certain(pooled) if pooled.given >= _LEAST else []
         if pooled.odd_score is not None:

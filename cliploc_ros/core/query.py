@@ -135,7 +135,7 @@ def _parts(arrays: Arrays, name: str) -> Iterator[NDArray[Any]]:
 
 
 def _fields_of(query: Query) -> dict[str, Any]:
-    """Return what JSON keeps of a query."""
+    """Return the fields of a query for JSON."""
     return {
         **{name: getattr(query, name) for name in
            ('run', 'limit', 'length_s', 'by_keyframes', 'is_thorough', 'rooms')},

@@ -84,7 +84,7 @@ class Labeller:
 
 def find_labeller(detections: PosedDetections, clip: Callable[[], ClipOptions] | None,
                   vocabulary: Path | None = None) -> Labeller:
-    """Return what labels the landmarks of a recording.
+    """Return the labeller of the landmarks of a recording.
 
     Parameters
     ----------

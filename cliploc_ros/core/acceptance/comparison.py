@@ -124,7 +124,7 @@ class Comparison:
 
     @property
     def source(self) -> str:
-        """Return what proposes the leading place: 'objects', 'keyframes' or 'both'."""
+        """Return the source of the leading place: 'objects', 'keyframes' or 'both'."""
         if self.by_objects is None:
             return 'keyframes'
         return 'objects' if self.place is None else 'both'

@@ -268,7 +268,7 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
 
 
 def _points(evidence: Evidence) -> str:
-    """Return what keyframes show at the pose, as a part of a sentence; empty without any."""
+    """Return the keyframes' evidence at the pose, as part of a sentence; empty without any."""
     if evidence.recognized is None:
         return ''
     return (f', {evidence.recognized.inliers} points of keyframes agree in '

@@ -73,7 +73,7 @@ class KernelFolders:
         self._preferred = folder
 
     def read(self, name: str) -> bytes | None:
-        """Return what is stored under a name, or None."""
+        """Return the content stored under a name, or None."""
         for number, folder in enumerate(self._all()):
             content = _read(folder / name)
             if content is not None:
@@ -201,7 +201,7 @@ def _read_source(module: str) -> tuple[bytes, list[str]]:
 
 
 def _describe(kind: Type) -> object:
-    """Return what identifies a type of argument; the fields of a named tuple are part of it."""
+    """Return the identity of an argument's type; it includes the fields of a named tuple."""
     if isinstance(kind, BaseTuple):
         named = getattr(kind, 'instance_class', None)
         identity = named and (named.__module__, named.__qualname__, named._fields)

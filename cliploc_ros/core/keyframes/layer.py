@@ -257,7 +257,7 @@ def load_layer_of_map(path: Path, landmark_map: LandmarkMap, kinds: FeatureKinds
 
 
 def layer_hash(path: Path) -> str:
-    """Return what tells one layer from another: of the names, sizes and checksums of its arrays.
+    """Return a digest of a layer, by the names, sizes and checksums of its arrays.
 
     It reads the table of contents only: a layer may be larger than the memory.
     """

@@ -63,7 +63,7 @@ def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
 
 
 def set_digest(landmark_map: LandmarkMap) -> str:
-    """Return what tells a map and the files that are written with it from other ones.
+    """Return the identity of a map and of the files that are written with it.
 
     Maps of keyframes alone say the same: they get a random one.
     """

@@ -350,7 +350,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
 
 
 def constraint_of(observation: Observation, options: RelocalizerOptions) -> Constraint:
-    """Return what is known of the camera of a frame before anything is searched."""
+    """Return the constraints on the camera of a frame that hold before the search."""
     vertical, (low, high) = vertical_of(observation, options), options.height_range_m
     known = vertical[6] > 0.0
     return Constraint(tuple(vertical[:3]) if known else _UPRIGHT, _UP_IN_MAP, low, high,

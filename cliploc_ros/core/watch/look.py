@@ -139,7 +139,7 @@ class LookEvidence(NamedTuple):
 
 
 def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
-    """Return what an aligned look says, and the landmarks that it expects."""
+    """Return the evidence of an aligned look, and the landmarks that it expects."""
     joined, fit = alignment.joined, alignment.fit
     landmark_map, observation = joined.landmark_map, joined.frames[0].observation
     index, (matches,) = landmark_map.classes, fit.matches

@@ -191,7 +191,7 @@ class _Cameras(NamedTuple):
 
     def decoder(self, stamp_ns: int, recorded_ns: int, data: bytes
                 ) -> Callable[[], tuple[NDArray[np.uint8], Camera]]:
-        """Return what decodes an image, with the camera_info nearest in time."""
+        """Return a decoder of an image, with the camera_info nearest in time."""
         info: bytes | Camera
         if self.given is not None:
             info = self.given
@@ -299,7 +299,7 @@ def _readings(cameras: _Cameras, rectified: bool) -> dict[str, Reading]:
 
 
 def _notes(reader: BagReader, topics: BagTopics) -> list[str]:
-    """Return what is unusual about the camera of a recording, by its first messages.
+    """Return unusual properties of the camera of a recording, by its first messages.
 
     DatasetError: its images are certainly rectified, and read as raw.
     """

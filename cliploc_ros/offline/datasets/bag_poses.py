@@ -48,7 +48,7 @@ _COMPARED, _SAME_M, _SAME_DEG = 50, 0.05, 2.0
 def poses_of_topic(name: str, max_gap_ns: int = 0,
                    body_from_camera: NDArray[np.float64] | None = None,
                    tolerance_ns: int = STAMP_TOLERANCE_NS, tf: str | None = None) -> ReadPoses:
-    """Return what reads a topic of PoseStamped, PoseWithCovarianceStamped or Odometry.
+    """Return a reader of a topic of PoseStamped, PoseWithCovarianceStamped or Odometry.
 
     Its parameters are those of TimedPoses. Without a mount, poses of a child_frame_id other than
     the images' are led on to the camera by tf. DatasetError, when it reads: the topic is missing,
@@ -196,7 +196,7 @@ class ChainedPoses:
 
 def poses_of_tf(map_frame: str, camera_frame: str | None, max_gap_ns: int,
                 tf: str | None = None) -> ReadPoses:
-    """Return what reads how a camera moved in a map, from /tf and /tf_static.
+    """Return a reader of a camera's poses in a map, from /tf and /tf_static.
 
     DatasetError, when it reads: the recording has no tf, or nothing connects the two frames.
 

@@ -227,7 +227,7 @@ class BagReader:
                                f'{next(iter(reasons))}')
 
     def left_out_notes(self) -> list[str]:
-        """Return what was left out, topic by topic, in words."""
+        """Return the messages that were left out, topic by topic, in words."""
         return [f'{len(reasons)} of {self.topic(topic).message_count} messages of {topic} left '
                 f'out: {next(iter(reasons))}' for topic, reasons in self.left_out.items()]
 

@@ -86,7 +86,7 @@ def rounded(center: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 def left_out_lines(left_out: Sequence[LeftOut]) -> list[str]:
-    """Return what is left out as text."""
+    """Return the landmarks that are left out, as text."""
     rows = [f'left out: {len(left_out)}'] if left_out else []
     rows += [f'  {one.class_id} at {one.center[0]:.2f} {one.center[1]:.2f} '
              f'{one.center[2]:.2f} with {one.support} frames: {one.reason}'

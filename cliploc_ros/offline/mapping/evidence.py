@@ -353,7 +353,7 @@ def _has_beside(place, near, was_seen, offsets, distances):
 
 @compiled
 def _hidden(place, near, boxes, distances, radii, is_solid, shown, edges, first, last):
-    """Return which share of a place landmarks in front of it hide, or boxes of no landmark."""
+    """Return the share of a place that nearer landmarks hide, or boxes of no landmark."""
     box = boxes[place]
     x0, y0 = 0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3])
     a, b = 0.5 * (box[2] - box[0]), 0.5 * (box[3] - box[1])

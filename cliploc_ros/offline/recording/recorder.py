@@ -109,7 +109,7 @@ class RecordingOptions:
 
     @property
     def networks(self) -> LoadNetworks:
-        """Return what loads the networks.
+        """Return a function that loads the networks.
 
         PyTorch rounds in another way on another number of threads. With one for each worker, the
         result is the same on any number of workers and on a cluster.
@@ -205,7 +205,7 @@ def _with_odometry(recorded: Recorded, odometry: Mapping[str, Poses] | None) -> 
 
 
 def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame | str]) -> Recorded:
-    """Return what networks at hand say of every frame with a pose; nothing is written.
+    """Return the output of given networks for every frame with a pose; write nothing.
 
     Frames that cannot be decoded are left out: for these, look returns why.
     """
@@ -265,7 +265,7 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log)
 
 
 def _parse_entry(line: bytes) -> Any:
-    """Return what run it is, which the first entry says, or the frame of any other entry."""
+    """Return the run that the first entry names, or the frame of any other entry."""
     entry = parse_json(line)
     return entry if 'run' in entry else SeenFrame.from_bytes(base64.b64decode(entry['frame']))
 
@@ -363,7 +363,7 @@ def _settings(options: DetectorOptions | ClipOptions) -> dict[str, Any]:
 
 
 def _state(path: Path) -> tuple[int, int] | None:
-    """Return what changes with a file; None for the name of a published model."""
+    """Return a value that changes with a file; None for the name of a published model."""
     try:
         stat = path.stat()
     except OSError:

@@ -73,7 +73,7 @@ class Sample(NamedTuple):
 
 
 def sample_from_msg(msg: Imu) -> Sample | None:
-    """Return what a message says about the vertical; None if it says nothing.
+    """Return the vertical by a message; None if it has none.
 
     A field is missing if its covariance begins with -1, or if it has its default value: no
     acceleration at all, or no rotation with a covariance of zeros. The latter may be a
@@ -311,7 +311,7 @@ class RobotStateSource:
     def at_instant(self, frame: Frame, parameters: RelocalizerParameters,
                    frame_ids: Sequence[str], map_hash: str, deadline: float = math.inf
                    ) -> KnownBefore:
-        """Return what is known at the instant of a frame, given the maps; see at."""
+        """Return the knowledge at the instant of a frame, given the maps; see at."""
         header = frame.image.header
         state = self.at(header, parameters.of_camera(frame.camera), deadline, frame.depth_frame)
         beside = []

@@ -34,7 +34,7 @@ _NUMBERS = ('no', 'one', 'two', 'three', 'four', 'five', 'six', 'seven', 'eight'
 
 
 def give_advice(report: CheckReport) -> list[Advice]:
-    """Return what to do, one sentence or two each."""
+    """Return advice, in one or two sentences each."""
     advice = [*_on_scale(report), *_on_look_alikes(report), *_on_landmarks(report),
               *_on_corrections(report),
               *_on_misled(report), *_on_spans(report), *_on_grid(report)]

@@ -56,7 +56,7 @@ class Fates(NamedTuple):
 
 def decide_fates(known: OldMap, judged: Judgement, objects: Shown, looks: 'Likeness | None'
                  ) -> Fates:
-    """Return what became of each old landmark."""
+    """Return the fate of each old landmark."""
     numbers, rivals = _identify(known, objects, judged, looks)
     found = numbers >= 0
     elsewhere = found.copy()

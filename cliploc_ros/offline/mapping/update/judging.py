@@ -95,7 +95,7 @@ class Judgement(NamedTuple):
 
 def judge(detections: PosedDetections, views: Views, known: OldMap, options: MappingOptions
           ) -> Judgement:
-    """Return what the recording says of each place of the map, and what else it shows.
+    """Return the recording's evidence for each place of the map, and the other objects it shows.
 
     The views have poses in the coordinate frame of the map.
     """

@@ -217,7 +217,7 @@ def _check_belongs(judged: Judgement, well_share: float) -> None:
 
 
 def _notes(known: OldMap, aligned: Aligned, detections: PosedDetections) -> list[str]:
-    """Return what the user should know of the input."""
+    """Return notes for the user about the input."""
     notes = []
     if aligned.estimated is not None:
         notes.append(estimated_note(aligned.estimated))
@@ -328,7 +328,7 @@ def _refitted(known: OldMap, objects: Shown, fates: Fates) -> dict[int, float]:
 
 
 def _looked_for(details: LandmarkDetails, sight: Sight, number: int) -> LandmarkDetails:
-    """Return what is known of a landmark with the frames that should have shown it, too."""
+    """Return the details of a landmark, updated by the frames that should have shown it."""
     support, expected = details.support or 0, int(sight.expected_frames[number])
     if support and details.seen_ratio:
         expected += round(support / details.seen_ratio)
@@ -338,7 +338,7 @@ def _looked_for(details: LandmarkDetails, sight: Sight, number: int) -> Landmark
 
 def _in_new_place(details: LandmarkDetails, sight: Sight, evidence: Evidence, number: int
                   ) -> LandmarkDetails:
-    """Return what is known of a landmark in a new place: what the recording says."""
+    """Return the details of a landmark in a new place, by the recording alone."""
     return replace(evidence.details(number, details),
                    seen_ratio=float(min(1.0, sight.seen_ratio[number])),
                    last_seen=max(0.0, float(evidence.last_seen[number])))
