@@ -38,7 +38,7 @@ def test_a_file_of_map_server_is_read(tmp_path, suffix, negate):
 
 @pytest.mark.parametrize(('before', 'after', 'text'), [
     ('image: walls', 'image: gone', 'gone.pgm'),
-    ('image: walls.{suffix}', 'image: /dev/zero', 'no image'), ('trinary', 'raw', 'mode raw'),
+    ('image: walls.{suffix}', 'image: /dev/zero', 'not an image'), ('trinary', 'raw', 'mode raw'),
     ('resolution: 0.5\n', '', "'resolution' is miss"), ('0.5', '0.0', 'resolution 0.0'),
     ('[1.0, -2.0, {yaw}]', '[1.0, .inf, 0.0]', 'origin'), ('0.196', '0.9', 'must rise'),
     (YAML, 'walls', 'no YAML mapping'), ('negate: {negate}', 'negate: maybe', 'maybe')])
