@@ -273,7 +273,7 @@ def _layer_of(arrays: dict[str, NDArray[Any]], kinds: FeatureKinds) -> KeyframeL
         header = parse_json(str(arrays.pop('header')))
         version, name = header.get('version'), str(header.get('descriptors'))
     except (AttributeError, ValueError) as error:
-        raise ArrayError(f'its header is not JSON object ({error})') from error
+        raise ArrayError(f'its header is not a JSON object ({error})') from error
     if version != VERSION:
         raise ArrayError(f'is of version {version!r}, expected {VERSION}')
     if name not in kinds:
