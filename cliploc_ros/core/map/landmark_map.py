@@ -218,6 +218,18 @@ class LandmarkMap:
             self.centers[rows], self.semi_axes[rows], self.quats_xyzw[rows],
             pick(self.details) if self.details else ())
 
+    def with_more(self, other: 'LandmarkMap') -> 'LandmarkMap':
+        """Return the map with the landmarks of another one behind its own."""
+        def details(one: LandmarkMap) -> tuple[LandmarkDetails, ...]:
+            return one.details or (LandmarkDetails(),) * len(one)
+
+        return LandmarkMap(
+            self.frame_id, self.landmark_ids + other.landmark_ids, self.labels + other.labels,
+            self.class_ids + other.class_ids, np.concatenate([self.centers, other.centers]),
+            np.concatenate([self.semi_axes, other.semi_axes]),
+            np.concatenate([self.quats_xyzw, other.quats_xyzw]), details(self) + details(other),
+            map_set=self.map_set)
+
     def joined(self, into: NDArray[np.int64]) -> 'LandmarkMap':
         """Return the map in which each landmark has the labels and classes of its parts, too.
 

@@ -118,8 +118,9 @@ def move_frames(frames: Frames, scale: float, rotation: NDArray[np.float64]) -> 
         for raw in frames.read_raw(lambda place, stamp_ns, pose: is_wanted(place, stamp_ns,
                                                                            moved(pose))):
             yield replace(raw, map_from_camera=moved(raw.map_from_camera))
-    return replace(frames, read_raw=read_raw, of_cameras=tuple(
-        move_frames(one, scale, rotation) for one in frames.of_cameras))
+    return replace(
+        frames, read_raw=read_raw, digest=f'{frames.digest} {scale} {rotation.tolist()}',
+        of_cameras=tuple(move_frames(one, scale, rotation) for one in frames.of_cameras))
 
 
 def join_frames(of_cameras: Mapping[str, Frames]) -> Frames:

@@ -40,6 +40,8 @@ class MapRecording:
     layout: str = ''
     intrinsics: str | None = None
     images: Path | None = None
+    #: The options of a folder that say what its poses are, see FolderOptions; only those given
+    placing: dict[str, Any] = field(default_factory=dict)
     #: From the poses of the observations to those of the map: positions times a scale, then turned
     #: by a rotation (3, 3)
     scale: float = 1.0
