@@ -169,6 +169,8 @@ def check_output(path: Path) -> None:
     """Refuse a file that cannot be written, before the work is done; MapError says why."""
     if not path.parent.is_dir():
         raise MapError(f'{path}: there is no folder {path.parent}; create it')
+    if not os.access(folder := Path(os.path.realpath(path)).parent, os.W_OK):
+        raise MapError(f'{path}: {folder} cannot be written to; choose another folder')
     if path.is_dir():
         raise MapError(f'{path} is a folder; name the file to write')
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.files.storage import open_file, replace_file
+from cliploc_ros.files.storage import MAKE_ROOM, open_file, replace_file
 
 #: Arrays by name.
 Arrays = Mapping[str, NDArray[Any]]
@@ -158,8 +158,8 @@ class Schema:
         except ArrayError as error:
             raise self.error(f'{path}: cannot be written: {error}') from error
         except OSError as error:
-            raise self.error(f'{path}: cannot be written: {error.strerror}; nothing was changed'
-                             ) from error
+            raise self.error(f'{path}: cannot be written: {error.strerror}; nothing was changed: '
+                             f'{MAKE_ROOM}') from error
 
     def check(self, arrays: Arrays) -> None:
         """Raise ArrayError if a type, a shape or a value is wrong."""

@@ -29,6 +29,12 @@ MOST_BYTES = 256 * 2**20
 # 64 bits have 19 or 20.
 _MOST_VALUES = 8_000_000
 _MOST_DIGITS = 20
+# A full disk may still take an empty file.
+_PROBE_BYTES = 4096
+#: What to do about a file that cannot be written
+MAKE_ROOM = 'make room, or choose another folder'
+#: What could not be kept in a cache by this process, see warn_not_kept
+NOT_KEPT: list[str] = []
 
 
 def open_file(path: str | os.PathLike[str]) -> BinaryIO:
@@ -188,15 +194,18 @@ def _staged(path: Path, digest: str) -> Path:
 def make_folder(folder: Path) -> None:
     """Create the output folder and its parents.
 
-    OptionsError: the folder cannot be created or written to.
+    OptionsError: the folder cannot be created or written to, or its disk is full.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / f'.{secrets.token_hex(6)}.probe'
-        probe.touch()
-        probe.unlink(missing_ok=True)
+        try:
+            probe.write_bytes(bytes(_PROBE_BYTES))
+        finally:
+            probe.unlink(missing_ok=True)
     except OSError as error:
-        raise OptionsError(f'{folder}: cannot be written to: {error.strerror}') from error
+        raise OptionsError(f'{folder}: cannot be written to: {error.strerror}; {MAKE_ROOM}'
+                           ) from error
 
 
 def write_text(path: Path, text: str) -> None:
@@ -214,7 +223,13 @@ def write_file(path: Path, write: Callable[[Path], object]) -> None:
         with replace_file(path) as partial:
             write(partial)
     except OSError as error:
-        raise OptionsError(f'{path}: cannot be written: {error.strerror}') from error
+        raise OptionsError(f'{path}: cannot be written: {error.strerror}; {MAKE_ROOM}') from error
+
+
+def warn_not_kept(text: str) -> None:
+    """Warn that something could not be kept in a cache, and remember that for `prepare`."""
+    NOT_KEPT.append(text)
+    logger.warning('%s', text)
 
 
 def resolve_cache_dir(cache_dir: str) -> Path:

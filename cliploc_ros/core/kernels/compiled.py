@@ -36,6 +36,7 @@ from cliploc_ros.files.storage import (
     read_file,
     replace_file,
     resolve_cache_dir,
+    warn_not_kept,
 )
 
 _PACKAGE = Path(__file__).resolve().parents[2]
@@ -101,8 +102,8 @@ class KernelFolders:
             failures.append(failure)
         if not self._is_warned:
             self._is_warned = True
-            logger.warning('cannot keep compiled kernels (%s): each start compiles them again; '
-                           'set cache_dir to a folder with room', '; '.join(failures))
+            warn_not_kept(f'cannot keep compiled kernels ({"; ".join(failures)}): each start '
+                          'compiles them again; set cache_dir to a folder with room')
 
     def _all(self) -> Iterator[Path]:
         given = os.environ.get('NUMBA_CACHE_DIR')

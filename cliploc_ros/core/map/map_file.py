@@ -22,7 +22,7 @@ from cliploc_ros.core.map.landmark_embeddings import (
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError
-from cliploc_ros.files.storage import WriteOfSet, replace_file, replace_set
+from cliploc_ros.files.storage import MAKE_ROOM, WriteOfSet, replace_file, replace_set
 
 _INDENT = ' ' * 10
 
@@ -53,8 +53,8 @@ def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
             embeddings_path(path): None if embeddings is None else write_embeddings,
             **(besides or {})})
     except OSError as error:
-        raise MapError(f'{path}: cannot be written: {error.strerror}; nothing was changed'
-                       ) from error
+        raise MapError(f'{path}: cannot be written: {error.strerror}; nothing was changed: '
+                       f'{MAKE_ROOM}') from error
 
 
 def write_landmarks(path: Path, digest: str, landmark_map: LandmarkMap,

@@ -33,6 +33,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.files.storage import MAKE_ROOM
 
 _VISION_MSGS = ('Point2D', 'Pose2D', 'BoundingBox2D', 'ObjectHypothesis',
                 'ObjectHypothesisWithPose', 'Detection2D', 'Detection2DArray')
@@ -389,4 +390,4 @@ class BagWriter:
         except (OSError, sqlite3.Error, WriterError) as error:
             reason = getattr(error, 'strerror', None) or str(error)
             raise DatasetError(f'{self.path}: cannot be written: {reason}; no partial file '
-                               'remains') from error
+                               f'remains: {MAKE_ROOM}') from error

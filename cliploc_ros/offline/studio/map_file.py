@@ -37,7 +37,7 @@ from cliploc_ros.core.map.parameter_file import (
     set_of,
 )
 from cliploc_ros.errors import MapError
-from cliploc_ros.files.storage import finish_set, read_file, replace_file
+from cliploc_ros.files.storage import MAKE_ROOM, finish_set, read_file, replace_file
 from cliploc_ros.offline.studio.landmark import (
     KNOWN_FIELDS,
     Encoded,
@@ -122,7 +122,7 @@ class MapFile:
                 partial.write_bytes(self.text.encode())
         except OSError as error:
             raise MapError(f'{self.path}: cannot be written: {error.strerror}; nothing was '
-                           'changed') from error
+                           f'changed: {MAKE_ROOM}') from error
 
     def digest_on_disk(self) -> str:
         """Return the digest of the file as it is now, NO_FILE where there is none."""
