@@ -230,7 +230,8 @@ def _earlier(frames: Frames, described: str, file: Path) -> dict[tuple[str, int]
     for path in {file, *source.parent.glob(f'{glob.escape(source.name)}{_BESIDE}*.npz')}:
         try:
             recorded = load_recorded(path)
-            is_same = networks(recorded.described) == networks(described)
+            is_same = recorded.described != described and (
+                networks(recorded.described) == networks(described))
         except (DatasetError, ValueError, KeyError, TypeError):
             continue
         if is_same:
