@@ -189,7 +189,7 @@ def needs_ros(program: str) -> Iterator[None]:
 def running_ros(args: Sequence[str]) -> Iterator[None]:
     """Run rclpy without its signal handlers.
 
-    OptionsError: it does not start with these arguments.
+    OptionsError: it does not start with these arguments, or cannot write its log.
     """
     import rclpy
     from rclpy.signals import SignalHandlerOptions
@@ -197,7 +197,8 @@ def running_ros(args: Sequence[str]) -> Iterator[None]:
     try:
         rclpy.init(args=list(args), signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rcl has its own types, for arguments and for missing folders
-        raise OptionsError(f'ROS 2 does not start with these arguments: {error}') from error
+        raise OptionsError(f'ROS 2 does not start: {error}; correct the arguments after '
+                           '--ros-args, or set ROS_LOG_DIR to a folder with room') from error
     try:
         yield
     finally:

@@ -122,6 +122,16 @@ def test_a_folder_that_does_not_take_it_all_is_not_ready(robot, tmp_path, kind):
     assert 'ready: with these' not in done.stdout
 
 
+def test_kernels_that_the_folder_does_not_take_are_missed(robot, prepared, tmp_path):
+    folder, _ = prepared
+    carried = Path(shutil.copytree(folder, tmp_path / 'carry'))
+    shutil.rmtree(carried / 'kernels')
+    (carried / 'kernels').write_text('no folder')
+    done = prepare('--params-file', robot, '--cache-dir', carried)
+    assert done.returncode == 1
+    assert 'error: not ready: compiled kernels are not kept in' in done.stderr
+
+
 @pytest.mark.parametrize(('old', 'new', 'named'), [
     (f'{ASSETS}/yolo.pt', 'yolov8n.pt', 'yolov8n.pt'),
     (f'{ASSETS}/clip.json\n    clip_pretrained: {ASSETS}/clip.safetensors',

@@ -32,6 +32,8 @@ from numba.core.serialize import dumps
 from numba.core.types import BaseTuple, Type  # type: ignore[attr-defined]
 
 from cliploc_ros.files.storage import (
+    MAKE_ROOM,
+    NOT_KEPT,
     is_foreign,
     read_file,
     replace_file,
@@ -117,15 +119,17 @@ class KernelFolders:
         if not os.access(own if own.exists() else _PACKAGE, os.W_OK):
             yield resolve_cache_dir('') / 'kernels'
 
-    @staticmethod
-    def _write(file: Path, content: bytes) -> str:
+    def _write(self, file: Path, content: bytes) -> str:
         """Write a file in one step; return what failed, or ''."""
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
             with replace_file(file) as partial:
                 partial.write_bytes(hashlib.sha256(content).digest() + content)
         except OSError as error:
-            return f'{file.parent}: {error.strerror}'
+            failure = f'{file.parent}: {error.strerror}'
+            if file.parent == self._preferred:  # this machine may have them elsewhere
+                NOT_KEPT.append(f'compiled kernels are not kept in {failure}; {MAKE_ROOM}')
+            return failure
         return ''
 
 

@@ -413,7 +413,8 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoR
     try:
         rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rcl has its own types, for arguments and for missing folders
-        sys.exit(f'error: ROS does not start: {error} (is HOME or ROS_LOG_DIR set?)')
+        sys.exit(f'error: ROS does not start: {error} (is HOME or ROS_LOG_DIR set, to a folder '
+                 'with room?)')
     executor = NodeExecutor()
     node = None
     try:
