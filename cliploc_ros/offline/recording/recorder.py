@@ -223,7 +223,8 @@ def _earlier(frames: Frames, described: str, file: Path) -> dict[tuple[str, int]
     """
     def networks(described: str) -> dict[str, Any]:
         tree = parse_json(described.encode())
-        return tree | {'source': tree['source'][:3], 'keyframes': None}
+        *source, digest = [*tree['source'], ''][:4]
+        return tree | {'source': [*source, digest.partition(' ')[0]], 'keyframes': None}
 
     source = frames.source.resolve()
     found: dict[tuple[str, int], SeenFrame] = {}
