@@ -80,7 +80,7 @@ def run_command(command: Callable[[], int], failure: int = 1) -> int:
 
 
 def _extra_with(package: str) -> str:
-    """Return what brings a package: an extra of this one, in its installed metadata."""
+    """Return the extra of this package that installs another, from the installed metadata."""
     try:
         requirements = metadata.requires('cliploc_ros') or []
     except metadata.PackageNotFoundError:  # it runs from its sources
@@ -169,6 +169,8 @@ def check_output(path: Path) -> None:
     """Refuse a file that cannot be written, before the work is done; MapError says why."""
     if not path.parent.is_dir():
         raise MapError(f'{path}: there is no folder {path.parent}; create it')
+    if not os.access(folder := Path(os.path.realpath(path)).parent, os.W_OK):
+        raise MapError(f'{path}: {folder} cannot be written to; choose another folder')
     if path.is_dir():
         raise MapError(f'{path} is a folder; name the file to write')
 
@@ -187,7 +189,7 @@ def needs_ros(program: str) -> Iterator[None]:
 def running_ros(args: Sequence[str]) -> Iterator[None]:
     """Run rclpy without its signal handlers.
 
-    OptionsError: it does not start with these arguments.
+    OptionsError: it does not start with these arguments, or cannot write its log.
     """
     import rclpy
     from rclpy.signals import SignalHandlerOptions
@@ -195,7 +197,8 @@ def running_ros(args: Sequence[str]) -> Iterator[None]:
     try:
         rclpy.init(args=list(args), signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rcl has its own types, for arguments and for missing folders
-        raise OptionsError(f'ROS 2 does not start with these arguments: {error}') from error
+        raise OptionsError(f'ROS 2 does not start: {error}; correct the arguments after '
+                           '--ros-args, or set ROS_LOG_DIR to a folder with room') from error
     try:
         yield
     finally:

@@ -88,7 +88,7 @@ class DatasetError(CliplocError):
 
 
 class MappingError(CliplocError):
-    """Posed detections of which no map can be made."""
+    """Posed detections from which no map can be made."""
 
 
 class InternalError(CliplocError):

@@ -136,7 +136,7 @@ def declared_size(data: bytes, stated_format: str) -> tuple[int, int]:
             return int.from_bytes(data[at + 7:at + 9]), int.from_bytes(data[at + 5:at + 7])
         at += 2 + int.from_bytes(data[at + 2:at + 4])
     raise ImageError(f"compressed image ('{stated_format}', {len(data)} bytes) does not decode: "
-                     'it is no JPEG or PNG, or it is cut off')
+                     'it is not a JPEG or PNG, or it is cut off')
 
 
 def depth_counts_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.generic]:
@@ -172,8 +172,8 @@ def _decode_depth_png(msg: CompressedImageMessage) -> NDArray[np.generic]:
     except cv2.error as error:
         raise ImageError(f"depth image ('{msg.format}') does not decode: {error.err}") from error
     if values is None or values.dtype != np.uint16 or values.ndim != 2:
-        raise ImageError(f"depth image ('{msg.format}', {len(data)} bytes) is no PNG of 16 bits "
-                         'with one channel')
+        raise ImageError(f"depth image ('{msg.format}', {len(data)} bytes) is not a PNG of 16 "
+                         'bits with one channel')
     if not is_inverse:
         return values
     _, a, b = _DEPTH_HEADER.unpack_from(data)
@@ -224,7 +224,7 @@ def camera_from_msg(msg: CameraInfoMessage, image_size: tuple[int, int], rectifi
 
 def faults_of_camera_info(msg: CameraInfoMessage, camera: Camera, rectified: bool
                           ) -> list[Fault]:
-    """Return what contradicts itself in a message, or is implausible; the certain faults first.
+    """Return contradictory or implausible fields of a message; the certain faults first.
 
     `camera` is the camera of the image that camera_from_msg makes of the message.
     """

@@ -171,7 +171,7 @@ class KidnappedRobot(Node):
     def _take_image(self, view: View, header: Header) -> None:
         camera, pixels = self._camera, cv2.imread(str(view.file))
         if pixels is None:
-            raise DemoError(f'{view.file} is no image: choose another folder with --assets')
+            raise DemoError(f'{view.file} is not an image: choose another folder with --assets')
         self._views[stamp_ns(header.stamp)] = view
         self._image.publish(image_to_msg(np.asarray(cv2.cvtColor(
             pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8), header))

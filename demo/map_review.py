@@ -18,6 +18,7 @@ from scipy.optimize import linear_sum_assignment
 
 from cliploc_ros.core.geometry.ellipsoid import outline_points, shape_matrices
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.files.storage import write_file
 from cliploc_ros.offline.datasets.parsing import parse_stamp_ns
 from cliploc_ros.offline.evaluation.figures import spread_names, write_name
 from cliploc_ros.offline.evaluation.summary import LIMITS_M, Summary
@@ -251,7 +252,7 @@ def draw_map_review(review: MapReview, map_from_camera: NDArray[np.float64], pat
         Line2D([], [], color='#666666', marker='.', linestyle=':',
                label='mapping walk, with the direction of each view')])
     spread_names(drawn)
-    drawn.savefig(path)
+    write_file(path, drawn.savefig)
 
 
 def _draw_panel(axes: Axes, review: MapReview, plane: tuple[int, int],

@@ -22,6 +22,7 @@ from cliploc_ros.core.geometry.ellipsoid import outline_points, project_ellipsoi
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
+from cliploc_ros.files.storage import write_file
 from cliploc_ros.offline.evaluation.figures import draw_map, spread_names, write_name
 from cliploc_ros.offline.page import ACCEPTED, BAD
 from demo.review import Judged, Review
@@ -68,13 +69,13 @@ def draw_wake_up(review: Review, landmark_map: LandmarkMap, path: Path) -> None:
         Line2D([], [], color='#B8A800', linewidth=1.5, linestyle=':',
                label='any other landmark of the map')])
     if review.beside:
-        figure.savefig(path)
+        write_file(path, figure.savefig)
         return
     panel = figure.add_axes((0.572, 0.03, 0.42, 0.885))
     panel.set_axis_off()
     panel.set(xlim=(0, 1), ylim=(_MOST_ROWS, -1))
     _list_matches(panel, review, landmark_map, numbers)
-    figure.savefig(path)
+    write_file(path, figure.savefig)
 
 
 def _numbers(review: Review) -> dict[int, int]:
@@ -199,7 +200,7 @@ def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
                 for name, color in class_colors.items()]
     figure.legend(handles=handles, loc='outside right upper', frameon=False, fontsize=9)
     spread_names(figure)
-    figure.savefig(path)
+    write_file(path, figure.savefig)
 
 
 def _draw_wake_up(axes: Axes, judged: Judged) -> None:
@@ -282,7 +283,7 @@ def draw_kidnapped(file: Path, camera: Camera, detections: Detections, landmark_
     timeline.legend(handles=[Patch(color=color, label=state) for state, color in _STATES.items()],
                     loc='lower left', fontsize=9)
     spread_names(figure)
-    figure.savefig(path)
+    write_file(path, figure.savefig)
 
 
 def _draw_expected(axes: Axes, file: Path, camera: Camera, detections: Detections,

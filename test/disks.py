@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What only one process sees: a small disk, numbers of processes."""
+"""What only one process sees: a small or read-only disk, numbers of processes."""
 
 import subprocess
 
 import pytest
 
 _MOUNT = ['unshare', '--map-root-user', '--mount', 'sh', '-c',
-          'mount -t tmpfs -o size=64k tmpfs "$0" && exec "$@"']
+          'mount -t tmpfs -o "$0" tmpfs "$1" && shift && exec "$@"']
 
 
 def small_disk(folder) -> list[str]:
@@ -16,7 +16,12 @@ def small_disk(folder) -> list[str]:
     The command gets a mount namespace of its own, which needs no privileges; the test is skipped
     where the system forbids that.
     """
-    return _tried([*_MOUNT, str(folder)])
+    return _tried([*_MOUNT, 'size=64k', str(folder)])
+
+
+def read_only_disk(folder) -> list[str]:
+    """Return the prefix of a command that runs it with an empty read-only disk on a folder."""
+    return _tried([*_MOUNT, 'ro', str(folder)])
 
 
 def own_numbers() -> list[str]:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from functools import cache
+from textwrap import dedent
 
 import pytest
 import yaml
@@ -40,7 +41,7 @@ class _CaughtError(Exception):
 
 @cache
 def parser_of(module: str) -> argparse.ArgumentParser:
-    """Return the parser of a module that runs as a program, the one that it makes itself."""
+    """Return the parser that a program makes for itself, by its module."""
     if module.startswith(('cliploc_ros.cli.', 'demo.__')):
         return importlib.import_module(module).make_parser()
 
@@ -166,8 +167,8 @@ def test_an_option_in_a_sentence_exists(command):
 
 
 def test_the_example_of_the_library_runs():
-    text = (PROJECT / 'doc/developers.md').read_text()
-    code = re.search(r'```python\n(.*?)```', text, re.DOTALL).group(1)
+    text = (PROJECT / 'doc/library.rst').read_text()
+    code = dedent(re.search(r'code-block:: python\n\n((?: {3}.*\n|\n)+)', text).group(1))
     done = subprocess.run([sys.executable, '-c', code], cwd=PROJECT, text=True,
                           capture_output=True, timeout=300)
     assert done.returncode == 0, done.stderr
@@ -177,4 +178,4 @@ def test_the_example_of_the_library_runs():
 def test_pages_have_commands():
     """Else a change of the layout of the pages would hide all of them from these tests."""
     pages = {command.page for command in commands()}
-    assert {'README.md', 'install.md', 'nav2.md', 'your_robot.md', 'fleet.md'} <= pages
+    assert {'README.md', 'install.md', 'nav2.md', 'your_robot.md', 'SECURITY.md'} <= pages

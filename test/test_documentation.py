@@ -20,6 +20,8 @@ from cliploc_ros.ros.parameters import RelocalizerParameters
 
 PROJECT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [PROJECT / 'README.md', *sorted((PROJECT / 'doc').glob('*.md'))]
+LINKING = [*DOCUMENTS, *(PROJECT / name for name in (
+    'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', 'SECURITY.md', 'studies/README.md'))]
 # what every node has
 OF_ROS = re.compile('/(clock|rosout|parameter_events|transition_event|get_type_description|'
                     'change_state|get_state|get_available_.*|get_transition_graph|'
@@ -52,7 +54,7 @@ def anchors(path):
     return {re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings}
 
 
-@pytest.mark.parametrize('path', DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize('path', LINKING, ids=lambda path: str(path.relative_to(PROJECT)))
 def test_links_lead_somewhere(path):
     for link in re.findall(r'\]\((?!https?:)([^)]+)\)', path.read_text()):
         name, _, anchor = link.partition('#')
@@ -61,7 +63,7 @@ def test_links_lead_somewhere(path):
         assert not anchor or anchor in anchors(target), link
 
 
-@pytest.mark.parametrize('path', DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize('path', LINKING, ids=lambda path: str(path.relative_to(PROJECT)))
 def test_commands_run_what_there_is(path):
     """Programs of this package, and the tests that a figure comes from."""
     text = path.read_text()

@@ -10,7 +10,7 @@ import pytest
 from browser import running_chromium
 
 PROJECT = Path(__file__).resolve().parents[1]
-PAGES = sorted(path.stem for path in (PROJECT / 'doc').glob('*.md'))
+PAGES = ['library', *sorted(path.stem for path in (PROJECT / 'doc').glob('*.md'))]
 # Of the window [px]: a laptop, a phone.
 WIDTHS = (1280, 400)
 
@@ -35,7 +35,7 @@ def test_every_page_is_there_and_in_the_menu(site):
 
 
 def test_the_reference_has_the_docstrings(site):
-    text = (site / 'developers.html').read_text()
+    text = (site / 'library.html').read_text()
     assert 'Find where the camera was when it saw the last of some frames.' in text
     assert 'id="cliploc_ros.core.relocalizer.Relocalizer.relocalize"' in text
 

@@ -325,14 +325,9 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
 
 def _read_images(options: argparse.Namespace) -> 'dict[str, Frames]':
     """Return the images of each camera with the true poses; of a folder, every n-th."""
-    from cliploc_ros.cli.sources import read_cameras
-    from cliploc_ros.offline.datasets.map_recording import load_recording
+    from cliploc_ros.cli.sources import read_cameras_of_map
 
-    built_from = load_recording(options.map[0])
-    if options.bag is not None and built_from is not None and built_from.is_moved:
-        raise OptionsError(f'{options.map[0]}: was turned or scaled by build_map, the poses of '
-                           '--bag are not; build it without --level and --object-size')
-    images = read_cameras(options, gap_s=0.0)
+    images = read_cameras_of_map(options, Path(options.map[0]))
     return images if options.bag is not None else {
         name: frames.select(range(0, frames.count, options.every))
         for name, frames in images.items()}

@@ -96,7 +96,7 @@ def _feature_kind(options: argparse.Namespace) -> 'FeatureKind':
 
 
 def add_use_option(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add the switch --keyframes to a parser; what it does is for the help."""
+    """Add the switch --keyframes to a parser; ``what`` is its help."""
     option(parser, '--keyframes', f'{what} (default: if NAME.keyframes.npz lies next to the map)',
            action=argparse.BooleanOptionalAction)
 

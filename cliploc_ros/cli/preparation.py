@@ -21,6 +21,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.query import Query
 from cliploc_ros.errors import ImageError, OptionsError
+from cliploc_ros.files.storage import NOT_KEPT
 from cliploc_ros.models.clip_towers import keep_text_tower
 from cliploc_ros.models.clip_weights import resolve_clip_weights
 from cliploc_ros.models.devices import import_openvino
@@ -91,6 +92,8 @@ def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bo
     with _step(f'{_REQUESTS} requests for {picture or "a drawn picture"}'):
         requests = [answer(image_rgb, detector, localizer, parameters) for _ in range(_REQUESTS)]
     print(cost_table(requests), flush=True)
+    if NOT_KEPT:
+        raise OptionsError(f'not ready: {NOT_KEPT[0]}')
     print('ready: with these parameters, start and requests need neither network nor compiler')
     if cache_dir is not None:
         print('\n'.join(carrying(cache_dir, used)))
@@ -159,7 +162,7 @@ def cost_table(requests: list[Request]) -> str:
 
 
 def carrying(cache_dir: Path, used: list[CommonParameters]) -> list[str]:
-    """Return what to do with a folder to carry, in lines."""
+    """Return instructions for a folder to carry, in lines."""
     size = sum(file.stat().st_size for file in cache_dir.rglob('*') if file.is_file()
                and not file.is_symlink())
     lines = [f'carry {cache_dir} ({size / 1e6:.0f} MB) to the robot, and set cache_dir to its '

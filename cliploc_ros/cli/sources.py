@@ -23,8 +23,8 @@ from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets import bag_frames, bag_poses
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
-from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, join_frames
-from cliploc_ros.offline.datasets.map_recording import MapRecording
+from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, join_frames, move_frames
+from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording
 from cliploc_ros.offline.datasets.observations import Recorded, load_recorded
 from cliploc_ros.offline.datasets.poses import Poses, mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
@@ -35,6 +35,8 @@ from cliploc_ros.units import NS_PER_S
 _READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'max_gap', 'image',
             'camera_info', 'rectified', 'depth', 'depth_unit', 'depth_intrinsics',
             'depth_baseline', 'intrinsics')
+# What the poses of a folder are.
+_PLACING = ('axes', 'scale', 'known_distance', 'level')
 # These do, too, and came later: where they are not given, observation files of before serve.
 _READING_MORE = {'tf': None, 'stamp_tolerance': 0.02}
 
@@ -62,7 +64,7 @@ def metres_of(text: str, option: str) -> float:
     try:
         return positive(text)
     except (ValueError, argparse.ArgumentTypeError):
-        raise OptionsError(f'{option}: {text} is no length above 0 m') from None
+        raise OptionsError(f'{option}: {text} is not a length above 0 m') from None
 
 
 def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
@@ -128,7 +130,7 @@ def recording_options(options: argparse.Namespace, keyframes: recorder.KeyframeO
 
 def recording_of(options: argparse.Namespace, file: Path, scale: float,
                  rotation: NDArray[np.float64]) -> MapRecording:
-    """Return what a map is built from; its poses are those of a file, scaled and turned."""
+    """Return the input of a map; its poses are those of a file, scaled and turned."""
     folder = folder_of(options)
     source, layout = folder or (options.bag, '')
     if options.bag is not None:
@@ -136,8 +138,35 @@ def recording_of(options: argparse.Namespace, file: Path, scale: float,
                             intrinsics=options.intrinsics, scale=scale, rotation=rotation.tolist())
     # --rgbd finds its layout itself
     return MapRecording(file, source, layout='' if layout == 'rgbd' else layout,
-                        intrinsics=options.intrinsics, images=options.images, scale=scale,
-                        rotation=rotation.tolist())
+                        intrinsics=options.intrinsics, images=options.images,
+                        placing={} if folder is None else {
+                            name: getattr(options, name) for name in _PLACING
+                            if getattr(options, name)},
+                        scale=scale, rotation=rotation.tolist())
+
+
+def read_cameras_of_map(options: argparse.Namespace, map_file: Path) -> dict[str, Frames]:
+    """Return the images of the source by camera, with their poses in a map, see read_cameras.
+
+    A map that was levelled or scaled has other poses than its recording; where the recording is
+    the source, they are placed as they were for the map.
+    """
+    built_from = load_recording(map_file)
+    if built_from is None or built_from.source is None or (
+            built_from.source.resolve() != source_of(options).resolve()):
+        if options.bag is not None and built_from is not None and built_from.is_moved:
+            raise OptionsError(f'{map_file}: was turned or scaled by build_map, the poses of '
+                               '--bag are not; only the recording it was built from is known')
+        return read_cameras(options, gap_s=0.0)
+    if not any(getattr(options, name) for name in _PLACING):
+        for name, value in built_from.placing.items():
+            setattr(options, name, value)
+    is_scaled = built_from.scale != 1.0  # by --object-size
+    frames = read_cameras(options, gap_s=0.0, any_unit=is_scaled)
+    if not built_from.is_moved:
+        return frames
+    return {name: move_frames(one, built_from.scale, np.array(built_from.rotation))
+            for name, one in frames.items()}
 
 
 def source_of(options: argparse.Namespace) -> Path:
@@ -152,7 +181,8 @@ def read_frames(options: argparse.Namespace) -> Frames:
     return of_cameras[''] if '' in of_cameras else join_frames(of_cameras)
 
 
-def read_cameras(options: argparse.Namespace, gap_s: float | None = None) -> dict[str, Frames]:
+def read_cameras(options: argparse.Namespace, gap_s: float | None = None, *,
+                 any_unit: bool = False) -> dict[str, Frames]:
     """Return the images of the source with their poses, by the name of the camera, '' for one.
 
     The poses of a topic or a folder are interpolated over gaps of `gap_s` [s]; None: as those of
@@ -174,7 +204,7 @@ def read_cameras(options: argparse.Namespace, gap_s: float | None = None) -> dic
     folder = FolderOptions(
         options.intrinsics, options.trajectory and read_tum_trajectory(options.trajectory), gap_ns,
         mounts[''], _depth_format(options), key, options.images, options.axes, options.scale,
-        distance, getattr(options, 'object_size', None) is not None, options.level,
+        distance, any_unit or getattr(options, 'object_size', None) is not None, options.level,
         round(options.stamp_tolerance * NS_PER_S))
     return {'': rgbd_frames(path, folder) if key == 'rgbd' else read_folder(path, folder)}
 
@@ -182,7 +212,7 @@ def read_cameras(options: argparse.Namespace, gap_s: float | None = None) -> dic
 def camera_names(options: argparse.Namespace) -> list[str]:
     """Return the names of the cameras of a bag; [''] for one without a name.
 
-    OptionsError: a name is given twice, or the source is no bag.
+    OptionsError: a name is given twice, or the source is not a bag.
     """
     names: list[str] = options.cameras
     if len(set(names)) < len(names):
@@ -222,7 +252,7 @@ def _frames_of(options: argparse.Namespace, name: str, mount: NDArray[np.float64
 
 def _poses_of_topic(options: argparse.Namespace, topic: str, camera: str,
                     mount: NDArray[np.float64] | None, gap_ns: int) -> bag_poses.ReadPoses:
-    """Return what reads a topic, which without a mount is the camera's own, in its namespace."""
+    """Return a reader of a topic, which without a mount is the camera's own, in its namespace."""
     return bag_poses.poses_of_topic(
         topic if mount is not None else bag_frames.topic_of(camera, topic), gap_ns, mount,
         round(options.stamp_tolerance * NS_PER_S), options.tf)
@@ -230,7 +260,7 @@ def _poses_of_topic(options: argparse.Namespace, topic: str, camera: str,
 
 def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.float64] | None,
                 gap_ns: int) -> bag_poses.ReadPoses:
-    """Return what reads the poses of a camera of a bag; the gap [ns] is that of a topic."""
+    """Return a reader of the poses of a camera of a bag; the gap [ns] is that of a topic."""
     given = [name for name in ('pose_topic', 'map_frame', 'trajectory')
              if getattr(options, name) is not None]
     max_gap_ns = round(options.max_gap * NS_PER_S)

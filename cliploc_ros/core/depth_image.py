@@ -66,7 +66,7 @@ def depth_from_counts(counts: NDArray[np.generic], unit_m: float | None, where: 
         File or message, for the error.
     """
     if counts.ndim != 2 or counts.dtype not in (np.uint16, np.float32, np.float64):
-        raise DatasetError(f'{where}: is no depth image of 16-bit integers or floats, but '
+        raise DatasetError(f'{where}: is not a depth image of 16-bit integers or floats, but '
                            f'{counts.dtype} with shape {counts.shape}')
     is_integer = counts.dtype == np.uint16
     depths = counts.astype(np.float32) * np.float32(

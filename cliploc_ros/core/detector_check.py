@@ -71,7 +71,7 @@ class DetectorCheck:
 
     @property
     def faults(self) -> list[Fault]:
-        """Return what is wrong with the detections of the last frames."""
+        """Return the faults of the detections of the last frames."""
         pooled = self._pooled
         found = self._certain(pooled) if pooled.given >= _LEAST else []
         if pooled.odd_score is not None:
@@ -80,9 +80,9 @@ class DetectorCheck:
         return found
 
     def explain(self, found: Relocalization) -> Relocalization:
-        """Return the result of the last frame, with the cause where its detections are of no use.
+        """Return the result of the last frame, with the cause if its detections are unusable.
 
-        Turning the camera is no remedy then.
+        Turning the camera does not help then.
         """
         last = self._frames[-1] if self._frames else _Tally()
         certain = self._certain(last)

@@ -199,7 +199,7 @@ class KeptInstant(NamedTuple):
 
 
 class Localizer:
-    """Answers each query with those before it.
+    """Answer each query together with the queries before it.
 
     Parameters
     ----------

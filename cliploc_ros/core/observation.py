@@ -66,7 +66,7 @@ class Detections:
 
 
 def check_planar(covariance: NDArray[np.float64]) -> None:
-    """Raise OptionsError for what is no covariance (3, 3) of x, y and yaw."""
+    """Raise OptionsError unless this is a covariance (3, 3) of x, y and yaw."""
     if not np.isfinite(covariance).all() or not np.linalg.eigvalsh(covariance).min() > 0.0:
         raise OptionsError('the covariance of x, y and yaw must be finite and positive definite; '
                            'give 10 rad^2 where yaw is unknown')
@@ -84,7 +84,7 @@ class Region:
     camera_from_body: NDArray[np.float64] = field(default_factory=OPTICAL_FROM_BODY.copy)
 
     def __post_init__(self) -> None:
-        """Raise OptionsError for what is no region."""
+        """Raise OptionsError unless this is a region."""
         if not np.isfinite(self.mean).all() or not 0.0 <= self.probability <= 1.0:
             raise OptionsError(f'region: {self.mean} must be finite, and its probability '
                                f'{self.probability} 0 to 1')

@@ -135,7 +135,7 @@ def _parts(arrays: Arrays, name: str) -> Iterator[NDArray[Any]]:
 
 
 def _fields_of(query: Query) -> dict[str, Any]:
-    """Return what JSON keeps of a query."""
+    """Return the fields of a query for JSON."""
     return {
         **{name: getattr(query, name) for name in
            ('run', 'limit', 'length_s', 'by_keyframes', 'is_thorough', 'rooms')},
@@ -209,7 +209,7 @@ def _decoded(image_png: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
 
 
 def _numbers(value: Any, *shape: int | None, nan: bool = False) -> NDArray[np.float64]:
-    """Return numbers of a shape; None for any length. ValueError, TypeError: they are no such."""
+    """Return numbers of a shape, None for any length. ValueError, TypeError: they differ."""
     found = np.array(value, dtype=np.float64)
     if None not in shape:
         _expect(found.shape == shape, 'the shape of numbers')

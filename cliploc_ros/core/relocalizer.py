@@ -215,7 +215,7 @@ class Relocalizer:
         ------
         OptionsError
             Similarities that the matching type needs are missing or of the wrong shape; the
-            vertical is no unit vector; odom_from_camera is missing or no rigid transform; there
+            vertical is not a unit vector; odom_from_camera is missing or no rigid transform; there
             are no frames or too many.
         """
         budget = self.begin(len(observations))

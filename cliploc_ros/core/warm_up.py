@@ -26,6 +26,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth import depth_errors
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
 from cliploc_ros.core.kernels.compiled import warm_up
+from cliploc_ros.core.keyframes.point_pose import free_focal, refine
 from cliploc_ros.core.map.pairs import find_repeats, make_pairs
 from cliploc_ros.core.map.similarities import keep_greatest
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Scene, make_scene
@@ -76,6 +77,9 @@ def call_fit_kernels() -> None:
     classes = np.zeros(3, dtype=np.int64)
     find_repeats(make_pairs(scene.centers, classes, cKDTree(scene.centers)), classes)
     scores_of(rig, np.eye(3)[None], np.zeros((1, 3)))
+    points = np.indices((3, 3, 2)).reshape(3, -1).T + np.array([0.0, 0.0, 3.0])
+    refine(points, points[:, :2] / points[:, 2:], np.eye(4))
+    free_focal(points, points[:, :2] / points[:, 2:], np.eye(4))
 
 
 def _make_scene() -> tuple[Scene, NDArray[np.int64]]:

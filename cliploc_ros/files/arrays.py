@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.files.storage import open_file, replace_file
+from cliploc_ros.files.storage import MAKE_ROOM, open_file, replace_file
 
 #: Arrays by name.
 Arrays = Mapping[str, NDArray[Any]]
@@ -158,8 +158,8 @@ class Schema:
         except ArrayError as error:
             raise self.error(f'{path}: cannot be written: {error}') from error
         except OSError as error:
-            raise self.error(f'{path}: cannot be written: {error.strerror}; nothing was changed'
-                             ) from error
+            raise self.error(f'{path}: cannot be written: {error.strerror}; nothing was changed: '
+                             f'{MAKE_ROOM}') from error
 
     def check(self, arrays: Arrays) -> None:
         """Raise ArrayError if a type, a shape or a value is wrong."""
@@ -202,7 +202,7 @@ class Schema:
                     if file.read(6) == b'\x93NUMPY':
                         raise ArrayError('is a single array, not an npz file of named arrays'
                                          ) from error
-                raise ArrayError(f'is no complete npz file ({error})') from error
+                raise ArrayError(f'is not a complete npz file ({error})') from error
             with archive:
                 try:
                     for member in archive.infolist():

@@ -57,7 +57,7 @@ class Log:
     def read(self) -> tuple[list[Any], bool]:
         """Return the entries before the first damaged line, and whether that is a whole line.
 
-        A kill leaves a part of a line, which is no damage. The next entry replaces the rest.
+        A kill leaves a part of a line, which is not damage. The next entry replaces the rest.
         """
         entries: list[Any] = []
         self._end = 0

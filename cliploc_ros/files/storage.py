@@ -13,6 +13,7 @@ import secrets
 import shutil
 import stat
 import tempfile
+import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -29,6 +30,14 @@ MOST_BYTES = 256 * 2**20
 # 64 bits have 19 or 20.
 _MOST_VALUES = 8_000_000
 _MOST_DIGITS = 20
+# Writers of one folder wait this long for their turn, and look this often [s]: a set takes less.
+_TURN_S, _TURN_POLL_S = 30.0, 0.02
+# A full disk may still take an empty file.
+_PROBE_BYTES = 4096
+#: What to do about a file that cannot be written
+MAKE_ROOM = 'make room, or choose another folder'
+#: What could not be kept in a cache by this process, see warn_not_kept
+NOT_KEPT: list[str] = []
 
 
 def open_file(path: str | os.PathLike[str]) -> BinaryIO:
@@ -65,7 +74,7 @@ def read_file(path: str | os.PathLike[str], most_bytes: int = MOST_BYTES) -> byt
 def parse_json(text: str | bytes, **options: Any) -> Any:
     """Return the value of a JSON text, see json.loads.
 
-    ValueError: it is no JSON, or nested so deeply, so long, or with such numbers that no file of
+    ValueError: it is not JSON, or nested so deeply, so long, or with such numbers that no file of
     this package or of the programs that it reads is.
     """
     marks = (b',', b'[', b'{') if isinstance(text, bytes) else (',', '[', '{')
@@ -163,11 +172,24 @@ def replace_set(path: Path, digest: str, write: WriteOfSet,
 
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
-    """Keep other writers of sets out of a folder meanwhile, where its file system can."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    """Keep other writers of sets out of a folder meanwhile, where its file system can.
+
+    OSError: another program keeps this one out for long, such as a process that was stopped.
+    """
+    descriptor, deadline = os.open(folder, os.O_RDONLY | os.O_CLOEXEC), time.monotonic() + _TURN_S
     try:
-        with suppress(OSError):  # some network file systems lock no folder
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    raise OSError(errno.EBUSY, 'another program has been writing there for '
+                                               f'{_TURN_S:g} s') from None
+                time.sleep(_TURN_POLL_S)
+            except OSError:  # some network file systems lock no folder
+                break
+            else:
+                break
         yield
     finally:
         os.close(descriptor)
@@ -188,15 +210,18 @@ def _staged(path: Path, digest: str) -> Path:
 def make_folder(folder: Path) -> None:
     """Create the output folder and its parents.
 
-    OptionsError: the folder cannot be created or written to.
+    OptionsError: the folder cannot be created or written to, or its disk is full.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / f'.{secrets.token_hex(6)}.probe'
-        probe.touch()
-        probe.unlink(missing_ok=True)
+        try:
+            probe.write_bytes(bytes(_PROBE_BYTES))
+        finally:
+            probe.unlink(missing_ok=True)
     except OSError as error:
-        raise OptionsError(f'{folder}: cannot be written to: {error.strerror}') from error
+        raise OptionsError(f'{folder}: cannot be written to: {error.strerror}; {MAKE_ROOM}'
+                           ) from error
 
 
 def write_text(path: Path, text: str) -> None:
@@ -214,7 +239,13 @@ def write_file(path: Path, write: Callable[[Path], object]) -> None:
         with replace_file(path) as partial:
             write(partial)
     except OSError as error:
-        raise OptionsError(f'{path}: cannot be written: {error.strerror}') from error
+        raise OptionsError(f'{path}: cannot be written: {error.strerror}; {MAKE_ROOM}') from error
+
+
+def warn_not_kept(text: str) -> None:
+    """Warn that something could not be kept in a cache, and remember that for `prepare`."""
+    NOT_KEPT.append(text)
+    logger.warning('%s', text)
 
 
 def resolve_cache_dir(cache_dir: str) -> Path:

@@ -17,7 +17,7 @@ from scipy.sparse import csr_matrix
 from cliploc_ros.core.map.landmark_details import WeightedLabels
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.arrays import Check, Field, Schema
-from cliploc_ros.files.storage import replace_file
+from cliploc_ros.files.storage import replace_file, warn_not_kept
 from cliploc_ros.models.files import remove_unused
 
 _FORMAT = 1
@@ -81,9 +81,9 @@ class LabelCache:
                 np.savez(partial, embeddings=embeddings,
                          identity=np.frombuffer(_identity(key, labels), dtype=np.uint8))
         except OSError as error:
-            logger.warning('label embeddings are not cached and the next start is slow again: '
-                           'cannot write %s (%s); make room, or choose a writable cache_dir',
-                           file, error.strerror or error)
+            warn_not_kept('label embeddings are not cached and the next start is slow again: '
+                          f'cannot write {file} ({error.strerror or error}); make room, or '
+                          'choose a writable cache_dir')
 
     def _file(self, key: str, labels: Sequence[str]) -> Path:
         digest = hashlib.sha256(_identity(key, labels)).hexdigest()

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.errors import CliplocError, ModelError
-from cliploc_ros.files.storage import parse_json, read_file, resolve_cache_dir
+from cliploc_ros.files.storage import parse_json, read_file, resolve_cache_dir, warn_not_kept
 from cliploc_ros.models.devices import count_threads, free_memory, import_openvino
 from cliploc_ros.models.files import fingerprint_file, first_line, remove_unused
 
@@ -131,9 +131,9 @@ def load_network(cache_dir: str, name: str, identity: Sequence[str],
         except Exception as failure:
             raise ConversionError(f'OpenVINO does not run {name} as PyTorch does: '
                                   f'{first_line(failure)}') from failure
-        logger.warning('the converted network is not cached and the next start is slow again: '
-                       'cannot write %s (%s); make room, or choose a writable cache_dir', folder,
-                       first_line(error))
+        warn_not_kept('the converted network is not cached and the next start is slow again: '
+                      f'cannot write {folder} ({first_line(error)}); make room, or choose a '
+                      'writable cache_dir')
     del conversion
     free_memory()
     logger.info('%s is converted after %.0f s', name, time.monotonic() - started)

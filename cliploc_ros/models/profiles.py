@@ -23,7 +23,7 @@ class Profile:
     clip_pretrained: str
 
 
-#: doc/results.md has their accuracy, time, memory and licences.
+#: doc/install.md has their accuracy, time, memory and licences.
 PROFILES = {
     'accurate': Profile('yolov8x.pt', 'ViT-L-14', 'openai'),  # the paper's
     'balanced': Profile('yolov8m.pt', 'ViT-B-32-256', 'datacomp_s34b_b86k'),

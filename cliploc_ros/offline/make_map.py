@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, removed_layer, save_layer
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.map.map_file import write_map
+from cliploc_ros.core.map.map_file import load_removed, removed_path, write_landmarks, write_map
 from cliploc_ros.errors import MappingError, ModelError
 from cliploc_ros.files.storage import WriteOfSet
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
@@ -48,6 +48,7 @@ class MadeMap:
     embeddings: LandmarkEmbeddings | None = None  #: What CLIP saw of each landmark
     layer: KeyframeLayer | None = None
     mount: MountCorrection | None = None  #: Where a correction was asked for
+    removed: LandmarkMap | None = None  #: What updates took out of the map
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class Labeller:
 
 def find_labeller(detections: PosedDetections, clip: Callable[[], ClipOptions] | None,
                   vocabulary: Path | None = None) -> Labeller:
-    """Return what labels the landmarks of a recording.
+    """Return the labeller of the landmarks of a recording.
 
     Parameters
     ----------
@@ -214,10 +215,11 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
     """
     old = LandmarkMap.from_file(path)
     old_embeddings = load_embeddings_of_map(path, old.landmark_ids, old.map_set)
-    updated = update_landmarks(old, detections, options, old_embeddings)
+    updated = update_landmarks(old, detections, options, old_embeddings,
+                               load_removed(path, old.map_set.family))
     landmark_map, first = updated.landmark_map, updated.first_new
     if first == len(landmark_map):
-        return MadeMap(landmark_map, updated.report, updated.embeddings)
+        return MadeMap(landmark_map, updated.report, updated.embeddings, removed=updated.removed)
     # only the new landmarks get labels; the others keep theirs
     new, _ = labeller.describe(landmark_map.select(range(first, len(landmark_map))), detections,
                                np.where(updated.shown >= first, updated.shown - first, -1))
@@ -227,7 +229,7 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
                 details=landmark_map.details[:first] + new.details),
         replace(updated.report, new=tuple(
             replace(one, label=texts[one.landmark_id]) for one in updated.report.new)),
-        updated.embeddings)
+        updated.embeddings, removed=updated.removed)
 
 
 def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording: MapRecording,
@@ -249,6 +251,9 @@ def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording
     else:
         lines += [removed_layer(path)] * layer_path(path).exists()
         besides[layer_path(path)] = None
+    besides[removed_path(path)] = partial(write_landmarks, landmark_map=replace(
+        made.removed, map_set=landmark_map.map_set)) if made.removed is not None and len(
+            made.removed) else None
     write_map(path, landmark_map, comments, made.embeddings, besides)
     if layer is None:
         return lines

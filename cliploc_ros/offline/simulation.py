@@ -90,7 +90,7 @@ class DetectorModel:
 
     def detect(self, map_from_camera: NDArray[np.float64], rng: np.random.Generator
                ) -> tuple[Detections, NDArray[np.int64]]:
-        """Return what the detector might find, and the landmark that each box shows."""
+        """Return simulated detections, and the landmark that each box shows."""
         rows, boxes = self.in_view(map_from_camera)
         chances = np.array([self._chance(row, map_from_camera) for row in rows])
         seen = rng.random(len(rows)) < chances

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check all that a request needs, one after another: what works, what fails, and what to do.
 
-It listens to what the relocalizer listens to, and localizes once. It hands no pose over.
+It subscribes to the relocalizer's inputs and localizes once. It delivers no pose.
 """
 
 import math
@@ -252,7 +252,7 @@ def _check_camera(node: Doctor, parameters: RelocalizerParameters, name: str,
 
 
 def _doubt_of_clock(node: Doctor, lag_s: float) -> str:
-    """Return what is wrong with the clocks of camera and node; empty if nothing is."""
+    """Return the fault of the clocks of camera and node; empty without one."""
     uses_sim_time = node.get_parameter('use_sim_time').value
     if uses_sim_time and not node.get_clock().now().nanoseconds:
         return ('use_sim_time is true, but nobody publishes /clock: start the simulation, play '

@@ -105,7 +105,7 @@ class FrameLocalizer:
 
     @property
     def description(self) -> str:
-        """Return what is loaded, in a line."""
+        """Return the loaded parts, in a line."""
         frames = ', '.join(f"'{frame_id}'" for frame_id in self.frame_ids)
         where = f'frame {frames}' if len(self.frame_ids) == 1 else \
             f'{len(self.frame_ids)} maps, frames {frames}'

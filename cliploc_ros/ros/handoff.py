@@ -210,7 +210,7 @@ class HandOff:
             return is_taken(given, self._shown)
 
     def _not_taken(self, given: PoseWithCovarianceStamped, times: int, begun_at: float) -> str:
-        """Return what the localizer shows in place of a pose."""
+        """Describe the localizer's pose, or its silence, where it did not take the given pose."""
         shown, why = self._shown, 'the localizer did not take the pose: '
         if not times:
             return 'too little time is left to see whether the localizer takes the pose: ask again'
@@ -309,7 +309,7 @@ def is_taken(given: PoseWithCovarianceStamped, shown: PoseWithCovarianceStamped 
 
 
 def tolerance_of(given: PoseWithCovarianceStamped) -> Tolerance:
-    """Return how far from a given pose a localizer may show it."""
+    """Return the allowed distance of a localizer's pose from the given one."""
     covariance = np.array(given.pose.covariance).reshape(6, 6)
     variance = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
     return TAKEN.wider(3.0 * math.sqrt(variance), math.degrees(3.0 * math.sqrt(covariance[5, 5])))

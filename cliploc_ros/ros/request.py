@@ -323,7 +323,7 @@ def _summary(localized: Localized, stages_ms: Mapping[str, float]) -> str:
 
 
 def _figures(localized: Localized, parameters: RelocalizerParameters) -> dict[str, object]:
-    """Return what decided the answer to a frame."""
+    """Return the evidence that decided the answer to a frame."""
     found = localized.found
     evidence, points = found.evidence, found.recognized
     needed = parameters.min_confidence if evidence is None else needed_confidence(
@@ -337,7 +337,7 @@ def _figures(localized: Localized, parameters: RelocalizerParameters) -> dict[st
 
 
 def time_is_up(stages_ms: Mapping[str, float]) -> str:
-    """Return which stage used up the time of a request, and what to do about it."""
+    """Return the stage that used up the time of a request, and the remedy."""
     stage = max(stages_ms, key=lambda name: stages_ms[name])
     total_s = sum(stages_ms.values()) / 1e3
     return (f'time is up: {_STAGES[stage]} took {stages_ms[stage] / 1e3:.1f} of {total_s:.1f} s; '

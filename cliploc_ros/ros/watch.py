@@ -409,7 +409,7 @@ class LocalizerPose:
                 continue
             if not is_rigid(map_from_base):
                 raise NoLocalizerPoseError(f"the transform from '{parameters.base_frame}' to "
-                                           f"'{frame_id}' is no pose: see the localizer's log")
+                                           f"'{frame_id}' is not a pose: see the localizer's log")
             return frame_id, map_from_base @ invert_transform(state.camera_from_base)
         raise PoselessError(str(problem)) from problem
 

@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cliploc_ros.cli.sources import metres_of
 from cliploc_ros.command import not_negative, positive_int, run_command
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.storage import make_folder, write_text
@@ -44,6 +45,8 @@ def run() -> int:
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('folders', nargs='+', metavar='DIR[@METRES]',
                         help='with the unit of depth, where it is not that of the layout')
+    parser.add_argument('--scale', nargs=2, action='append', default=[], metavar=('DIR', 'METRES'),
+                        help='of a unit of the poses of a folder that does not know it')
     parser.add_argument('--model', required=True, help='weights of YOLO')
     parser.add_argument('--conf', type=not_negative, default=RoomOptions.conf,
                         help='least confidence of a box (%(default)s)')
@@ -67,7 +70,10 @@ def run() -> int:
     if len(set(names)) < len(names):
         raise OptionsError('two folders have one name: rename one')
     make_folder(options.out)
-    reading = RoomOptions(options.model, options.out, options.conf)
+    scales = {Path(name).name: metres_of(text, '--scale') for name, text in options.scale}
+    if unknown := sorted(set(scales) - set(names)):
+        raise OptionsError(f'--scale {unknown[0]}: is none of the folders')
+    reading = RoomOptions(options.model, options.out, options.conf, scales)
     rooms = [read_room(one, reading) for one in options.folders]
     if ROBOT in options.kinds:  # recorded once, before several workers need it
         for room in rooms:

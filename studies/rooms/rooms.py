@@ -5,10 +5,11 @@
 import hashlib
 import pickle
 from argparse import ArgumentTypeError
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import cv2
@@ -54,7 +55,7 @@ _VERTICAL_DEG = 1.0
 _USUAL_VIEW_DEG = 65.0
 # What the robot's camera shows of an image, and the width of its own.
 _ROBOT_SHARE, _ROBOT_PX = 0.8, 424
-# Parts with fewer images are no map, or no question.
+# Parts with fewer images are not a map, or no question.
 _LEAST_IMAGES = 15
 
 
@@ -112,6 +113,8 @@ class RoomOptions:
     model: str  #: Weights of YOLO
     out: Path  #: Folder of what is kept from run to run
     conf: float = DetectorOptions.conf
+    #: Metres of a unit of the poses, by the names of folders that do not know it
+    scales: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,16 +187,19 @@ def read_room(where: str, options: RoomOptions) -> Room:
 
     ``DIR@METRES`` gives the unit of depth.
     """
-    folder, frames, has_poses = open_folder(where)
+    folder, frames, has_poses = open_folder(where, options.scales)
     raws = tuple(replace(raw, place=row) for row, raw in enumerate(posed(frames)))
-    frames = frames_of_raws(frames.source, raws)
+    frames = replace(frames_of_raws(frames.source, raws), digest=frames.digest)
     make_folder(options.out)
     return Room(folder.name, options, frames, raws, has_poses=has_poses,
                 ups=_measured_verticals(folder, raws), **_seen(frames, raws, options, folder.name))
 
 
-def open_folder(where: str) -> tuple[Path, Frames, bool]:
+def open_folder(where: str, scales: Mapping[str, float] = MappingProxyType({})
+                ) -> tuple[Path, Frames, bool]:
     """Return a folder, its frames, z up, and whether their poses are true.
+
+    Scales are metres of a unit of the poses by the name of a folder.
 
     ``DIR@METRES`` gives the unit of depth.
     """
@@ -202,13 +208,13 @@ def open_folder(where: str) -> tuple[Path, Frames, bool]:
     try:
         unit = positive(text) if text else None
     except (ValueError, ArgumentTypeError):
-        raise OptionsError(f'{where}: {text!r} is no unit of depth in metres') from None
+        raise OptionsError(f'{where}: {text!r} is not a unit of depth in metres') from None
     if find_layout(folder) is None and (folder / 'images').is_dir():
         return folder, _without_poses(folder / 'images'), False
     is_tum = (folder / 'rgb.txt').exists()
     return folder, read_folder(folder, FolderOptions(
         layout='tum' if is_tum and not (folder / 'depth.txt').exists() else '',
-        depth=DepthFormat(unit), level=not is_tum)), True
+        depth=DepthFormat(unit), scale=scales.get(folder.name), level=not is_tum)), True
 
 
 def posed(frames: Frames) -> tuple[RawFrame, ...]:

@@ -28,8 +28,8 @@ from demo import ASSETS
 
 pytestmark = pytest.mark.full
 
-PAGES = [PROJECT / page for page in ('doc/from_a_bag.md', 'README.md', 'doc/your_robot.md',
-                                     'doc/mapping.md', 'doc/keyframes.md')]
+PAGES = [PROJECT / page for page in ('doc/first_relocalization.md', 'README.md',
+                                     'doc/your_robot.md', 'doc/mapping.md', 'doc/keyframes.md')]
 # Of another robot or recording, or with a network that has to be downloaded.
 OTHER = {'--cameras', '--update', '--observations', '--colmap', '--queries', '--keyframe-features'}
 MOUNT = mount_from_numbers([0.1, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5])

@@ -3,18 +3,26 @@
 """A map of a COLMAP project, a walk of a phone in it, and the studio with its images."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
-from capture_folders import ASSETS, shots_of, write_colmap, write_polycam
+from capture_folders import ASSETS, WALK, shots_of, write_colmap, write_polycam
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.cli.build_map import main as build_map
+from cliploc_ros.cli.check_map import main as check_map
 from cliploc_ros.cli.evaluate import main as evaluate
 from cliploc_ros.cli.studio import make_parser, open_studio
+from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets.images import open_images
+from cliploc_ros.offline.datasets.map_recording import load_recording
+from cliploc_ros.offline.mapping.evidence import explained_boxes
+from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
+from cliploc_ros.offline.mapping.views import make_views
 
 pytestmark = [pytest.mark.full, pytest.mark.needs('pycolmap')]
 NETWORKS = ('--model', ASSETS / 'yolo.pt', '--device', 'cpu')
@@ -65,3 +73,80 @@ def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys)
     # the studio shows each image as the camera of the boxes does, whatever its own focus is
     image = open_images(folder, None).near(2.0, '', Camera(640, 480, 250.0, 250.0, 319.5, 239.5))
     assert (image[:110] == 0).all() and image[240, 320].any()
+
+
+def errors_of(folder):
+    return [one['error_m'] for one in json.loads((folder / 'results.json').read_text())
+            if one['accepted']]
+
+
+@pytest.mark.parametrize('how', [('--scale', '0.4'), ('--object-size', 'clock', '0.3')])
+def test_a_scaled_and_levelled_map_is_evaluated_on_its_own_recording(tmp_path, capsys, caplog,
+                                                                     how):
+    """The options are known from the map; another scale runs no network again."""
+    import pycolmap
+
+    tilt = np.eye(4)
+    tilt[:3, :3] = Rotation.from_euler('x', 25.0, degrees=True).as_matrix()
+    folder, built = write_colmap(tmp_path / 'scan', shots_of(), scale=0.4, world=tilt), (
+        tmp_path / 'built.yaml')
+    arguments = ('--colmap', folder, *NETWORKS, *CLIP, '--level', '--keyframes', 0, 0, '--out')
+    assert run(build_map, *arguments, built, *how) == 0
+    assert run(evaluate, '--colmap', folder, '--map', built, *NETWORKS, '--no-clip', '--every', 3,
+               '--methods', 'auto', '--no-keyframes', '--trials', 1, '--sweep', '--no-figures',
+               '--out', tmp_path / 'out') == 0
+    errors = errors_of(tmp_path / 'out')
+    assert len(errors) >= 3 and max(errors) < 0.25
+    assert check_map([str(built), '--positions', '4', '--headings', '2', '--frames', '4']) < 2
+    assert 'observations: ' in capsys.readouterr().out
+    detections = load_recording(built).load()
+    up = LandmarkMap.from_file(built)
+    assert explained_boxes(make_views(detections), landmarks_of_map(
+        up, detections.class_names)).explained > 0.5
+    studio = open_studio(make_parser().parse_args([str(built)]))
+    try:
+        assert np.allclose(studio.recording.detections.map_from_camera,
+                           detections.map_from_camera)
+        assert studio.recording.images.of(detections, 3).shape == (480, 640, 3)
+    finally:
+        studio.document.close()
+    caplog.clear()
+    assert run(build_map, '--colmap', folder, '--model', ASSETS / 'yolo.pt', *NETWORKS[2:], *CLIP,
+               '--level', '--scale', 0.8, '--out', tmp_path / 'twice.yaml') == 0
+    assert any('other poses or keyframes' in one for one in caplog.messages)
+    twice, once = (load_recording(path).load() for path in (tmp_path / 'twice.yaml', built))
+    again = np.isin(once.stamps_s, twice.stamps_s)
+    assert len(twice) == again.sum()
+    np.testing.assert_array_equal(once.select_frames(np.nonzero(again)[0]).bboxes_xyxy,
+                                  twice.bboxes_xyxy)
+    # boxes are of the pinhole of their camera: those of another camera would be wrong
+    model = pycolmap.Reconstruction(str(folder / 'sparse/0'))
+    for camera in model.cameras.values():
+        camera.focal_length_x *= 1.01
+    model.write_binary(str(folder / 'sparse/0'))
+    caplog.clear()
+    assert run(build_map, '--colmap', folder, '--model', ASSETS / 'yolo.pt', *NETWORKS[2:], *CLIP,
+               '--level', '--scale', 0.8, '--out', tmp_path / 'longer.yaml') < 2
+    assert not any('other poses or keyframes' in one for one in caplog.messages)
+
+
+def test_a_levelled_map_is_evaluated_on_the_bag_that_made_it(tmp_path, capsys):
+    shutil.copytree(WALK, tmp_path / 'walk')
+    tilt = Rotation.from_euler('x', 25.0, degrees=True)
+    truth = np.loadtxt(WALK / 'groundtruth.txt')
+    truth[:, 1:4] = tilt.apply(truth[:, 1:4])
+    truth[:, 4:] = (tilt * Rotation.from_quat(truth[:, 4:])).as_quat()
+    (tmp_path / 'walk/groundtruth.txt').unlink()
+    np.savetxt(tmp_path / 'walk/groundtruth.txt', truth, fmt='%.9f')
+    bag, other, built = tmp_path / 'bag', tmp_path / 'other', tmp_path / 'built.yaml'
+    assert tum_to_bag([str(tmp_path / 'walk'), str(bag)]) == 0
+    assert tum_to_bag([str(tmp_path / 'walk'), str(other)]) == 0
+    assert run(build_map, '--bag', bag, '--level', *NETWORKS, '--no-clip', '--out', built) == 0
+    asked = ('--map', built, *NETWORKS, '--no-clip', '--methods', 'auto', '--trials', 1, '--sweep',
+             '--no-figures', '--out', tmp_path / 'out')
+    assert run(evaluate, '--bag', bag, *asked) == 0
+    errors = errors_of(tmp_path / 'out')
+    assert len(errors) >= 15 and max(errors) < 0.1
+    capsys.readouterr()
+    assert run(evaluate, '--bag', other, *asked) == 1
+    assert 'was turned or scaled' in capsys.readouterr().err

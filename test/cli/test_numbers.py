@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""No executable takes what is no number for a number."""
+"""No executable takes what is not a number for a number."""
 
 import argparse
 from importlib import import_module

@@ -78,7 +78,7 @@ def test_what_moves_is_no_landmark(office, tmp_path, capsys):
     assert 'person' in plain.class_ids
     built = build(crowded)
     assert 'person' not in built.landmark_map.class_ids
-    assert any('person are no landmarks' in note for note in built.report.notes)
+    assert any('person are not landmarks' in note for note in built.report.notes)
     report = check(plain, crowded)
     faults = {one.landmark_id: one for one in report.landmarks}
     assert all(faults[name].severity >= 1.0 for name, kind in zip(

@@ -446,8 +446,8 @@ def test_bad_odometry_is_named(room, walk):
     scaled[:3, :3] *= 1.01
     broken[0, 3] = np.nan
     mirrored[:3, 0] *= -1.0
-    for odom, named in ((None, 'missing'), (scaled, 'no rigid'), (broken, 'no rigid'),
-                        (mirrored, 'no rigid'), (np.eye(3), 'no rigid')):
+    for odom, named in ((None, 'missing'), (scaled, 'not a rigid'), (broken, 'not a rigid'),
+                        (mirrored, 'not a rigid'), (np.eye(3), 'not a rigid')):
         bad = replace(first, odom_from_camera=odom)
         for number, frames in enumerate(([bad, last], [last, bad]), 1):
             with pytest.raises(OptionsError, match=f'frame {number} of 2 is {named}'):

@@ -336,7 +336,7 @@ def test_invalid_inputs_are_named(watch, room):
             watch.look(see(room, pose), wrong)
     with pytest.raises(OptionsError, match='odom_from_camera'):
         watch.look(replace(see(room, pose), odom_from_camera=np.full((4, 4), np.nan)), pose)
-    with pytest.raises(OptionsError, match='is no unit vector'):
+    with pytest.raises(OptionsError, match='is not a unit vector'):
         watch.look(replace(see(room, pose), up_in_camera=np.full(3, np.nan)), pose)
     with pytest.raises(OptionsError, match='has no pixels'):
         watch.look(see(room, pose), pose, np.zeros((0, 0, 3), np.uint8))

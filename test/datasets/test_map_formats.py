@@ -166,8 +166,9 @@ def test_what_no_map_can_hold_is_left_out_with_the_reason(tmp_path):
     assert imported.landmark_map.landmark_ids == ('cup_0',)
     reasons = dict(imported.left_out)
     for name, reason in {
-            'object 1': 'no ellipsoid: squared semi-axes -0.04', 'object 2': 'no ellipsoid',
-            'object 3': 'no finite centre', 'object 4': 'not finite',
+            'object 1': 'not an ellipsoid: squared semi-axes -0.04',
+            'object 2': 'not an ellipsoid', 'object 3': 'no finite centre',
+            'object 4': 'not finite',
             'object 5': 'has 9 numbers, not 16', 'object 6': '0 categories',
             'object 7': 'not symmetric', 'cup_8': 'semi-axes are 1 1 200 m',
             'cup_0': 'its id occurs before'}.items():
@@ -175,11 +176,11 @@ def test_what_no_map_can_hold_is_left_out_with_the_reason(tmp_path):
 
 
 @pytest.mark.parametrize(('read', 'content', 'message'), [
-    (read_msgloc, b'{"nodes": [', 'is no JSON'), (read_msgloc, b'[' * 100_000, 'is no JSON'),
+    (read_msgloc, b'{"nodes": [', 'is not JSON'), (read_msgloc, b'[' * 100_000, 'is not JSON'),
     (read_msgloc, json.dumps({'nodes': [msgloc_node(0, [0] * 3, [1] * 3, [0, 0, 0, 1],
                                                     baseline_label={'812.0': [1.0]})]}).encode(),
      '812.* `class_names`'),
-    (read_msgloc, b'{"edges": []}', 'is no map of MSG-Loc'),
+    (read_msgloc, b'{"edges": []}', 'is not a map of MSG-Loc'),
     (read_goreloc, goreloc_object(0, SPHERE, [(CUP, 1)])[:-1],
      r'byte \d+'),
     (read_goreloc, b'\xff' * 11, 'more than 10 bytes'),

@@ -119,7 +119,7 @@ def test_an_empty_cell_is_no_cell_of_another_column(tmp_path):
         with pytest.raises(DatasetError, match=r'table\.csv:2: a cell between its'):
             read_numbers(path, 'a b c d')
     path.write_text('1.0,2,three,4\n')
-    with pytest.raises(DatasetError, match=r"table\.csv:1: 'three' is no number"):
+    with pytest.raises(DatasetError, match=r"table\.csv:1: 'three' is not a number"):
         read_numbers(path, 'a b c d')
 
 

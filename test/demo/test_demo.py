@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from disks import small_disk
 
 PROJECT = Path(__file__).resolve().parents[2]
 
@@ -51,6 +52,15 @@ def test_poses_are_right_or_refused(finished):
     assert f'{WAKE_UPS} wake-ups: {len(errors_m)} accepted' in output
     assert len(errors_m) >= 0.8 * WAKE_UPS
     assert max(errors_m) < 0.5
+
+
+def test_a_disk_that_fills_up_is_named_in_one_line(tmp_path):
+    done = subprocess.run([*small_disk(tmp_path), sys.executable, '-m', 'demo', '--out', tmp_path,
+                           '--wake-ups', '1', '--rate', '100'], text=True, cwd=PROJECT,
+                          capture_output=True, timeout=PATIENCE_S, check=False)
+    assert done.returncode == 1 and 'Traceback' not in done.stderr
+    assert re.match(rf'error: {tmp_path}/\S+: cannot be written: No space left .*make room',
+                    done.stderr.splitlines()[-1]), done.stderr
 
 
 @pytest.mark.clock  # the request takes the cameras whose images come in time

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from disks import small_disk
+from disks import read_only_disk, small_disk
 
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.files.log import Log
@@ -102,6 +102,47 @@ def test_a_full_disk(path, tmp_path):
     message, kept = done.stdout.splitlines()
     assert 'No space left' in message
     assert 8 <= int(kept.split()[0]) <= 13 and kept.endswith('False')
+
+
+FILES = """
+import sys
+from pathlib import Path
+from matplotlib.figure import Figure
+from cliploc_ros.command import check_output
+from cliploc_ros.errors import CliplocError
+from cliploc_ros.files.arrays import Field, Schema
+from cliploc_ros.files.storage import make_folder, write_file
+import numpy as np
+disk = Path(sys.argv[1])
+try:
+    (disk / 'full').write_bytes(bytes(2**17))
+except OSError:
+    pass
+for write in (lambda: make_folder(disk / 'out'), lambda: check_output(disk / 'map.yaml'),
+              lambda: write_file(disk / 'a.png', Figure((20, 20)).savefig),
+              lambda: Schema('file', {'a': Field('float64', ('N',))}, CliplocError).write(
+                  disk / 'a.npz', {'a': np.zeros(2**14)})):
+    try:
+        write()
+    except CliplocError as error:
+        print(error)
+print(sorted(one.name for one in disk.rglob('*')))
+"""
+
+
+@pytest.mark.parametrize(('kind', 'cause', 'left'), [
+    (small_disk, 'No space left on device', ['full', 'out']),
+    (read_only_disk, 'Read-only file system', [])])
+def test_what_cannot_be_written_is_named_with_the_remedy(tmp_path, kind, cause, left):
+    done = subprocess.run([*kind(tmp_path), sys.executable, '-c', FILES, str(tmp_path)],
+                          cwd=PROJECT, capture_output=True, text=True, timeout=60, check=True)
+    *messages, kept = done.stdout.splitlines()
+    if kind is read_only_disk:
+        assert 'map.yaml' in (refused := messages.pop(1)) and 'another folder' in refused
+    for name, message in zip(('out', 'a.png', 'a.npz'), messages, strict=True):
+        assert message.startswith(str(tmp_path / name)) and cause in message
+        assert 'make room, or choose another folder' in message
+    assert kept == str(left)
 
 
 @dataclass(frozen=True)

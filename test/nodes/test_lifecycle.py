@@ -42,8 +42,8 @@ class Manager:
             return any(future.done() for _, future in asked)
         tester.wait(answered, 'a state')
 
-    def change(self, transition_id):
-        request = ChangeState.Request(transition=Transition(id=transition_id))
+    def change(self, transition_id, label=''):
+        request = ChangeState.Request(transition=Transition(id=transition_id, label=label))
         return self._tester.answer(self._change.call_async(request)).success
 
     def do(self, *transitions):
@@ -98,6 +98,14 @@ def test_sigterm_ends_a_node_in_every_state(manage, room_map, name, state):
     assert code == 0, process.output()
     assert seconds < 2.0
     assert 'Traceback' not in process.output()
+
+
+def test_a_label_of_a_megabyte_is_refused_in_a_short_line(manage, room_map):
+    process, manager = manage('relocalizer', **class_matching(room_map))
+    assert not manager.change(IDS['configure'], 'x' * 1_000_000)
+    assert manager.change(IDS['configure'], 'configure') and manager.state == 'inactive'
+    assert process.stop()[0] == 0
+    assert max(map(len, process.output().splitlines())) < 2000
 
 
 def processor_share(process, tester, seconds=3.0):

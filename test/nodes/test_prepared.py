@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from disks import read_only_disk, small_disk
 from processes import PROJECT
 from without_pytorch import hide_pytorch
 
@@ -109,6 +110,26 @@ def test_the_folder_is_all_that_the_nodes_need_without_a_network_and_read_only(
     log = (tmp_path / 'relocalizer.log').read_text()
     assert 'labels cached' in log and 'compiling' not in log and 'Read-only' not in log
     assert content(carried) == before, 'a node had to compute or fetch what the folder lacked'
+
+
+@pytest.mark.parametrize('kind', [small_disk, read_only_disk])
+def test_a_folder_that_does_not_take_it_all_is_not_ready(robot, tmp_path, kind):
+    done = prepare('--params-file', robot, '--cache-dir', tmp_path / 'carry',
+                   within=kind(tmp_path))
+    assert done.returncode == 1 and 'Traceback' not in done.stderr
+    (error,) = [line for line in done.stderr.splitlines() if line.startswith('error:')]
+    assert error.startswith('error: not ready: ') and str(tmp_path) in error
+    assert 'ready: with these' not in done.stdout
+
+
+def test_kernels_that_the_folder_does_not_take_are_missed(robot, prepared, tmp_path):
+    folder, _ = prepared
+    carried = Path(shutil.copytree(folder, tmp_path / 'carry'))
+    shutil.rmtree(carried / 'kernels')
+    (carried / 'kernels').write_text('no folder')
+    done = prepare('--params-file', robot, '--cache-dir', carried)
+    assert done.returncode == 1
+    assert 'error: not ready: compiled kernels are not kept in' in done.stderr
 
 
 @pytest.mark.parametrize(('old', 'new', 'named'), [

@@ -3,26 +3,26 @@
 """Whether the boxes of a camera agree with its image, its camera_info, its mount and the map.
 
 A wrong camera_info, or boxes in other pixels, displace all boxes by one rule. One image hardly
-shows it: the pose gives way. Many images do, since poses differ and the rule does not. A look is
-what one frame says of the errors of its camera, whatever its pose, see
-cliploc_ros.core.fit.camera_fit: an information and a vector, which add up over looks. Looks from
-one view share the errors of their boxes, so they count as one, with their mean.
+shows it, because the pose adapts. Many images do, because their poses differ and the rule stays. A
+look is the evidence of one frame about the errors of its camera, with the pose eliminated, see
+cliploc_ros.core.fit.camera_fit: an information matrix and a vector, which add up over looks.
+Looks from one view share the errors of their boxes, so they count as one, with their mean.
 
 A camera is right, with the small errors of any calibration, or wrong in one of a few ways (kinds),
 with large errors. The Bayes factor of wrong against right is a mean of likelihood ratios. With a
 right camera it ever exceeds N with a probability of at most 1 / N, however often it is computed
-(Ville, "Etude critique de la notion de collectif", 1939). So of cameras that are right, one of
-1000 at most is called wrong at odds of 1000, if the looks of different views are independent. No
-single view counts more than e^3: its boxes may be matched by mistake.
+(Ville, "Etude critique de la notion de collectif", 1939). At odds of 1000, at most one right
+camera in 1000 is therefore called wrong, if the looks of different views are independent. No
+single view counts more than e^3, because its boxes may be matched by mistake.
 
-Until the odds are clear, a pose counts as far as it is right under each kind. A pose of a few far
-objects needs a camera that looks have verified; one of many objects at different distances does
-not.
+Until the odds are clear, the confidence of a pose is weighted by the probability that it is right
+under each kind. A pose from a few far objects needs a camera that looks have verified; a pose from
+many objects at different distances does not.
 
 A detector's boxes end at the border of the image that it sees. Where many end at one line inside
 of the image, and none beyond, they are in the pixels of another image. This counts as evidence for
-some kinds of errors, at most as e^8: a border within the image itself, such as black bars, looks
-alike, and the looks then say so.
+some kinds of errors, at most as e^8, because a border within the image itself, such as black bars,
+looks the same; then the looks decide.
 """
 
 import math
@@ -132,7 +132,7 @@ class CameraOdds(NamedTuple):
 
 def odds_of(information: NDArray[np.float64], vector: NDArray[np.float64], extent: float = 0.0
             ) -> CameraOdds:
-    """Return what looks say of a camera.
+    """Return the evidence of looks about a camera.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def odds_of(information: NDArray[np.float64], vector: NDArray[np.float64], exten
 
 
 def looks_of(joined: JoinedFrames, pose: Finalist) -> list[CameraLook]:
-    """Return what each frame says of its camera, given a pose of the last one."""
+    """Return the evidence of each frame about its camera, given a pose of the last frame."""
     inliers = one_to_one(joined.rig, verify_rig(joined.rig, pose.rotation, pose.translation),
                          pose.rotation, pose.translation)
     looks, last = [], joined.frames[-1].observation
@@ -210,7 +210,7 @@ class Views(NamedTuple):
                        for both in zip(self, other, strict=True)))
 
     def odds(self, extent: float = 0.0) -> CameraOdds:
-        """Return what all looks say together."""
+        """Return the evidence of all looks together."""
         return odds_of(self.informations.sum(axis=0), self.vectors.sum(axis=0), extent)
 
 
@@ -284,20 +284,20 @@ class _Record:
         self.odds, self.by_looks = self.views.odds(self.by_extent), self.views.odds().log_odds
 
     def copied(self) -> '_Record':
-        """Return what is known now. Views and boxes are replaced, and never change."""
+        """Return the present state. Views and boxes are replaced, and never change."""
         same = copy(self)
         same.extent = copy(self.extent)
         return same
 
     def fields(self) -> dict[str, Any]:
-        """Return what is known, as lists and numbers."""
+        """Return the state, as lists and numbers."""
         return {'camera': asdict(self.camera), 'boxes': self.extent.boxes.tolist(),
                 **{name: [part.tolist() for part in getattr(self, name)]
                    for name in ('views', 'since')}}
 
     @classmethod
     def of_fields(cls, name: str, fields: Mapping[str, Any]) -> '_Record':
-        """Return what `fields` returned; KeyError, TypeError or ValueError: it is broken."""
+        """Return the state of `fields`; KeyError, TypeError or ValueError: it is broken."""
         camera = dict(fields['camera'])
         record = cls(name, Camera(**camera | {'distortion': tuple(camera['distortion'])}))
         record.extent.boxes = np.array(fields['boxes'], dtype=np.float64).reshape(-1, 4)
@@ -315,7 +315,7 @@ class _Record:
 
     @property
     def fault(self) -> str:
-        """Return what is certainly wrong with the camera; empty if nothing is."""
+        """Return the certain faults of the camera; empty without any."""
         return self.in_words(self.odds) if self.odds.is_wrong else ''
 
     def in_words(self, odds: CameraOdds) -> str:
@@ -347,18 +347,18 @@ class CameraCheck:
             maxlen=int(_TERMS.most_instants))
 
     def copied(self) -> 'CameraCheck':
-        """Return what the looks so far say; it stays as it is."""
+        """Return the evidence of the looks so far; it never changes."""
         same = CameraCheck()
         same._records = {name: record.copied() for name, record in self._records.copy().items()}
         return same
 
     def fields(self) -> dict[str, Any]:
-        """Return what decides about poses, as lists and numbers, for a file."""
+        """Return the state that decides about poses, as lists and numbers, for a file."""
         return {name: record.fields() for name, record in self._records.items()}
 
     @classmethod
     def of_fields(cls, fields: Mapping[str, Any]) -> 'CameraCheck':
-        """Return what `fields` returned; KeyError, TypeError or ValueError: it is broken."""
+        """Return the state of `fields`; KeyError, TypeError or ValueError: it is broken."""
         check = cls()
         check._records = {name: _Record.of_fields(name, one) for name, one in fields.items()}
         return check
@@ -379,7 +379,7 @@ class CameraCheck:
 
     def judge(self, looks: Sequence[CameraLook], covariance: NDArray[np.float64]
               ) -> tuple[float, str]:
-        """Return what the cameras do to a pose, with its looks, which are not taken in.
+        """Return the effect of the cameras on a pose, with its looks, which are not taken in.
 
         That is the factor of CameraOdds.share_near, and what is wrong with a camera that is
         certainly wrong; empty without one. The covariance (6, 6) is that of the pose.
@@ -397,7 +397,7 @@ class CameraCheck:
 
     @property
     def faults(self) -> list[str]:
-        """Return what is wrong with cameras that are certainly wrong."""
+        """Return the faults of cameras that are certainly wrong."""
         return [record.fault for record in self._records.copy().values() if record.fault]
 
     @property

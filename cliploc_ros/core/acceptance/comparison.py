@@ -8,9 +8,9 @@ leads, and the evidence for it is all that decides whether it is accepted.
 
 A pose may explain a mirror image well: of a room in a mirror, or of a flipped camera. A camera on
 the other side of a plane sees the points of the plane mirrored, at the same distances: objects on
-a table from below, those along a wall from behind. So the image is mirrored back, and the best
-pose for that competes with the pose found. It starts where reflection takes the camera, at planes
-through the objects that are matched.
+a table from below, those along a wall from behind. The image is therefore mirrored back,
+and the best pose for the mirrored image competes with the pose found. It starts at reflections of
+the camera in planes through the matched objects.
 """
 
 import math
@@ -124,7 +124,7 @@ class Comparison:
 
     @property
     def source(self) -> str:
-        """Return what proposes the leading place: 'objects', 'keyframes' or 'both'."""
+        """Return the source of the leading place: 'objects', 'keyframes' or 'both'."""
         if self.by_objects is None:
             return 'keyframes'
         return 'objects' if self.place is None else 'both'
@@ -215,7 +215,7 @@ class Comparison:
             else len(self._last.detections) - len(self._last.compared))
 
     def _signs(self, best: Contender) -> Signs | None:
-        """Return the signs that the leading place is no picture; None without keyframes there.
+        """Return the signs that the leading place is not a picture; None without keyframes there.
 
         In the last frame, since keyframes are recognized there.
         """
@@ -234,7 +234,7 @@ class Comparison:
                               self.place, passed[1])
 
     def _not_mirrored(self, by_points: float) -> float:
-        """Return the probability that the image is no mirror image.
+        """Return the probability that the image is not mirrored.
 
         Features of a mirror image match nothing, so keyframes exclude it, where they are sure. A
         pose that is refused anyway is not worth the time.

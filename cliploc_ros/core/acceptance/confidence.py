@@ -294,7 +294,7 @@ def points_utility(place: RecognizedPlace, calibration: Calibration = CALIBRATIO
 
 
 def objects_utility(support: Support, calibration: Calibration = CALIBRATION) -> float:
-    """Return what objects say of a pose that keyframes propose: log odds, against none."""
+    """Return the log odds by objects of a pose that keyframes propose, against none."""
     terms = calibration.keyframes
     return (terms.explained * min(terms.most_objects, support.inliers)
             + terms.unexplained * min(terms.most_objects, support.unexplained))

@@ -63,8 +63,8 @@ class Looks:
                        ) -> tuple[float, ...]:
         """Return the confidence of each look before an observation in its pose (4, 4).
 
-        A look that leads elsewhere has none: 0. How far apart two poses may be grows with the way
-        between them.
+        A look that leads elsewhere has 0. The allowed distance between two poses grows with the
+        way between them.
         """
         terms, odom_from_camera = CALIBRATION.looks, observation.odom_from_camera
         if odom_from_camera is None:

@@ -117,7 +117,7 @@ class Evidence:
     #: That the place is there and no picture of it; None where keyframes do not propose it
     signs: Signs | None = None
     motion: Motion | None = None  #: Since an earlier look by keyframes
-    #: Probability that the image is no mirror image, see cliploc_ros.core.acceptance.comparison
+    #: Probability that the image is not a mirror image, see cliploc_ros.core.acceptance.comparison
     not_mirrored: float = 1.0
     #: Probability that keyframes are wrong which recognize another place only
     uncontradicted: float = 1.0
@@ -268,7 +268,7 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
 
 
 def _points(evidence: Evidence) -> str:
-    """Return what keyframes show at the pose, as a part of a sentence; empty without any."""
+    """Return the keyframes' evidence at the pose, as part of a sentence; empty without any."""
     if evidence.recognized is None:
         return ''
     return (f', {evidence.recognized.inliers} points of keyframes agree in '

@@ -303,7 +303,7 @@ def _sums(rows: NDArray[np.float64], groups: NDArray[np.int64], count: int
 def _mean_square(fit: _Fit) -> float:
     """Return the mean square of the residuals, at least that of the deviations assumed.
 
-    Views of an object together count as one. Six residuals are zero by construction.
+    All views of an object count as one. Six residuals are zero by construction.
     """
     views = len(fit.objects) / max(1, len(fit.sigmas))
     squares = np.minimum(np.abs(fit.residuals), _TERMS.most_residual) ** 2

@@ -73,7 +73,7 @@ def cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64
         if one.odom_from_camera is None:
             raise OptionsError(f'{where} is missing: several frames need it')
         if not is_rigid(one.odom_from_camera):
-            raise OptionsError(f'{where} is no rigid transform')
+            raise OptionsError(f'{where} is not a rigid transform')
         linked.append(one.odom_from_camera)
     for row, odom_from_camera in enumerate(linked[:-1]):
         cameras[row] = invert_transform(odom_from_camera) @ linked[-1]

@@ -48,7 +48,7 @@ class Fault(NamedTuple):
 
 def calibration_faults(sensor: Camera, k: NDArray[np.float64], r: NDArray[np.float64],
                        p: NDArray[np.float64], rectified: bool) -> list[Fault]:
-    """Return what is implausible about a calibration, or contradicts itself.
+    """Return implausible or contradictory values of a calibration.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def check_faults(faults: Iterable[Fault]) -> None:
 
 @lru_cache(_CACHED)
 def camera_faults(camera: Camera) -> tuple[Fault, ...]:
-    """Return what is implausible about the camera of whole images, the certain faults first.
+    """Return implausible values of the camera of whole images, the certain faults first.
 
     An image that is cut out of a larger one has any principal point: give the camera of the whole.
     """
@@ -132,10 +132,10 @@ def _faults_of(camera: Camera) -> Iterator[Fault]:
 
 def _doubts(rotation: NDArray[np.float64], projection: NDArray[np.float64], rectified: bool
             ) -> Iterator[str]:
-    """Return what is unusual about R (3, 3) and P (3, 4); zeros stand for none."""
+    """Return unusual values of R (3, 3) and P (3, 4); zeros stand for none."""
     if np.any(rotation):
         if not is_rigid(make_transform(rotation, np.zeros(3)), _ROTATION_TOLERANCE):
-            yield 'R is no rotation: set it to the identity'
+            yield 'R is not a rotation: set it to the identity'
         elif (turn_deg := rotation_angle_deg(rotation)) > _MOST_TURN_DEG and not rectified:
             yield (f'R turns rectified images by {turn_deg:.3g} degrees, and the coordinate frame '
                    'is theirs: use them, with rectified true')

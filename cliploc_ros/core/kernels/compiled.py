@@ -32,10 +32,13 @@ from numba.core.serialize import dumps
 from numba.core.types import BaseTuple, Type  # type: ignore[attr-defined]
 
 from cliploc_ros.files.storage import (
+    MAKE_ROOM,
+    NOT_KEPT,
     is_foreign,
     read_file,
     replace_file,
     resolve_cache_dir,
+    warn_not_kept,
 )
 
 _PACKAGE = Path(__file__).resolve().parents[2]
@@ -73,7 +76,7 @@ class KernelFolders:
         self._preferred = folder
 
     def read(self, name: str) -> bytes | None:
-        """Return what is stored under a name, or None."""
+        """Return the content stored under a name, or None."""
         for number, folder in enumerate(self._all()):
             content = _read(folder / name)
             if content is not None:
@@ -101,8 +104,8 @@ class KernelFolders:
             failures.append(failure)
         if not self._is_warned:
             self._is_warned = True
-            logger.warning('cannot keep compiled kernels (%s): each start compiles them again; '
-                           'set cache_dir to a folder with room', '; '.join(failures))
+            warn_not_kept(f'cannot keep compiled kernels ({"; ".join(failures)}): each start '
+                          'compiles them again; set cache_dir to a folder with room')
 
     def _all(self) -> Iterator[Path]:
         given = os.environ.get('NUMBA_CACHE_DIR')
@@ -116,15 +119,17 @@ class KernelFolders:
         if not os.access(own if own.exists() else _PACKAGE, os.W_OK):
             yield resolve_cache_dir('') / 'kernels'
 
-    @staticmethod
-    def _write(file: Path, content: bytes) -> str:
+    def _write(self, file: Path, content: bytes) -> str:
         """Write a file in one step; return what failed, or ''."""
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
             with replace_file(file) as partial:
                 partial.write_bytes(hashlib.sha256(content).digest() + content)
         except OSError as error:
-            return f'{file.parent}: {error.strerror}'
+            failure = f'{file.parent}: {error.strerror}'
+            if file.parent == self._preferred:  # this machine may have them elsewhere
+                NOT_KEPT.append(f'compiled kernels are not kept in {failure}; {MAKE_ROOM}')
+            return failure
         return ''
 
 
@@ -201,7 +206,7 @@ def _read_source(module: str) -> tuple[bytes, list[str]]:
 
 
 def _describe(kind: Type) -> object:
-    """Return what identifies a type of argument; the fields of a named tuple are part of it."""
+    """Return the identity of an argument's type; it includes the fields of a named tuple."""
     if isinstance(kind, BaseTuple):
         named = getattr(kind, 'instance_class', None)
         identity = named and (named.__module__, named.__qualname__, named._fields)

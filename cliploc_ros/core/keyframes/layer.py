@@ -187,7 +187,7 @@ _SCHEMA = Schema('file of keyframes', {
     'landmark_ids': Field('text', ('L',)),
     'landmark_centers': Field('float32', ('L', 3), (FINITE,)),
     'map_from_camera': Field('float64', ('K', 4, 4), (
-        FINITE, Check('is no rigid transform', lambda poses: ~are_rigid(poses)))),
+        FINITE, Check('is not a rigid transform', lambda poses: ~are_rigid(poses)))),
     'offsets': Field('int64', ('K+1',), (Offsets('descriptors', 'points'),)),
     'pixels': Field('uint16', ('n', 2), stays=True),
     'points': Field('float32', ('n', 3), (FINITE,), stays=True),
@@ -257,7 +257,7 @@ def load_layer_of_map(path: Path, landmark_map: LandmarkMap, kinds: FeatureKinds
 
 
 def layer_hash(path: Path) -> str:
-    """Return what tells one layer from another: of the names, sizes and checksums of its arrays.
+    """Return a digest of a layer, by the names, sizes and checksums of its arrays.
 
     It reads the table of contents only: a layer may be larger than the memory.
     """
@@ -273,7 +273,7 @@ def _layer_of(arrays: dict[str, NDArray[Any]], kinds: FeatureKinds) -> KeyframeL
         header = parse_json(str(arrays.pop('header')))
         version, name = header.get('version'), str(header.get('descriptors'))
     except (AttributeError, ValueError) as error:
-        raise ArrayError(f'its header is no JSON object ({error})') from error
+        raise ArrayError(f'its header is not a JSON object ({error})') from error
     if version != VERSION:
         raise ArrayError(f'is of version {version!r}, expected {VERSION}')
     if name not in kinds:

@@ -179,7 +179,7 @@ class KeyframeLocalizer:
         deadline : float
             No further keyframe is matched then (monotonic clock) [s].
         constraint : Constraint, optional
-            Poses that its height range or max_tilt excludes are no places.
+            Poses that its height range or max_tilt excludes are not places.
         fast : Recognition, optional
             What the fast pass found. With it, this is the thorough pass: many keyframes are
             matched instead of a few, and the pose is refined by all of their points. It takes

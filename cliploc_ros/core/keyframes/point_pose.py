@@ -7,9 +7,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.kernels.compiled import compiled
 
 #: Fewer inliers determine no pose: three fix it, the others agree with it.
 LEAST_INLIERS = 8
@@ -26,6 +26,8 @@ _ROUGH, _WRONG_FOCAL, _MOST_LOGARITHM = (2.0, 1.0), (12.0, 6.0, 3.0, 1.0), np.lo
 _OF_X_AND_Y = np.array([[1.0, 1.0], [1.0, -1.0]])
 # The least deviation of a feature, as an angle: half a pixel at f = 525 px.
 _LEAST_DEVIATION = 0.5 / 525.0
+# Points behind the camera count as ones before it, so near [m].
+_LEAST_DEPTH = 1e-3
 # Of a normal distribution: standard deviation divided by the median of absolute values.
 _FROM_MEDIAN = 1.4826
 
@@ -156,26 +158,56 @@ def agreeing(points: NDArray[np.float64], bearings: NDArray[np.float64],
 
 def _least_squares(points: NDArray[np.float64], bearings: NDArray[np.float64], fit: _Fit) -> _Fit:
     """Return a fit after some steps of Gauss and Newton."""
+    points, bearings = np.ascontiguousarray(points), np.ascontiguousarray(bearings)
     for _ in range(_STEPS):
-        inside = points @ fit.camera_from_map[:3, :3].T + fit.camera_from_map[:3, 3]
-        x, y, z = inside.T
-        z = np.maximum(z, 1e-3)
-        zero, one, u, v = np.zeros_like(z), 1.0 / z, x / z, y / z
-        residuals = np.stack([u, v], axis=1) - bearings / fit.ratios
-        deviation = max(_LEAST_DEVIATION, _FROM_MEDIAN * np.median(np.abs(residuals)))
-        # of the residuals times the focal length: else an endless one would fit best
-        by_x = np.stack([one, zero, -u / z, -u * v, 1.0 + u**2, -v, u, u], axis=1)
-        by_y = np.stack([zero, one, -v / z, -1.0 - v**2, u * v, u, v, -v], axis=1)
-        jacobian = np.concatenate([by_x, by_y])[:, :len(fit.information)] / deviation
-        scaled = residuals / deviation
-        weights = 1.0 / (1.0 + np.sum(scaled**2, axis=1) / 4.0)
-        weighted = jacobian.T * np.tile(weights, 2)
-        information = weighted @ jacobian
-        step = -np.linalg.lstsq(information, weighted @ scaled.T.ravel(), rcond=None)[0]
+        information, gradient = _normal_equations(
+            points, bearings, np.ascontiguousarray(fit.camera_from_map), fit.ratios,
+            len(fit.information))
+        try:
+            step = -np.linalg.solve(information, gradient)
+        except np.linalg.LinAlgError:  # the points fix no pose
+            return fit._replace(information=information)
         step /= max(1.0, np.abs(step[6:]).max(initial=0.0) / _MOST_STEP)
-        moved = make_transform(Rotation.from_rotvec(step[3:6]).as_matrix(), step[:3])
+        moved = make_transform(cv2.Rodrigues(step[3:6])[0], step[:3])
         fit = _Fit(moved @ fit.camera_from_map,
                    fit.logarithms + np.append(step[6:], [0.0, 0.0])[:2], information)
         if np.abs(step).max() < _SMALL_STEP:
             break
     return fit
+
+
+@compiled
+def _normal_equations(points, bearings, camera_from_map, ratios, size):
+    """Return the information (size, size) and the gradient of a fit with Cauchy's weights.
+
+    The unknowns are a step (v, w) from the left of camera_from_map, and with a size of 8 the
+    logarithms of the focal length and its aspect. Residuals are divided by their deviation.
+    """
+    count = len(points)
+    seen, residuals = np.empty((count, 3)), np.empty(2 * count)
+    for row in range(count):
+        for axis in range(3):
+            seen[row, axis] = camera_from_map[axis, 3]
+            for other in range(3):
+                seen[row, axis] += camera_from_map[axis, other] * points[row, other]
+        seen[row, 2] = 1.0 / max(seen[row, 2], _LEAST_DEPTH)
+        for axis in range(2):
+            seen[row, axis] *= seen[row, 2]
+            residuals[2 * row + axis] = seen[row, axis] - bearings[row, axis] / ratios[axis]
+    deviation = max(_LEAST_DEVIATION, _FROM_MEDIAN * np.median(np.abs(residuals)))
+    information, gradient = np.zeros((size, size)), np.zeros(size)
+    jacobian = np.empty((2, 8))
+    for row in range(count):
+        u, v, one = seen[row]
+        # of the residuals times the focal length: else an endless one would fit best
+        jacobian[0] = one, 0.0, -u * one, -u * v, 1.0 + u * u, -v, u, u
+        jacobian[1] = 0.0, one, -v * one, -1.0 - v * v, u * v, u, v, -v
+        square = (residuals[2 * row] ** 2 + residuals[2 * row + 1] ** 2) / deviation ** 2
+        weight = 1.0 / (1.0 + square / 4.0) / deviation ** 2
+        for i in range(size):
+            for axis in range(2):
+                weighted = weight * jacobian[axis, i]
+                gradient[i] += weighted * residuals[2 * row + axis]
+                for j in range(size):
+                    information[i, j] += weighted * jacobian[axis, j]
+    return information, gradient

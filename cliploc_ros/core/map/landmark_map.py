@@ -112,7 +112,7 @@ class ClassIndex:
 
     def have(self, landmarks: NDArray[np.int64], classes: NDArray[np.int64]
              ) -> NDArray[np.bool_]:
-        """Return whether landmarks (p,) are members of classes (p,); below 0 is no class."""
+        """Return whether landmarks (p,) are members of classes (p,); no class below 0."""
         # a class below 0 gets a key below 0, which no member has
         keys = np.where(classes < 0, -1, landmarks * (len(self.starts) - 1) + classes)
         return np.asarray((self.of_landmarks[landmarks] == classes)
@@ -169,8 +169,8 @@ def objects_of(centers: NDArray[np.float64], shapes: NDArray[np.float64],
                neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the number of each landmark's object (L,): duplicates share one.
 
-    Landmarks of one class are duplicates if they stand in one another. So books side by side are
-    none.
+    Landmarks of one class are duplicates if they stand in one another. Books side by side are not
+    duplicates.
 
     Parameters
     ----------
@@ -217,6 +217,18 @@ class LandmarkMap:
             self.frame_id, pick(self.landmark_ids), pick(self.labels), pick(self.class_ids),
             self.centers[rows], self.semi_axes[rows], self.quats_xyzw[rows],
             pick(self.details) if self.details else ())
+
+    def with_more(self, other: 'LandmarkMap') -> 'LandmarkMap':
+        """Return the map with the landmarks of another one behind its own."""
+        def details(one: LandmarkMap) -> tuple[LandmarkDetails, ...]:
+            return one.details or (LandmarkDetails(),) * len(one)
+
+        return LandmarkMap(
+            self.frame_id, self.landmark_ids + other.landmark_ids, self.labels + other.labels,
+            self.class_ids + other.class_ids, np.concatenate([self.centers, other.centers]),
+            np.concatenate([self.semi_axes, other.semi_axes]),
+            np.concatenate([self.quats_xyzw, other.quats_xyzw]), details(self) + details(other),
+            map_set=self.map_set)
 
     def joined(self, into: NDArray[np.int64]) -> 'LandmarkMap':
         """Return the map in which each landmark has the labels and classes of its parts, too.

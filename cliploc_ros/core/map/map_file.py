@@ -8,6 +8,7 @@ import os
 import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from cliploc_ros.core.map.landmark_embeddings import (
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError
-from cliploc_ros.files.storage import WriteOfSet, replace_file, replace_set
+from cliploc_ros.files.storage import MAKE_ROOM, WriteOfSet, replace_file, replace_set
 
 _INDENT = ' ' * 10
 
@@ -42,28 +43,44 @@ def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
     """
     path = Path(path)
 
-    def write(place: Path, digest: str) -> None:
-        family = landmark_map.map_set.family or digest
-        with replace_file(place) as partial, partial.open('w', encoding='utf-8') as file:
-            file.writelines(f'# {" ".join(line.split())}\n' for line in comments)
-            file.write(f'# set {family} {digest}\n')
-            file.writelines(f'{line}\n' for line in _lines(landmark_map))
-
     def write_embeddings(place: Path, digest: str) -> None:
         assert embeddings is not None
         save_landmark_embeddings(place, replace(embeddings, set_digest=digest))
 
     try:
-        replace_set(path, set_digest(landmark_map), write, {
+        replace_set(path, set_digest(landmark_map), partial(
+            write_landmarks, landmark_map=landmark_map, comments=comments), {
             embeddings_path(path): None if embeddings is None else write_embeddings,
             **(besides or {})})
     except OSError as error:
-        raise MapError(f'{path}: cannot be written: {error.strerror}; nothing was changed'
-                       ) from error
+        raise MapError(f'{path}: cannot be written: {error.strerror}; nothing was changed: '
+                       f'{MAKE_ROOM}') from error
+
+
+def write_landmarks(path: Path, digest: str, landmark_map: LandmarkMap,
+                    comments: Iterable[str] = ()) -> None:
+    """Write a file of landmarks that is of a set; OSError: it cannot be written."""
+    family = landmark_map.map_set.family or digest
+    with replace_file(path) as unfinished, unfinished.open('w', encoding='utf-8') as file:
+        file.writelines(f'# {" ".join(line.split())}\n' for line in comments)
+        file.write(f'# set {family} {digest}\n')
+        file.writelines(f'{line}\n' for line in _lines(landmark_map))
+
+
+def removed_path(map_path: Path) -> Path:
+    """Return the file of the landmarks that updates took out of a map."""
+    return map_path.with_suffix('.removed.yaml')
+
+
+def load_removed(map_path: Path, family: str) -> LandmarkMap | None:
+    """Return what updates took out of a map; None for nothing, or of another family of maps."""
+    path = removed_path(map_path)
+    found = LandmarkMap.from_file(path) if path.exists() else None
+    return found if found is not None and found.map_set.family == family else None
 
 
 def set_digest(landmark_map: LandmarkMap) -> str:
-    """Return what tells a map and the files that are written with it from other ones.
+    """Return the identity of a map and of the files that are written with it.
 
     Maps of keyframes alone say the same: they get a random one.
     """

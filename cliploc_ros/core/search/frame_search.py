@@ -43,7 +43,7 @@ from cliploc_ros.errors import OptionsError
 #: few milliseconds. In sparse maps of 100,000 landmarks this limit ends the search before its
 #: iterations do: candidates of equal class are hardly ever neighbours.
 MAX_CANDIDATES = 1_500
-# Coordinates on the plane z = 1 beyond this are no image of any lens; their squares are finite.
+# Coordinates on the plane z = 1 beyond this come from no lens; their squares are finite.
 _FARTHEST = 1e6
 # Depths beyond this have another unit.
 _FARTHEST_M = 40.0
@@ -311,7 +311,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
     """Search one frame, until a deadline of used_time_s [s].
 
     OptionsError: similarities that the matching type needs are missing or of the wrong shape, or
-    the vertical is no unit vector.
+    the vertical is not a unit vector.
     """
     if not len(landmark_map):  # of keyframes alone: boxes tell nothing
         none = np.empty(0, dtype=np.int64)
@@ -350,7 +350,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
 
 
 def constraint_of(observation: Observation, options: RelocalizerOptions) -> Constraint:
-    """Return what is known of the camera of a frame before anything is searched."""
+    """Return the constraints on the camera of a frame that hold before the search."""
     vertical, (low, high) = vertical_of(observation, options), options.height_range_m
     known = vertical[6] > 0.0
     return Constraint(tuple(vertical[:3]) if known else _UPRIGHT, _UP_IN_MAP, low, high,
@@ -365,13 +365,13 @@ def coverage_of(frames: Sequence[SearchedFrame]) -> float:
 def vertical_of(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64]:
     """Return the vertical (7,) of a frame; the paper's algorithms do not use it.
 
-    OptionsError: it is no unit vector.
+    OptionsError: it is not a unit vector.
     """
     up = observation.up_in_camera
     if up is None or options.algorithm != 'auto':
         return VERTICAL_UNKNOWN
     if up.shape != (3,) or not abs(np.linalg.norm(up) - 1.0) < _UNIT_TOLERANCE:
-        raise OptionsError(f'up_in_camera: {up} is no unit vector')
+        raise OptionsError(f'up_in_camera: {up} is not a unit vector')
     return np.array([*up, *_UP_IN_MAP, np.radians(options.vertical_deviation_deg)])
 
 

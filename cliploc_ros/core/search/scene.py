@@ -127,8 +127,8 @@ class Constraint(NamedTuple):
                    ) -> float:
         """Return the angle between both verticals at a pose (4, 4), in its standard deviations.
 
-        Those of the vertical and of the pose, with covariance (6, 6), count. Of right poses, one
-        of 1,000 exceeds 3.7, if the vertical is right. 0 where the vertical is unknown.
+        The deviations are those of the vertical and of the pose with covariance (6, 6). With a
+        right vertical, one right pose in 1,000 exceeds 3.7. 0 where the vertical is unknown.
         """
         up = map_from_camera[:3, :3] @ self.up_in_camera
         axis = np.cross(up, self.up_in_map)

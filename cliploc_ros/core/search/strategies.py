@@ -217,8 +217,8 @@ def _compatible_before(compatible, newest, earlier):
 def enumerate_compatible_pairs(compatible, cursor, samples):
     """Write the next pairs of compatible candidates, by their newer; return their number.
 
-    As enumerate_compatible_triples does, into two columns: older, newer. The cursor (2,) is at
-    first 1, 0, and its first value is c at the end.
+    As enumerate_compatible_triples does, into two columns: older, newer. The cursor (2,) starts
+    at 1, 0; at the end its first value is c.
     """
     count = compatible.shape[0]
     newest, first = cursor[0], cursor[1]
@@ -323,7 +323,7 @@ class Leaders(NamedTuple):
 
     @staticmethod
     def none_yet(count: int = MAX_DISTINCT) -> 'Leaders':
-        """Return room for a number of leaders, all unused."""
+        """Return storage for a number of leaders, all of it unused."""
         return Leaders(np.full(count, -1.0), np.zeros(count, dtype=np.int64),
                        np.full((count, 3), -1, dtype=np.int64),
                        np.zeros((count, 3, 3)), np.zeros((count, 3)))

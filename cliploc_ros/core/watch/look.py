@@ -76,7 +76,7 @@ def look_at(landmark_map: LandmarkMap, observation: Observation, options: Reloca
             ) -> JoinedFrames:
     """Return an observation as a frame that poses are compared on.
 
-    Its vertical comes by the stated mount, which may be wrong, so it must not bend the fit.
+    Its vertical depends on the given mount, which may be wrong, so it must not bias the fit.
     """
     if observation.similarities is None:
         options = replace(options, matching='class')
@@ -139,7 +139,7 @@ class LookEvidence(NamedTuple):
 
 
 def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
-    """Return what an aligned look says, and the landmarks that it expects."""
+    """Return the evidence of an aligned look, and the landmarks that it expects."""
     joined, fit = alignment.joined, alignment.fit
     landmark_map, observation = joined.landmark_map, joined.frames[0].observation
     index, (matches,) = landmark_map.classes, fit.matches
@@ -162,7 +162,7 @@ def log_odds(evidence: LookEvidence, is_full: bool, calibration: Calibration = C
              ) -> float:
     """Return the log odds of a look by its objects that the given pose is right.
 
-    A place that the map does not show is no wrong pose, nor is a view without objects: a look that
+    Neither a place that the map lacks nor a view without objects makes the pose wrong: a look that
     is not full says little against a pose.
     """
     terms = calibration.watch

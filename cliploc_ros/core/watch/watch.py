@@ -115,7 +115,7 @@ def _correlation(one: _Look, look: _Look) -> float:
     else:
         way_m, turn_deg = pose_error(then.odom_from_camera, now.odom_from_camera)
         away = way_m / terms.correlated_m + turn_deg / terms.correlated_deg
-    # looks that say the opposite are no repetition: the robot was carried away, or back
+    # looks that say the opposite are not a repetition: the robot was carried away, or back
     return terms.correlated * math.exp(-away - abs(one.log_odds - look.log_odds) / terms.most)
 
 
@@ -177,12 +177,13 @@ class Watch:
         Raises
         ------
         OptionsError
-            A pose is no rigid transform, the image has no pixels, or the observation is invalid.
+            A pose is not a rigid transform, the image has no pixels, or the observation is
+            invalid.
         """
         for name, pose in (('map_from_camera', map_from_camera),
                            ('odom_from_camera', observation.odom_from_camera)):
             if pose is not None and not is_rigid(pose, _RIGID):
-                raise OptionsError(f'{name} is no rigid transform: {np.asarray(pose).tolist()}')
+                raise OptionsError(f'{name} is not a rigid transform: {np.asarray(pose).tolist()}')
         vertical_of(observation, self._options)  # refuses an invalid one
         if image is not None and not image.size:
             raise OptionsError(f'image of shape {image.shape} has no pixels')
@@ -204,7 +205,7 @@ class Watch:
         alignment = align(look_at(self._map, observation, self._options),
                           given if turn is None else given @ turn.stated_from_true)
         evidence, expected = measure(alignment)
-        # where the map is out of date, objects that nothing explains are no wrong pose
+        # where the map is out of date, objects that nothing explains are not a wrong pose
         is_full = evidence.is_full(self._belief.has_jumped) and (
             self._belief.has_jumped or not self._missing.is_outdated)
         odds = log_odds(evidence, is_full) + by_vertical(

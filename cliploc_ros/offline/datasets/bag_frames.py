@@ -87,7 +87,7 @@ def topic_of(camera: str, topic: str) -> str:
 def find_topics(bag: Path, image: str | None, camera_info: str | None) -> tuple[str, str]:
     """Return the topics of image and camera_info; None is found where there is one candidate.
 
-    Depth and debug images are no candidates; raw images go before compressed ones of the same
+    Depth and debug images are not candidates; raw images go before compressed ones of the same
     camera. DatasetError: there is none, or there are several; names them and the parameter.
     """
     with BagReader(bag) as reader:
@@ -116,7 +116,7 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
                depth: DepthFormat | None = None) -> Frames:
     """Return the frames of a recording, a rosbag2 folder or file.
 
-    DatasetError: a topic is missing, of another type, or empty, or the poses are of another time.
+    DatasetError: a topic is missing, empty or of another type, or no pose is near the images.
     """
     if topics.depth == topics.image:
         raise DatasetError(f'{bag}: {topics.image} cannot be both the image and its depth')
@@ -191,7 +191,7 @@ class _Cameras(NamedTuple):
 
     def decoder(self, stamp_ns: int, recorded_ns: int, data: bytes
                 ) -> Callable[[], tuple[NDArray[np.uint8], Camera]]:
-        """Return what decodes an image, with the camera_info nearest in time."""
+        """Return a decoder of an image, with the camera_info nearest in time."""
         info: bytes | Camera
         if self.given is not None:
             info = self.given
@@ -299,7 +299,7 @@ def _readings(cameras: _Cameras, rectified: bool) -> dict[str, Reading]:
 
 
 def _notes(reader: BagReader, topics: BagTopics) -> list[str]:
-    """Return what is unusual about the camera of a recording, by its first messages.
+    """Return unusual properties of the camera of a recording, by its first messages.
 
     DatasetError: its images are certainly rectified, and read as raw.
     """

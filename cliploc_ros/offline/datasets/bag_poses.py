@@ -48,7 +48,7 @@ _COMPARED, _SAME_M, _SAME_DEG = 50, 0.05, 2.0
 def poses_of_topic(name: str, max_gap_ns: int = 0,
                    body_from_camera: NDArray[np.float64] | None = None,
                    tolerance_ns: int = STAMP_TOLERANCE_NS, tf: str | None = None) -> ReadPoses:
-    """Return what reads a topic of PoseStamped, PoseWithCovarianceStamped or Odometry.
+    """Return a reader of a topic of PoseStamped, PoseWithCovarianceStamped or Odometry.
 
     Its parameters are those of TimedPoses. Without a mount, poses of a child_frame_id other than
     the images' are led on to the camera by tf. DatasetError, when it reads: the topic is missing,
@@ -92,11 +92,11 @@ def poses_of_topic(name: str, max_gap_ns: int = 0,
 def find_poses(max_gap_ns: int, ground_truth: str = GROUND_TRUTH,
                camera_frame: str | None = None, topic_gap_ns: int | None = None,
                tolerance_ns: int = STAMP_TOLERANCE_NS, tf: str | None = None) -> ReadPoses:
-    """Return what reads the camera's poses where nobody says where they are.
+    """Return a reader of the camera's poses for a recording whose source of poses is not named.
 
-    They are those of the topic of ground truth, else of tf in the coordinate frame `map`. Other
-    topics are not taken: nothing says what their poses are of. The greatest gap of a topic may
-    differ from that of tf. DatasetError, when it reads: there are none.
+    It takes the topic of ground truth, else tf in the coordinate frame `map`. It takes no other
+    topic, because nothing says which body its poses describe. The greatest gap of a topic may
+    differ from that of tf. DatasetError, when it reads: there are no poses.
     """
     def read(reader: BagReader, image_frame: str) -> Poses:
         problem, of_tf = 'no tf', None
@@ -196,7 +196,7 @@ class ChainedPoses:
 
 def poses_of_tf(map_frame: str, camera_frame: str | None, max_gap_ns: int,
                 tf: str | None = None) -> ReadPoses:
-    """Return what reads how a camera moved in a map, from /tf and /tf_static.
+    """Return a reader of a camera's poses in a map, from /tf and /tf_static.
 
     DatasetError, when it reads: the recording has no tf, or nothing connects the two frames.
 

@@ -33,6 +33,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.files.storage import MAKE_ROOM
 
 _VISION_MSGS = ('Point2D', 'Pose2D', 'BoundingBox2D', 'ObjectHypothesis',
                 'ObjectHypothesisWithPose', 'Detection2D', 'Detection2DArray')
@@ -66,7 +67,7 @@ def typestore() -> Typestore:
 
 
 def deserialize(data: bytes, msgtype: str, where: str) -> Any:
-    """Return a message of its bytes; DatasetError: they are no such message."""
+    """Return a message of its bytes. DatasetError: they are not such a message."""
     try:
         return typestore().deserialize_cdr(data, msgtype)
     except Exception as error:  # the library raises what the bytes happen to cause
@@ -117,8 +118,8 @@ class BagReader:
             raise DatasetError(f'{self.path}: no such recording')
         if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
             raise DatasetError(
-                f'{self.path}: has no metadata.yaml; it is no rosbag2 recording, or an incomplete '
-                f'one that `ros2 bag reindex {self.path}` rebuilds'
+                f'{self.path}: has no metadata.yaml; it is not a rosbag2 recording, or an '
+                f'incomplete one that `ros2 bag reindex {self.path}` rebuilds'
             )
         try:
             reader = Reader(self.path)
@@ -218,7 +219,7 @@ class BagReader:
     def leave_out(self, topic: str, reason: str) -> None:
         """Count a message that cannot be used; the same one again counts once.
 
-        DatasetError: too many cannot, so that the fault is no accident.
+        DatasetError: too many cannot, so that the fault is not an accident.
         """
         reasons = self.left_out.setdefault(topic, {})
         reasons[reason] = None
@@ -227,7 +228,7 @@ class BagReader:
                                f'{next(iter(reasons))}')
 
     def left_out_notes(self) -> list[str]:
-        """Return what was left out, topic by topic, in words."""
+        """Return the messages that were left out, topic by topic, in words."""
         return [f'{len(reasons)} of {self.topic(topic).message_count} messages of {topic} left '
                 f'out: {next(iter(reasons))}' for topic, reasons in self.left_out.items()]
 
@@ -389,4 +390,4 @@ class BagWriter:
         except (OSError, sqlite3.Error, WriterError) as error:
             reason = getattr(error, 'strerror', None) or str(error)
             raise DatasetError(f'{self.path}: cannot be written: {reason}; no partial file '
-                               'remains') from error
+                               f'remains: {MAKE_ROOM}') from error

@@ -86,7 +86,8 @@ class Frames:
     #: The frames of each of several cameras; empty for one
     of_cameras: tuple['Frames', ...] = ()
     varies: bool = False  #: Whether each image has a camera of its own
-    digest: str = ''  #: Of poses and cameras, which may change while the folder does not
+    #: Of what may change while the folder does not: images and their cameras, then their poses
+    digest: str = ''
     notes: tuple[str, ...] = ()  #: What the user should know about how they were read
 
     @property
@@ -118,8 +119,9 @@ def move_frames(frames: Frames, scale: float, rotation: NDArray[np.float64]) -> 
         for raw in frames.read_raw(lambda place, stamp_ns, pose: is_wanted(place, stamp_ns,
                                                                            moved(pose))):
             yield replace(raw, map_from_camera=moved(raw.map_from_camera))
-    return replace(frames, read_raw=read_raw, of_cameras=tuple(
-        move_frames(one, scale, rotation) for one in frames.of_cameras))
+    return replace(
+        frames, read_raw=read_raw, digest=f'{frames.digest} {scale} {rotation.tolist()}',
+        of_cameras=tuple(move_frames(one, scale, rotation) for one in frames.of_cameras))
 
 
 def join_frames(of_cameras: Mapping[str, Frames]) -> Frames:
@@ -253,7 +255,7 @@ def read_depth(file: ImageFile, form: DepthFormat) -> DepthImage:
     if file.confidence is not None:
         certain = cv2.imread(str(file.confidence), cv2.IMREAD_UNCHANGED)
         if certain is None or certain.shape != depths_m.shape:
-            raise DatasetError(f'{file.confidence} is no image of the size of {file.depth}')
+            raise DatasetError(f'{file.confidence} is not an image of the size of {file.depth}')
         depths_m[certain == 0] = np.nan
     return DepthImage(depths_m, form.camera)
 

@@ -40,6 +40,8 @@ class MapRecording:
     layout: str = ''
     intrinsics: str | None = None
     images: Path | None = None
+    #: The options of a folder that say what its poses are, see FolderOptions; only those given
+    placing: dict[str, Any] = field(default_factory=dict)
     #: From the poses of the observations to those of the map: positions times a scale, then turned
     #: by a rotation (3, 3)
     scale: float = 1.0
@@ -62,7 +64,7 @@ def recording_path(map_file: Path) -> Path:
 
 def save_recording(map_file: Path, recording: MapRecording, place: Path | None = None,
                    set_digest: str = '') -> None:
-    """Write what a map was built from, next to it or to a place in the same folder.
+    """Write the sources of a map next to it, or to a place in the same folder.
 
     CliplocError: the file cannot be written.
     """
@@ -75,7 +77,7 @@ def save_recording(map_file: Path, recording: MapRecording, place: Path | None =
 
 
 def load_recording(map_file: Path) -> MapRecording | None:
-    """Return what a map was built from; None where nothing says it, or its observations are gone.
+    """Return the sources of a map; None if they are not recorded, or its observations are gone.
 
     A source that is gone is None. DatasetError: the file is damaged.
     """

@@ -43,7 +43,7 @@ FRAME_FIELDS = {
     'scores': npz.Field('numbers', ('n',), (npz.FINITE, npz.SHARE)),
     'timestamps': npz.Field('numbers', ('F',), (npz.FINITE,)),
     'map_from_camera': npz.Field('numbers', ('F', 4, 4), (npz.FINITE, npz.Check(
-        'is no rigid transform', lambda poses: ~are_rigid(poses)))),
+        'is not a rigid transform', lambda poses: ~are_rigid(poses)))),
     # NaN where unknown [m]
     'depths': npz.Field('floats', ('n',), (npz.Check(
         'is not positive and finite', lambda depths: (depths <= 0.0) | np.isinf(depths)),),
@@ -57,7 +57,7 @@ FRAME_FIELDS = {
 
 def _check_truth(name: str, arrays: npz.Arrays) -> None:
     landmarks = len(arrays['landmark_ids'])
-    npz.Check('is no landmark', lambda rows: (rows < -1) | (rows >= landmarks))(name, arrays)
+    npz.Check('is not a landmark', lambda rows: (rows < -1) | (rows >= landmarks))(name, arrays)
 
 
 def _check_groups(name: str, arrays: npz.Arrays) -> None:
@@ -79,7 +79,7 @@ _QUERIES = npz.Schema('query file', {
         lambda numbers: (numbers <= 0) & (np.arange(4) < 2)))),
     # half precision rounds some cosines to just above 1
     'similarities': npz.Field('numbers', ('n', 'L'), (npz.FINITE, npz.Check(
-        'is no cosine, outside -1 to 1', lambda rows: (np.abs(rows) > 1.001).any(axis=1)))),
+        'is not a cosine, outside -1 to 1', lambda rows: (np.abs(rows) > 1.001).any(axis=1)))),
     'true_landmark': npz.Field('integers', ('n',), (_check_truth,)),
     'timestamps': npz.Field('numbers', ('F',), (
         npz.FINITE, npz.Check('is negative', lambda seconds: seconds < 0))),
@@ -249,7 +249,7 @@ _OBSERVATIONS = npz.Schema('observation file', {
     'encoder_key': npz.Field('text', is_optional=True),
     # a row without odometry is NaN
     'odom_from_camera': npz.Field('floats', ('F', 4, 4), (npz.Check(
-        'is no rigid transform',
+        'is not a rigid transform',
         lambda poses: ~np.isnan(poses).all(axis=(1, 2)) & ~are_rigid(poses)),), is_optional=True),
     'image_counts': npz.Field('integers', (2,), (_NOT_NEGATIVE,), is_optional=True),
     # of several cameras: their names, width and height, fx, fy, cx, cy, and the camera of each

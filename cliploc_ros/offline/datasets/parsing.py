@@ -86,14 +86,14 @@ def parse_all[T](cells: Sequence[str], kind: Callable[[str], T], where: str) -> 
         try:
             numbers.append(kind(cell))
         except ValueError:
-            raise DatasetError(f'{where}: {cell[:40]!r} is no number') from None
+            raise DatasetError(f'{where}: {cell[:40]!r} is not a number') from None
     return numbers
 
 
 def unit_of_stamps(texts: Iterable[str]) -> Decimal:
     """Return the unit of the times of a file [s]: seconds where all can be, else ms, us or ns.
 
-    Texts that are no numbers are passed over.
+    Texts that are not numbers are passed over.
     """
     greatest = 0.0
     for text in texts:
@@ -106,7 +106,7 @@ def unit_of_stamps(texts: Iterable[str]) -> Decimal:
 def parse_stamp_ns(text: str, where: str, unit_s: Decimal = Decimal(1)) -> int:
     """Convert a decimal time to nanoseconds exactly, without a float.
 
-    DatasetError: the text is no number, or outside the range of a ROS time.
+    DatasetError: the text is not a number, or outside the range of a ROS time.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def parse_stamp_ns(text: str, where: str, unit_s: Decimal = Decimal(1)) -> int:
     except Overflow:
         seconds = Decimal('inf')
     except InvalidOperation:
-        raise DatasetError(f'{where}: {text!r} is no timestamp in seconds') from None
+        raise DatasetError(f'{where}: {text!r} is not a timestamp in seconds') from None
     if not seconds.is_finite() or not 0 <= seconds <= MAX_STAMP_S:
         raise DatasetError(f'{where}: timestamp {text} is outside 0 to {MAX_STAMP_S} s')
     return int((seconds * NS_PER_S).to_integral_value())
@@ -187,7 +187,7 @@ class Fields:
     def of_file(cls, path: Path, read: Callable[[Path], str | bytes] = read_text) -> 'Fields':
         """Return the mapping that a file holds."""
         text = read(path)
-        with naming(path, ValueError, what='is no JSON: '):
+        with naming(path, ValueError, what='is not JSON: '):
             return cls(parse_json(text, parse_float=WrittenFloat), str(path))
 
     def __contains__(self, name: str) -> bool:

@@ -48,7 +48,7 @@ class TumSequence:
         DatasetError: the step is less than 1.
         """
         if step < 1:
-            raise DatasetError(f'every {step}th image is no selection: give 1 or more')
+            raise DatasetError(f'every {step}th image is not a selection: give 1 or more')
         return replace(
             self, stamps_ns=self.stamps_ns[::step], image_paths=self.image_paths[::step])
 
@@ -146,7 +146,7 @@ def _pose_of_matrix(numbers: list[float], where: str) -> list[float]:
     """Return position and quaternion of 12 or 16 numbers of a matrix, row after row."""
     pose = np.array([*numbers[:12], 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
     if numbers[12:] not in ([], [0.0, 0.0, 0.0, 1.0]) or not is_rigid(pose, 1e-2):
-        raise DatasetError(f'{where}: {len(numbers)} numbers are no matrix of a pose; expected '
+        raise DatasetError(f'{where}: {len(numbers)} numbers are not a matrix of a pose; expected '
                            f'{_COLUMNS}, or name the columns in the first line')
     return [*pose[:3, 3].tolist(), *quaternion_from_transform(pose).tolist()]
 

@@ -44,10 +44,10 @@ class ConversionOptions:
     def topic(self, name: str) -> str:
         """Return the absolute name of a topic.
 
-        DatasetError: the prefix is no valid ROS namespace.
+        DatasetError: the prefix is not a valid ROS namespace.
         """
         if _NAMESPACE.fullmatch(self.prefix) is None:
-            raise DatasetError(f'prefix {self.prefix!r} is no ROS namespace, such as /camera')
+            raise DatasetError(f'prefix {self.prefix!r} is not a ROS namespace, such as /camera')
         return '/'.join(['', *filter(None, self.prefix.split('/')), name])
 
 

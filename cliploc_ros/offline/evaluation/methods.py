@@ -120,7 +120,7 @@ def _converted(where: str, value: Any, default: Any) -> Any:
     """Return an option's value from YAML, where it is of the default's type."""
     if isinstance(default, tuple):
         if not isinstance(value, list) or len(value) != len(default):
-            raise OptionsError(f'{where}: {value!r} is no list of {len(default)}')
+            raise OptionsError(f'{where}: {value!r} is not a list of {len(default)}')
         return tuple(_converted(where, *pair) for pair in zip(value, default, strict=True))
     kind = type(default)
     fits = isinstance(value, int | float if kind is float else kind)

@@ -231,7 +231,7 @@ def read_results(log: Log, run: Mapping[str, Any]) -> list[Result]:
 def describe(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], methods: Sequence[Method],
              trials: int, layer: KeyframeLayer | None, noisy: Sequence[Sequence[PosedQuery]]
              ) -> dict[str, Any]:
-    """Return what identifies a run, as JSON keeps it."""
+    """Return the identity of a run, as JSON keeps it."""
     asked = _digest(part for query in chain(queries, *noisy) for part in (
         *(part for one in (*query.neighbours, query.observation) for part in (
             one.similarities, one.detections.bboxes_xyxy, one.detections.class_ids,

@@ -248,7 +248,7 @@ def with_vertical(queries: Sequence[PosedQuery], noise_deg: float = 0.0, seed: i
 
 def _same_vertical(one: Observation, other: Observation, up_in_other: NDArray[np.float64]
                    ) -> Observation:
-    """Return what another camera of the robot sees, with the same vertical."""
+    """Return the observation of another camera of the robot, with the same vertical."""
     if one.odom_from_camera is None or other.odom_from_camera is None:
         return one
     turn = one.odom_from_camera[:3, :3].T @ other.odom_from_camera[:3, :3]

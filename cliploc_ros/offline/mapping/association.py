@@ -132,7 +132,7 @@ def associate(views: Views, landmarks: Landmarks, min_iou: float = ASSOCIATION_I
 
     In every frame a landmark has at most one box and a box at most one landmark; the sum of
     their IoUs is the greatest possible (Hungarian method). Pairs that overlap less than min_iou
-    are no candidates.
+    are not candidates.
     """
     boxes, candidates, ious = find_overlaps(views, landmarks, min_iou)
     if among is not None:

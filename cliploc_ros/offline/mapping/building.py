@@ -86,7 +86,7 @@ def rounded(center: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 def left_out_lines(left_out: Sequence[LeftOut]) -> list[str]:
-    """Return what is left out as text."""
+    """Return the landmarks that are left out, as text."""
     rows = [f'left out: {len(left_out)}'] if left_out else []
     rows += [f'  {one.class_id} at {one.center[0]:.2f} {one.center[1]:.2f} '
              f'{one.center[2]:.2f} with {one.support} frames: {one.reason}'
@@ -196,7 +196,7 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     moving = Counter(name for name in np.array(detections.class_names)[detections.classes].tolist()
                      if options.moves(name))
     if moving:
-        notes.append(f'{moving.total()} boxes of {", ".join(sorted(moving))} are no landmarks: '
+        notes.append(f'{moving.total()} boxes of {", ".join(sorted(moving))} are not landmarks: '
                      'they move')
     if len(draft.landmarks.centers) == 0:
         why = ('no boxes of one class meet in space; check that poses and stamps belong to these '
@@ -364,7 +364,7 @@ def _windows(stamps_s: NDArray[np.float64]) -> list[tuple[int, int]]:
 
 def _keep(landmarks: Landmarks, into: NDArray[np.int64], shown: NDArray[np.int64]
           ) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Return the landmarks that are no part of another, and the landmark of each box."""
+    """Return the landmarks that are not part of another, and the landmark of each box."""
     is_kept = into == np.arange(len(into))
     numbers = np.append((np.cumsum(is_kept) - 1)[into], -1)
     return landmarks.select(is_kept), numbers[shown]

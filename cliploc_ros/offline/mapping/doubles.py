@@ -67,7 +67,7 @@ class Relation(Enum):
 
 def relation(views: Views, landmarks: Landmarks, rows_of: Sequence[NDArray[np.int64]],
              pair: tuple[int, int]) -> Relation:
-    """Return what the images show of two landmarks, by the boxes of each."""
+    """Return the images' evidence about two landmarks, by the boxes of each."""
     first, second = (rows_of[number] for number in pair)
     common, *places = np.intersect1d(views.frames[first], views.frames[second],
                                      return_indices=True)

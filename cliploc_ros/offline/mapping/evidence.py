@@ -260,7 +260,7 @@ def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
 
 
 def _least_extents(views: Views, last_class: int) -> NDArray[np.float64]:
-    """Return from which size on boxes are detected, by class, on the plane z = 1.
+    """Return the least size of detected boxes, by class, on the plane z = 1.
 
     The last entry is that of all classes together.
     """
@@ -354,7 +354,7 @@ def _has_beside(place, near, was_seen, offsets, distances):
 
 @compiled
 def _hidden(place, near, boxes, distances, radii, is_solid, shown, edges, first, last):
-    """Return which share of a place landmarks in front of it hide, or boxes of no landmark."""
+    """Return the share of a place that nearer landmarks hide, or boxes of no landmark."""
     box = boxes[place]
     x0, y0 = 0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3])
     a, b = 0.5 * (box[2] - box[0]), 0.5 * (box[3] - box[1])

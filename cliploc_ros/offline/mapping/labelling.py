@@ -34,9 +34,9 @@ _LEAST_MEDOID_GAIN = 0.005
 
 def embed_landmarks(landmark_ids: Sequence[str], detections: PosedDetections,
                     shown: NDArray[np.int64]) -> LandmarkEmbeddings:
-    """Return what the encoder saw of each landmark.
+    """Return the encoder's embeddings of each landmark.
 
-    Frames of one viewpoint share the weight of one. Embeddings of the length 0 are no crops.
+    Frames of one viewpoint share the weight of one. Embeddings of the length 0 are not crops.
     """
     assert detections.embeddings is not None
     viewpoints = number_viewpoints(detections)

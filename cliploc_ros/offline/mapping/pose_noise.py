@@ -68,7 +68,7 @@ def significant_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[n
 
 
 def estimated_note(errors: PoseErrors) -> str:
-    """Return what the user should know of estimated errors of the poses."""
+    """Return notes for the user about estimated errors of the poses."""
     return (f'poses are off by about {100 * errors.sigma_m:.1f} cm and {errors.sigma_deg:.1f} '
             f'degrees on each axis for {errors.correlation_s:.1f} s, estimated from the boxes; '
             'refined')

@@ -45,7 +45,7 @@ class PosedDetections:
     #: (F, 4, 4): the same cameras by odometry, which drifts but does not jump; NaN where unknown
     odom_from_camera: NDArray[np.float64] | None = None
     #: (n, 4): the edge lay at the border of the image, so the object may extend beyond it. For a
-    #: lens with distortion, whose border is no straight line of the undistorted image; None: an
+    #: lens with distortion, whose border is not a straight line of the undistorted image; None: an
     #: edge is open at the border of that.
     open_edges: NDArray[np.bool_] | None = None
     #: (F,): the row of each frame's camera among the cameras; None: all are of the first

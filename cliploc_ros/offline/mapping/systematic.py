@@ -198,10 +198,10 @@ class _Descent(NamedTuple):
 def _descend(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[np.int64],
              start: NDArray[np.float64], prior: NDArray[np.float64], steps: int, precision: float
              ) -> _Descent:
-    """Return the numbers of a cause that fit best, from a start.
+    """Return the best-fitting values of a cause, from a start.
 
-    The prior (G,) are inverse variances about zero. No step is taken after one below the precision
-    times the deviations.
+    The prior (G,) has inverse variances about zero. The descent ends after a step below the
+    precision times the deviations.
     """
     values, views = start, cause.apply(given, start) if start.any() else given
     linear = linearize_boxes(views, shown, landmarks)
@@ -224,7 +224,7 @@ def _descend(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[n
 
 
 def _fit(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> _Fit:
-    """Return the numbers of a cause that fit best."""
+    """Return the best-fitting values of a cause."""
     nothing = np.zeros(len(cause.names))
     found = _descend(cause, given, landmarks, shown, nothing, nothing, _STEPS, 0.2)
     own = cause.boxes[found.linear.rows]

@@ -98,7 +98,7 @@ class Views(NamedTuple):
 
 
 def make_views(detections: PosedDetections) -> Views:
-    """Return what the kernels read of posed detections."""
+    """Return the arrays of posed detections that the kernels read."""
     boxes_px, is_open = detections.bboxes_xyxy, detections.open_edges
     of_boxes = detections.frame_cameras[detections.frames]
     sizes = np.array([[one.width, one.height] * 2 for one in detections.cameras], dtype=np.float64)

@@ -30,7 +30,7 @@ from cliploc_ros.offline.datasets.frames import Frames, PosedImage, undistorted
 _MOST_FOUND = 2000
 # A larger image is made smaller first.
 _LONGEST_PX = 800
-# An image with fewer points is no keyframe.
+# An image with fewer points is not a keyframe.
 _LEAST_POINTS = 20
 # Stored images are for people: 7 to 9 kB each.
 _IMAGE_PX, _JPEG_QUALITY = 256, 60

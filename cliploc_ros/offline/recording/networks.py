@@ -96,7 +96,7 @@ class LoadNetworks:
 
 
 def _look_if_readable(look: 'RunNetworks', raw: RawFrame) -> SeenFrame | str:
-    """Return what networks say about a frame; why not, where its images cannot be used."""
+    """Return the networks' output for a frame, or the reason if its images are unusable."""
     try:
         return look(raw)
     except DatasetError as error:
@@ -112,7 +112,7 @@ class RunNetworks:
     encoder: ImageTextEncoder | None = None
 
     def __call__(self, raw: RawFrame) -> SeenFrame:
-        """Return what the networks say about a frame with a pose.
+        """Return the networks' output for a frame with a pose.
 
         DatasetError: the image or depth image cannot be used.
         """

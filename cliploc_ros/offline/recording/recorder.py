@@ -7,6 +7,7 @@ that is stopped leaves its partial results beside it, and the next run goes on.
 """
 
 import base64
+import glob
 import hashlib
 import json
 import logging
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from cliploc_ros.core.depth_image import PLAUSIBLE_DEPTH_M
+from cliploc_ros.core.depth_image import PLAUSIBLE_DEPTH_M, depths_of_boxes
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
@@ -39,6 +40,7 @@ from cliploc_ros.offline.mapping.posed_detections import (
     group_cameras,
     names_of_group,
 )
+from cliploc_ros.offline.mapping.views import at_border
 from cliploc_ros.offline.recording.networks import LoadNetworks, SeenFrame
 from cliploc_ros.units import NS_PER_S
 
@@ -109,7 +111,7 @@ class RecordingOptions:
 
     @property
     def networks(self) -> LoadNetworks:
-        """Return what loads the networks.
+        """Return a function that loads the networks.
 
         PyTorch rounds in another way on another number of threads. With one for each worker, the
         result is the same on any number of workers and on a cluster.
@@ -126,7 +128,7 @@ def observation_file(frames: Frames, options: RecordingOptions) -> Path:
 
 
 def source_of(observations: Path) -> Path | None:
-    """Return the source that an observation file lies beside, see observation_file; else None."""
+    """Return the source beside an observation file, see observation_file; None without one."""
     name, _, rest = observations.name.partition(_BESIDE)
     source = observations.with_name(name or observations.name)
     return source if rest and source.exists() else None
@@ -187,7 +189,7 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
     with closing(Log(file.with_name(f'.{file.name}.unfinished'), DatasetError,
                      'make room or name another file with `record_to`, then run again: it goes '
                      'on from here', _parse_entry)) as log:
-        recorded = _with_odometry(_record(frames, options, described, log), odometry)
+        recorded = _with_odometry(_record(frames, options, described, log, file), odometry)
         save_recorded(file, recorded)
         log.remove()
     logger.warning('wrote %s', file)
@@ -205,7 +207,7 @@ def _with_odometry(recorded: Recorded, odometry: Mapping[str, Poses] | None) -> 
 
 
 def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame | str]) -> Recorded:
-    """Return what networks at hand say of every frame with a pose; nothing is written.
+    """Return the output of given networks for every frame with a pose; write nothing.
 
     Frames that cannot be decoded are left out: for these, look returns why.
     """
@@ -214,8 +216,82 @@ def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame | st
     return _assemble(seen, frames, filters, '', '')
 
 
-def _record(frames: Frames, options: RecordingOptions, described: str, log: Log) -> Recorded:
-    """Look at all keyframes that are not in the log of an unfinished run."""
+def _earlier(frames: Frames, described: str, file: Path) -> dict[tuple[str, int], SeenFrame]:
+    """Return the output of the same networks for these images earlier, by camera and stamp.
+
+    Boxes do not depend on the poses, as those of another scale, nor on the keyframes.
+    """
+    def networks(described: str) -> dict[str, Any]:
+        tree = parse_json(described.encode())
+        *source, digest = [*tree['source'], ''][:4]
+        return tree | {'source': [*source, digest.partition(' ')[0]], 'keyframes': None}
+
+    source = frames.source.resolve()
+    found: dict[tuple[str, int], SeenFrame] = {}
+    for path in {file, *source.parent.glob(f'{glob.escape(source.name)}{_BESIDE}*.npz')}:
+        try:
+            recorded = load_recorded(path)
+            is_same = recorded.described != described and (
+                networks(recorded.described) == networks(described))
+        except (DatasetError, ValueError, KeyError, TypeError):
+            continue
+        if is_same:
+            logger.warning('using the boxes of an earlier run with other poses or keyframes: %s',
+                           path)
+            found |= {(one.camera, one.stamp_ns): one for one in _seen_frames(recorded, frames)}
+    return found
+
+
+def _seen_frames(recorded: Recorded, frames: Frames) -> Iterator[SeenFrame]:
+    """Yield the frames of a recording as the networks saw them; depth is unknown."""
+    all_boxes = recorded.detections
+    for frame, stamp_ns in enumerate(recorded.stamps_ns.tolist()):
+        rows = slice(*all_boxes.frame_offsets[frame:frame + 2].tolist())
+        camera, boxes = all_boxes.camera_of(frame), all_boxes.bboxes_xyxy[rows]
+        size = [camera.width, camera.height]
+        unknown = np.full(len(boxes), np.nan, dtype=np.float32)
+        yield SeenFrame(
+            frame, '' if frames.varies else all_boxes.name_of(frame), stamp_ns,
+            all_boxes.map_from_camera[frame],
+            np.array([*size, camera.fx, camera.fy, camera.cx, camera.cy]), boxes,
+            at_border(boxes, np.array(size * 2)) if all_boxes.open_edges is None
+            else all_boxes.open_edges[rows], all_boxes.open_edges is not None,
+            np.array(all_boxes.class_names, dtype=np.str_)[all_boxes.classes[rows]],
+            all_boxes.scores[rows], np.empty((len(boxes), 0), dtype=np.float16)
+            if all_boxes.embeddings is None else all_boxes.embeddings[rows], unknown, unknown,
+            float(recorded.detector_ms[frame]), float(recorded.clip_ms[frame]))
+
+
+def _seen_again(raw: RawFrame, earlier: Mapping[tuple[str, int], SeenFrame]) -> SeenFrame | None:
+    """Return the earlier output for an image, with its pose and depth now; None: look again."""
+    found = earlier.get((raw.camera, raw.stamp_ns))
+    if found is None or raw.map_from_camera is None:
+        return None
+    found = replace(found, place=raw.place, map_from_camera=raw.map_from_camera)
+    if raw.depth is None:
+        return found
+    frame = raw.decode()
+    if frame.camera != found.pinhole or frame.depth is None:  # boxes are those of a pinhole
+        return None
+    depths, spreads = depths_of_boxes(frame.depth, frame.camera, found.bboxes_xyxy)
+    return replace(found, depths=depths, depth_spreads=spreads)
+
+
+def _unseen(raws: Iterator[RawFrame], seen: dict[int, SeenFrame],
+            earlier: Mapping[tuple[str, int], SeenFrame]) -> Iterator[RawFrame]:
+    """Yield the frames that no run has seen, and add those of an earlier run to `seen`."""
+    for raw in raws:
+        if raw.place not in seen:
+            again = _seen_again(raw, earlier)
+            if again is None:
+                yield raw
+            else:
+                seen[raw.place] = again
+
+
+def _record(frames: Frames, options: RecordingOptions, described: str, log: Log, file: Path
+            ) -> Recorded:
+    """Look at all keyframes that neither an unfinished run nor an earlier one has seen."""
     # another release may have other fields
     run = {'run': described, 'fields': list(SeenFrame.__dataclass_fields__)}
     entries, _ = log.read()
@@ -229,7 +305,7 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log)
         logger.warning('going on after %d frames of an unfinished run', len(seen))
     try:
         with _read_keyframes(frames, options.keyframes) as (raws, filters):
-            tasks = (raw for raw in raws if raw.place not in seen)
+            tasks = _unseen(raws, seen, _earlier(frames, described, file))
             for _, result in run_tasks(options.networks, tasks, workers=options.workers,
                                        scheduler=options.scheduler):
                 if isinstance(result, str):
@@ -265,7 +341,7 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log)
 
 
 def _parse_entry(line: bytes) -> Any:
-    """Return what run it is, which the first entry says, or the frame of any other entry."""
+    """Return the run that the first entry names, or the frame of any other entry."""
     entry = parse_json(line)
     return entry if 'run' in entry else SeenFrame.from_bytes(base64.b64decode(entry['frame']))
 
@@ -363,7 +439,7 @@ def _settings(options: DetectorOptions | ClipOptions) -> dict[str, Any]:
 
 
 def _state(path: Path) -> tuple[int, int] | None:
-    """Return what changes with a file; None for the name of a published model."""
+    """Return a value that changes with a file; None for the name of a published model."""
     try:
         stat = path.stat()
     except OSError:

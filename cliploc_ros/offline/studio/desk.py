@@ -15,8 +15,8 @@ from typing import Any
 
 import viser
 
-from cliploc_ros.errors import CliplocError, MapError
-from cliploc_ros.files.storage import replace_file
+from cliploc_ros.errors import CliplocError
+from cliploc_ros.files.storage import write_text
 from cliploc_ros.offline.studio import viewpoint
 from cliploc_ros.offline.studio.edits import EditError
 from cliploc_ros.offline.studio.studio import Studio
@@ -164,11 +164,7 @@ class Desk:
     def export(self) -> str:
         """Write the scene as one page that opens without a server."""
         path = self.studio.document.path.with_suffix('.html')
-        try:
-            with replace_file(path) as partial:
-                partial.write_text(self.server.scene.as_html(), encoding='utf-8')
-        except OSError as error:
-            raise MapError(f'{path}: cannot be written: {error.strerror}') from error
+        write_text(path, self.server.scene.as_html())
         return f'wrote {path.name}; open it in a browser'
 
     def extent(self) -> Bounds:

@@ -48,7 +48,7 @@ class Document:
     notes : tuple of str
         What a person should know of the files.
 
-    CliplocError: the file is no map, another studio edits it, or its folder is not writable.
+    CliplocError: the file is not a map, another studio edits it, or its folder is not writable.
     """
 
     ACTIONS = ('save', 'overwrite', 'reload', 'undo', 'redo')
@@ -262,7 +262,7 @@ class Document:
     def reload(self) -> str:
         """Take the map from the file; this is an edit that undo takes back.
 
-        CliplocError: the file is no map, or there is none.
+        CliplocError: the file is not a map, or there is none.
         """
         with self.lock:
             file = read_map_file(self.path)

@@ -122,7 +122,7 @@ def set_fields(landmarks: Landmarks, landmark_ids: Iterable[str], **fields: Any)
     """
     ids = list(landmark_ids)
     if unknown := fields.keys() - _FIELDS.keys():
-        raise EditError(f'{unknown} are no fields of a landmark')
+        raise EditError(f'{unknown} are not fields of a landmark')
     if (quat_xyzw := fields.get('orientation')) is not None:
         norm = float(np.linalg.norm(quat_xyzw))
         if not 1e-6 <= norm < np.inf:

@@ -111,7 +111,7 @@ def some_cameras(count: int) -> NDArray[np.int64]:
 
 
 def draw_cameras(on_click: Callable[[int], None]) -> Draw:
-    """Return what draws the trajectory and the cameras of views; a click chooses a view."""
+    """Return a function that draws the trajectory and the cameras; a click chooses a view."""
     def draw(scene: viser.SceneApi, detections: PosedDetections) -> list[Any]:
         poses, order = detections.map_from_camera, detections.by_camera
         is_way = np.diff(detections.frame_cameras[order]) == 0
@@ -155,7 +155,7 @@ def draw_answers(scene: viser.SceneApi, answers: Mapping[int, Trial]) -> list[An
 # ---- coverage and look-alike places -------------------------------------------------------------
 
 def draw_coverage(tell: Callable[[str], None]) -> Draw:
-    """Return what draws a tile at each position; a click on one tells its figures."""
+    """Return a function that draws a tile at each position; a click shows its figures."""
     def draw(scene: viser.SceneApi, places: Coverage) -> list[Any]:
         check = places.check
         if not len(check.positions):

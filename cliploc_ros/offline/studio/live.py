@@ -37,7 +37,7 @@ _PATIENCE_S = 120.0
 _POLL_S = 0.1
 # How long closing waits for a request that is released.
 _GRACE_S = 2.0
-# Answers that are no failure, though no pose was delivered.
+# Answers that are not a failure, though no pose was delivered.
 _ANSWERS = ('refused', 'withheld')
 _MAX_TEXT = 600
 

@@ -37,7 +37,7 @@ from cliploc_ros.core.map.parameter_file import (
     set_of,
 )
 from cliploc_ros.errors import MapError
-from cliploc_ros.files.storage import finish_set, read_file, replace_file
+from cliploc_ros.files.storage import MAKE_ROOM, finish_set, read_file, replace_file
 from cliploc_ros.offline.studio.landmark import (
     KNOWN_FIELDS,
     Encoded,
@@ -122,7 +122,7 @@ class MapFile:
                 partial.write_bytes(self.text.encode())
         except OSError as error:
             raise MapError(f'{self.path}: cannot be written: {error.strerror}; nothing was '
-                           'changed') from error
+                           f'changed: {MAKE_ROOM}') from error
 
     def digest_on_disk(self) -> str:
         """Return the digest of the file as it is now, NO_FILE where there is none."""
@@ -137,7 +137,7 @@ class MapFile:
 def read_map_file(path: Path) -> MapFile:
     """Return a map file; an empty map where there is none.
 
-    MapError: it is no map, or a landmark is invalid. Unknown fields of landmarks are accepted.
+    MapError: it is not a map, or a landmark is invalid. Unknown fields of landmarks are accepted.
     """
     path = path.resolve()
     if not os.path.exists(path):  # noqa: PTH110 - never raises
@@ -286,9 +286,9 @@ class LookFile(NamedTuple):
     def write(self, landmarks: Landmarks) -> tuple['LookFile', str]:
         """Write the looks of all landmarks of the map in one step.
 
-        Those of another encoder are left out. Nothing is written where nothing changed, and
-        nothing over the content of another program. Return the file as it is then, and why it
-        does not hold these looks, '' if it does. MapError: it cannot be written.
+        Looks of another encoder are left out. An unchanged file is not written, and the content
+        of another program is not overwritten. Return the file after that, and the reason if it
+        does not hold these looks, otherwise ''. MapError: it cannot be written.
         """
         known = {key: one.look for key, one in landmarks.items()
                  if one.look is not None and one.look.encoder_key == self.encoder_key}

@@ -80,7 +80,7 @@ class Recording:
         return max(1, round(_PICTURE_S / max(float(np.median(gaps_s)), 1e-3)))
 
     def witness(self, landmark_map: LandmarkMap) -> Witness:
-        """Return what the boxes say of a map."""
+        """Return the evidence of the boxes about a map."""
         return hear_witness(self.views, landmark_map, self.detections.class_names)
 
     def boxes_of(self, landmarks: Landmarks) -> dict[str, NDArray[np.int64]]:
@@ -137,7 +137,7 @@ class Recording:
         return self.image(int(views[0])) if len(views) else None
 
     def crop(self, view: int, box: NDArray[np.float64]) -> NDArray[np.uint8] | None:
-        """Return what a box (4,) [px] and a margin around it show.
+        """Return the crop of a box (4,) [px] with a margin.
 
         None without the image, or for a box that is not finite.
         """

@@ -59,7 +59,7 @@ def read_walls(file: Path) -> Walls:
         text = f'{error} is missing' if isinstance(error, KeyError) else str(error)
         raise MapError(f'occupancy_grid {file}: {text.splitlines()[0]}') from error
     if image is None:
-        raise MapError(f'occupancy_grid {file}: {image_file} is no image, or damaged')
+        raise MapError(f'occupancy_grid {file}: {image_file} is not an image, or damaged')
     dark = np.abs((0.0 if negate else 1.0) - image / 255.0)
     return Walls(np.where(dark > occupied, OCCUPIED, np.where(dark < free, FREE, UNKNOWN)
                           ).astype(np.uint8), side, (x, y, yaw))

@@ -176,5 +176,5 @@ def _words(words: Any, where: str) -> list[str]:
         raise OptionsError(f'{where}: expected a list of text, not {words!r:.60}')
     for word in words:
         if not isinstance(word, str) or not word.strip():
-            raise OptionsError(f'{where}: {word!r:.60} is no text (quote numbers and yes/no)')
+            raise OptionsError(f'{where}: {word!r:.60} is not text (quote numbers and yes/no)')
     return words

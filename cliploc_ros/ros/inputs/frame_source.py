@@ -340,7 +340,7 @@ class FrameSource:
              for one in boxes]).tobytes(), received_at)
 
     def _stamp_problems(self) -> list[str]:
-        """Return what is wrong with the stamps of images and detections, and what to do."""
+        """Return the fault of the stamps of images and detections, and the remedy."""
         return [f'the stamp of the {"images" if name == "image" else name} on '
                 f'{self._resolved(name)} {stamps.problem}: {_STAMPING[name]}'
                 for name, stamps in self._stamps.items() if stamps.problem]
@@ -351,7 +351,7 @@ class FrameSource:
                 if name not in _OF_DEPTH and self._heard_at(name) < since}
 
     def why_none(self, since: float) -> str:
-        """Return what was missing since a moment of the monotonic clock."""
+        """Return in words the inputs that were missing since a moment of the monotonic clock."""
         if missing := self.unheard(since):
             return '; '.join(missing.values())
         if problems := self._stamp_problems():

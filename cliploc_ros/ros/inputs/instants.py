@@ -56,7 +56,7 @@ class Instants:
 
     @property
     def faults(self) -> list[Fault]:
-        """Return what is wrong with the newest frames, their cameras and their detector."""
+        """Return the faults of the newest frames, their cameras and their detector."""
         return [*(fault._replace(text=f'{name}: {fault.text}' if name else fault.text)
                   for name, faults in self._faults.copy().items() for fault in faults),
                 *(fault._replace(text=f'the detector: {fault.text}')
@@ -158,7 +158,7 @@ def _run_of(state: RobotState) -> int | None:
 
 def faults_of_frame(frame: Frame, camera: Camera, parameters: RelocalizerParameters,
                     state: RobotState) -> list[Fault]:
-    """Return what contradicts itself in a frame, given its camera and the robot's state."""
+    """Return contradictions in a frame, given its camera and the robot's state."""
     image, info = frame.image.header.frame_id, frame.camera_info
     return [*faults_of_headers(image, info.header.frame_id, frame.detections.header.frame_id),
             *faults_of_camera_info(info, camera, parameters.rectified),

@@ -140,7 +140,7 @@ class PriorSource:
             fields: dict[str, Any] = parse_json(read_file(path))
             pose = np.array(fields['map_from_robot'], dtype=np.float64)
             if not is_rigid(pose):
-                raise ValueError('map_from_robot is no pose')
+                raise ValueError('map_from_robot is not a pose')
             msg = pose_with_covariance_msg(Header(), pose, np.array(
                 fields['covariance'], dtype=np.float64).reshape(6, 6))
             msg.header.frame_id = str(fields['frame_id'])
@@ -163,7 +163,7 @@ class PriorSource:
                 frame_ids[0], frame_id, stamp, parameters.tf_timeout_s,
                 'give the prior in the frame of the map')
             if not is_rigid(map_from_frame):
-                raise NoTransformError(f"the transform of '{frame_id}' is no pose: correct it")
+                raise NoTransformError(f"the transform of '{frame_id}' is not a pose: correct it")
             pose, turn = map_from_frame @ pose, np.eye(3)
             turn[:2, :2] = map_from_frame[:2, :2]
             covariance, frame_id = turn @ covariance @ turn.T, frame_ids[0]

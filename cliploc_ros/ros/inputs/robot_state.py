@@ -73,7 +73,7 @@ class Sample(NamedTuple):
 
 
 def sample_from_msg(msg: Imu) -> Sample | None:
-    """Return what a message says about the vertical; None if it says nothing.
+    """Return the vertical by a message; None if it has none.
 
     A field is missing if its covariance begins with -1, or if it has its default value: no
     acceleration at all, or no rotation with a covariance of zeros. The latter may be a
@@ -95,13 +95,13 @@ def sample_from_msg(msg: Imu) -> Sample | None:
 
 
 class VerticalSource(qos.Listener):
-    """Knows the vertical in the camera's coordinate frame.
+    """The vertical in the camera's coordinate frame.
 
-    An IMU's orientation counts more than its acceleration: its filter knows how the robot moves.
-    But many drivers leave the orientation at its default, or fill it wrongly. It has to agree
-    with the acceleration at rest, where the IMU measures both.
+    An IMU's orientation is preferred to its acceleration, because its filter removes the robot's
+    motion. But many drivers leave the orientation at its default or fill it wrongly. It has to
+    agree with the acceleration at rest, where the IMU measures both.
 
-    `transforms` knows how the camera and the IMU are mounted.
+    `transforms` has the mounts of the camera and the IMU.
     """
 
     def __init__(self, node: Node, transforms: CoordinateFrames) -> None:
@@ -294,7 +294,7 @@ class RobotStateSource:
         self.odometry.forget()
 
     def examine(self, health: Health) -> None:
-        """Report stamps of odometry and of the IMU that are no time."""
+        """Report invalid stamps of odometry and of the IMU."""
         for problem in (self.odometry.problem, self.vertical.problem):
             if problem:
                 health.warn(problem)
@@ -311,7 +311,7 @@ class RobotStateSource:
     def at_instant(self, frame: Frame, parameters: RelocalizerParameters,
                    frame_ids: Sequence[str], map_hash: str, deadline: float = math.inf
                    ) -> KnownBefore:
-        """Return what is known at the instant of a frame, given the maps; see at."""
+        """Return the knowledge at the instant of a frame, given the maps; see at."""
         header = frame.image.header
         state = self.at(header, parameters.of_camera(frame.camera), deadline, frame.depth_frame)
         beside = []

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Stamps of messages: what is no time, what belongs together, and time that goes back."""
+"""Stamps of messages: invalid stamps, messages that belong together, time that goes back."""
 
 import math
 import time
@@ -95,7 +95,7 @@ class TimeJumps:
 
 
 def stamp_problem(stamp: Time) -> str:
-    """Return why a stamp is no time, as in "the stamp is 0"; empty if it may be one."""
+    """Return why a stamp is invalid, as in "the stamp is 0"; empty if it may be valid."""
     if stamp.nanosec > NS_PER_S:  # some drivers round up to a second
         return f'has {stamp.nanosec} nanoseconds (limit {NS_PER_S - 1})'
     if stamp.sec < 0:

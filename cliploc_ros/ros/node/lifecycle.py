@@ -47,6 +47,8 @@ _HEARTBEAT_TIMEOUT_S = 4.0
 _LAST_WORD_S = 0.2
 # A transition may load weights for seconds; meanwhile clients can ask for the state.
 _MAX_TRANSITION_REQUESTS = 3
+# Characters of the label of a transition; rclpy's own have 21.
+_MOST_LABEL = 100
 # Between attempts of a node to bring itself up; the pause doubles each time.
 _FIRST_PAUSE_S = 2.0
 _LONGEST_PAUSE_S = 60.0
@@ -370,6 +372,8 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         def answer(request: ChangeState.Request, response: ChangeState.Response
                    ) -> ChangeState.Response:
             self._self_managed = False
+            # rcl logs a label that it does not know, of any length
+            request.transition.label = request.transition.label[:_MOST_LABEL]
             with self._transition, self._state_machine:
                 try:
                     return change(request, response)
@@ -409,7 +413,8 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoR
     try:
         rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rcl has its own types, for arguments and for missing folders
-        sys.exit(f'error: ROS does not start: {error} (is HOME or ROS_LOG_DIR set?)')
+        sys.exit(f'error: ROS does not start: {error} (is HOME or ROS_LOG_DIR set, to a folder '
+                 'with room?)')
     executor = NodeExecutor()
     node = None
     try:

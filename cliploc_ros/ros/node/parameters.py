@@ -128,7 +128,7 @@ class Parameters:
 
     @classmethod
     def rows(cls) -> tuple[ParameterRow, ...]:
-        """Return what is declared of each, its own first, then those that it inherits."""
+        """Return the declarations, those of the class first, then the inherited ones."""
         own_first = sorted(fields(cls), key=lambda one: one.name not in cls.__annotations__)
         return tuple(replace(one.metadata['row'], name=one.name) for one in own_first)
 

@@ -108,7 +108,7 @@ class Worker:
     Parameters
     ----------
     report : callable
-        Takes the traceback of an exception that is no CliplocError.
+        Takes the traceback of an exception that is not a CliplocError.
     """
 
     def __init__(self, report: Callable[[str], object]) -> None:

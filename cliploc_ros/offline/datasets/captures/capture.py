@@ -96,7 +96,7 @@ def arrange(files: Sequence[ImageFile], where: object) -> tuple[ImageFile, ...]:
     Raises
     ------
     DatasetError
-        No image is there or has a pose, two are one file, or a pose is no rigid transform.
+        No image is there or has a pose, two are one file, or a pose is not a rigid transform.
     """
     present = [one for one in files if beside(one.color) is not None]
     if not present:
@@ -133,7 +133,7 @@ def _sound(pose: NDArray[np.float64] | None, where: str) -> NDArray[np.float64] 
         return None
     if not is_rigid(pose, _ROTATION_TOLERANCE):
         is_mirrored = is_rigid(pose @ np.diag([1.0, 1.0, -1.0, 1.0]), _ROTATION_TOLERANCE)
-        raise DatasetError(f'{where} is no rotation and translation' + (
+        raise DatasetError(f'{where} is not a rotation and translation' + (
             ': it is a reflection; export with right-handed axes'
             if is_mirrored else ': its axes have no unit length or are not at right angles'))
     left, _, right = np.linalg.svd(pose[:3, :3])

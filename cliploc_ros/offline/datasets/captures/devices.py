@@ -171,7 +171,7 @@ def read_arkitscenes(folder: Path, options: capture.FolderOptions) -> capture.Ca
 
 
 def _pincam(folder: Path, scan: str, time_s: float) -> Camera | None:
-    """Return the camera of an image; None without its file, whose time may be rounded."""
+    """Return the camera of an image, from a file whose time may be rounded; None without it."""
     for shift_s in (0.0, -_ROUNDING_S, _ROUNDING_S):
         path = capture.beside(folder / f'{scan}_{time_s + shift_s:.3f}.pincam')
         if path is not None:

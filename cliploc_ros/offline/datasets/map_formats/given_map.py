@@ -24,7 +24,7 @@ from cliploc_ros.offline.datasets.parsing import FieldError, Fields, naming, uni
 from cliploc_ros.offline.mapping.refit import refit_map
 from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
 
-# A landmark with a thinner semi-axis is a fit that collapsed; a larger one is no object. Guesses.
+# A thinner semi-axis is a fit that collapsed; a larger one does not belong to an object. Guesses.
 _SEMI_AXIS_RANGE_M = (1e-3, 100.0)
 _MAX_COORDINATE_M = 1e6
 _MAX_NORM_ERROR = 0.01
@@ -256,7 +256,7 @@ def read_msgloc(path: Path, class_names: Sequence[str]) -> GivenMap:
     negative = 0
     content = Fields.of_file(path, read_bytes)
     if not isinstance(content.values.get('nodes'), list):
-        raise DatasetError(f"{path}: is no map of MSG-Loc: it has no list 'nodes'")
+        raise DatasetError(f"{path}: is not a map of MSG-Loc: it has no list 'nodes'")
     for place, values in enumerate(content.entries('nodes')):
         try:
             node = Fields(values, f'node {place}')
@@ -320,7 +320,7 @@ def _name_of(key: str, class_names: Sequence[str], where: str) -> str:
             raise FieldError(f'{where}: the class has no name') from None
         return key
     if not index.is_integer():
-        raise FieldError(f'{where}: the class is no index')
+        raise FieldError(f'{where}: the class is not an index')
     return class_name(class_names, int(index))
 
 

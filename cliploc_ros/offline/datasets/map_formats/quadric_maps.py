@@ -38,7 +38,7 @@ _MAX_VARINT_BYTES = 10
 
 
 class QuadricError(Exception):
-    """Why a dual quadric is no ellipsoid."""
+    """Why a dual quadric is not an ellipsoid."""
 
 
 class WireError(Exception):
@@ -53,7 +53,7 @@ def read_goreloc(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
     message names the file and what is wrong with it.
     """
     given = given_map.GivenMap([], [], [])
-    with naming(path, WireError, what='is no complete NAME.objects of GOReloc: '):
+    with naming(path, WireError, what='is not a complete NAME.objects of GOReloc: '):
         for item in _messages(path):
             number, quadric = _integer(item, 2), _quadric(item)
             categories, counts = _integers(item, 3), _integers(item, 4)
@@ -108,7 +108,7 @@ def _read_saved_map(path: Path, class_names: Sequence[str]) -> given_map.GivenMa
     if not tracks_path.is_file():
         raise DatasetError(f'{tracks_path} is missing: it holds the classes of {path.name}')
     given = given_map.GivenMap([], [], [_NOTE])
-    broken = 'is no complete map of OA-SLAM: '
+    broken = 'is not a complete map of OA-SLAM: '
     with naming(tracks_path, WireError, what=broken):
         # category and number of keyframes of each track
         tracks = {_integer(item, 1): (_integer(item, 2), len(item.get(8, ())))
@@ -128,7 +128,7 @@ def _read_saved_map(path: Path, class_names: Sequence[str]) -> given_map.GivenMa
 
 def _add(given: given_map.GivenMap, name: str, number: int, quadric: list[float],
          details: LandmarkDetails = _NO_DETAILS, shown: str = '') -> None:
-    """Append an object to the content of a file; one that is no ellipsoid is left out."""
+    """Append an object to the content of a file, unless it is not an ellipsoid."""
     landmark_id = given_map.make_id(name, number)
     try:
         ellipsoid = decompose(quadric)
@@ -142,7 +142,7 @@ def _add(given: given_map.GivenMap, name: str, number: int, quadric: list[float]
 def decompose(numbers: list[float]) -> tuple[list[float], list[float], list[float]]:
     """Return centre, semi-axes and quaternion x, y, z, w of a dual quadric, 16 numbers by rows.
 
-    QuadricError: it is no ellipsoid.
+    QuadricError: it is not an ellipsoid.
     """
     if len(numbers) != 16:
         raise QuadricError(f'its dual quadric has {len(numbers)} numbers, not 16')
@@ -159,7 +159,7 @@ def decompose(numbers: list[float]) -> tuple[list[float], list[float], list[floa
     squares, axes = np.linalg.eigh(quadric[:3, :3] + np.outer(center, center))
     if squares[0] <= 0.0:
         shown = ' '.join(f'{square:.3g}' for square in squares)
-        raise QuadricError(f'its dual quadric is no ellipsoid: squared semi-axes {shown}')
+        raise QuadricError(f'its dual quadric is not an ellipsoid: squared semi-axes {shown}')
     if np.linalg.det(axes) < 0.0:
         axes[:, 2] *= -1.0
     return (center.tolist(), np.sqrt(squares).tolist(),
@@ -170,7 +170,7 @@ def decompose(numbers: list[float]) -> tuple[list[float], list[float], list[floa
 #
 # A message is a sequence of fields. Each begins with a varint, 8 * number + wire type; what
 # follows depends on the wire type: protobuf.dev/programming-guides/encoding. The package protobuf
-# is no dependency of others here, and would need compiled schemas.
+# is not a dependency of others here, and would need compiled schemas.
 
 _Fields = Mapping[int, list[int | memoryview]]
 
@@ -228,7 +228,7 @@ def _integers(item: _Fields, number: int) -> list[int]:
 def _fields(data: memoryview) -> _Fields:
     """Return the values of a message by the number of their field; nothing is copied.
 
-    WireError: the bytes are no message, or end too early.
+    WireError: the bytes are not a message, or end too early.
     """
     fields: dict[int, list[int | memoryview]] = defaultdict(list)
     place = 0

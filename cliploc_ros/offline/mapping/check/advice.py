@@ -18,7 +18,7 @@ from cliploc_ros.offline.mapping.check.relocalization import Trial, refused_span
 from cliploc_ros.offline.mapping.check.report import SERIOUS, Advice, CheckReport, GridCheck
 
 _MOST_OF_A_KIND, _MOST_MISLED = 5, 3
-# A shorter run of refused frames is no side of a room.
+# A shorter run of refused frames is not a side of a room.
 _MIN_SPAN = 2
 # Cosine of the angle between views of one side: 45 degrees, a guess.
 _ONE_SIDE = 0.7
@@ -34,7 +34,7 @@ _NUMBERS = ('no', 'one', 'two', 'three', 'four', 'five', 'six', 'seven', 'eight'
 
 
 def give_advice(report: CheckReport) -> list[Advice]:
-    """Return what to do, one sentence or two each."""
+    """Return advice, in one or two sentences each."""
     advice = [*_on_scale(report), *_on_look_alikes(report), *_on_landmarks(report),
               *_on_corrections(report),
               *_on_misled(report), *_on_spans(report), *_on_grid(report)]
@@ -195,7 +195,7 @@ def _misled(report: CheckReport) -> list[Trial]:
 
 
 def _takes_for(trial: Trial, pair: LookAlike) -> bool:
-    """Return whether a wrong pose takes one of two places that look alike for the other."""
+    """Return whether a wrong pose confuses two places that look alike."""
     if trial.estimate is None:
         return False
     for here, there, turn_deg in ((pair.first, pair.second, pair.turn_deg),

@@ -133,7 +133,7 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
 
 def judge_grid(grid: Grid, model: DetectorModel, trials: Sequence[Trial], headings: int
                ) -> GridCheck:
-    """Return what trials say of a grid, or of its first positions.
+    """Return the result of trials on a grid, or on its first positions.
 
     The trials were made with the model, heading by heading of each position.
     """

@@ -78,7 +78,7 @@ class LandmarkCheck:
 
 
 class Witness(NamedTuple):
-    """What a recording says of a map."""
+    """The evidence of a recording about a map."""
 
     class_names: tuple[str, ...]  #: Of the recording
     landmarks: Landmarks  #: Of the map, with the recording's classes
@@ -91,7 +91,7 @@ class Witness(NamedTuple):
 
 
 def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str, ...]) -> Witness:
-    """Return what a recording says of a map."""
+    """Return the evidence of a recording about a map."""
     landmarks = landmarks_of_map(landmark_map, class_names)
     shown = associate(views, landmarks)
     evidence = gather_evidence(views, landmarks, shown)

@@ -115,7 +115,7 @@ class LookAlike:
 def find_look_alikes(landmark_map: LandmarkMap) -> list[LookAlike]:
     """Return the pairs of places that look alike, the most alike first.
 
-    A place that a turn by more than 45 degrees lays on itself counts, too.
+    A place that looks the same after a turn by more than 45 degrees counts as well.
     """
     ids, labels = landmark_map.landmark_ids, landmark_map.labels
     found: list[LookAlike] = []

@@ -190,7 +190,7 @@ class Trial:
 
 def simulated(detections: PosedDetections, frame: int, shown: NDArray[np.int64],
               labels: LabelModel, seed: int) -> Observation:
-    """Return what a recorded frame shows, with simulated similarities, equal ones each time.
+    """Return the observation of a recorded frame, with simulated similarities, equal each time.
 
     shown (n,) has the landmark of each box of the recording, -1 for none.
     """

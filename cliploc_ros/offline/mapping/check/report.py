@@ -248,7 +248,7 @@ class CheckReport:
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """Return what to do, the most urgent first."""
+        """Return advice, the most urgent first."""
         return tuple(one.text for one in self.to_do)
 
     @property
@@ -264,7 +264,7 @@ class CheckReport:
 
     @property
     def evidence(self) -> str:
-        """Return what gives the accepted poses that count, in words."""
+        """Return the source of the accepted poses that count, in words."""
         return 'by objects or keyframes' if self.keyframes is not None and self._by_images else (
             'by objects')
 
@@ -370,7 +370,7 @@ def share(trials: Sequence[Trial], verdict: str) -> float:
 
 def check_keyframes(layer: KeyframeLayer, grid: GridCheck,
                     recorded: NDArray[np.float64] | None) -> KeyframeCheck:
-    """Return what keyframes reach; recorded (F, 4, 4) has the poses of a recording."""
+    """Return the coverage by keyframes; recorded (F, 4, 4) has the poses of a recording."""
     poses = np.empty((0, 4, 4)) if recorded is None else recorded
     reached = in_reach(layer, np.array([one.position for one in grid.trials]),
                        np.array([one.forward for one in grid.trials]))

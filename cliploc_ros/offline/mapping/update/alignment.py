@@ -26,7 +26,7 @@ from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.pose_noise import significant_pose_errors
 from cliploc_ros.offline.mapping.views import Views
 
-# A position is known no better than this [m]: objects are no ellipsoids. A guess.
+# A position is known no better than this [m]: objects are not ellipsoids. A guess.
 _LEAST_SIGMA_M = 0.01
 # Deviation of a centre where the map does not say it [m]. A guess.
 _UNKNOWN_SIGMA_M = 0.05
@@ -170,7 +170,7 @@ def _offset(known: OldMap, refits: Refits) -> NDArray[np.float64]:
 
     found = least_squares(residuals, np.zeros(6), loss='cauchy', f_scale=_LOSS_SCALE)
     lengths, step = found.fun[:-6], np.eye(4)
-    # positions err more than their deviations say: objects are no ellipsoids
+    # positions err more than their deviations say: objects are not ellipsoids
     inflation = max(1.0, float(np.median(lengths)) / _MEDIAN_LENGTH)
     if float(found.x @ (found.jac.T @ found.jac) @ found.x) >= _SIGNIFICANT * inflation ** 2:
         step[:3, :3] = Rotation.from_rotvec(found.x[3:]).as_matrix()

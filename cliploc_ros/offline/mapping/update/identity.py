@@ -25,16 +25,19 @@ from cliploc_ros.offline.mapping.update.judging import Judgement, Shown
 
 # Gains, in nats. Guesses: no look outweighs an object that is seen in its place, but two looks
 # that are exchanged do; and looks decide whether a new object is a missing one.
-_IN_PLACE_GAIN, _NEAR_GAIN, _ELSEWHERE_GAIN = 6.0, 4.0, 2.0
+_IN_PLACE_GAIN, _NEAR_GAIN, _ELSEWHERE_GAIN = 8.0, 6.0, 4.0
 _MAX_LOOK_GAIN = 5.0
-# Of equal objects the nearer one is chosen.
-_GAIN_PER_M = 0.02
+# Of like objects the nearer one is chosen: the logarithm of a way from this length on [m] counts.
+_WAY_GAIN, _WAY_M = 1.2, 0.3
 # A landmark that is only doubted has not moved farther than this [m]. A guess.
 _MAX_DOUBTED_MOVE_M = 1.5
+# A landmark that was seen in a greater share of the viewpoints has not moved: a wrong box appears
+# in less. A guess.
+_MOST_SEEN_IF_MOVED = 0.05
 # A second choice that gains hardly less makes the first one ambiguous.
 _AMBIGUOUS_GAIN = 1.0
 # Of the logarithm of an object's size, and the largest difference. Guesses.
-_SIZE_SIGMA, _MAX_SIZE_CHANGE = 0.2, 0.5
+_SIZE_SIGMA, _MAX_SIZE_CHANGE = 0.25, 0.8
 # Objects in their place from which the usual similarity of two looks is learned.
 _FEWEST_LOOKS = 8
 # A landmark in its place is doubted if its look fits worse than usual by this many deviations.
@@ -56,7 +59,7 @@ class Fates(NamedTuple):
 
 def decide_fates(known: OldMap, judged: Judgement, objects: Shown, looks: 'Likeness | None'
                  ) -> Fates:
-    """Return what became of each old landmark."""
+    """Return the fate of each old landmark."""
     numbers, rivals = _identify(known, objects, judged, looks)
     found = numbers >= 0
     elsewhere = found.copy()
@@ -70,7 +73,8 @@ def decide_fates(known: OldMap, judged: Judgement, objects: Shown, looks: 'Liken
     return Fates(
         np.nonzero(found & ~elsewhere)[0], np.nonzero(elsewhere)[0], np.nonzero(missing)[0],
         np.nonzero(~found & ~missing)[0],
-        np.setdiff1d(np.arange(len(objects.owners)), numbers[found]), numbers, rivals)
+        np.setdiff1d([number for number, weak in enumerate(objects.weak) if not weak],
+                     numbers[found]), numbers, rivals)
 
 
 class Likeness(NamedTuple):
@@ -165,7 +169,9 @@ def _identify(known: OldMap, objects: Shown, judged: Judgement, looks: Likeness 
         cosines = np.einsum('ld,ld->l', *pairs).astype(np.float64)
         doubtful = (pairs[0].any(axis=1) & pairs[1].any(axis=1)
                     & (cosines < model.own - _DOUBT * model.sigma))
-    searched = judged.is_gone | judged.is_doubtful
+    own = judged.sight.select(slice(len(known.sigmas)))
+    searched = (judged.is_gone | judged.is_doubtful) & (
+        own.seen <= _MOST_SEEN_IF_MOVED * own.expected)
     searched[[row for rows in objects.near for row in rows]] = True
     searched[owners] = doubtful
     offered = objects.owners < 0
@@ -219,13 +225,14 @@ def _learn_looks(objects: Shown, looks: Likeness, groups: NDArray[np.int64]) -> 
 
 def _gains(known: OldMap, objects: Shown, judged: Judgement, rows: NDArray[np.int64],
            columns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the gains (k, j) by place, class and size; -inf where a pair is impossible."""
+    """Return the gains (k, j) by place, class, size and way; -inf where a pair is impossible."""
     sizes = [np.log(np.sort(np.linalg.norm(one.bases, axis=1), axis=1)[:, 1:]).mean(axis=1)
              for one in (known.landmarks.select(rows), objects.landmarks.select(columns))]
     change = np.abs(sizes[0][:, None] - sizes[1][None])
     ways_m = np.linalg.norm(known.landmarks.centers[rows][:, None]
                             - objects.landmarks.centers[columns][None], axis=2)
-    gains = _ELSEWHERE_GAIN - 0.5 * np.square(change / _SIZE_SIGMA) - _GAIN_PER_M * ways_m
+    gains = (_ELSEWHERE_GAIN - 0.5 * np.square(change / _SIZE_SIGMA)
+             - _WAY_GAIN * np.log1p(ways_m / _WAY_M))
     names = known.names
     for place, row in enumerate(rows):
         for column, number in enumerate(columns):

@@ -48,12 +48,19 @@ _PRIOR_VIEWS = 4.0
 # An object is gone, or there, below and above these probabilities of being there; the second one
 # where another object was found in its place.
 _GONE_BELOW, _GONE_BELOW_IF_TAKEN, _THERE_ABOVE = 0.05, 0.5, 0.95
+# Nor is an object there that was never seen where one is usually seen from this number of
+# viewpoints: how often an object is seen differs more from recording to recording than the map's
+# seen_ratio says. Measured with studies.updates.
+_USUALLY_SEEN = 4.0
 #: Its place must be in view from this number of viewpoints before an object can be missing.
 LEAST_VIEWS = 5
 # A new landmark must be detected this often, and one in its place, in units of how often the old
 # ones are. The second one was chosen on blocks of TUM fr3, between landmarks that were displaced
 # in the map (at most 0.17) and those that were not (at least 0.2, but for 3 of 47).
 _MIN_NEW_SHARE, _MIN_SHARE_IN_PLACE = 0.4, 0.15
+# A find of an old landmark that moved is good enough if it was seen from directions so far apart,
+# and however rarely. A guess.
+_MIN_MOVED_BASELINE_DEG = 10.0
 
 
 class Finds(NamedTuple):
@@ -63,6 +70,8 @@ class Finds(NamedTuple):
     class_ids: tuple[str, ...]
     details: tuple[LandmarkDetails, ...]
     left_out: tuple[LeftOut, ...]  #: Objects that are not good enough for a map, or are old ones
+    #: Why each is not good enough for a new landmark, only for an old one that moved; '' if it is
+    weak: tuple[str, ...] = ()
 
     def without(self, reasons: Sequence[str | None], sight: Sight) -> 'Finds':
         """Return the finds without those that have a reason (m,), which are left out.
@@ -74,7 +83,7 @@ class Finds(NamedTuple):
         return Finds(
             self.landmarks.select(np.array(kept, dtype=np.int64)),
             tuple(self.class_ids[row] for row in kept), tuple(self.details[row] for row in kept),
-            self.left_out + tuple(
+            weak=tuple(self.weak[row] for row in kept), left_out=self.left_out + tuple(
                 LeftOut(self.class_ids[row], rounded(self.landmarks.centers[row]),
                         int(own.seen_frames[row]), int(own.seen[row]), reason)
                 for row, reason in enumerate(reasons) if reason is not None))
@@ -95,12 +104,17 @@ class Judgement(NamedTuple):
 
 def judge(detections: PosedDetections, views: Views, known: OldMap, options: MappingOptions
           ) -> Judgement:
-    """Return what the recording says of each place of the map, and what else it shows.
+    """Return the recording's evidence for each place of the map, and the other objects it shows.
 
     The views have poses in the coordinate frame of the map.
     """
     count = len(known.landmarks.centers)
     finds = _find_new(detections, views, _free(views, known), options)
+    # weak finds beside an old landmark would take its boxes
+    _, sight = _look(views, known, finds, np.zeros(count, dtype=np.bool_))
+    beside = {new for new, _, _ in _pairs_between(finds.landmarks, known.landmarks)}
+    finds = finds.without([weak if weak and new in beside else None
+                           for new, weak in enumerate(finds.weak)], sight)
     # old landmarks and finds compete for the boxes: an old one may have those of a neighbour
     shown, _ = _look(views, known, finds, np.zeros(count, dtype=np.bool_))
     refits = refit(views, known.landmarks, np.where(shown < count, shown, -1),
@@ -116,10 +130,10 @@ def judge(detections: PosedDetections, views: Views, known: OldMap, options: Map
     ratios = sight.seen_ratio[:count][sight.seen[:count] > 0]
     usual = float(np.median(ratios)) if len(ratios) else 1.0
     least = _MIN_NEW_SHARE * usual
-    finds = finds.without([
-        None if ratio >= least else f'seen in {100 * ratio:.1f} % of the frames that show its '
-        f'place, not {100 * least:.1f} %, {_MIN_NEW_SHARE:g} of what is usual'
-        for ratio in sight.seen_ratio[count:]], sight)
+    finds = finds._replace(weak=tuple(
+        weak if weak or ratio >= least else f'seen in {100 * ratio:.1f} % of the frames that show '
+        f'its place, not {100 * least:.1f} %, {_MIN_NEW_SHARE:g} of what is usual'
+        for weak, ratio in zip(finds.weak, sight.seen_ratio[count:], strict=True)))
     # new objects hide old places
     shown, sight = _look(views, known, finds, is_gone)
     # an old landmark is hardly there if a find with more boxes is in its place
@@ -156,7 +170,10 @@ def _is_absent(known: OldMap, sight: Sight, limits: NDArray[np.float64] | float
     A detector that never found a class in this recording may not know it, or not at these sizes.
     """
     is_told = (known.landmarks.classes >= 0) & (sight.expected >= LEAST_VIEWS)
-    return np.asarray(is_told & (_probability_there(known, sight) < limits))
+    seen = sight.seen > 0
+    usual = np.median(sight.seen[seen] / sight.expected[seen]) if seen.any() else 0.0
+    is_never_seen = ~seen & (usual * sight.expected >= _USUALLY_SEEN)
+    return np.asarray(is_told & (is_never_seen | (_probability_there(known, sight) < limits)))
 
 
 def _probability_there(known: OldMap, sight: Sight) -> NDArray[np.float64]:
@@ -182,7 +199,7 @@ def _probability_there(known: OldMap, sight: Sight) -> NDArray[np.float64]:
     certainty, rows = _PRIOR_VIEWS, seen & (sight.expected >= _FEW_VIEWS)
     if np.count_nonzero(rows) >= _FEW_LANDMARKS:
         shares, usual = sight.seen[rows] / sight.expected[rows], ratios[rows]
-        # the median, since objects that are gone are no scatter
+        # the median, since objects that are gone are not scatter
         scatter = np.median(np.square(shares - usual) / (usual * (1.0 - usual))) / _MEDIAN_SQUARE
         certainty = float(np.clip(1.0 / max(float(scatter), 1e-3) - 1.0, _LEAST_WORTH,
                                   _PRIOR_VIEWS))
@@ -234,11 +251,15 @@ def _find_new(detections: PosedDetections, views: Views, is_free: NDArray[np.boo
     posed = detections.with_poses(views.poses).select_boxes(is_free)
     try:
         built = build_map(posed, replace(options, pose_errors=None, estimate_pose_errors=False,
-                                         refine_mount=False))
+                                         refine_mount=False, min_baseline_deg=min(
+                                             options.min_baseline_deg, _MIN_MOVED_BASELINE_DEG)))
     except NothingFoundError as error:
         return nothing._replace(left_out=error.left_out)
     return Finds(landmarks_of_map(built.landmark_map, detections.class_names),
-                 built.landmark_map.class_ids, built.landmark_map.details, built.report.left_out)
+                 built.landmark_map.class_ids, built.landmark_map.details, built.report.left_out,
+                 tuple('' if (one.baseline_deg or 0.0) >= options.min_baseline_deg else
+                       f'seen from one side only: {one.baseline_deg:.1f} degrees, not '
+                       f'{options.min_baseline_deg:g}' for one in built.landmark_map.details))
 
 
 def _with_displaced(finds: Finds, refits: Refits, displaced: NDArray[np.bool_],
@@ -251,14 +272,15 @@ def _with_displaced(finds: Finds, refits: Refits, displaced: NDArray[np.bool_],
     return finds._replace(
         landmarks=Landmarks.joined(finds.landmarks, refits.landmarks.select(rows)),
         class_ids=finds.class_ids + tuple(class_ids[row] for row in rows.tolist()),
-        details=finds.details + (LandmarkDetails(),) * len(rows))
+        details=finds.details + (LandmarkDetails(),) * len(rows),
+        weak=finds.weak + ('',) * len(rows))
 
 
 def _without_copies(views: Views, finds: Finds, old: Landmarks, known: OldMap,
                     shown: NDArray[np.int64], sight: Sight, majority: float) -> Finds:
     """Return the new landmarks without those that are an old one in its place.
 
-    An old landmark is in its place if it has a box, and a majority for each of the new one's. Of
+    An old landmark is in its place if it has a box, and a majority for each box of the new. Of
     two landmarks that lie in one another, the boxes are those of one object: parts of it, or
     another name for it. If they only touch, frames that show both tell them apart.
     """
@@ -292,11 +314,19 @@ class Shown(NamedTuple):
     shown: NDArray[np.int64]  #: (n,): the object that each box shows, -1 for none
     sight: Sight
     given: tuple[LandmarkDetails, ...]  #: Classes and source of the finds
+    weak: tuple[str, ...]  #: See Finds
+    class_ids: tuple[str, ...]  #: Of the finds; '' of old landmarks
 
     @property
     def landmarks(self) -> Landmarks:
         """Return the objects as landmarks."""
         return self.refits.landmarks
+
+    def left_out(self, chosen: NDArray[np.int64]) -> tuple[LeftOut, ...]:
+        """Return the weak finds that are not among the objects chosen."""
+        return tuple(LeftOut(self.class_ids[row], rounded(self.landmarks.centers[row]),
+                             int(self.sight.seen_frames[row]), int(self.sight.seen[row]), weak)
+                     for row, weak in enumerate(self.weak) if weak and row not in chosen)
 
 
 def gather_objects(aligned: Aligned, known: OldMap, judged: Judgement, options: MappingOptions
@@ -321,4 +351,5 @@ def gather_objects(aligned: Aligned, known: OldMap, judged: Judgement, options: 
     return Shown(
         refits, np.concatenate([in_place, np.full(len(finds.details), -1, dtype=np.int64)]),
         tuple(map(frozenset, near)), shown, judged.sight.select(places),
-        (LandmarkDetails(),) * len(in_place) + finds.details)
+        (LandmarkDetails(),) * len(in_place) + finds.details, ('',) * len(in_place) + finds.weak,
+        ('',) * len(in_place) + finds.class_ids)

@@ -29,12 +29,10 @@ from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.pose_noise import estimated_note
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.update.alignment import (
-    LEAST_MOVE_SIGMAS,
     MIN_CONFIRMED,
     Aligned,
     OldMap,
     align,
-    deviations,
     known_landmarks,
 )
 from cliploc_ros.offline.mapping.update.identity import (
@@ -140,11 +138,14 @@ class UpdatedMap:
     #: (F, 4, 4): the poses in the coordinate frame of the map
     map_from_camera: NDArray[np.float64]
     embeddings: LandmarkEmbeddings | None  #: Image embeddings of the new map
+    #: Landmarks that are missing now, or were before: an object that is back gets its id again
+    removed: LandmarkMap
 
 
 def update_map(old: LandmarkMap, detections: PosedDetections,
                options: MappingOptions | None = None,
-               embeddings: LandmarkEmbeddings | None = None) -> UpdatedMap:
+               embeddings: LandmarkEmbeddings | None = None,
+               removed: LandmarkMap | None = None) -> UpdatedMap:
     """Update a map with a new recording of its place.
 
     Parameters
@@ -155,6 +156,8 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
         How new landmarks are built; with pose_errors, poses are refined against the map.
     embeddings : LandmarkEmbeddings, optional
         How the old landmarks look. Ignored if another encoder looked at the recording.
+    removed : LandmarkMap, optional
+        What earlier updates took out of the map, see UpdatedMap.
 
     Raises
     ------
@@ -165,12 +168,16 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     options = options or MappingOptions()
     given = make_views(detections)
     notes = check_input(detections, given, options.min_viewpoints)
+    count = len(old)
+    if removed is not None:
+        old = old.with_more(removed.select([row for row, name in enumerate(removed.landmark_ids)
+                                            if name not in old.landmark_ids]))
     known = known_landmarks(old, detections.class_names)
     aligned = align(given, known, options)
     judged = judge(detections, aligned.views, known, options)
     loose, well = (int((associate(aligned.views, known.landmarks, min_iou) >= 0).sum())
                    for min_iou in (ASSOCIATION_IOU, MIN_MEDIAN_IOU))
-    _check_belongs(judged, well / max(1, loose))
+    _check_belongs(judged, count, well / max(1, loose))
     objects = gather_objects(aligned, known, judged, options)
     unlike = why_not_comparable(embeddings, detections)
     looks = None
@@ -179,15 +186,22 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     elif embeddings is not None:
         looks = compare_looks(embeddings, old.landmark_ids, detections, objects)
     fates = decide_fates(known, judged, objects, looks)
-    updated = _renew(known, aligned.views, objects, fates, judged, detections.class_names)
-    kept = np.setdiff1d(np.arange(len(old)), fates.missing)
+    away = fates.objects < 0
+    away[:count] = False
+    was_here = np.arange(len(old)) < count
+    fates = fates._replace(not_observed=fates.not_observed[was_here[fates.not_observed]],
+                           missing=fates.missing[was_here[fates.missing]])
+    kept = np.setdiff1d(np.nonzero(~away)[0], fates.missing)
+    updated = _renew(known, aligned.views, objects, fates, judged, detections.class_names, kept)
     rows_of = np.full(len(objects.owners) + 1, -1, dtype=np.int64)
     has_object = fates.objects[kept] >= 0
     rows_of[fates.objects[kept][has_object]] = np.nonzero(has_object)[0]
     rows_of[fates.new] = len(kept) + np.arange(len(fates.new))
     without_doubles, shown, first_new, joined = _one_of_each(
         updated, aligned.views, rows_of[objects.shown], len(kept), detections.class_names)
-    notes += _notes(known, aligned, detections) + joined
+    notes += _notes(known, aligned, detections) + joined + [
+        f'{old.landmark_ids[row]} is back: an earlier update had removed it'
+        for row in kept[kept >= count]]
     lists = _describe(known.map, updated, objects, fates, judged)
     lists['new'] = tuple(one for one in lists['new']
                          if one.landmark_id in without_doubles.landmark_ids)
@@ -196,17 +210,20 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
         offset_m=aligned.offset_m, offset_deg=aligned.offset_deg,
         pose_change_m=aligned.change_m, pose_change_deg=aligned.change_deg,
         **lists,
-        left_out=tuple(sorted(judged.finds.left_out, key=lambda one: -one.support)),
+        left_out=tuple(sorted(judged.finds.left_out + objects.left_out(fates.objects),
+                              key=lambda one: -one.support)),
         notes=tuple(notes))
     return UpdatedMap(without_doubles, report, shown, first_new, aligned.views.poses,
                       renew_embeddings(embeddings, without_doubles.landmark_ids, detections,
-                                       shown))
+                                       shown),
+                      old.select(np.setdiff1d(np.arange(len(old)), kept).tolist()))
 
 
-def _check_belongs(judged: Judgement, well_share: float) -> None:
+def _check_belongs(judged: Judgement, count: int, well_share: float) -> None:
     """Refuse a recording that shows hardly any landmark in its place, or most of them badly."""
-    count, there = len(judged.is_there), int(judged.is_there.sum())
-    in_view = int((judged.is_there | (judged.sight.expected[:count] >= LEAST_VIEWS)).sum())
+    is_there = judged.is_there[:count]
+    there = int(is_there.sum())
+    in_view = int((is_there | (judged.sight.expected[:count] >= LEAST_VIEWS)).sum())
     if (there < min(MIN_CONFIRMED, count) or there < _MIN_CONFIRMED_SHARE * in_view
             or well_share < _MIN_WELL_SHARE):
         raise MappingError(
@@ -217,7 +234,7 @@ def _check_belongs(judged: Judgement, well_share: float) -> None:
 
 
 def _notes(known: OldMap, aligned: Aligned, detections: PosedDetections) -> list[str]:
-    """Return what the user should know of the input."""
+    """Return notes for the user about the input."""
     notes = []
     if aligned.estimated is not None:
         notes.append(estimated_note(aligned.estimated))
@@ -237,8 +254,8 @@ def _notes(known: OldMap, aligned: Aligned, detections: PosedDetections) -> list
 
 
 def _renew(known: OldMap, views: Views, objects: Shown, fates: Fates, judged: Judgement,
-           class_names: tuple[str, ...]) -> LandmarkMap:
-    """Return the new map: the old landmarks that are left, in their order, then new ones.
+           class_names: tuple[str, ...], kept: NDArray[np.int64]) -> LandmarkMap:
+    """Return the new map: the old landmarks that are kept, in their order, then new ones.
 
     The class names are those of the recording; the views have its poses in the map.
     """
@@ -256,7 +273,7 @@ def _renew(known: OldMap, views: Views, objects: Shown, fates: Fates, judged: Ju
         details[row] = _in_new_place(details[row], objects.sight, evidence, fates.objects[row])
     for row in fates.not_observed[judged.is_doubtful[fates.not_observed]].tolist():
         details[row] = _looked_for(details[row], judged.sight, row)
-    placed = dict.fromkeys(fates.moved.tolist(), 1.0) | _refitted(known, objects, fates)
+    placed = dict.fromkeys(fates.moved.tolist(), 1.0) | _refitted(known, views, objects, fates)
     for row, weight in placed.items():
         number = fates.objects[row]
         centers[row] += weight * (objects.landmarks.centers[number] - centers[row])
@@ -265,7 +282,6 @@ def _renew(known: OldMap, views: Views, objects: Shown, fates: Fates, judged: Ju
             sigma = objects.refits.sigmas[number]
             details[row] = replace(details[row], position_sigma=float(
                 sigma if weight == 1.0 else np.sqrt(weight) * sigma))
-    kept = np.setdiff1d(np.arange(len(old)), fates.missing)
     names = tuple(class_names[number] for number in objects.landmarks.classes[fates.new])
     every = [details[row] for row in kept] + [
         _in_new_place(objects.given[number], objects.sight, evidence, number)
@@ -315,20 +331,25 @@ def _one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], f
     ).select(kept.tolist()), numbers[shown], int(np.sum(kept < first_new)), notes
 
 
-def _refitted(known: OldMap, objects: Shown, fates: Fates) -> dict[int, float]:
+def _refitted(known: OldMap, views: Views, objects: Shown, fates: Fates) -> dict[int, float]:
     """Return the weight of the new centre for the confirmed landmarks that are fitted again."""
     rows = np.array([row for row in fates.confirmed
                      if known.map.details[row].position_sigma is not None
                      and objects.refits.is_known[fates.objects[row]]], dtype=np.int64)
-    refits, old_sigmas = objects.refits.select(fates.objects[rows]), known.sigmas[rows]
-    nudged = deviations(known.landmarks.select(rows), old_sigmas, refits) > LEAST_MOVE_SIGMAS
-    weights = np.where(nudged, 1.0, old_sigmas ** 2 / (old_sigmas ** 2 + refits.sigmas ** 2))
-    better = nudged | (refits.sigmas < old_sigmas)
+    numbers = fates.objects[rows]
+    renumbered = np.full(len(objects.owners) + 1, -1, dtype=np.int64)
+    renumbered[numbers] = np.arange(len(rows))
+    before = gather_evidence(views, known.landmarks.select(rows), renumbered[objects.shown])
+    # a fit to other sides of the object differs, too, but then the old ellipsoid fits the boxes
+    nudged = before.median_iou < MIN_MEDIAN_IOU
+    old_sigmas, new_sigmas = known.sigmas[rows], objects.refits.sigmas[numbers]
+    weights = np.where(nudged, 1.0, old_sigmas ** 2 / (old_sigmas ** 2 + new_sigmas ** 2))
+    better = nudged | (new_sigmas < old_sigmas)
     return dict(zip(rows[better].tolist(), weights[better].tolist(), strict=True))
 
 
 def _looked_for(details: LandmarkDetails, sight: Sight, number: int) -> LandmarkDetails:
-    """Return what is known of a landmark with the frames that should have shown it, too."""
+    """Return the details of a landmark, updated by the frames that should have shown it."""
     support, expected = details.support or 0, int(sight.expected_frames[number])
     if support and details.seen_ratio:
         expected += round(support / details.seen_ratio)
@@ -338,7 +359,7 @@ def _looked_for(details: LandmarkDetails, sight: Sight, number: int) -> Landmark
 
 def _in_new_place(details: LandmarkDetails, sight: Sight, evidence: Evidence, number: int
                   ) -> LandmarkDetails:
-    """Return what is known of a landmark in a new place: what the recording says."""
+    """Return the details of a landmark in a new place, by the recording alone."""
     return replace(evidence.details(number, details),
                    seen_ratio=float(min(1.0, sight.seen_ratio[number])),
                    last_seen=max(0.0, float(evidence.last_seen[number])))
