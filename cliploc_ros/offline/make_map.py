@@ -185,7 +185,7 @@ def scale_of_objects(detections: PosedDetections, options: MappingOptions, class
     if detections.depths is not None:
         raise MappingError('`object_size`: the recording has depth, which is in metres; give '
                            '`scale` where the poses are not')
-    scale, options = 1.0, replace(options, knows_unit=False)
+    scale = 1.0
     for _ in range(_TRIALS):
         built = build_map(detections.moved(scale, np.eye(3)), options).landmark_map
         own = [row for row, one in enumerate(built.class_ids) if one == class_name]

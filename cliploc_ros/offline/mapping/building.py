@@ -168,7 +168,6 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     builder = _Builder(detections, options, np.random.default_rng(options.random_seed),
                        progress or (lambda stage, share: None))
     given = make_views(detections)
-    given = given if options.knows_unit else given.without_sizes
     notes = check_input(detections, given, options.min_viewpoints)
     draft = builder.draft(given)
     if detections.depths is not None:

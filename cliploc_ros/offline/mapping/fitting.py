@@ -6,9 +6,9 @@ Each edge that does not lie at the image border gives a residual: projected edge
 edge, in standard deviations. An edge at the border only bounds the object: it counts where the
 projection ends inside of it. A measured depth gives one more residual. Residuals r pass through
 the Cauchy loss c^2/2 log(1 + r^2/c^2). A weak prior draws the logarithms of the semi-axes to
-their mean, since boxes from similar directions leave the thickness open. For the same reason each
-semi-axis that is longer than objects of the class are gives a residual of its logarithm, with the
-same loss: where the scale of the whole map is wrong, boxes from all sides win.
+their mean, since boxes from similar directions leave the thickness open. Where depth lets boxes of
+one side suffice, each semi-axis that is longer than objects of the class are gives a residual of
+its logarithm, with the same loss, for the same reason.
 """
 
 from math import log, sqrt

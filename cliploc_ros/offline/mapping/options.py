@@ -81,7 +81,6 @@ class MappingOptions:
     """Options of mapping."""
 
     moving_classes: tuple[str, ...] = MOVING_CLASSES  #: These never become landmarks
-    knows_unit: bool = True  #: Poses are in metres, so that sizes of classes count in the fit
     min_viewpoints: int = 3  #: A landmark needs support from this number of viewpoints
     #: Share of the frames showing a landmark's place in which it must be detected. Chance
     #: arrangements of boxes are seen rarely, but so are objects that others hide.

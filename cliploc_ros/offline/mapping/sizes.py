@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.views import NO_SIZE
 
 # The scale of a map is told by as many classes as this. A whole map is off by more than this
 # factor before it is named: ellipsoids enclose objects loosely, or show parts of them. Guesses.
@@ -42,7 +43,7 @@ def log_sizes(names: Iterable[str]) -> NDArray[np.float64]:
     The factor within which nearly all objects lie counts as two standard deviations.
     """
     sizes = [size_of_class(name) for name in names]
-    return np.array([(np.inf, 1.0) if one is None else
+    return np.array([NO_SIZE if one is None else
                      (np.log(0.5 * one.extent_m), 2.0 / np.log(one.factor)) for one in sizes])
 
 

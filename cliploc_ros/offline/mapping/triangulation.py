@@ -27,6 +27,7 @@ from cliploc_ros.offline.mapping.landmarks import (
 )
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.sizes import log_sizes
 from cliploc_ros.offline.mapping.views import Views
 
 # How far the centre lies behind the surface, in radii that the box suggests, and the standard
@@ -68,8 +69,9 @@ def options_with_depth(options: MappingOptions) -> MappingOptions:
 
 def add_depths(views: Views, detections: PosedDetections,
                scales: NDArray[np.float64] | None = None) -> Views:
-    """Return views that know how deep the centre of each box's object lies.
+    """Return views that know how deep the centre of each box's object lies, and class sizes.
 
+    With depth, boxes of one side place a landmark, but leave open how long it is along the rays.
     The scales are true depth divided by measured depth, of each camera; None: all are 1.
     """
     assert detections.depths is not None
@@ -84,7 +86,8 @@ def add_depths(views: Views, detections: PosedDetections,
                      + np.square(_CENTER_SIGMA * radii * centers))
     known = np.isfinite(centers) & np.isfinite(sigmas)
     return views._replace(depths=np.where(known, centers, 0.0), depth_stiffness=np.where(
-        known, 1.0 / np.where(known, sigmas, 1.0), 0.0))
+        known, 1.0 / np.where(known, sigmas, 1.0), 0.0),
+        sizes=log_sizes(detections.class_names)[detections.classes])
 
 
 def box_radii(views: Views, rows: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.mapping.sizes import log_sizes
 from cliploc_ros.offline.simulation import EDGE_SIGMA_PX, EDGE_SIGMA_SHARE
 
+#: In Views.sizes.
+NO_SIZE = (np.inf, 1.0)
 # An edge this near to the image border is open: the object may extend beyond it.
 _BORDER_PX = 3.0
 # Two frames less than this apart in both show a landmark from one viewpoint.
@@ -56,8 +57,8 @@ class Views(NamedTuple):
     #: unknown
     depths: NDArray[np.float64]
     depth_stiffness: NDArray[np.float64]
-    #: (n, 2): logarithm of half the longest extent [m] of objects of the box's class, infinite
-    #: where unknown, and its inverse standard deviation
+    #: (n, 2): logarithm of half the longest extent [m] of objects of the box's class and its
+    #: inverse standard deviation, see cliploc_ros.offline.mapping.sizes; of recordings with depth
     sizes: NDArray[np.float64]
 
     @property
@@ -76,7 +77,7 @@ class Views(NamedTuple):
     @property
     def without_sizes(self) -> 'Views':
         """Return the same views with classes of no known size."""
-        return self._replace(sizes=np.tile([np.inf, 1.0], (len(self.frames), 1)))
+        return self._replace(sizes=np.tile(NO_SIZE, (len(self.frames), 1)))
 
     def with_poses(self, map_from_camera: NDArray[np.float64]) -> 'Views':
         """Return the same views with other poses (F, 4, 4)."""
@@ -124,8 +125,7 @@ def make_views(detections: PosedDetections) -> Views:
         detections.frame_offsets, detections.frames, detections.classes,
         (boxes_px - principals[of_boxes]) / focals[of_boxes], focals[of_boxes] / deviations_px,
         is_open, ((bounds_px - principals) / focals)[detections.frame_cameras],
-        np.zeros(len(boxes_px)), np.zeros(len(boxes_px)),
-        log_sizes(detections.class_names)[detections.classes])
+        np.zeros(len(boxes_px)), np.zeros(len(boxes_px)), np.tile(NO_SIZE, (len(boxes_px), 1)))
 
 
 def at_border(boxes_px: NDArray[np.float64], sizes: NDArray[np.float64]) -> NDArray[np.bool_]:
