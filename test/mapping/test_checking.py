@@ -141,6 +141,9 @@ def test_boxes_that_leave_a_place_open_do_not_say_that_a_landmark_moved(detectio
     (one,) = [one for one in check_landmarks(TABLE, witness, [])
               if one.landmark_id == 'thing_4']
     assert not any(' cm away' in fault for fault in one.faults)
+    # how uncertain a map is, it says itself
+    sure = replace(TABLE, details=(LandmarkDetails(position_sigma=0.07),) * len(TABLE))
+    assert {one.position_sigma_m for one in check_landmarks(sure, witness, [])} == {0.07}
 
 
 def test_a_shifted_landmark_is_told_its_offset(detections):

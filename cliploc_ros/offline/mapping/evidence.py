@@ -18,13 +18,8 @@ from cliploc_ros.core.map import visibility
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.visibility import HIDDEN_SHARE, SHOWN_SHARE
 from cliploc_ros.offline.mapping.association import find_overlaps, ious_with
-from cliploc_ros.offline.mapping.fitting import accumulate
-from cliploc_ros.offline.mapping.landmarks import (
-    LANDMARK_SIZE,
-    Landmarks,
-    group_boxes,
-    project_box,
-)
+from cliploc_ros.offline.mapping.fitting import centre_covariance
+from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes, project_box
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.views import Views
 
@@ -34,7 +29,7 @@ REACH = 1.2
 #: Of the boxes of a landmark in a map.
 MIN_MEDIAN_IOU = 0.5
 #: The centre of a large landmark may deviate by this share of its size.
-MAX_SIGMA_SHARE = 0.1
+MAX_SIGMA_SHARE = 0.15
 # IoU from which a landmark explains a box of its class.
 _EXPLAINED_IOU = 0.3
 # A class with fewer boxes is taken to be seen at the sizes of its boxes and of all classes only.
@@ -82,8 +77,7 @@ class Evidence(NamedTuple):
 
 def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> Evidence:
     """Return the evidence for each landmark from the boxes that show it."""
-    # what the size of its class does to a landmark that contradicts it makes it no more certain
-    cameras, sizeless = views.centers, views.without_sizes
+    cameras = views.centers
     columns: list[tuple[float, ...]] = []
     for center, basis, rows in zip(landmarks.centers, landmarks.bases,
                                    group_boxes(shown, len(landmarks.centers)), strict=True):
@@ -93,18 +87,11 @@ def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
         frames = views.frames[rows]
         offsets = center - cameras[frames]
         distances = np.linalg.norm(offsets, axis=1)
-        information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
-        accumulate(sizeless, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
-        try:
-            variance = np.linalg.eigvalsh(np.linalg.inv(information)[:3, :3])[-1]
-        except np.linalg.LinAlgError:  # boxes that the image cuts on all sides leave it open
-            variance = np.inf
         columns.append((
             len(rows), len(np.unique(views.viewpoints[frames])),
             is_expected(views, cameras, center, basis, REACH * distances.max()).sum(),
             widest_angle_deg(offsets / distances[:, None]),
-            # rounding makes what no box restrains negative
-            np.sqrt(variance) if variance > 0.0 else np.inf,
+            np.sqrt(np.linalg.eigvalsh(centre_covariance(views, rows, center, basis))[-1]),
             np.median(ious_with(views, rows, center, basis)), views.stamps_s[frames].max()))
     values = np.array(columns, dtype=np.float64).reshape(-1, 7).T
     return Evidence(*values[:3].astype(np.int64), *values[3:])

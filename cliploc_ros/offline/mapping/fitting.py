@@ -35,6 +35,11 @@ _AXIS_SPREAD = 0.7
 # An ellipsoid that is not wholly in front of a camera costs what four edges this far off cost.
 _BEHIND_RESIDUAL = 20.0
 _BEHIND_COST = 4.0 * 20.0
+# Objects are no ellipsoids, and detectors have habits: the boxes of one landmark err alike. A mean
+# of any number of viewpoints keeps this share of the variance. Chosen on TUM fr3 and the demo: .59
+# and .84 of all errors are within a deviation, .93 and 1.00 within three.
+_ALIKE = 0.15
+_UNKNOWN_M = 1e6
 _MAX_DAMPING = 1e7
 _LEAST_IMPROVEMENT = 1e-4
 # Greatest change of a logarithm, and of the centre in greatest semi-axes, in one step.
@@ -74,6 +79,25 @@ def fit_ellipsoid(views: Views, rows: NDArray[np.int64], center: NDArray[np.floa
     cost = descend(views, np.ascontiguousarray(rows, dtype=np.int64), center, basis, iterations,
                    information)
     return Fit(center, basis, cost, information)
+
+
+def centre_covariance(views: Views, rows: NDArray[np.int64], center: NDArray[np.float64],
+                      basis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the covariance (3, 3) [m^2] of a centre that was fitted to the boxes of some rows.
+
+    All who ask how uncertain a landmark is get this answer. Where its boxes do not restrain a
+    landmark, it is a large multiple of the identity. The size of its class does not count.
+    """
+    information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
+    accumulate(views.without_sizes, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
+    alike = 1.0 + _ALIKE * len(np.unique(views.viewpoints[views.frames[rows]]))
+    try:
+        covariance = alike * np.linalg.inv(information)[:3, :3]
+    except np.linalg.LinAlgError:  # boxes that the image cuts on all sides leave it open
+        covariance = np.full((3, 3), np.nan)
+    # rounding makes what no box restrains negative
+    is_known = np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0.0
+    return covariance if is_known else _UNKNOWN_M ** 2 * np.eye(3)
 
 
 @compiled

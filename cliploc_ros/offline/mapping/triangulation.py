@@ -44,8 +44,8 @@ _UNIT_FACTOR = 1.6
 _LEAST_CORRECTION = 0.02
 
 # With depth a landmark may deviate this much [m]: along the rays, which its boxes hardly show.
-# Chosen on the kitchen's frames, where .05 m leaves out a sixth of the explained boxes.
-_MAX_POSITION_SIGMA_M = 0.1
+# Chosen on the kitchen's frames, where half of it leaves out a sixth of the explained boxes.
+_MAX_POSITION_SIGMA_M = 0.15
 # Angles between the rays of a pair: less leaves the depth open, more shows other sides.
 _PARALLAX_DEG = (5.0, 75.0)
 _GREATEST_COSINE, _LEAST_COSINE = (float(value) for value in np.cos(np.radians(_PARALLAX_DEG)))
