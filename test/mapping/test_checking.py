@@ -72,6 +72,7 @@ def rooms_report():
 
 def test_a_true_map_has_no_fault_and_its_frames_are_accepted(report):
     assert all(one.faults == () for one in report.landmarks)
+    assert any('set `height_range_m` to [' in note for note in report.notes)
     recording, grid = report.recording, report.grid
     assert recording.held_out.explained == 1.0
     assert 0.9 < recording.held_out.median_iou < 1.0

@@ -29,7 +29,7 @@ REACH = 1.2
 #: Of the boxes of a landmark in a map.
 MIN_MEDIAN_IOU = 0.5
 #: The centre of a large landmark may deviate by this share of its size.
-MAX_SIGMA_SHARE = 0.15
+MAX_SIGMA_SHARE = 0.2
 # IoU from which a landmark explains a box of its class.
 _EXPLAINED_IOU = 0.3
 # A class with fewer boxes is taken to be seen at the sizes of its boxes and of all classes only.
