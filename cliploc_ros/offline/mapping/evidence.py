@@ -131,8 +131,10 @@ def is_expected(views, cameras, center, basis, reach):
 def reasons_against(landmarks: Landmarks, evidence: Evidence, options: MappingOptions
                     ) -> list[str | None]:
     """Return for each landmark why it stays out of the map; None where it belongs into it."""
-    return [_reason(evidence, number, float(np.linalg.norm(basis)), options)
-            for number, basis in enumerate(landmarks.bases)]
+    # by its volume: what is drawn out along the rays is uncertain, not large
+    sizes_m = np.sqrt(3.0) * np.cbrt(np.abs(np.linalg.det(landmarks.bases)))
+    return [_reason(evidence, number, size_m, options)
+            for number, size_m in enumerate(sizes_m.tolist())]
 
 
 def _reason(evidence: Evidence, number: int, size_m: float, options: MappingOptions) -> str | None:
