@@ -30,7 +30,6 @@ EXTRAS = {
         'pillow>=10,<15', 'safetensors>=0.4,<1', 'torch>=2.4,<3', 'torchvision>=0.19,<1',
         'ultralytics-opencv-headless>=8.4,<9',
     ],
-    'transformers': ['transformers>=5,<6'],  # an Apache-licensed detector, beside 'models'
     # The programs that make, check and measure maps.
     'evaluate': [OPENCV, 'matplotlib>=3.8,<4', 'rosbags>=0.11,<0.12'],
     'studio': [OPENCV, 'rosbags>=0.11,<0.12', 'viser==1.1.1'],

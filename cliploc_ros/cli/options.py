@@ -104,7 +104,7 @@ def add_network_options(group: Any) -> None:
     option(group, '--profile', 'detector and CLIP: that of the robot, as image embeddings are of '
            'one CLIP (%(default)s: accurate on a GPU, balanced on a CPU)', default='auto',
            choices=PROFILE_NAMES)
-    option(group, '--model', 'YOLO weights, or a detector of transformers: folder or OWNER/NAME '
+    option(group, '--model', 'YOLO weights, or an ONNX detector: file, folder or OWNER/NAME '
            "(the profile's)", default='')
     option(group, '--detector-vocabulary NAMES', "what a YOLO-World or YOLOE looks for: 'mug, "
            "chair', or a map (.yaml) with its classes and labels", default='')

@@ -19,6 +19,8 @@ _BLOCK_BYTES = 64 * 1024
 _BLOCK_COUNT = 66
 # A zip archive, a bare pickle (PyTorch before 1.6), a NumPy array.
 _HEADS = (b'PK', b'\x80', b'\x93NUMPY')
+# The first field of an ONNX file: the version of the format.
+_ONNX_HEAD = b'\x08'
 # A writer that takes longer than this was killed [s].
 _STALE_S = 24 * 3600.0
 
@@ -66,9 +68,10 @@ def check_weights_file(path: Path) -> None:
         raise ModelError(f'{path} is a web page, not weights: download the file behind it')
     if head.startswith(b'PK') and not zipfile.is_zipfile(path):
         raise damaged(path, 'the end of the archive is missing')
-    if path.suffix != '.safetensors' and not head.startswith(_HEADS):
+    heads = _ONNX_HEAD if path.suffix == '.onnx' else _HEADS
+    if path.suffix != '.safetensors' and not head.startswith(heads):
         raise ModelError(f'{path} holds no weights: it is neither a file of PyTorch nor, by its '
-                         'name, of safetensors')
+                         'name, of ONNX or safetensors')
     # The format: eight bytes with the length of a JSON header, the header, the tensors.
     if path.suffix == '.safetensors' and (
             len(head) < 8 or struct.unpack('<Q', head[:8])[0] + 8 > size):
@@ -91,6 +94,8 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
     try:
         folder.mkdir(parents=True, exist_ok=True)
         return Path(fetch())
+    except ModelError:
+        raise
     except Exception as error:  # each library raises exceptions of its own
         reason = f'{type(error).__name__}: {first_line(error).rstrip(".")}'
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):

@@ -3,6 +3,7 @@
 """Profiles: which detector and which encoder suit a device."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.errors import OptionsError
@@ -75,10 +76,13 @@ def load_detector(options: 'DetectorOptions') -> 'ObjectDetector':
     OptionsError
         The device or the inference engine is missing.
     """
-    from cliploc_ros.models.transformers_detector import TransformersDetector, is_of_transformers
+    from cliploc_ros.models.hub import is_hub_name
 
-    if is_of_transformers(options.model):
-        return TransformersDetector(options)
+    path = Path(options.model).expanduser()
+    if path.suffix == '.onnx' or any(path.rglob('*.onnx')) or is_hub_name(options.model):
+        from cliploc_ros.models.onnx_detector import OnnxDetector
+
+        return OnnxDetector(options)
     from cliploc_ros.models.yolo_detector import YoloDetector
 
     return YoloDetector(options)

@@ -26,8 +26,8 @@ class DetectorOptions:
     OptionsError: for values out of range.
     """
 
-    #: Path of a ``.pt`` file or of a folder with an OpenVINO export or a model of transformers, or
-    #: a name that is downloaded once: of a published ``.pt`` file, or OWNER/NAME of the hub
+    #: Path of a ``.pt`` or ONNX file, or of a folder with ONNX files or an OpenVINO export, or a
+    #: name that is downloaded once: of a published ``.pt`` file, or OWNER/NAME[@REVISION][:FILE]
     model: str = 'yolov8x.pt'
     conf: float = 0.1  #: Least confidence of a detection, 0 to 1
     iou: float = 0.7  #: IoU from which the weaker of two boxes of a class is dropped, 0 to 1

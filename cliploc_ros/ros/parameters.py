@@ -84,7 +84,7 @@ class DetectorParameters(CommonParameters):
         "Detector of a profile: 'accurate', 'balanced' or 'fast'; 'auto': accurate on a GPU, "
         'balanced on a CPU.', choices=PROFILE_NAMES, read_only=True)
     model: str = parameter('',
-        'Weights: a local file, a folder with an OpenVINO export or a model of transformers, or a '
+        'Weights: a .pt or ONNX file, a folder with ONNX files or an OpenVINO export, or a '
         'name that is downloaded once: of ultralytics, or OWNER/NAME of the Hugging Face hub; '
         "empty: the profile's.", read_only=True)
     vocabulary: str = parameter('',
