@@ -245,10 +245,11 @@ class DetrHead:
     def find(self, image_rgb: NDArray[np.uint8], options: DetectorOptions) -> NDArray[np.float32]:
         """Return the boxes (n, 6) in an image, see _Head.find."""
         found = self._run(image_rgb)
-        logits: NDArray[np.floating] = found[_LOGITS].astype(np.float64)
+        logits = found[_LOGITS].astype(np.float64)
+        scores: NDArray[Any]
         if self._has_nothing:
-            shares = np.exp(logits - logits.max(axis=1, keepdims=True))
-            scores: NDArray[np.floating] = (
+            shares: NDArray[np.float64] = np.exp(logits - logits.max(axis=1, keepdims=True))
+            scores = (
                 shares / shares.sum(axis=1, keepdims=True))[:, :-1]
             queries, classes = np.arange(len(scores)), scores.argmax(axis=1)
         else:
@@ -259,8 +260,8 @@ class DetrHead:
         chosen = scores[queries, classes]
         order = np.argsort(-chosen, kind='stable')
         order = order[chosen[order] > options.conf]
-        middle, half = np.split(found[_BOXES][queries[order]], [2], axis=1)
-        half = half / 2
+        middle, size = np.split(found[_BOXES][queries[order]], [2], axis=1)
+        half = size / 2
         sides = np.array(image_rgb.shape[1::-1] * 2, dtype=np.float32)
         boxes = np.clip(np.hstack([middle - half, middle + half]) * sides, 0, sides)
         return np.hstack([boxes, chosen[order, None], classes[order, None]]).astype(np.float32)
