@@ -41,7 +41,7 @@ class _CaughtError(Exception):
 
 @cache
 def parser_of(module: str) -> argparse.ArgumentParser:
-    """Return the parser of a module that runs as a program, the one that it makes itself."""
+    """Return the parser that a program makes for itself, by its module."""
     if module.startswith(('cliploc_ros.cli.', 'demo.__')):
         return importlib.import_module(module).make_parser()
 

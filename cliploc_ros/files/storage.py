@@ -13,6 +13,7 @@ import secrets
 import shutil
 import stat
 import tempfile
+import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -29,6 +30,8 @@ MOST_BYTES = 256 * 2**20
 # 64 bits have 19 or 20.
 _MOST_VALUES = 8_000_000
 _MOST_DIGITS = 20
+# Writers of one folder wait this long for their turn, and look this often [s]: a set takes less.
+_TURN_S, _TURN_POLL_S = 30.0, 0.02
 # A full disk may still take an empty file.
 _PROBE_BYTES = 4096
 #: What to do about a file that cannot be written
@@ -169,11 +172,24 @@ def replace_set(path: Path, digest: str, write: WriteOfSet,
 
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
-    """Keep other writers of sets out of a folder meanwhile, where its file system can."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    """Keep other writers of sets out of a folder meanwhile, where its file system can.
+
+    OSError: another program keeps this one out for long, such as a process that was stopped.
+    """
+    descriptor, deadline = os.open(folder, os.O_RDONLY | os.O_CLOEXEC), time.monotonic() + _TURN_S
     try:
-        with suppress(OSError):  # some network file systems lock no folder
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    raise OSError(errno.EBUSY, 'another program has been writing there for '
+                                               f'{_TURN_S:g} s') from None
+                time.sleep(_TURN_POLL_S)
+            except OSError:  # some network file systems lock no folder
+                break
+            else:
+                break
         yield
     finally:
         os.close(descriptor)

@@ -99,7 +99,8 @@ class DetectorParameters(CommonParameters):
     iou: float = parameter(0.7,
         'Drop the weaker of two boxes of one class that overlap more.', low=0.0, high=1.0)
     imgsz: int = parameter(640,
-        'Longer side of the image as the network sees it.', unit='px', low=32, high=4096)
+        'Longer side of the image as the network sees it. Memory grows with its square.',
+        unit='px', low=32, high=2560)
     max_det: int = parameter(100,
         'Publish only the most confident detections, this many.', low=1, high=1000)
 

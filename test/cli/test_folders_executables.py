@@ -84,6 +84,8 @@ def errors_of(folder):
 def test_a_scaled_and_levelled_map_is_evaluated_on_its_own_recording(tmp_path, capsys, caplog,
                                                                      how):
     """The options are known from the map; another scale runs no network again."""
+    import pycolmap
+
     tilt = np.eye(4)
     tilt[:3, :3] = Rotation.from_euler('x', 25.0, degrees=True).as_matrix()
     folder, built = write_colmap(tmp_path / 'scan', shots_of(), scale=0.4, world=tilt), (
@@ -117,6 +119,15 @@ def test_a_scaled_and_levelled_map_is_evaluated_on_its_own_recording(tmp_path, c
     assert len(twice) == again.sum()
     np.testing.assert_array_equal(once.select_frames(np.nonzero(again)[0]).bboxes_xyxy,
                                   twice.bboxes_xyxy)
+    # boxes are of the pinhole of their camera: those of another camera would be wrong
+    model = pycolmap.Reconstruction(str(folder / 'sparse/0'))
+    for camera in model.cameras.values():
+        camera.focal_length_x *= 1.01
+    model.write_binary(str(folder / 'sparse/0'))
+    caplog.clear()
+    assert run(build_map, '--colmap', folder, '--model', ASSETS / 'yolo.pt', *NETWORKS[2:], *CLIP,
+               '--level', '--scale', 0.8, '--out', tmp_path / 'longer.yaml') < 2
+    assert not any('other poses or keyframes' in one for one in caplog.messages)
 
 
 def test_a_levelled_map_is_evaluated_on_the_bag_that_made_it(tmp_path, capsys):

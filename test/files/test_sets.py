@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files that belong together, written by processes that are killed or that share a folder."""
 
+import fcntl
 import multiprocessing
 import os
 import random
@@ -257,3 +258,18 @@ def test_a_set_without_end_is_not_printed(path):
     with pytest.raises(MapError, match=r'is of the set a{12}, its') as error:
         load_embeddings_of_map(path, landmark_map.landmark_ids, landmark_map.map_set)
     assert len(str(error.value)) < 500
+
+
+def test_a_writer_that_keeps_the_others_out_is_named(tmp_path, monkeypatch):
+    """Such as a process that was stopped while it wrote."""
+    monkeypatch.setattr('cliploc_ros.files.storage._TURN_S', 0.3)
+    path = tmp_path / 'office.yaml'
+    write_map(path, ROOM)
+    before = path.read_bytes()
+    descriptor = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    with pytest.raises(MapError, match=r'another program has been writing there for 0\.3 s'):
+        write_map(path, ROOM)
+    os.close(descriptor)
+    assert path.read_bytes() == before
+    write_map(path, ROOM)

@@ -45,7 +45,8 @@ def wake_up_on_frames(tester):
 def core_answers(office, detections):
     """What the core says of detections in turn, without any ROS.
 
-    A frame that was asked for twice is localized twice: each answer tells of the camera.
+    A frame that is requested twice is localized twice, since each answer adds evidence about the
+    camera.
     """
     localizer = Localizer(Relocalizer(LandmarkMap.from_file(office / 'map.yaml'),
                                       RelocalizerOptions(matching='class')))

@@ -56,7 +56,7 @@ def test_maps_change_while_the_node_runs(own_relocalizer, tester, floors):
     frame = make_frame(see_room(other_room()))
 
     def reloaded(**parameters):
-        """Set parameters; return whether the maps could be read anew."""
+        """Set parameters; return whether the maps could be read again."""
         assert all(tester.set_parameter(*one).successful for one in parameters.items())
         return tester.trigger('reload_map').success
     assert not tester.relocalize(frame).success

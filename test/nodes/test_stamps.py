@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Stamps that do not tell of which image detections are: refused with the cause."""
+"""Stamps by which detections cannot be assigned to an image: refused with the cause."""
 
 import numpy as np
 import pytest

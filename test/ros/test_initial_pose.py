@@ -30,7 +30,7 @@ def test_without_a_localizer_the_pose_is_withheld_once_time_is_up(robot):
     robot.meet()
     robot.hand_over()
     robot.wait(lambda: robot.localizer.poses, 'the pose')
-    assert len(robot.localizer.poses) == 1, 'the one that was withheld is not delivered late'
+    assert len(robot.localizer.poses) == 1, 'the withheld pose is not delivered late'
 
 
 def test_a_localizer_that_starts_meanwhile_is_waited_for(robot):

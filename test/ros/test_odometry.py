@@ -104,10 +104,10 @@ def test_an_origin_that_is_reset_is_a_restart_and_reported_once(robot, source, m
     talk(source, *np.arange(9.5, 10.05, 0.1))
     run = place(robot, 10.0).run
     for moment in moments_s:
-        anew = message(moment)
+        restarted = message(moment)
         for axis, metres in moved.items():
-            setattr(anew.pose.pose.position, axis, metres)
-        source.take(anew)
+            setattr(restarted.pose.pose.position, axis, metres)
+        source.take(restarted)
     assert stamps_ns == [round(moments_s[0] * 1e9)]
     assert place(robot, sum(moments_s) / 2).run != run
 

@@ -175,10 +175,11 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
     flat = sum(one.depth is None for one in files)
     if 0 < flat < len(files):
         notes.append(f'{flat} of {len(files)} images have no depth image')
-    known = [(one.color.name, one.camera, np.round(one.pose, 6).tolist())
-             for one in files if one.pose is not None]
-    return replace(frames, digest=hashlib.sha256(repr(known).encode()).hexdigest()[:12],
-                   notes=(*filter(None, notes), *frames.notes))
+    posed = [(one, one.pose) for one in files if one.pose is not None]
+    digest = ' '.join(hashlib.sha256(repr(known).encode()).hexdigest()[:12] for known in (
+        [(one.color.name, one.stamp_ns, one.camera) for one, _ in posed],
+        [np.round(pose, 6).tolist() for _, pose in posed]))
+    return replace(frames, digest=digest, notes=(*filter(None, notes), *frames.notes))
 
 
 def tum_frames(sequence: TumSequence, camera: Camera) -> Frames:

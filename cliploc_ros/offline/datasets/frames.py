@@ -86,7 +86,8 @@ class Frames:
     #: The frames of each of several cameras; empty for one
     of_cameras: tuple['Frames', ...] = ()
     varies: bool = False  #: Whether each image has a camera of its own
-    digest: str = ''  #: Of poses and cameras, which may change while the folder does not
+    #: Of what may change while the folder does not: images and their cameras, then their poses
+    digest: str = ''
     notes: tuple[str, ...] = ()  #: What the user should know about how they were read
 
     @property

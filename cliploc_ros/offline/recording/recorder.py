@@ -217,13 +217,14 @@ def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame | st
 
 
 def _earlier(frames: Frames, described: str, file: Path) -> dict[tuple[str, int], SeenFrame]:
-    """Return what the same networks said of these images before, by camera and stamp.
+    """Return the output of the same networks for these images earlier, by camera and stamp.
 
     Boxes do not depend on the poses, as those of another scale, nor on the keyframes.
     """
     def networks(described: str) -> dict[str, Any]:
         tree = parse_json(described.encode())
-        return tree | {'source': tree['source'][:3], 'keyframes': None}
+        *source, digest = [*tree['source'], ''][:4]
+        return tree | {'source': [*source, digest.partition(' ')[0]], 'keyframes': None}
 
     source = frames.source.resolve()
     found: dict[tuple[str, int], SeenFrame] = {}
@@ -237,12 +238,12 @@ def _earlier(frames: Frames, described: str, file: Path) -> dict[tuple[str, int]
         if is_same:
             logger.warning('using the boxes of an earlier run with other poses or keyframes: %s',
                            path)
-            found |= {(one.camera, one.stamp_ns): one for one in _frames_of(recorded, frames)}
+            found |= {(one.camera, one.stamp_ns): one for one in _seen_frames(recorded, frames)}
     return found
 
 
-def _frames_of(recorded: Recorded, frames: Frames) -> Iterator[SeenFrame]:
-    """Yield what the networks said of each frame; depth is unknown."""
+def _seen_frames(recorded: Recorded, frames: Frames) -> Iterator[SeenFrame]:
+    """Yield the frames of a recording as the networks saw them; depth is unknown."""
     all_boxes = recorded.detections
     for frame, stamp_ns in enumerate(recorded.stamps_ns.tolist()):
         rows = slice(*all_boxes.frame_offsets[frame:frame + 2].tolist())
@@ -262,7 +263,7 @@ def _frames_of(recorded: Recorded, frames: Frames) -> Iterator[SeenFrame]:
 
 
 def _seen_again(raw: RawFrame, earlier: Mapping[tuple[str, int], SeenFrame]) -> SeenFrame | None:
-    """Return what was said of an image before, with its pose and depth now; None: look again."""
+    """Return the earlier output for an image, with its pose and depth now; None: look again."""
     found = earlier.get((raw.camera, raw.stamp_ns))
     if found is None or raw.map_from_camera is None:
         return None
@@ -278,7 +279,7 @@ def _seen_again(raw: RawFrame, earlier: Mapping[tuple[str, int], SeenFrame]) -> 
 
 def _unseen(raws: Iterator[RawFrame], seen: dict[int, SeenFrame],
             earlier: Mapping[tuple[str, int], SeenFrame]) -> Iterator[RawFrame]:
-    """Yield the frames that nothing was said of, and add those of an earlier run to the seen."""
+    """Yield the frames that no run has seen, and add those of an earlier run to `seen`."""
     for raw in raws:
         if raw.place not in seen:
             again = _seen_again(raw, earlier)
