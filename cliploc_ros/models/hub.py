@@ -26,8 +26,8 @@ def is_hub_name(name: str) -> bool:
             and Path(name).suffix not in ('.pt', '.ts', '.safetensors', '.bin', '.json'))
 
 
-def resolve_folder(name: str, networks: Sequence[str], beside: Sequence[str], cache_dir: str
-                   ) -> Path:
+def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequence[str],
+                   cache_dir: str) -> Path:
     """Return a folder with networks and the files beside them; download it if necessary.
 
     A download is made once: with a marker of it, no request is sent. Content is compared with the
@@ -40,9 +40,9 @@ def resolve_folder(name: str, networks: Sequence[str], beside: Sequence[str], ca
     ----------
     name : str
         A folder, or OWNER/NAME[@REVISION][:FILE].
-    networks : sequence of str
-        Patterns of ONNX files; the first that exists is taken, with its file of weights. A FILE in
-        the name takes its place.
+    networks : sequence of sequences of str
+        For each network the patterns of its ONNX file; the first that exists is taken, with its
+        file of weights. A FILE in the name takes the place of the first network.
     beside : sequence of str
         Patterns of all other files.
     """
@@ -53,9 +53,9 @@ def resolve_folder(name: str, networks: Sequence[str], beside: Sequence[str], ca
     if match is None:
         raise ModelError(f'{folder} does not exist: check the path of the network')
     repository, revision, file = match.groups()
-    wanted = [file] if file else list(networks)
+    wanted = [[file], *networks[1:]] if file else list(networks)
     own = resolve_cache_dir(cache_dir) / 'weights'
-    request = json.dumps([repository, revision, wanted, list(beside)])
+    request = json.dumps([repository, revision, [*map(list, wanted)], list(beside)])
     marker = own / f'{repository.replace("/", "--")}-{_digest(request.encode())[:16]}.json'
     try:
         found = own / str(json.loads(read_file(marker)))
@@ -70,23 +70,25 @@ def resolve_folder(name: str, networks: Sequence[str], beside: Sequence[str], ca
 
         told = huggingface_hub.HfApi().model_info(repository, revision=revision,
                                                   timeout=_PATIENCE_S)
-        files = [one.rfilename for one in told.siblings or ()]
-        chosen = [one for one in files if any(fnmatch(one, pattern) for pattern in beside)]
-        groups = [[one for one in files if fnmatch(one, pattern)] for pattern in wanted]
-        network = next(filter(None, groups), None)
-        if network is None:
-            raise ModelError(f'{name} has none of {", ".join(wanted)}: it has {", ".join(files)}')
-        weights = [one for one in files for main in network if one.startswith(f'{main}')]
-        for one in [*chosen, *weights]:
+        files = [each.rfilename for each in told.siblings or ()]
+        chosen = [each for each in files if any(fnmatch(each, pattern) for pattern in beside)]
+        for patterns in wanted:
+            main = next((each for pattern in patterns for each in files
+                         if fnmatch(each, pattern)), None)
+            if main is None:
+                raise ModelError(f'{name} has none of {", ".join(patterns)}: it has '
+                                 f'{", ".join(files)}')
+            chosen += [each for each in files if each.startswith(main)]
+        for each in chosen:
             path = Path(huggingface_hub.hf_hub_download(
-                repository, one, revision=told.sha, cache_dir=own))
+                repository, each, revision=told.sha, cache_dir=own))
             _check_content(path)
-        snapshot = Path(str(path)[:-len(one)])
+        snapshot = Path(str(path)[:-len(each)])
         with replace_file(marker) as partial:
             partial.write_text(json.dumps(str(snapshot.relative_to(own))))
         return snapshot
 
-    listed = ', '.join([*wanted[:1], *beside])
+    listed = ', '.join([*(patterns[0] for patterns in wanted), *beside])
     return download(f"the network '{name}'", own, (
         f'Without a network: download {listed} from https://huggingface.co/{repository} on '
         'another machine into a folder, and name the path of that folder'), fetch)

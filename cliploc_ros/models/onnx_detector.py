@@ -104,7 +104,7 @@ def _resolve(options: DetectorOptions) -> Path:
     path = Path(options.model).expanduser().absolute()
     if path.suffix == '.onnx' or path.is_file():
         return path
-    return find_network(resolve_folder(options.model, NETWORKS, BESIDE, options.cache_dir),
+    return find_network(resolve_folder(options.model, [NETWORKS], BESIDE, options.cache_dir),
                         options.model, NETWORKS)
 
 

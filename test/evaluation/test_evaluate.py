@@ -25,8 +25,7 @@ from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
 
 PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'demo/assets'
-NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
-            '--clip-pretrained', ASSETS / 'clip.safetensors', '--map', ASSETS / 'map.yaml')
+NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--clip-pretrained', ASSETS / 'clip', '--map', ASSETS / 'map.yaml')
 FIGURES = ('success_over_threshold', 'success_over_iterations', 'best_iteration', 'top_view',
            'reliability', 'consistency',
            'time_by_stage', 'success_by_boxes', 'precision_over_recall')
@@ -199,7 +198,7 @@ def test_a_map_of_the_same_images_is_noted(walk, evaluated_bag, evaluate_here):
     own = walk / 'own.yaml'
     shutil.copy(ASSETS / 'map.yaml', own)
     cache, = walk.glob('bag.cliploc-*.npz')
-    given = ('--no-clip', '--model', ASSETS / 'yolo.pt', '--map', own, '--methods',
+    given = ('--no-clip', '--model', ASSETS / 'yolo.onnx', '--map', own, '--methods',
              'class_ransac', '--trials', 1, '--no-figures')
     for source, is_noted in (('bag', True), ('tum', False)):
         save_recording(own, MapRecording(cache, walk / source))

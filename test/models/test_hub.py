@@ -24,7 +24,7 @@ from cliploc_ros.errors import ModelError
 from cliploc_ros.models.hub import find_network, resolve_folder
 networks = ['model.onnx', 'onnx/model.onnx']
 try:
-    folder = resolve_folder(sys.argv[2], networks, ['config.json'], sys.argv[1])
+    folder = resolve_folder(sys.argv[2], [networks], ['config.json'], sys.argv[1])
 except ModelError as error:
     print(json.dumps({'error': str(error)}))
 else:

@@ -20,8 +20,7 @@ from cliploc_ros.offline.studio import edits
 from demo.truth import read_frames
 
 WALK = ASSETS / 'mapping'
-CLIP = ('--clip-model', str(ASSETS / 'clip.json'),
-        '--clip-pretrained', str(ASSETS / 'clip.safetensors'))
+CLIP = ('--clip-pretrained', str(ASSETS / 'clip'))
 PATIENCE_S = 120.0
 
 
