@@ -79,7 +79,7 @@ def _export_detector(options: argparse.Namespace, desk: Path) -> Path:
     detector = detector_options(options)
     file = resolve_published(detector.model, '', 'model')
     with needs_pytorch('an export'):
-        from cliploc_ros.models.export import export_detector
+        from cliploc_ros.models.yolo_detector import export_detector
 
         export_detector(file, detector, desk, options.half)
     return desk / DETECTOR

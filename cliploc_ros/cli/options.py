@@ -122,8 +122,8 @@ def add_weights_options(group: Any) -> None:
            "chair', or a map (.yaml) with its classes and labels", default='')
     option(group, '--text-model FILE', 'text tower of that detector (downloaded once)', str, '')
     option(group, '--clip-model', "architecture of open_clip (the profile's)", default='')
-    option(group, '--clip-pretrained', 'folder with ONNX files or OWNER/NAME of the hub, or tag or '
-           "file of open_clip (the profile's)", default='')
+    option(group, '--clip-pretrained', 'folder with ONNX files or OWNER/NAME of the hub, or a tag '
+           "or file of open_clip (the profile's)", default='')
 
 
 def folder_of(options: argparse.Namespace) -> tuple[Path, str] | None:

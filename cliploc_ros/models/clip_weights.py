@@ -96,7 +96,7 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
     """
     named = options.checkpoint_path or options.pretrained
     given = Path(named).expanduser().absolute()
-    if given.is_dir() or is_hub_name(named):
+    if names_onnx(options):
         return _of_onnx(resolve_folder(named, [IMAGE_TOWERS, TEXT_TOWERS], BESIDE,
                                        options.cache_dir), named)
     identity = _identity_of(options, given)
@@ -106,6 +106,12 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
             return _of_onnx(folder, identity[1])
     with needs_pytorch(f'CLIP {identity[1]}, which is no ONNX network,', WITHOUT_CLIP):
         return _resolve_by_open_clip(options, identity)
+
+
+def names_onnx(options: ClipOptions) -> bool:
+    """Return whether the options name ONNX files: a folder, or OWNER/NAME of the hub."""
+    named = options.checkpoint_path or options.pretrained
+    return Path(named).expanduser().is_dir() or is_hub_name(named)
 
 
 def runs_in_openvino(options: ClipOptions) -> bool:

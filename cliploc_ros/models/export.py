@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Export networks of PyTorch to ONNX, and compare the two: needs the extra ``models``."""
+"""Export a CLIP of open_clip to ONNX, and what exports of all networks share. Needs PyTorch."""
 
 import contextlib
 import gzip
@@ -23,16 +23,14 @@ from cliploc_ros.models.clip_weights import (
     ClipWeights,
 )
 from cliploc_ros.models.devices import import_openvino
-from cliploc_ros.models.exports import DETECTOR, ExportError, describe_export
+from cliploc_ros.models.exports import ExportError, describe_export
 from cliploc_ros.models.onnx_network import CompiledNetwork
-from cliploc_ros.models.open_vocabulary import set_prompts
-from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.models.yolo_weights import load_yolo, stride_of
 
 if TYPE_CHECKING:
     import torch
 
-_OPSET = 17
+#: The newest that OpenVINO and exporters agree on.
+OPSET = 17
 # How far an output may be off, as a share of its length; measured: 1e-5.
 _TOLERANCE = 1e-3
 # Smaller tensors stay in fp32.
@@ -40,47 +38,13 @@ _LEAST_HALVED = 1024
 _TEXTS = ['a photo of a red mug', "the dog's 2 bowls!", '']
 
 
-# ---- detectors ----------------------------------------------------------------------------------
-
-def export_detector(file: Path, options: DetectorOptions, folder: Path, half: bool = False
-                    ) -> None:
-    """Write a YOLO of ultralytics into a folder; its classes become those of the options' prompts.
-
-    With ``half``, weights are stored in half precision, and the network runs in fp32 nevertheless.
-
-    ExportError: the network gives other results than in PyTorch. ModelError: the file is damaged
-    or no detection model. OptionsError: the network takes no texts.
-    """
-    import torch
-
-    loaded = load_yolo(file, is_download=Path(options.model).expanduser().absolute() != file)
-    if options.prompts:
-        set_prompts(loaded, options)
-        classes = dict(options.prompts)
-        loaded.model.names = {number: classes[name] for number, name in loaded.names.items()}
-    model = loaded.model.float().eval()
-    model.pt_path = str(folder / 'model.pt')
-    with _quiet_export():
-        loaded.export(format='onnx', dynamic=True, simplify=False, opset=_OPSET, verbose=False)
-    if half:
-        _halve(folder / DETECTOR)
-    stride = stride_of(model)
-    probe = np.random.default_rng(0).random((1, 3, 2 * stride, 3 * stride), dtype=np.float32)
-    with torch.inference_mode():
-        outputs = model(torch.from_numpy(probe))
-    expected = outputs[0] if isinstance(outputs, tuple | list) else outputs
-    _compare(folder / DETECTOR, probe, expected[0] if isinstance(expected, tuple) else expected,
-             half)
-    describe_export(folder, 'detector')
-
-
-# ---- CLIP ---------------------------------------------------------------------------------------
-
 def export_clip(weights: ClipWeights, folder: Path, half: bool = False) -> None:
     """Write both towers of a CLIP of open_clip into a folder, with all that the towers need.
 
-    ``half`` is as in export_detector. ExportError: a tower gives other results than in PyTorch, or
-    the tokenizer is not CLIP's own. ModelError: the file does not hold the weights of the model.
+    With ``half``, weights are stored in half precision, and run in fp32 nevertheless.
+
+    ExportError: a tower gives other results than in PyTorch, or the tokenizer is not CLIP's own.
+    ModelError: the file does not hold the weights of the model.
     """
     import open_clip
     import torch
@@ -98,14 +62,14 @@ def export_clip(weights: ClipWeights, folder: Path, half: bool = False) -> None:
         file = folder / towers[-1]
         file.parent.mkdir(parents=True)
         tower = getattr(model, name)
-        with _quiet_export():
+        with quiet_export():
             torch.onnx.export(tower, (example[:2],), file, input_names=[name], dynamo=False,
                               output_names=['embedding'], dynamic_axes={name: {0: 'n'}},
-                              opset_version=_OPSET)
+                              opset_version=OPSET)
             expected = tower(example)
         if half:
-            _halve(file)
-        _compare(file, example.numpy(), expected, half)
+            halve(file)
+        compare(file, example.numpy(), expected, half)
         del model, tower
     (folder / PREPROCESS).write_text(json.dumps(crops))
     (folder / 'textual' / TOKENIZER).write_text(_tokenizer_of(tokenizer))
@@ -143,10 +107,10 @@ def _tokenizer_of(tokenizer: Any) -> str:
     return str(found.to_str())
 
 
-# ---- files --------------------------------------------------------------------------------------
+# ---- of all networks ----------------------------------------------------------------------------
 
 @contextlib.contextmanager
-def _quiet_export() -> Iterator[None]:
+def quiet_export() -> Iterator[None]:
     """Export without the warnings of constants in a trace: a probe tests them."""
     import torch
 
@@ -160,7 +124,7 @@ def _quiet_export() -> Iterator[None]:
         torch.backends.mha.set_fastpath_enabled(fast)
 
 
-def _halve(file: Path) -> None:
+def halve(file: Path) -> None:
     """Store large tensors of an ONNX file in half precision, and cast them where they are used."""
     import onnx
     from onnx import TensorProto, helper, numpy_helper
@@ -180,7 +144,7 @@ def _halve(file: Path) -> None:
     onnx.save(network, str(file))
 
 
-def _compare(file: Path, probe: NDArray[Any], expected: 'torch.Tensor', half: bool) -> None:
+def compare(file: Path, probe: NDArray[Any], expected: 'torch.Tensor', half: bool) -> None:
     """Raise an ExportError where OpenVINO gives another first output for a probe than PyTorch."""
     wanted = expected.numpy()
     try:

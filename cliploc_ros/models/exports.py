@@ -88,16 +88,19 @@ def keep_export(cache_dir: str, name: str, identity: Sequence[str],
 
     ExportError: it failed. ModelError, ModuleNotFoundError: from ``export``.
     """
-    folder = find_export(cache_dir, name, identity)
-    if folder is not None:
-        return folder
     folder, started = _folder(cache_dir, name, identity), time.monotonic()
+    if folder in _unkept:
+        return Path(_unkept[folder].name)
+    if export_key(folder):
+        return folder
     logger.info('exporting %s to ONNX: once, into %s', name, folder)
     # A library that meets a full disk raises the errors of a network that it cannot export, so it
     # writes elsewhere.
     desk = tempfile.TemporaryDirectory(prefix='cliploc_ros_export_')
     try:
         export(Path(desk.name))
+    except ExportError as error:
+        raise ExportError(f'{name}: {error}') from error
     except (CliplocError, ModuleNotFoundError):
         raise
     except Exception as error:  # tracing and exporting raise exceptions of all kinds

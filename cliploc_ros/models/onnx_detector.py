@@ -36,6 +36,7 @@ class _Head(Protocol):
     """What stands before and after a network."""
 
     names: dict[int, str]  #: Class number to name
+    has_doubles: bool  #: Whether several boxes of a class may be of one object
 
     def find(self, image_rgb: NDArray[np.uint8], options: DetectorOptions) -> NDArray[np.float32]:
         """Return the boxes (n, 6) in an image: left, top, right, bottom, score, class.
@@ -92,8 +93,9 @@ class OnnxDetector:
         rows = self._head.find(np.ascontiguousarray(image_rgb), self._options)
         numbers = np.array([self.class_names.index(names[int(one)]) for one in rows[:, 5]],
                            dtype=np.int64)
-        rows = rows[without_doubles(rows[:, :4], numbers, self._options.iou,
-                                    self._options.max_det)]
+        if self._head.has_doubles:
+            rows = rows[without_doubles(rows[:, :4], numbers, self._options.iou,
+                                        self._options.max_det)]
         return Detections(bboxes_xyxy=rows[:, :4].astype(np.float64),
                           class_ids=tuple(names[int(one)] for one in rows[:, 5]),
                           scores=rows[:, 4].astype(np.float64))
@@ -122,6 +124,8 @@ class YoloHead:
             raise ModelError(f"{network.file} is a YOLO model for the task '{task}': one for "
                              "'detect' is needed")
         self.names = _names(network)
+        # two texts of a class
+        self.has_doubles = len(set(self.names.values())) < len(self.names)
         self._stride = int(about['stride']) if about.get('stride', '').isdecimal() else _STRIDE
         height, width = self._input.shape[2:]
         self._size = None if ANY in (height, width) else (height, width)
@@ -179,6 +183,8 @@ class DetrHead:
 
     ``config.json`` has the class names, ``preprocessor_config.json`` how images are prepared.
     """
+
+    has_doubles = True  # of weak queries
 
     def __init__(self, network: OnnxNetwork) -> None:
         self._network, self._input = network, network.image_input()

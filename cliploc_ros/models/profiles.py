@@ -122,7 +122,7 @@ def _exported(file: Path, options: 'DetectorOptions') -> 'DetectorOptions | None
     folder = find_export(options.cache_dir, 'YOLO', identity)
     if folder is None:
         with needs_pytorch(f'{file}, which is no ONNX network,'):
-            from cliploc_ros.models.export import export_detector
+            from cliploc_ros.models.yolo_detector import export_detector
 
             try:
                 folder = keep_export(options.cache_dir, 'YOLO', identity,

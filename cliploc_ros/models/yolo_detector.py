@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A YOLO of ultralytics in PyTorch: for a GPU, and for networks that have no ONNX file."""
+"""A YOLO of ultralytics in PyTorch, for a GPU; and its export to ONNX."""
 
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.models.devices import resolve_device, resolve_precision
+from cliploc_ros.models.export import OPSET, compare, halve, quiet_export
+from cliploc_ros.models.exports import DETECTOR, describe_export
 from cliploc_ros.models.images import check_image_rgb
 from cliploc_ros.models.open_vocabulary import set_prompts
 from cliploc_ros.models.protocols import DetectorOptions
@@ -78,3 +80,35 @@ class YoloDetector:
             bboxes_xyxy=rows[:, :4].astype(np.float64),
             class_ids=tuple(self._class_of[int(index)] for index in rows[:, 5]),
             scores=rows[:, 4].astype(np.float64))
+
+
+def export_detector(file: Path, options: DetectorOptions, folder: Path, half: bool = False
+                    ) -> None:
+    """Write a YOLO of ultralytics into a folder; its classes become those of the options' prompts.
+
+    ``half`` is as in export_clip.
+
+    ExportError: the network gives other results than in PyTorch. ModelError: the file is damaged
+    or no detection model. OptionsError: the network takes no texts.
+    """
+    import torch
+
+    loaded = load_yolo(file, is_download=Path(options.model).expanduser().absolute() != file)
+    if options.prompts:
+        set_prompts(loaded, options)
+        classes = dict(options.prompts)
+        loaded.model.names = {number: classes[name] for number, name in loaded.names.items()}
+    model = loaded.model.float().eval()
+    model.pt_path = str(folder / 'model.pt')
+    with quiet_export():
+        loaded.export(format='onnx', dynamic=True, simplify=False, opset=OPSET, verbose=False)
+    if half:
+        halve(folder / DETECTOR)
+    stride = stride_of(model)
+    probe = np.random.default_rng(0).random((1, 3, 2 * stride, 3 * stride), dtype=np.float32)
+    with torch.inference_mode():
+        outputs = model(torch.from_numpy(probe))
+    expected = outputs[0] if isinstance(outputs, tuple | list) else outputs
+    compare(folder / DETECTOR, probe, expected[0] if isinstance(expected, tuple) else expected,
+             half)
+    describe_export(folder, 'detector')

@@ -25,7 +25,8 @@ from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
 
 PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'demo/assets'
-NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--clip-pretrained', ASSETS / 'clip', '--map', ASSETS / 'map.yaml')
+NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--clip-pretrained', ASSETS / 'clip', '--map',
+            ASSETS / 'map.yaml')
 FIGURES = ('success_over_threshold', 'success_over_iterations', 'best_iteration', 'top_view',
            'reliability', 'consistency',
            'time_by_stage', 'success_by_boxes', 'precision_over_recall')

@@ -30,8 +30,8 @@ from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.files import fingerprint_file
 from cliploc_ros.models.images import crop_bounds
 from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
-from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.protocols import DetectorOptions
 
 pytestmark = pytest.mark.full
 

@@ -152,7 +152,7 @@ def test_without_openvino_pytorch_runs_and_one_line_says_so():
     assert 'is not installed' in done.stdout
 
 
-def test_a_network_whose_export_gives_other_results_is_run_by_pytorch(small_clip, tmp_path, caplog):
+def test_pytorch_runs_a_network_whose_export_gives_other_results(small_clip, tmp_path, caplog):
     state = {name: torch.full_like(tensor, float('nan'))
              for name, tensor in small_clip.model.state_dict().items()}
     torch.save(state, tmp_path / 'weights.pt')
@@ -178,7 +178,8 @@ def compare(first: ObjectDetector, second: ObjectDetector, images: list[np.ndarr
 
 
 def detector(model: object, cache: Path, **changes) -> ObjectDetector:
-    return load_detector(DetectorOptions(str(model), device='cpu', cache_dir=str(cache), **changes))
+    return load_detector(DetectorOptions(str(model), device='cpu', cache_dir=str(cache),
+                                         **changes))
 
 
 def test_boxes_in_real_images_equal_those_of_pytorch(shared_data, cache):

@@ -43,7 +43,8 @@ detector = load_detector(DetectorOptions(
 clip = ([str(ASSETS / 'clip.json'), str(ASSETS / 'clip.safetensors')] if inference == 'pytorch'
         else ['', str(ASSETS / 'clip')])
 observer = Observer(*load_encoder_for_map(ClipOptions(
-    *clip, inference=inference, cache_dir=cache, device='cpu', precision='fp32'), landmark_map, [], 'text'))
+    *clip, inference=inference, cache_dir=cache, device='cpu', precision='fp32'),
+    landmark_map, [], 'text'))
 relocalizer = Relocalizer(landmark_map, RelocalizerOptions(time_budget_s=60.0))
 camera, _ = find_camera(None, ASSETS / 'sequence')
 found = []

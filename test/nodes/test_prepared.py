@@ -134,7 +134,8 @@ def test_kernels_that_the_folder_does_not_take_are_missed(robot, prepared, tmp_p
 @pytest.mark.parametrize(('old', 'new', 'named'), [
     (f'{ASSETS}/yolo.onnx', 'yolov8n.pt', 'yolov8n.pt'),
     (f'clip_pretrained: {ASSETS}/clip',
-     'clip_model: ViT-B-32\n    clip_pretrained: openai', "the weights 'openai' of CLIP model 'ViT-B-32'")])
+     'clip_model: ViT-B-32\n    clip_pretrained: openai',
+     "the weights 'openai' of CLIP model 'ViT-B-32'")])
 def test_missing_weights_are_named_with_the_remedy(offline, tmp_path, old, new, named):
     assert old in ROBOT
     robot = tmp_path / 'robot.yaml'

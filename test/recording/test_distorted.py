@@ -111,8 +111,9 @@ def test_a_recording_is_localized_in_the_map_of_the_room(folder):
     bend(ASSETS / 'sequence', folder / 'sequence', every=4)
     assert tum_to_bag(arguments(folder / 'sequence', folder / 'bag')) == 0
     assert evaluate(arguments(
-        '--bag', folder / 'bag', '--map', ASSETS / 'map.yaml', *NETWORKS, '--clip-pretrained', ASSETS / 'clip', '--methods',
-        'auto', '--trials', 1, '--workers', 1, '--no-figures', '--out', folder / 'out')) == 0
+        '--bag', folder / 'bag', '--map', ASSETS / 'map.yaml', *NETWORKS, '--clip-pretrained',
+        ASSETS / 'clip', '--methods', 'auto', '--trials', 1, '--workers', 1, '--no-figures',
+        '--out', folder / 'out')) == 0
     results = json.loads((folder / 'out/results.json').read_text())
     right = [one['solved'] and one['error_m'] < 0.5 for one in results]
     accepted = [one['accepted'] for one in results]

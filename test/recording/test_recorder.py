@@ -30,7 +30,7 @@ from cliploc_ros.offline.recording.recorder import (
 PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--device', 'cpu')
-CLIP = ('--clip-pretrained', ASSETS / 'clip'
+CLIP = ('--clip-pretrained', ASSETS / 'clip')
 # A short walk shows objects from one side: this test is about what the networks say.
 ALL = ('--min-baseline', '1', '--frame-id', 'room', '--no-check')
 TIMEOUT_S = 600.0  # with networks, on a machine under load
