@@ -25,17 +25,19 @@ if TYPE_CHECKING:  # nodes know the names of profiles before they load a network
 class Profile:
     """A detector and an encoder."""
 
-    detector: str  #: A published YOLO model
-    #: See ClipOptions
+    detector: str  #: See DetectorOptions.model
+    #: See ClipOptions; an ONNX network needs no model
     clip_model: str
     clip_pretrained: str
 
 
+# OpenAI's ViT-B-32.
+_CLIP = 'Xenova/clip-vit-base-patch32'
 #: doc/install.md has their accuracy, time, memory and licences.
 PROFILES = {
     'accurate': Profile('yolov8x.pt', 'ViT-L-14', 'openai'),  # the paper's
-    'balanced': Profile('yolov8m.pt', 'ViT-B-32-256', 'datacomp_s34b_b86k'),
-    'fast': Profile('yolov8n.pt', 'ViT-B-32', 'datacomp_xl_s13b_b90k'),
+    'balanced': Profile('onnx-community/dfine_m_obj365-ONNX', '', _CLIP),
+    'fast': Profile('onnx-community/dfine_n_coco-ONNX', '', _CLIP),
 }
 PROFILE_NAMES = ('auto', *PROFILES)
 logger = logging.getLogger(__name__)

@@ -103,5 +103,5 @@ def test_networks_that_are_no_onnx_are_named_with_the_remedies(hidden, walk, tmp
               '--clip-pretrained', tmp_path / 'clip.safetensors'], '--no-clip')):
         done = run([*sources, *networks], environment)
         assert done.returncode == 1 and 'Traceback' not in done.stderr
-        assert 'is not installed' in done.stderr and 'prepare --cache-dir' in done.stderr
+        assert 'is not installed' in done.stderr and 'export_network' in done.stderr
         assert named in done.stderr
