@@ -74,7 +74,8 @@ def export_clip(weights: ClipWeights, folder: Path, half: bool = False) -> None:
     (folder / PREPROCESS).write_text(json.dumps(crops))
     (folder / 'textual' / TOKENIZER).write_text(_tokenizer_of(tokenizer))
     (folder / CONFIG).write_text(json.dumps({
-        'embed_dim': weights.embed_dim, 'text_cfg': {'context_length': tokenizer.context_length}}))
+        'embed_dim': weights.embed_dim, 'text_cfg': {
+            'context_length': tokenizer.context_length, 'vocab_size': tokenizer.vocab_size}}))
     describe_export(folder, weights.key)
 
 

@@ -11,13 +11,14 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from cliploc_ros.errors import CliplocError, ModelError
 from cliploc_ros.files.storage import parse_json, read_file, resolve_cache_dir, warn_not_kept
 from cliploc_ros.models.devices import free_memory
-from cliploc_ros.models.files import fingerprint_file, first_line, remove_unused
+from cliploc_ros.models.files import fingerprint_file, first_line, keep_folder
 from cliploc_ros.models.protocols import DetectorOptions
 
 # Of such a folder, and of how networks are exported.
@@ -106,7 +107,7 @@ def keep_export(cache_dir: str, name: str, identity: Sequence[str],
     except Exception as error:  # tracing and exporting raise exceptions of all kinds
         raise ExportError(f'{name} cannot be exported to ONNX: {first_line(error)}') from error
     try:
-        _move(Path(desk.name), folder)
+        keep_folder(folder, _MOST_EXPORTS, partial(shutil.copytree, desk.name))
     except OSError as error:
         warn_not_kept('the exported network is not cached and the next start is slow again: '
                       f'cannot write {folder} ({first_line(error)}); make room, or choose a '
@@ -115,19 +116,6 @@ def keep_export(cache_dir: str, name: str, identity: Sequence[str],
     free_memory()
     logger.info('%s is exported after %.0f s', name, time.monotonic() - started)
     return folder
-
-
-def _move(export: Path, folder: Path) -> None:
-    """Copy an export to its place in the cache, where it appears as a whole."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    remove_unused([each for each in folder.parent.iterdir() if not each.name.startswith('.')],
-                  folder.parent.glob('.*.tmp'), _MOST_EXPORTS - 1)
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix='.', suffix='.tmp',
-                                     ignore_cleanup_errors=True) as desk:
-        whole = Path(shutil.copytree(export, Path(desk) / folder.name))
-        if folder.exists():  # damaged, or of another process
-            folder.rename(Path(desk) / 'old')
-        whole.rename(folder)
 
 
 def _folder(cache_dir: str, name: str, identity: Sequence[str]) -> Path:

@@ -7,6 +7,7 @@ import hashlib
 import logging
 import shutil
 import struct
+import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterable
@@ -118,6 +119,23 @@ def remove_unused(entries: Iterable[Path], partial: Iterable[Path], most: int) -
             shutil.rmtree(entry, ignore_errors=True)
         else:
             entry.unlink(missing_ok=True)
+
+
+def keep_folder(folder: Path, most: int, write: Callable[[Path], object]) -> None:
+    """Write a folder of a cache, which appears as a whole; keep so many that were used last.
+
+    ``write`` gets the path of a folder to make. Any number of processes may share the cache.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    remove_unused([each for each in folder.parent.iterdir() if not each.name.startswith('.')],
+                  folder.parent.glob('.*.tmp'), most - 1)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix='.', suffix='.tmp',
+                                     ignore_cleanup_errors=True) as desk:
+        whole = Path(desk) / folder.name
+        write(whole)
+        if folder.exists():  # damaged, or of another process
+            folder.rename(Path(desk) / 'old')
+        whole.rename(folder)
 
 
 def first_line(error: Exception) -> str:

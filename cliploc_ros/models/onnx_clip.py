@@ -33,6 +33,10 @@ from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, read_config
 
 # Pillow's numbers of filters, which transformers writes.
 _FILTERS = {2: 'bilinear', 3: 'bicubic'}
+# Of a CLIP.
+_DEFAULTS = {'max_position_embeddings': 77, 'vocab_size': 49_408}
+# A tokenizer uses nearly all of the tokens that its text tower knows.
+_LEAST_SHARE = 0.9
 _EMBEDDINGS = ('image_embeds', 'text_embeds', 'embedding')
 
 
@@ -119,7 +123,7 @@ class OnnxTextTower:
         self._text, self._masks = texts[0], masks
         #: The most tokens of a label
         self.context = (self._text.shape[1] if self._text.shape[1] != ANY
-                        else _context_of(weights.file))
+                        else _of_text(weights.file, 'max_position_embeddings', 'context_length'))
         self._tokenizer, self._padding = _read_tokenizer(weights.file)
 
     def count(self, label: str) -> int:
@@ -170,17 +174,20 @@ def _embedding(network: OnnxNetwork, outputs: dict[str, NDArray[np.float32]],
     return names[0]
 
 
-def _context_of(folder: Path) -> int:
-    config = read_config(folder / CONFIG, 'it has the length of a text')
+def _of_text(folder: Path, *names: str) -> int:
+    """Return a size of the text tower, by the names that transformers and open_clip have for it.
+
+    ModelError: the configuration does not say it.
+    """
+    config = read_config(folder / CONFIG, 'it has the sizes of the text tower')
     text: dict[str, Any] = next((config[name] for name in ('text_config', 'text_cfg')
-                 if isinstance(config.get(name), dict)), {})
-    # transformers writes what differs from its defaults only
-    length = text.get('max_position_embeddings', text.get('context_length'))
-    length = 77 if length is None and config.get('model_type') == 'clip' else length
-    if not isinstance(length, int) or not 2 < length < 2**16:
-        raise ModelError(f"{folder / CONFIG} names the length of a text neither as "
-                         "'max_position_embeddings' nor as 'context_length': add it")
-    return length
+                                 if isinstance(config.get(name), dict)), {})
+    size = next((text[name] for name in names if name in text), None)
+    if size is None and (config.get('model_type') == 'clip' or 'text_cfg' in config):
+        size = _DEFAULTS[names[0]]  # what equals the default is not written
+    if not isinstance(size, int) or not 2 < size < 2**24:
+        raise ModelError(f"{folder / CONFIG} does not say '{names[0]}' of its text tower: add it")
+    return size
 
 
 def _read_tokenizer(folder: Path) -> tuple[Any, int]:
@@ -196,6 +203,9 @@ def _read_tokenizer(folder: Path) -> tuple[Any, int]:
         tokenizer = tokenizers.Tokenizer.from_str(read_file(files[0]).decode())
         if len(tokenizer.encode('a cup').ids) < 3:
             raise ValueError('it marks no end of a text')
+        known, size = _of_text(folder, 'vocab_size'), tokenizer.get_vocab_size()
+        if not _LEAST_SHARE * known <= size <= known:
+            raise ValueError(f'it has {size} tokens, the text tower {known}')
     except Exception as error:  # the library has no exceptions of its own
         raise ModelError(f'{files[0]} is no tokenizer of a CLIP: {first_line(error)}') from error
     padding = 0

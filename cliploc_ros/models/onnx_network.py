@@ -9,8 +9,8 @@ import hashlib
 import json
 import logging
 import os
-import tempfile
 import threading
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +25,7 @@ from cliploc_ros.models.files import (
     damaged,
     fingerprint_file,
     first_line,
-    remove_unused,
+    keep_folder,
 )
 
 # A compiled network is as large as its file: ViT-L-14 takes 1.2 GB, YOLOv8x .3 GB.
@@ -201,7 +201,7 @@ def _compile(file: Path, folder: Path, precision: str | None) -> tuple[Any, dict
                          'again, without quantization') from error
     del network
     try:
-        _keep(compiled, metadata, folder)
+        keep_folder(folder, _MOST_NETWORKS, partial(_write, compiled, metadata))
     except Exception as error:  # OpenVINO reports a full disk as it reports a bad network
         warn_not_kept('the compiled network is not cached and the next start is slow again: '
                       f'cannot write {folder} ({first_line(error)}); make room, or choose a '
@@ -210,26 +210,16 @@ def _compile(file: Path, folder: Path, precision: str | None) -> tuple[Any, dict
     return compiled, metadata
 
 
-def _keep(compiled: Any, metadata: dict[str, str], folder: Path) -> None:
-    """Write a compiled network; any number of processes may share the cache."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    remove_unused([each for each in folder.parent.iterdir() if not each.name.startswith('.')],
-                  folder.parent.glob('.*.tmp'), _MOST_NETWORKS - 1)
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix='.', suffix='.tmp',
-                                     ignore_cleanup_errors=True) as desk:
-        whole = Path(desk) / folder.name
-        whole.mkdir()
-        content = compiled.export_model()
-        blob = content if isinstance(content, bytes) else content.getbuffer()
-        about = {'sha256': hashlib.sha256(blob).hexdigest(), 'metadata': metadata}
-        for name, written in ((_BLOB, blob), (_ABOUT, json.dumps(about).encode())):
-            with (whole / name).open('wb') as file:
-                file.write(written)
-                file.flush()
-                os.fsync(file.fileno())
-        if folder.exists():  # damaged, or of another process
-            folder.rename(Path(desk) / 'old')
-        whole.rename(folder)
+def _write(compiled: Any, metadata: dict[str, str], folder: Path) -> None:
+    folder.mkdir()
+    content = compiled.export_model()
+    blob = content if isinstance(content, bytes) else content.getbuffer()
+    about = {'sha256': hashlib.sha256(blob).hexdigest(), 'metadata': metadata}
+    for name, written in ((_BLOB, blob), (_ABOUT, json.dumps(about).encode())):
+        with (folder / name).open('wb') as file:
+            file.write(written)
+            file.flush()
+            os.fsync(file.fileno())
 
 
 def _release_pages(file: Path) -> None:

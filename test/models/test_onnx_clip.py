@@ -15,6 +15,7 @@ import onnx
 import open_clip
 import pytest
 import torch
+from tokenizers import Tokenizer, models, pre_tokenizers, processors
 
 from cliploc_ros.cli.export_network import main as export_network
 from cliploc_ros.errors import ModelError, OptionsError
@@ -147,6 +148,16 @@ def text_of(file: Path, **changes) -> None:
     file.write_text(json.dumps(json.loads(file.read_text()) | changes))
 
 
+def other_words(file: Path) -> None:
+    """Write a tokenizer of another model."""
+    tokenizer = Tokenizer(models.WordLevel({'[UNK]': 0, '[CLS]': 1, '[SEP]': 2} | {
+        f'word{number}': number for number in range(3, 30)}, '[UNK]'))
+    tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
+    tokenizer.post_processor = processors.TemplateProcessing(
+        single='[CLS] $0 [SEP]', special_tokens=[('[CLS]', 1), ('[SEP]', 2)])
+    tokenizer.save(str(file))
+
+
 @pytest.mark.parametrize(('change', 'named'), [
     (lambda folder: (folder / 'config.json').unlink(), 'config.json is missing'),
     (lambda folder: text_of(folder / 'config.json', projection_dim='x'), "'projection_dim'"),
@@ -158,6 +169,7 @@ def text_of(file: Path, **changes) -> None:
     (lambda folder: (folder / 'onnx/text_model.onnx').unlink(), 'text_model.onnx'),
     (lambda folder: (folder / 'tokenizer.json').unlink(), 'tokenizer.json is missing'),
     (lambda folder: (folder / 'tokenizer.json').write_text('{}'), 'no tokenizer of a CLIP'),
+    (lambda folder: other_words(folder / 'tokenizer.json'), 'it has 30 tokens, the text'),
     (lambda folder: shutil.copy(ASSETS / 'yolo.onnx', folder / 'onnx/vision_model.onnx'),
      'expected one output'),
     (lambda folder: shutil.copy(ASSETS / 'yolo.onnx', folder / 'onnx/text_model.onnx'),
