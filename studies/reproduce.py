@@ -12,7 +12,6 @@ and the paper's figures are in studies/reproduce.yaml.
 import argparse
 import csv
 import hashlib
-import io
 import json
 import os
 import platform
@@ -21,7 +20,7 @@ import sys
 import tarfile
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -56,6 +55,8 @@ _FIGURES = 'success_over_threshold', 'success_over_iterations', 'top_view'
 # Of the table of `evaluate`: all but accepted and precision. The paper's columns come after these.
 _COLUMNS = (0, 1, 2, 3, 4, 7)
 _OF_PAPER = ('paper: success', 'paper: error [m]', 'paper: time [s]')
+_CSV_OF_PAPER = [f'paper_{name}{kind}' for name in ('success', 'error_m', 'time_s')
+                 for kind in ('', '_std')]
 _AGAIN = 'run the same command again, it goes on from here'
 
 
@@ -110,6 +111,11 @@ class Sources:
             return cls(networks, recordings, **content)
         except (KeyError, TypeError, AttributeError) as error:
             raise OptionsError(f'{path}: is not like {_SOURCES.name}: {error}') from error
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Reproduce; return the exit code."""
+    return run_main(make_parser(), run, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -309,16 +315,27 @@ def _table(folder: Path, paper: Mapping[str, Sequence[str]]) -> list[tuple[str, 
     return [row + cells for row, cells in zip(rows, beside, strict=True)]
 
 
+def _csv_rows(name: str, folder: Path, paper: Mapping[str, Sequence[str]]
+              ) -> Iterator[dict[str, str]]:
+    """Yield the rows of summary.csv of `evaluate`, with the paper's figures."""
+    with (folder / 'summary.csv').open(newline='') as file:
+        for row in csv.DictReader(file):
+            beside = paper.get(row['method'], ('', '', ''))
+            numbers = [part for cell in beside for part in cell.partition('±')[::2]]
+            yield {'sequence': name, **row, **dict(zip(_CSV_OF_PAPER, numbers, strict=True))}
+
+
 def _write_results(names: Sequence[str], sources: Sources, out: Path) -> None:
     """Print the tables, and write them as text, CSV, LaTeX and a page, and all as results.tar."""
-    texts, latex, lines, parts = [], [], io.StringIO(), []
+    texts: list[str] = []
+    lines: list[dict[str, str]] = []
+    latex, parts = [], []
     for name in names:
         one, folder = sources.recordings[name], out / name / 'evaluation'
         rows, title = _table(folder, one.paper), f'{name}: {one.name}'
         texts += [title, summary.as_text(rows), '']
         latex.append(f'% {title}\n{summary.as_latex(rows)}')
-        csv.writer(lines, lineterminator='\n').writerows(
-            [('sequence', *rows[0]), *((name, *row) for row in rows[1:])])
+        lines += _csv_rows(name, folder, one.paper)
         parts.append(html.fold(title, html.table(rows[0], rows[1:]), html.side_by_side(
             html.figure((folder / f'{figure}.png').read_bytes(), CAPTIONS[figure], figure)
             for figure in _FIGURES), is_open=True))
@@ -327,7 +344,7 @@ def _write_results(names: Sequence[str], sources: Sources, out: Path) -> None:
     texts += notes
     print('\n'.join(['', *texts, '']), flush=True)
     write_text(out / 'table.txt', '\n'.join([*texts, '']))
-    write_text(out / 'table.csv', lines.getvalue())
+    write_text(out / 'table.csv', summary.csv_text(lines))
     write_text(out / 'table.tex', '\n'.join(latex))
     write_text(out / 'page.html', html.page("The paper's table, on this machine", *parts,
                                             html.items(notes)))
@@ -361,4 +378,4 @@ def _about(out: Path, names: Sequence[str], sources: Sources) -> dict[str, Any]:
 
 
 if __name__ == '__main__':
-    sys.exit(run_main(make_parser(), run, None))
+    sys.exit(main())

@@ -354,10 +354,17 @@ def as_csv(summaries: Sequence[Summary],
                          for source in _SOURCES}
             rows[-1] |= {'keyframe_inliers': float(np.median(one.keyframe_inliers)),
                          'keyframes_ms': float(one.keyframes_ms.mean())}
+    return csv_text(rows)
+
+
+def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return rows with equal names of columns as CSV, numbers with six digits."""
     text = io.StringIO()
     writer = csv.DictWriter(text, rows[0], lineterminator='\n')
     writer.writeheader()
-    writer.writerows(rows)
+    for row in rows:
+        writer.writerow({name: f'{value:.6g}' if isinstance(value, float) else value
+                         for name, value in row.items()})
     return text.getvalue()
 
 
