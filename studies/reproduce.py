@@ -11,6 +11,7 @@ and the paper's figures are in studies/reproduce.yaml.
 
 import argparse
 import csv
+import fcntl
 import hashlib
 import json
 import os
@@ -21,7 +22,7 @@ import tarfile
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib import metadata
@@ -147,13 +148,26 @@ def run(options: argparse.Namespace) -> int:
         return 1
     if options.plan:
         return 0
-    networks = list(sources.options)
-    for one in sources.networks:
-        networks += [one.option, str(_downloaded(one, out))]
-    for name in names:
-        _reproduce(name, sources, networks, options)
-    _write_results(names, sources, out)
+    with _alone_in(out):
+        networks = list(sources.options)
+        for one in sources.networks:
+            networks += [one.option, str(_downloaded(one, out))]
+        for name in names:
+            _reproduce(name, sources, networks, options)
+        _write_results(names, sources, out)
     return 0
+
+
+@contextmanager
+def _alone_in(out: Path) -> Iterator[None]:
+    """Keep other runs out of a folder meanwhile; OptionsError: one is there."""
+    with (out / '.lock').open('w') as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise OptionsError(f'{out}: another run is at work there: wait for it, or give '
+                               'another --out') from None
+        yield
 
 
 def _missing(names: Sequence[str], sources: Sources, out: Path) -> list[Download]:
@@ -238,7 +252,7 @@ def _reproduce(name: str, sources: Sources, networks: Sequence[str],
         if build_map.build(build_map.make_parser().parse_args([
                 '--bag', str(folder / _MAPPED), '--out', str(landmark_map), '--no-check',
                 '--no-keyframe-layer', *networks, *sources.mapping])):
-            raise MappingError(f'{name}: there is no map, see above')
+            raise MappingError(f'{name}: there is no map, see above: attach that text to an issue')
     if not _is_evaluated(evaluation):
         print(f'{name}: the queries', flush=True)
         evaluate.evaluate(evaluate.make_parser().parse_args([

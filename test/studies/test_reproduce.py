@@ -3,6 +3,7 @@
 """The paper with one command, from a server of this machine, on the demo's rooms and networks."""
 
 import csv
+import fcntl
 import io
 import json
 import os
@@ -115,7 +116,7 @@ def archive_of_walks():
 def sources_of(address, **changes):
     """Return sources on a server; few classes are mapped, for the test to be short."""
     sequence = {'name': 'the demo', 'url': f'{address}/{ARCHIVE}', 'megabytes': 4.3,
-                'licence': 'Apache-2.0', 'unpacked': 9, 'queries': 6,
+                'licence': 'Apache-2.0', 'unpacked': 9, 'queries': 4,
                 'paper': SHIPPED['sequences']['fr3']['paper']}
     return {
         'networks': [{'name': name, 'url': f'{address}/{name}', 'megabytes': 2, 'option': option,
@@ -303,6 +304,14 @@ def test_a_full_disk(write_sources, refused, tmp_path):
     assert done.returncode == 1
     assert 'is full: make room, or set --out to another disk' in done.stderr
     assert 'Traceback' not in done.stderr
+
+
+def test_another_run_in_the_folder(write_sources, refused, tmp_path):
+    (tmp_path / 'out').mkdir()
+    with (tmp_path / 'out/.lock').open('w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert 'another run is at work' in refused(
+            '--yes', '--sources', write_sources(), '--out', tmp_path / 'out')
 
 
 def test_an_output_that_cannot_be_written(write_sources, refused):
