@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper with one command, from a server of this machine, on the demo's rooms and networks."""
+"""The paper with one command, from a server of this machine, on the demo's room and networks."""
 
 import csv
 import fcntl
@@ -74,11 +74,11 @@ class Handler(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def server():
-    """Serves the demo's networks and its two walks as one sequence of TUM RGB-D."""
+    """Serves the demo's networks, and one of its walks as a sequence of TUM RGB-D."""
     with ThreadingHTTPServer(('127.0.0.1', 0), Handler) as serving:
         serving.files = {name: (ASSETS / name).read_bytes()
                          for name in ('yolo.pt', 'clip.json', 'clip.safetensors')}
-        serving.files[ARCHIVE] = archive_of_walks()
+        serving.files[ARCHIVE] = archive_of_walk()
         serving.asked, serving.held, serving.released = [], '', threading.Event()
         thread = threading.Thread(target=serving.serve_forever, args=(0.05,))
         thread.start()
@@ -88,28 +88,14 @@ def server():
         thread.join()
 
 
-def archive_of_walks():
-    """Two walks, one after the other, as the archives of TUM RGB-D."""
-    images, poses, content = [], [], io.BytesIO()
+def archive_of_walk():
+    """Return a walk as an archive of TUM RGB-D."""
+    content = io.BytesIO()
     with tarfile.open(fileobj=content, mode='w:gz', compresslevel=1) as archive:
-        def add(name, data):
-            member = tarfile.TarInfo(f'rgbd_dataset_freiburg3_demo/{name}')
-            member.size = len(data)
-            archive.addfile(member, io.BytesIO(data))
-
-        for walk, later_s in (('mapping', 0.0), ('sequence', 100.0)):
-            for file, lines in (('rgb.txt', images), ('groundtruth.txt', poses)):
-                for line in (ASSETS / walk / file).read_text().splitlines()[1:]:
-                    stamp, *rest = line.split()
-                    stamp = f'{float(stamp) + later_s:.6f}'
-                    if lines is images:
-                        add(f'rgb/{stamp}.jpg', (ASSETS / walk / rest[0]).read_bytes())
-                        rest = [f'rgb/{stamp}.jpg']
-                    lines.append(' '.join([stamp, *rest]))
-        add('rgb.txt', '\n'.join(images).encode())
-        add('groundtruth.txt', '\n'.join(poses).encode())
-        add('depth/filler', np.random.default_rng(0).bytes(FILLER_BYTES))
-        add('camera.json', (ASSETS / 'sequence/camera.json').read_bytes())
+        archive.add(ASSETS / 'mapping', 'rgbd_dataset_freiburg3_demo')
+        filler = tarfile.TarInfo('rgbd_dataset_freiburg3_demo/depth')
+        filler.size = FILLER_BYTES
+        archive.addfile(filler, io.BytesIO(np.random.default_rng(0).bytes(FILLER_BYTES)))
     return content.getvalue()
 
 
