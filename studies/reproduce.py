@@ -354,7 +354,8 @@ def _write_results(names: Sequence[str], sources: Sources, out: Path) -> None:
             html.figure((folder / f'{figure}.png').read_bytes(), CAPTIONS[figure], figure)
             for figure in _FIGURES), is_open=True))
     notes = ['± is the standard deviation over trials, of the time over searches.',
-             '~: the queries are too few to separate it from the best one.', *sources.remarks]
+             '~: the queries are too few to separate it from the method of most success within '
+             '1 m.', *sources.remarks]
     texts += notes
     print('\n'.join(['', *texts, '']), flush=True)
     write_text(out / 'table.txt', '\n'.join([*texts, '']))
