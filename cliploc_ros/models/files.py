@@ -5,6 +5,7 @@
 import errno
 import hashlib
 import logging
+import os
 import shutil
 import struct
 import tempfile
@@ -84,12 +85,13 @@ def damaged(path: Path, reason: object) -> ModelError:
     return ModelError(f'{path} is truncated or corrupt ({reason}): download it again')
 
 
-def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Path]) -> Path:
+def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Path],
+             setting: str = 'cache_dir') -> Path:
     """Download a file with a library's own function; ModelError: that fails.
 
-    ``fetch`` returns the file's path and must leave no partial file there. The folder is made if
-    it does not exist. The error names ``what`` was to be downloaded, and as a remedy what the user
-    can do without a network.
+    ``fetch`` returns the file's path and must leave no partial file under that name. The folder is
+    made if it does not exist. The error names ``what`` was to be downloaded, and as a remedy what
+    the user can do without a network. ``setting`` names what chooses the folder.
     """
     logger.info('downloading %s into %s', what, folder)
     try:
@@ -100,9 +102,35 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
     except Exception as error:  # each library raises exceptions of its own
         reason = f'{type(error).__name__}: {first_line(error).rstrip(".")}'
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            reason = f'the disk of {folder} is full: make room, or set cache_dir to another disk'
-        raise ModelError(f'cannot download {what}: {reason}. {remedy}; or run prepare --cache-dir '
-                         'there, and set cache_dir to a copy of its folder') from error
+            reason = f'the disk of {folder} is full: make room, or set {setting} to another disk'
+        if setting == 'cache_dir':
+            remedy += ('; or run prepare --cache-dir there, and set cache_dir to a copy of its '
+                       'folder')
+        raise ModelError(f'cannot download {what}: {reason}. {remedy}') from error
+
+
+def download_file(url: str, file: Path, remedy: str, setting: str) -> Path:
+    """Download a file from its address; the rest of it, where a part is there.
+
+    The part is NAME.partial, until it is whole. ModelError, remedy and setting: see download.
+    """
+    partial = file.with_name(f'{file.name}.partial')
+
+    def fetch() -> Path:
+        os.environ.setdefault('HF_HUB_DISABLE_TELEMETRY', '1')
+        from huggingface_hub.errors import HfHubHTTPError
+        from huggingface_hub.file_download import http_get
+
+        try:
+            with partial.open('ab') as opened:
+                http_get(url, opened, resume_size=opened.tell(), displayed_filename=file.name)
+        except HfHubHTTPError as error:
+            if error.response.status_code == 416:  # the part is longer than the file
+                partial.unlink()
+            raise
+        return partial.replace(file)
+
+    return download(url, file.parent, remedy, fetch, setting)
 
 
 def remove_unused(entries: Iterable[Path], partial: Iterable[Path], most: int) -> None:
