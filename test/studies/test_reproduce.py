@@ -77,7 +77,7 @@ def server():
     """Serves the demo's networks, and one of its walks as a sequence of TUM RGB-D."""
     with ThreadingHTTPServer(('127.0.0.1', 0), Handler) as serving:
         serving.files = {name: (ASSETS / name).read_bytes()
-                         for name in ('yolo.pt', 'clip.json', 'clip.safetensors')}
+                         for name in ('yolo.onnx', 'clip.json', 'clip.safetensors')}
         serving.files[ARCHIVE] = archive_of_walk()
         serving.asked, serving.held, serving.released = [], '', threading.Event()
         thread = threading.Thread(target=serving.serve_forever, args=(0.05,))
@@ -107,7 +107,7 @@ def sources_of(address, **changes):
     return {
         'networks': [{'name': name, 'url': f'{address}/{name}', 'megabytes': 2, 'option': option,
                       'licence': 'Apache-2.0'} for name, option in (
-            ('yolo.pt', '--model'), ('clip.json', '--clip-model'),
+            ('yolo.onnx', '--model'), ('clip.json', '--clip-model'),
             ('clip.safetensors', '--clip-pretrained'))],
         'options': [], 'remarks': ['No frame of this is real.'], 'asking': [
             '--sweep', '50', '--workers', '1'],
@@ -129,7 +129,6 @@ def write_sources(server, tmp_path):
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
     """An empty cache of the user, but for the demo's converted networks."""
-    shutil.copytree(ASSETS / 'openvino', tmp_path / 'cache/cliploc_ros/openvino')
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
 
 
@@ -221,7 +220,7 @@ def check_results(out, printed):
         'table.txt', 'table.csv', 'table.tex', 'page.html', 'about.json', 'fr3/map.yaml',
         'fr3/evaluation/results.json', 'fr3/evaluation/summary.csv')]
     assert (out / 'results.tar').stat().st_size < 3e6
-    assert set(about['digests']) == {ARCHIVE, 'yolo.pt', 'clip.json', 'clip.safetensors'}
+    assert set(about['digests']) == {ARCHIVE, 'yolo.onnx', 'clip.json', 'clip.safetensors'}
 
 
 def test_it_says_what_it_downloads_and_asks(server, write_sources, run_here, tmp_path,
@@ -241,12 +240,12 @@ def test_it_says_what_it_downloads_and_asks(server, write_sources, run_here, tmp
 
 def test_what_cannot_be_downloaded(server, write_sources, refused, tmp_path):
     given = ('--yes', '--sources', write_sources(), '--out', tmp_path / 'out')
-    weights = server.files.pop('yolo.pt')
+    weights = server.files.pop('yolo.onnx')
     said = refused(*given)
     assert 'cannot download' in said and '404' in said and 'Check network and address' in said
-    server.files['yolo.pt'] = weights
+    server.files['yolo.onnx'] = weights
     # of another file, longer than the one that is there now
-    part = tmp_path / 'out/downloads/yolo.pt.partial'
+    part = tmp_path / 'out/downloads/yolo.onnx.partial'
     part.write_bytes(bytes(len(weights) + 1))
     assert '416' in refused(*given)
     assert not part.exists()
@@ -257,7 +256,7 @@ def test_a_server_that_is_off(server, write_sources, refused, tmp_path):
     sources.write_text(sources.read_text().replace(str(server.server_port), '9'))
     said = refused('--yes', '--sources', sources, '--out', tmp_path / 'out')
     assert 'cannot download' in said and 'refused' in said
-    assert f'put the file there yourself, as {tmp_path}/out/downloads/yolo.pt' in said
+    assert f'put the file there yourself, as {tmp_path}/out/downloads/yolo.onnx' in said
 
 
 def test_another_file_at_an_address(server, write_sources, refused, tmp_path):
@@ -265,9 +264,9 @@ def test_another_file_at_an_address(server, write_sources, refused, tmp_path):
     said = refused(*given)
     assert f'expected {"0" * 64}' in said and f'kept as {ARCHIVE}.refused' in said
     # a digest that nobody knew is compared later, too
-    (tmp_path / 'out/downloads/yolo.pt').write_bytes(b'something else')
-    assert 'yolo.pt has SHA-256' in refused(*given)
-    assert not (tmp_path / 'out/downloads/yolo.pt').exists()
+    (tmp_path / 'out/downloads/yolo.onnx').write_bytes(b'something else')
+    assert 'yolo.onnx has SHA-256' in refused(*given)
+    assert not (tmp_path / 'out/downloads/yolo.onnx').exists()
 
 
 def test_an_archive_that_is_cut_short(server, write_sources, refused, tmp_path):
