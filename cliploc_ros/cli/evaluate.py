@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from cliploc_ros.offline.evaluation.trials import PosedQuery
 
 EPILOG = f"""\
-methods: {', '.join(PAPER_METHODS)};
-  '{ALL}': these ten; '{AUTO}': the relocalizer's defaults;
+methods: {', '.join(PAPER_METHODS)}: the paper's ten;
+  '{AUTO}': the relocalizer's defaults; '{ALL}': these eleven;
   FILE.yaml: named sets of options, such as
     wide: {{base: hybrid_b-prosac, k: 5, iterations: 2000}}
 
@@ -60,8 +60,8 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='evaluate', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Compare methods on the same input. Writes the paper's table, results.json, "
-        'summary.csv, figures and trajectories. Needs no sourced ROS.')
+        description="Compare methods on the same input. Writes the paper's table as a page, text, "
+        'LaTeX and CSV, results.json, figures and trajectories. Needs no sourced ROS.')
     group = parser.add_mutually_exclusive_group(required=True)
     option(group, '--queries NPZ', 'recorded boxes and similarities')
     option(group, '--bag', 'a rosbag2 recording with ground truth; or a request that ~/record '

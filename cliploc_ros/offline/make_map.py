@@ -16,7 +16,12 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import load_removed, removed_path, write_landmarks, write_map
 from cliploc_ros.errors import MappingError, ModelError
 from cliploc_ros.files.storage import WriteOfSet
-from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
+from cliploc_ros.models.clip_weights import (
+    ClipOptions,
+    ClipWeights,
+    names_onnx,
+    resolve_clip_weights,
+)
 from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.datasets.map_recording import (
     MapRecording,
@@ -121,7 +126,7 @@ def _weights_of(detections: PosedDetections, clip: ClipOptions) -> ClipWeights:
     theirs = detections.encoder_key.split(':')[0]
     ours = Path(clip.model).stem if clip.model.endswith('.json') else clip.model.replace('/', '-')
     # compared first, since the weights of another model would be downloaded in vain
-    if ours != theirs:
+    if not names_onnx(clip) and ours != theirs:
         raise ModelError(f"the embeddings are of CLIP model '{theirs}', not '{ours}'; {hint}")
     weights = resolve_clip_weights(clip)
     if weights.key != detections.encoder_key:

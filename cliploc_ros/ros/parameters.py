@@ -45,10 +45,10 @@ class CommonParameters(Parameters):
         "Where the network runs: 'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'.",
         read_only=True)
     inference: str = parameter('auto',
-        "What runs the network: 'auto' (OpenVINO on a CPU where it is installed, else "
-        "PyTorch), 'pytorch' or 'openvino'.", choices=INFERENCES, read_only=True)
+        "What runs the network: 'auto' (OpenVINO on a CPU, PyTorch on a GPU), 'pytorch' or "
+        "'openvino'.", choices=INFERENCES, read_only=True)
     cache_dir: str = parameter('',
-        'Folder of downloads, label embeddings, converted networks and compiled kernels; '
+        'Folder of downloads, label embeddings, compiled networks and kernels; '
         'empty: ~/.cache/cliploc_ros.', read_only=True)
     image_transport: str = parameter('raw',
         "Subscribe to 'image' or to 'image/compressed'.", choices=TRANSPORTS, read_only=True)
@@ -84,7 +84,7 @@ class DetectorParameters(CommonParameters):
         "Detector of a profile: 'accurate', 'balanced' or 'fast'; 'auto': accurate on a GPU, "
         'balanced on a CPU.', choices=PROFILE_NAMES, read_only=True)
     model: str = parameter('',
-        'Weights: a local file, a folder with an OpenVINO export or a model of transformers, or a '
+        'An ONNX file or a folder with one, OWNER/NAME of the Hugging Face hub, or YOLO weights '
         'name that is downloaded once: of ultralytics, or OWNER/NAME of the Hugging Face hub; '
         "empty: the profile's.", read_only=True)
     vocabulary: str = parameter('',

@@ -22,14 +22,14 @@ from cliploc_ros.files.storage import read_file
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.parsing import FieldError, Fields, naming, unit_quaternion
 from cliploc_ros.offline.mapping.refit import refit_map
-from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
+from cliploc_ros.offline.vocabulary.vocabulary import coco_classes
 
 # A thinner semi-axis is a fit that collapsed; a larger one does not belong to an object. Guesses.
 _SEMI_AXIS_RANGE_M = (1e-3, 100.0)
 _MAX_COORDINATE_M = 1e6
 _MAX_NORM_ERROR = 0.01
 MAX_FILE_BYTES = 512 * 1024 * 1024
-COCO = shipped_classes()
+COCO = coco_classes()
 _MAX_LENGTH = 1000
 # A map file holds four decimals of a weight. A class with less means nothing.
 _LEAST_SHARE = 0.001
