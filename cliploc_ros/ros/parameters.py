@@ -207,7 +207,8 @@ class RelocalizerParameters(CommonParameters):
         "Weights: a tag of open_clip, or a local file; empty: the profile's, or openai with a "
         'clip_model.', read_only=True)
     clip_checkpoint_path: str = parameter('',
-        'Local file with the weights of the tag clip_pretrained; empty: download them once.', read_only=True)
+        'Local file with the weights of the tag clip_pretrained; empty: download them once.',
+        read_only=True)
     landmark_embeddings: str = parameter('image',
         "Crops are compared with the map's labels, the images next to map_file, or both. "
         'Without images of this CLIP: labels.', choices=COMPARED, read_only=True)
