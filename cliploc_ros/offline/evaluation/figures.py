@@ -30,7 +30,8 @@ from cliploc_ros.offline.evaluation.trials import PosedQuery, Result
 
 #: Outlines text, so that it is legible on any background.
 EDGED = (withStroke(linewidth=2.0, foreground='white'),)
-_MOST_NAMES = 100
+# Of landmarks: more would have to be too small to be read.
+_MOST_NAMES, _NAME_PT = 40, 8
 _NAME = 'name'
 # Steps of a name from its place, in half widths and in heights, the nearest first.
 _STEPS = sorted(product((0.0, 1.1, -1.1, 2.2, -2.2), np.arange(-4, 5) * 1.05),
@@ -60,7 +61,8 @@ def draw_map(axes: Axes, landmark_map: LandmarkMap) -> dict[str, tuple[float, ..
     if len(landmark_map) <= _MOST_NAMES:
         # the highest first: they hide the others
         for row in np.argsort(-landmark_map.centers[:, 2], kind='stable'):
-            write_name(axes, landmark_map.centers[row, :2], landmark_map.landmark_ids[row], 6)
+            write_name(axes, landmark_map.centers[row, :2], landmark_map.landmark_ids[row],
+                       _NAME_PT)
     return colors
 
 
@@ -212,6 +214,7 @@ def new_axes(xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
     figure = Figure(figsize=_SIZE, layout='constrained')
     axes = figure.add_subplot()
     axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.set_prop_cycle(color=_JUDGED_COLORS)
     axes.grid(alpha=0.3)
     axes.set_axisbelow(True)
     return figure, axes
