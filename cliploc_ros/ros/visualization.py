@@ -50,9 +50,8 @@ _UNMATCHED, _BOX, _ELLIPSE = (255, 255, 255), (86, 180, 233), (230, 159, 0)
 _ACCEPTED_BAR, _REFUSED_BAR = (0, 114, 178), (176, 70, 0)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _LABEL_CHARS = 40
-# The scale of text, by the width of the image [1/px]; the width of a character, at most, and the
-# height of a line of scale 1 [px].
-_LEAST_SCALE, _SCALE_PER_PX, _CHAR_PX, _LINE_PX = 0.45, 1 / 1400, 20, 44
+# The scale of text, by the width of the image [1/px], and the height of a line of scale 1 [px].
+_LEAST_SCALE, _SCALE_PER_PX, _LINE_PX = 0.45, 1 / 1400, 44
 # The text of the bar, beside other text, and its lines, at most: a longer verdict is cut.
 _BAR_SCALE, _BAR_LINES = 0.8, 2
 
@@ -197,15 +196,16 @@ def _above_bar(canvas: NDArray[np.uint8], verdict: str, color: tuple[int, int, i
                ) -> NDArray[np.uint8]:
     """Return an image (h, w, 3) above a bar with the verdict, which covers none of it."""
     scale = _BAR_SCALE * _scale(canvas)
-    lines = textwrap.wrap(verdict, max(8, int(canvas.shape[1] / (_CHAR_PX * scale))),
+    verdict = verdict.encode('ascii', 'replace').decode()  # OpenCV has no other characters
+    (width, _), _ = cv2.getTextSize(verdict, _FONT, scale, 1)
+    lines = textwrap.wrap(verdict, max(8, len(verdict) * (canvas.shape[1] - 24) // max(1, width)),
                           max_lines=_BAR_LINES, placeholder=' ...', break_long_words=False,
                           break_on_hyphens=False)
     bar = np.full((int((len(lines) + 0.3) * _LINE_PX * scale), canvas.shape[1], 3), color,
                   dtype=np.uint8)
     for line, text in enumerate(lines):
         at = 6, int((line + 0.85) * _LINE_PX * scale)
-        cv2.putText(bar, text.encode('ascii', 'replace').decode(), at, _FONT, scale, _TEXT, 1,
-                    cv2.LINE_AA)
+        cv2.putText(bar, text, at, _FONT, scale, _TEXT, 1, cv2.LINE_AA)
     return np.concatenate([canvas, bar], axis=0)
 
 
