@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Images, cameras and detections from messages, read by rclpy or by rosbags.
 
-No field of a message is taken for valid.
+No field of a message is assumed valid.
 """
 
 import math

@@ -58,7 +58,7 @@ def make_parser() -> argparse.ArgumentParser:
            'as build_map')
     option(parser, '--clip-pretrained TAG|FILE', 'its weights')
     option(parser, '--device', 'of CLIP (%(default)s)', default='auto')
-    option(parser, '--vocabulary FILE', 'phrases by class (YAML), besides the shipped ones')
+    option(parser, '--vocabulary FILE', 'further phrases by class (YAML)')
     option(parser, '--occupancy-grid FILE', 'show the walls: the YAML file of nav2_map_server, in '
            "the map's coordinate frame")
     option(parser, '--port N', 'the next free one from this on (%(default)s)', within(0, 65535),

@@ -95,7 +95,7 @@ def can_do_without_crops(options: RelocalizerOptions) -> bool:
 
 
 def by_classes(observation: Observation, landmarks: int) -> Observation:
-    """Return an observation of which CLIP saw no crop, for a map with a number of landmarks.
+    """Return an observation whose crops CLIP did not see, for a map with a number of landmarks.
 
     The node compares crops of one camera only; this is what the others of a rig saw.
     """

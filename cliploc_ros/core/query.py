@@ -32,7 +32,7 @@ from cliploc_ros.files.storage import parse_json
 
 @dataclass(frozen=True)
 class Query:
-    """The frames of one instant, and what is known besides."""
+    """The frames of one instant, with mount, vertical and prior."""
 
     #: One of each camera, with one stamp and a camera_name each; the camera to localize is last.
     #: odom_from_camera links the cameras of an instant, and the instants of one run.
@@ -60,7 +60,7 @@ class Query:
 
 @dataclass(frozen=True)
 class Case:
-    """The queries of a request, the oldest first, and a report of its answer."""
+    """The queries of a request, oldest first, and a report of its answer."""
 
     queries: tuple[Query, ...]
     report: Mapping[str, Any]

@@ -9,5 +9,5 @@ log
 storage
     A file in the place of another one in one step, and the cache folder.
 parallel
-    Tasks on processes or on a cluster, some of which die.
+    Tasks on processes or on a cluster, some of whose workers die.
 """

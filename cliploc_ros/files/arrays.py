@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The schema of an npz file: which arrays it holds, of which type and shape, with which values.
+"""The schema of an npz file: its arrays, with their types, shapes and values.
 
 A reader is a table of fields. An untrusted file ends in an error that names file, array and row:
 pickles are refused, check sums are compared, and no array is larger than the file says.
@@ -31,7 +31,7 @@ _ROWS_AT_ONCE = 10_000
 # Of a member of a zip file: where the lengths of its name and of a further field stand, and where
 # the name begins.
 _ZIP_LENGTHS, _ZIP_HEAD = 26, 30
-# Arrays may take this much memory [bytes], or so many times what the file takes on the disk: a
+# Arrays may take this much memory [bytes], or this many times what the file takes on the disk: a
 # small file may declare any size, and so may one with holes.
 _MOST_BYTES, _MOST_GROWTH = 512 * 2**20, 8
 # Beyond any pixel, coordinate [m] and time [s].

@@ -93,7 +93,7 @@ def find_labeller(detections: PosedDetections, clip: Callable[[], ClipOptions] |
         Returns the CLIP of the recording; called only where the recording has embeddings. None:
         labels are class names.
     vocabulary : Path, optional
-        Phrases by class (YAML), besides the shipped ones.
+        Phrases by class (YAML), in addition to the shipped phrases.
 
     Raises
     ------

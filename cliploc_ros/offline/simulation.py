@@ -177,7 +177,7 @@ class LabelModel:
 
 
 def shared_noise(biases: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the noise (n, D) of crops, a part of which all crops of an object share."""
+    """Return the noise (n, D) of crops. All crops of an object share a part of it."""
     return np.asarray(np.sqrt(1.0 - _SHARED_NOISE) * noise + np.sqrt(_SHARED_NOISE) * biases)
 
 

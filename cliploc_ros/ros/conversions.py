@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Conversion of messages to values and back. No field of a message is taken for valid."""
+"""Conversion of messages to values and back. No field of a message is assumed valid."""
 
 import importlib
 from collections.abc import Callable

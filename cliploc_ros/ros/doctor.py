@@ -111,11 +111,11 @@ class Doctor(ManagedNode[RelocalizerParameters]):
     Parameters
     ----------
     given : sequence of Parameter
-        Of the relocalizer.
+        Parameters of the relocalizer.
     topics : sequence of str
-        Its remappings, NAME:=TOPIC.
+        Remappings of the relocalizer, NAME:=TOPIC.
     wrong_cameras : str
-        What its looks have shown to be wrong with its cameras.
+        Faults of the relocalizer's cameras, by its looks.
     """
 
     def __init__(self, given: Sequence[Parameter], topics: Sequence[str], wrong_cameras: str = ''

@@ -61,7 +61,7 @@ class Localized(NamedTuple):
 
     #: In the coordinate frame of the map.
     found: Relocalization
-    #: Of several maps, the one of the best pose.
+    #: With several maps, the map of the best pose.
     landmark_map: LandmarkMap
     #: With the crops that were compared, and their similarities to this map.
     seen: SeenImage
@@ -118,7 +118,7 @@ class FrameLocalizer:
                  times: StageTimes, deadline: float = math.inf) -> Localized:
         """Find where the camera was, with a frame and those that odometry links to it.
 
-        `parameters` are as they are now, `known` is what is known besides. No crops are compared
+        `parameters` are as they are now, `known` is the prior knowledge. No crops are compared
         after `deadline` (monotonic clock) [s].
 
         CliplocError: names what to fix in the frame or in the parameters.

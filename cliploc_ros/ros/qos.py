@@ -111,7 +111,7 @@ class AdaptiveSubscription:
 
     def _create(self) -> Subscription:
         # A group of its own: if a subscription is destroyed before its event is taken, rclpy
-        # leaves the group busy for ever. Besides, a group keeps a reference to each of its former
+        # leaves the group busy for ever. A group also keeps a reference to each of its former
         # members.
         group = MutuallyExclusiveCallbackGroup()
         profile = QoSProfile(history=self._profile.history, depth=self._profile.depth,

@@ -21,7 +21,7 @@ from rclpy.validate_topic_name import validate_topic_name
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import CliplocError, OptionsError
 
-#: The diagnostics come once a second; a relocalizer that is silent for longer is taken for dead.
+#: The diagnostics come once a second; a relocalizer that is silent for longer counts as dead.
 SILENT_S = 5.0
 _SPIN_S = 0.05
 

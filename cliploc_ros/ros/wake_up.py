@@ -51,7 +51,7 @@ _ON_ITS_WAY_S = 5.0
 
 
 class Turning:
-    """Turns a robot by a step at a time; to the other side after a turn that failed.
+    """Turns a robot one step at a time, and to the other side after a turn that failed.
 
     Parameters
     ----------

@@ -205,7 +205,7 @@ class Views(NamedTuple):
         return Views(self.poses, counts, informations, vectors)
 
     def joined(self, other: 'Views') -> 'Views':
-        """Return these views and others, of which the last ones remain."""
+        """Return these views and others; only the last views remain."""
         return Views(*(np.concatenate(both)[-int(_TERMS.most_views):]
                        for both in zip(self, other, strict=True)))
 
@@ -269,7 +269,7 @@ class _Record:
             self.odds = self.views.odds(self.by_extent)
 
     def add(self, look: CameraLook) -> None:
-        """Take in a look. Those after a camera was called wrong tell whether it was mended."""
+        """Take in a look. Looks after a verdict of wrong decide whether it was repaired."""
         if self.by_looks <= _TERMS.sure:
             self.views, self.since = self.views.with_look(look), Views()
         else:

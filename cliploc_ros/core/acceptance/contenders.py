@@ -48,14 +48,14 @@ class JoinedFrames(NamedTuple):
 
     @property
     def setting(self) -> Setting:
-        """Return the setting: besides the supports, the chance of a wrong pose depends on it."""
+        """Return the setting: with the supports, it determines the chance of a wrong pose."""
         return Setting(len(self.landmark_map),
                        self.options.vertical_deviation_deg if self.knows_vertical else math.inf)
 
 
 def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
                 frames: Sequence[SearchedFrame]) -> JoinedFrames:
-    """Return some searched frames, the last one of which is to be localized.
+    """Return some searched frames, of which the last is to be localized.
 
     OptionsError: odom_from_camera is missing or no rigid transform; there are no frames or too
     many.

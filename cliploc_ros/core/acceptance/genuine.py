@@ -3,7 +3,7 @@
 """Whether a place is where the camera is, and as it was mapped: not a picture, and not changed.
 
 Objects and points that lie in a picture of a place agree on where it was taken. Neither judges
-the other: they see the same pixels. What tells is what lies around the picture, its size and
+the other: they see the same pixels. The differences lie around the picture, in its size and
 aspect, which other intrinsics would explain, and how it moves.
 
 A picture of the room shows the same points as the room, but moves as a plane: where the robot
@@ -28,7 +28,7 @@ from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import find_pose
 
 _TERMS = CALIBRATION.genuine
-#: Motions of right poses are no further off, in squared deviations (dof 6).
+#: Largest squared Mahalanobis distance of the motion between right poses (dof 6).
 SURE_MOTION = float(chi2.ppf(_TERMS.sure_motion, 6))
 
 

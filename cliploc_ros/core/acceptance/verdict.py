@@ -49,7 +49,7 @@ class RefusalKind(StrEnum):
     WRONG_DETECTIONS = auto()
 
 
-# Factors of the confidence besides likely and found, in the order in which equal ones are named.
+# Factors of the confidence other than likely and found. Of equal factors, the first is named.
 _FACTORS = ('distinct', 'near', 'camera', 'genuine', 'not_mirrored', 'uncontradicted')
 # What a refusal says of an Evidence whose weakest factor names its cause.
 _ADVICE = {
@@ -59,7 +59,7 @@ _ADVICE = {
                'another focal length or other pixels of the boxes may fit; turn the camera to '
                'nearer objects, or check camera_info'),
     'genuine': (RefusalKind.CHANGED, '{0.recognized.inliers} points of keyframes agree as in a '
-                                     'picture or a changed place; move, and ask again'),
+                                     'picture or a changed place; move, and request again'),
     'not_mirrored': (RefusalKind.AMBIGUOUS, 'mirrored, the image fits another pose; turn the '
                                             'camera to more objects'),
     'found': (RefusalKind.SEARCH_CUT_SHORT,
@@ -97,7 +97,7 @@ class Evidence:
     #: The same without the objects; 0 where keyframes do not propose it
     by_points: float = 0.0
     rival: Rival | None = None
-    distinct: float = 1.0  #: Probability that its place is not mistaken for one that looks alike
+    distinct: float = 1.0  #: Probability that no look-alike place is mistaken for its place
     #: Where the camera is, and where it would be at the likeliest place that looks alike [m]
     place: Point = (0.0, 0.0, 0.0)
     twin: Point | None = None
@@ -144,7 +144,7 @@ class Evidence:
 
     @property
     def certainty(self) -> float:
-        """Return the probability that nothing besides the poses found makes it wrong."""
+        """Return the probability that nothing makes it wrong but the poses found."""
         return math.prod(getattr(self, name) for name in _FACTORS)
 
     @property

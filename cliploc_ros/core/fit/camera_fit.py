@@ -18,7 +18,7 @@ the others are logarithms. A turn about the axis of the camera is a turn of the 
 
 Pose and errors are fitted to the edges of one frame (Levenberg and Marquardt, see refinement).
 Eliminating the pose leaves the information of the errors alone (Schur's complement). A frame of
-eight objects knows its focal length to 15 to 25 %: many frames tell what one does not.
+eight objects determines its focal length to 15 to 25 %; many frames determine it better.
 """
 
 from math import exp

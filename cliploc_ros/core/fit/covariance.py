@@ -17,7 +17,7 @@ covariance is H^-1 M H^-1, and M is a sum over sources of error:
 * odometry, a random walk: the error of a step displaces all frames beyond it;
 * the mounts of several cameras, between whose frames of one instant there is no such step.
 
-Cauchy's weight w of an edge stands for a variance of 1 / w. Besides, each object may be wrong:
+Cauchy's weight w of an edge stands for a variance of 1 / w. Each object may also be wrong:
 moved, or matched by mistake. Then the pose without this object is the right one, and how far it is
 away, and how much less certain it is, adds to the covariance.
 """
@@ -51,7 +51,7 @@ _STANDS_STILL = 1e-9
 _WEIGHTS = np.linspace(0.0, 1.0, 11)
 #: Deviations of the errors of a perfect camera.
 EXACT = np.zeros(ERRORS)
-#: Of a pose whose boxes do not fix it.
+#: Covariance of a pose that the boxes do not fix.
 POSE_UNKNOWN = np.diag(PRIOR_VARIANCES)
 
 

@@ -194,10 +194,10 @@ _SCHEMA = Schema('file of keyframes', {
     'descriptors': Field('uint8', ('n', 'd'), stays=True),
     'words': Field('uint16', ('n',), (_check_words,)),
     'vocabulary': Field('uint8', ('W', 'd')),
-    # only there where images were asked for, both of them
+    # both are missing unless images were requested
     'images': Field('uint8', ('b',), is_optional=True, stays=True),
     'image_offsets': Field('int64', ('K+1',), (Offsets('images', 'bytes'),), is_optional=True),
-    # only there for several cameras, which the header has
+    # missing for a single camera; the header holds the cameras
     'camera_rows': Field('int64', ('K',), is_optional=True),
 }, MapError, 'make the layer again with build_map --keyframe-layer, or remove the file',
     {'K': 'keyframes', 'W': 'keyframes'}, is_stored=True,
@@ -210,7 +210,7 @@ def layer_path(map_path: str | os.PathLike[str]) -> Path:
 
 
 def removed_layer(map_path: str | os.PathLike[str]) -> str:
-    """Return that the layer of a map went with it, for the user."""
+    """Return a message for the user: the layer of a replaced map was removed."""
     return f'removed {layer_path(map_path)}: its keyframes belonged to the map before'
 
 

@@ -41,7 +41,7 @@ _FURTHER, _STRONGEST, _CLEAR = 25, 600, 20
 _THOROUGH_FEATURES, _THOROUGH_PX = 3000, 1600
 _CANDIDATES, _VOTERS, _VOTED = 100, 300, 20
 # Then the points of keyframes near the pose are looked for where it puts them: within this angle
-# (8 px at f = 525 px), among so many nearest features: a camera with a long lens has all of them
+# (8 px at f = 525 px), among this many nearest features: a camera with a long lens has all of them
 # there. Their descriptors are at least so similar.
 _GUIDED_RADIUS, _GUIDED_NEAREST = 8.0 / 525.0, 10
 _GUIDED_COSINE, _GUIDED_KEYFRAMES = 0.8, 12
@@ -51,7 +51,7 @@ _GUIDED_LEAST_M, _GUIDED_MOST_BEARING = 0.1, 5.0
 LEAST_S = 0.5
 #: Places of an image that do not agree with each other.
 MOST_PLACES = 3
-# Similar keyframes of which those elsewhere are chosen.
+# Similar keyframes; the search chooses among those elsewhere.
 _MOST_RANKED = 500
 #: A keyframe sees the same as a pose if it looks the same way from near enough: the shares of the
 #: two that it is away are less than 1 together.
@@ -62,7 +62,7 @@ _ITERATIONS, _RIVAL_ITERATIONS = 3000, 1000
 _RIVAL_TOLERANCE = 3.0
 #: Nothing is known of the camera.
 NOTHING_KNOWN = Constraint()
-# Cells of the image (columns, rows). A cell is comparable from so many points of keyframes and
+# Cells of the image (columns, rows). A cell is comparable from this many points of keyframes and
 # features of the image on; an image has half as many features as a keyframe.
 _CELLS = (8, 6)
 _LEAST_EXPECTED, _LEAST_SEEN = 4, 2

@@ -143,7 +143,7 @@ def _make_tree(centers: NDArray[np.float64], radii: NDArray[np.float64],
 
 
 def morton_codes(centers: NDArray[np.float64]) -> NDArray[np.uint64]:
-    """Return the place (u,) of points (u, 3) on a Morton curve through their bounding cube."""
+    """Return the Morton codes (u,) of points (u, 3) in their bounding cube."""
     offsets = centers - centers.min(axis=0, initial=np.inf)
     extent = max(offsets.max(initial=0.0), 1e-9)
     cells = (offsets / extent * (2**_MORTON_BITS - 1)).astype(np.uint64)

@@ -107,7 +107,7 @@ class ClassIndex:
         return np.column_stack([self.landmarks[order], classes[order]])
 
     def are_own(self, classes: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether each class (n,) is a landmark's own, not one that it is taken for."""
+        """Return whether each class (n,) is the own class of a landmark, not a confusion."""
         return np.asarray((classes >= 0) & (classes <= self.of_landmarks.max(initial=-1)))
 
     def have(self, landmarks: NDArray[np.int64], classes: NDArray[np.int64]
@@ -279,7 +279,7 @@ class LandmarkMap:
 
     @cached_property
     def classes(self) -> ClassIndex:
-        """Return the landmarks by class: by their own, and by others that they are taken for."""
+        """Return the landmarks by class: their own, and classes that they are mistaken for."""
         others = [(row, name) for row, one in enumerate(self.details)
                   for name in one.likely_classes() if name != self.class_ids[row]]
         weights = {(row, name): share for row, one in enumerate(self.details)

@@ -61,7 +61,7 @@ _HERE, _LEAST_GONE, _LEAST_SHARE = 10, 2.0, 0.25
 
 def is_in_image(box: NDArray[np.float64], bounds: NDArray[np.float64], least_share: float
                 ) -> NDArray[np.bool_]:
-    """Tell whether an image shows more than a share of a box (4,), or of each of n boxes (4, n).
+    """Return whether an image shows more than a share of a box (4,), or of each of n boxes (4, n).
 
     Box and bounds (4,) of the image are left, top, right, bottom.
     """
@@ -73,7 +73,7 @@ def is_in_image(box: NDArray[np.float64], bounds: NDArray[np.float64], least_sha
 
 def is_beside(cosine: NDArray[np.float64], distance: NDArray[np.float64],
               of_place: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell whether an image that shows a landmark shows a place, too: no wall is before it.
+    """Return whether an image that shows a landmark also shows a place: no wall is before it.
 
     The landmark is beside the place or behind it, by the cosine between their directions, its
     distance and that of the place.

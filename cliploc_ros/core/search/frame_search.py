@@ -202,7 +202,7 @@ def _depths(observation: Observation, options: RelocalizerOptions) -> NDArray[np
 
 def _potential(landmark_map: LandmarkMap, classes: NDArray[np.int64], nearest: Candidates | None
                ) -> tuple[NDArray[np.int64], SortedLandmarks | None]:
-    """Return the pairs (p, 2) to verify, and the landmarks to verify by class besides.
+    """Return the pairs (p, 2) to verify, and further landmarks to verify by class.
 
     In a small map the pairs are complete: culling costs more there than it saves.
     """

@@ -40,8 +40,8 @@ class Scene(NamedTuple):
     #: (c, 2): detection and landmark of each correspondence candidate, in order of preference
     pairs: NDArray[np.int64]
     iou_threshold: float  #: A detection and a landmark match only if their IoU is above this
-    #: Of a large map, the landmarks that detections may show because of their class. In a small
-    #: map both are empty, and these pairs are in potential.
+    #: For a large map: the landmarks of the detected classes. For a small map both are empty,
+    #: and potential holds these pairs.
     sorted_landmarks: SortedLandmarks
     groups: Groups
 

@@ -59,7 +59,7 @@ _STEPS = np.array([*product(_TURNS_DEG, _TURNS_DEG, (0.0,), _SHIFTS_M, _SHIFTS_M
 _GRID = np.tile(np.eye(4), (len(_STEPS), 1, 1))
 _GRID[:, :3, :3] = Rotation.from_rotvec(_STEPS[:, :3], degrees=True).as_matrix()
 _GRID[:, [0, 2], 3] = _STEPS[:, 3:]
-# Those that are refined are no nearer to each other.
+# Least distance between poses that are refined.
 _APART = Tolerance(_TERMS.apart_m, _TERMS.apart_deg)
 
 

@@ -41,7 +41,7 @@ AXES: Mapping[str, Callable[[_Pose], _Pose]] = {
 _PAIRS, _TRIED, _REACH = 4, 12, 20
 _TURN_DEG = (4.0, 30.0)
 _FEATURES, _LONGEST_PX = 500, 480
-# Matches that one epipolar geometry explains to within so many pixels, and their least share.
+# Matches that one epipolar geometry explains to within this many pixels, and their least share.
 _LEAST_MATCHES, _LEAST_SHARE, _GATE_PX = 25, 0.5, 2.0
 # Median epipolar errors at an image _LONGEST_PX wide [px]: a true choice has 0.3 to 2 of them.
 _GOOD_PX, _WRONG_PX, _BETTER = 3.0, 4.0, 0.35

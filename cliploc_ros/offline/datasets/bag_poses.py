@@ -41,7 +41,7 @@ ReadPoses = Callable[[BagReader, str], Poses]
 GROUND_TRUTH, MAP_FRAME = '/ground_truth', 'map'
 _TF, _TF_STATIC = '/tf', '/tf_static'
 _TF_TYPE = 'tf2_msgs/msg/TFMessage'
-# Poses of two sources are compared at so many stamps, and are the same within this [m] [deg].
+# Poses of two sources are compared at this many stamps, and are the same within this [m] [deg].
 _COMPARED, _SAME_M, _SAME_DEG = 50, 0.05, 2.0
 
 

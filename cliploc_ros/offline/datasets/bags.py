@@ -245,7 +245,7 @@ class BagReader:
         if topic.type_hash and topic.type_hash != store.hash_rihs01(topic.msgtype):
             raise DatasetError(
                 f'{self.path}: {topic.name} was recorded with another definition of '
-                f'{topic.msgtype} than the one of Jazzy')
+                f'{topic.msgtype} than in Jazzy')
         return deserialize(message.data, topic.msgtype,
                            f'{self.path}: {topic.name} at {message.stamp_ns}')
 

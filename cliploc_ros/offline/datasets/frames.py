@@ -25,8 +25,8 @@ from cliploc_ros.core.geometry.transforms import move_poses
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.units import NS_PER_S
 
-_MOST_NOTES = 5  # on cameras, of which each image may have its own
-# An undistorted image has so many places computed, which take 0.6 kB each.
+_MOST_NOTES = 5  # on cameras; each image may have its own
+# Places computed for an undistorted image, of 0.6 kB each.
 _MOST_PLACES = 1_000_000
 
 
@@ -70,7 +70,7 @@ class RawFrame:
                           None if self.depth is None else self.depth())
 
 
-#: Tells whether the frame of a place, stamp [ns] and pose is to be read.
+#: Returns whether to read the frame of a place, stamp [ns] and pose.
 Wanted = Callable[[int, int, 'NDArray[np.float64] | None'], bool]
 
 

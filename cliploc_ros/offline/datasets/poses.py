@@ -16,7 +16,7 @@ from cliploc_ros.units import NS_PER_S
 
 #: A stamp has a pose only if a sample lies this close to it, unless the user says otherwise.
 STAMP_TOLERANCE_NS = 20_000_000
-#: Of a quaternion that is taken for a unit one.
+#: Greatest deviation of the length of a unit quaternion from 1.
 MAX_NORM_ERROR = 0.01
 # A clock that is off by less than this is a late start of the recording, not another clock.
 _OTHER_CLOCK_S = 60.0

@@ -241,7 +241,7 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
               for one in summaries if 0.0 < one.crops_share < 1.0]
     if any(one.has_keyframes for one in summaries):
         lines.append('Keyframes: number of poses from each source, median of the points that '
-                     'agree, and mean time besides the search; --no-keyframes leaves them out.')
+                     'agree, and mean time outside the search; --no-keyframes leaves them out.')
     if len(summaries) > 1:
         lines.append(f'{_WITHIN_NOISE}: the queries are too few to separate it from {best.method} '
                      '(at 1 m; paired bootstrap, 95 %).')

@@ -77,7 +77,7 @@ class Result:
     reason: str  #: Reason of the refusal; empty when accepted
     search_ms: float  #: Of the objects. The times are the only fields that differ from run to run.
     crops_share: float = 1.0  #: Share of the crops of its frames that were compared with labels
-    #: Of several maps, the one of the pose, which is in the coordinates of the first map: on
+    #: With several maps, the map of the pose, which is in the coordinates of the first map: on
     #: another map, it is far away. Empty for a single map.
     map: str = ''
     refusal_kind: str = ''  #: See cliploc_ros.core.acceptance.verdict; empty when accepted
@@ -122,8 +122,8 @@ def join_cameras(queries: Mapping[str, Sequence[PosedQuery]], tolerance_s: float
                  ) -> tuple[PosedQuery, ...]:
     """Return the queries of the first camera, each with what the others saw at its instant.
 
-    The true poses tell how the cameras are mounted. DatasetError: no other image is so near in
-    time to one of the first camera.
+    The mounts of the cameras follow from the true poses. DatasetError: no other image is so near
+    in time to one of the first camera.
     """
     (first, main), *others = queries.items()
     stamps = {name: np.array([one.observation.stamp_ns for one in its]) for name, its in others}

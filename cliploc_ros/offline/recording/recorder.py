@@ -72,7 +72,7 @@ EVERY_FRAME = KeyframeOptions(0.0, 0.0)
 
 
 class KeyframeFilter:
-    """Asked once for each frame of a camera in order, tells whether it is a keyframe."""
+    """Chooses the keyframes among the frames of a camera, which come in order."""
 
     def __init__(self, options: KeyframeOptions) -> None:
         self._options = options
@@ -80,7 +80,7 @@ class KeyframeFilter:
         self.asked = self.without_pose = self.keyframes = 0
 
     def __call__(self, place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
-        """Tell whether the frame with this pose is a keyframe."""
+        """Return whether the frame with this pose is a keyframe."""
         self.asked += 1
         if pose is None:
             self.without_pose += 1

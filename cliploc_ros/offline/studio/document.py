@@ -57,7 +57,7 @@ class Document:
         self.lock = RLock()
         self.changed = Event()
         self.notes: tuple[str, ...] = ()
-        #: The digest of a foreign content, of which a person has to decide
+        #: The digest of a content by another program, until a person decides about it
         self.foreign = ''
         self._accepted = ''
         self.selection: tuple[str, ...] = ()

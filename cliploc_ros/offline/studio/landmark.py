@@ -110,7 +110,7 @@ class Landmark:
 
     @property
     def label(self) -> str:
-        """The label; of several, the one with the greatest weight."""
+        """The label; of several, the label with the greatest weight."""
         if 'label' in self.fields:
             return str(self.fields['label'])
         return max(self.details.labels or (('', 0.0),), key=lambda pair: pair[1])[0]

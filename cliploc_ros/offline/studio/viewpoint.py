@@ -22,7 +22,7 @@ _FLAT_RAD = 0.08
 _FLAT_NEAR, _NEAR_M = 0.3, 0.01
 # A vertical by hand-held cameras that is so near z confirms z [deg].
 _SAME_UP_DEG = 20.0
-# Of landmarks and cameras, so many lie within the extent.
+# Share of landmarks and cameras within the extent.
 _EXTENT_SHARE = 0.95
 # Steps of a flight, and seconds of one.
 _FLIGHT_STEPS, _STEP_S = 10, 0.03

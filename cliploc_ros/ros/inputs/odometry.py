@@ -33,7 +33,7 @@ _UNIT_TOLERANCE = 0.01
 _FARTHEST_M = 1e7
 # Poses further apart are not interpolated: wheels send every 20 ms, visual odometry every 100.
 _MAX_GAP_NS = NS_PER_S // 2
-# A message is never this late, nor are more than this many in a row: time was set back.
+# A message this late, or this many late ones in a row, means that time was set back.
 _MAX_LATE_NS, _MOST_LATE = NS_PER_S, 5
 # For moves [m] and turns [rad]. Wheels that slip, poses that tremble and stamps are off by less.
 _SLACK = np.array([SAME_SPOT.distance_m, np.radians(SAME_SPOT.angle_deg)])
@@ -42,7 +42,7 @@ _SLACK = np.array([SAME_SPOT.distance_m, np.radians(SAME_SPOT.angle_deg)])
 # Guesses: no run of a Husky ends at 5 Hz or more, see python -m studies.sensors.
 _FASTEST, _CHANGE = np.array([3.0, 3.0]), np.array([3.0, 8.0])
 _TWIST_CHANGE, _CHANGE_S = np.array([3.0, 4.0]), 0.5
-# Twists fit that miss at most this share of a motion, at least so much; what happened long ago
+# Twists fit that miss at most this share of a motion, at least this much; what happened long ago
 # counts less.
 _MISSED_SHARE, _LEAST_MOTION, _MOST_MOTION = 0.25, np.array([0.3, 0.5]), np.array([4.0, 6.0])
 _NO_TWIST, _MOST_TWIST = np.zeros((2, 3)), 1e3
@@ -182,9 +182,9 @@ class OdometryWindow:
         return float(max(way[0] for way in ways)), math.degrees(max(way[1] for way in ways))
 
     def way_at(self, stamp_ns: int) -> float:
-        """Return the way driven since this run began until an instant [m], to a few centimetres.
+        """Return the length of the way from the start of this run to an instant [m].
 
-        Its length, however near to its beginning it leads.
+        It is right to a few centimetres. Driving in a circle counts.
         """
         row = bisect_right(self._poses, stamp_ns, key=lambda one: one.stamp_ns)
         return self._poses[row - 1].way_m if row else 0.0

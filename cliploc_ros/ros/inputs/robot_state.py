@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the robot knows besides its image: mount, vertical, odometry, and where it was."""
+"""Mount, vertical, odometry and last pose of the robot: everything but its image."""
 
 import math
 import threading
@@ -250,7 +250,7 @@ class RobotState:
 
 
 class KnownBefore(NamedTuple):
-    """What is known at an instant besides its messages."""
+    """Knowledge about an instant that its messages do not hold."""
 
     state: RobotState  #: At the stamp of the frame to localize
     #: The frames of other cameras whose mounts are known, with the robot's state at each

@@ -25,7 +25,7 @@ _MAX_DISORDER_NS = NS_PER_S
 _EXPECTED = 4
 # Detections may come this much later than the last ones.
 _SPARE = 1.5
-# So many messages in a row with a stamp of their own show that each has one: stamps in whole
+# This many messages in a row with a stamp of their own show that each has one: stamps in whole
 # seconds differ at times, too. The same message comes again twice, as relays send it, or more.
 _SHOWN, _REPEATED = 3, 2
 # Ten seconds of a camera at 30 Hz.
@@ -104,7 +104,7 @@ def stamp_problem(stamp: Time) -> str:
 
 
 class StampOrder:
-    """Finds jumps in the stamps of several streams, each of which is in order otherwise."""
+    """Finds jumps in the stamps of several streams that are in order otherwise."""
 
     def __init__(self) -> None:
         self._newest_ns: dict[str, int] = {}
@@ -245,7 +245,7 @@ class ExactPairing:
 
 
 class MessageStamps:
-    """Tells whether the stamps of a topic name its messages, for which each needs its own.
+    """Finds out whether each message of a topic has a stamp of its own, which then names it.
 
     Detections with a stamp that several images have may be of any of them. The same message may
     come again.
@@ -272,9 +272,9 @@ class MessageStamps:
         return self._known.get(at_ns, (0, 0))[1] >= _REPEATED
 
     def add(self, stamp: Time, content: Hashable, received_at: float) -> bool:
-        """Take in a stamp and what tells its message from others; return whether it names it.
+        """Take in a stamp and the content of its message; return whether the stamp names it.
 
-        After a stamp that does not, so does none until some in a row are right. The message
+        After a stamp that does not, no stamp does until some in a row are right. The message
         arrived at `received_at` (monotonic clock) [s].
         """
         at_ns, message, why, times = stamp_ns(stamp), hash(content), stamp_problem(stamp), 0

@@ -147,7 +147,7 @@ class NodeParameters[P: Parameters]:
     node : Node
         Made with automatically_declare_parameters_from_overrides=True.
     others : type, optional
-        Parameters of the nodes that may be given the same file.
+        Parameters of other nodes, which the same parameter file may hold.
     """
 
     def __init__(self, node: Node, kind: type[P], others: type[Parameters] = Parameters) -> None:

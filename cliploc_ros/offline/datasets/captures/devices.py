@@ -268,10 +268,10 @@ def read_nerf(folder: Path, options: capture.FolderOptions) -> capture.Capture:
 
 
 def _file_of(folder: Path, name: str, images: Path | None) -> Path:
-    """Return the file of a name in a transforms.json, as the systems of others write them, too.
+    """Return the image file that a name in a transforms.json stands for, also of Windows.
 
-    It is in a folder of images by its name alone where one is given, or where the whole path leads
-    nowhere.
+    If a folder of images is given, or the whole path does not exist, only the last part of the
+    name counts.
     """
     alone = PureWindowsPath(name).name  # of / and \\ alike
     within = name.replace('\\', '/')
