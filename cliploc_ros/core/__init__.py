@@ -17,7 +17,7 @@ keyframes
 search
     Observation and map to candidates, minimal samples, and the best hypotheses of one frame.
 observation, options
-    Inputs: the frame, and what the caller chooses.
+    Inputs: the frame, and the caller's options.
 map
     One map or several with their files; landmarks by class, by similarity of labels, by place.
 geometry

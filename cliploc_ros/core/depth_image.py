@@ -81,7 +81,7 @@ def depth_from_counts(counts: NDArray[np.generic], unit_m: float | None, where: 
 
 def depths_of_boxes(depth: DepthImage, camera: Camera, bboxes_xyxy: NDArray[np.float64]
                     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the depth of what boxes show, and its spread.
+    """Return the depth of the objects in boxes, and its spread.
 
     Parameters
     ----------

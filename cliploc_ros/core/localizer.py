@@ -332,7 +332,7 @@ class Localizer:
 
     def _crops_of(self, query: Query, row: int, source: CropSource | None, remembers: bool,
                   begin_stage: Callable[[str], None]) -> Crops | None:
-        """Return the crops of a frame, recorded ones or those of its image; None without both."""
+        """Return the crops of a frame, recorded or cut from its image; None without both."""
         frame = query.frames[row]
         given, rows = frame.similarities, frame.similarity_rows
         if given is not None and (source is None or not query.images

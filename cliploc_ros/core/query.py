@@ -46,7 +46,7 @@ class Query:
     length_s: float = 0.0
     by_keyframes: bool = True  #: Whether there is time for keyframes
     is_thorough: bool = True  #: Whether to search them thoroughly where a fast pass is refused
-    #: What looks before said of the cameras; None: the localizer knows it
+    #: Evidence of earlier looks about the cameras; None: the localizer knows it
     cameras: CameraCheck | None = None
     #: How many crops of the last frame the first search had, and how many each further search was
     #: given room for: 0 where time ended. Empty: as the options and the time allow.
@@ -67,7 +67,7 @@ class Case:
 
     @property
     def options(self) -> RelocalizerOptions:
-        """Return the options of the case; no clock cuts the search. DatasetError: bad ones."""
+        """Return the options of the case; no clock cuts the search. DatasetError: they are bad."""
         defaults = vars(RelocalizerOptions())
         try:
             given: dict[str, Any] = {

@@ -28,7 +28,7 @@ from cliploc_ros.core.geometry.transforms import (
 # cliploc_ros.core.fit.covariance. A filter that trusts its odometry less is less certain, not
 # wrong.
 _DRIFT = CALIBRATION.covariance.odometry_drift
-# These are not in calibration.yaml: what a filter is given decides about no pose.
+# These are not in calibration.yaml: the input of a filter decides about no pose.
 # Answers further apart than this quantile contradict each other.
 _CONTRADICTION = float(chi2.ppf(0.99, 6))
 # An answer keeps this share of its information in directions in which it says nothing new: a

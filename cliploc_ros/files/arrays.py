@@ -39,14 +39,14 @@ _MOST = 1e10
 
 
 class ArrayError(Exception):
-    """What is wrong with an array; the schema adds the file's name."""
+    """A fault of an array; the schema adds the file's name."""
 
 
 @dataclass(frozen=True)
 class Check:
     """A condition that each row of an array meets."""
 
-    what: str  #: What is wrong with a row that fails, such as 'is not finite'
+    what: str  #: The fault of a row that fails, such as 'is not finite'
     #: Takes the array (n, ...), returns whether each row (n,) fails
     is_wrong: Callable[[NDArray[Any]], NDArray[np.bool_]]
 
@@ -116,8 +116,8 @@ class Schema:
 
     kind: str  #: Names the file, as in 'no such query file'
     fields: Mapping[str, Field]  #: Other arrays of a file are not read
-    error: type[CliplocError]  #: What is raised
-    advice: str = ''  #: What to do about an invalid file
+    error: type[CliplocError]  #: The exception to raise
+    advice: str = ''  #: Advice about an invalid file
     #: Lengths that must be above 0, and what they count
     not_empty: Mapping[str, str] = field(default_factory=dict)
     #: Arrays of other kinds of files, and what a file is that has one where a field is missing
@@ -128,7 +128,7 @@ class Schema:
     largest_read: int = 0
 
     def read(self, path: Path) -> dict[str, NDArray[Any]]:
-        """Return the arrays of a file, validated; optional ones that it lacks are missing.
+        """Return the arrays of a file, validated, without the optional arrays that it lacks.
 
         CliplocError: names the file, the array, what is wrong with it, and what to do.
         """

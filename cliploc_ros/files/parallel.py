@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 _TASKS_A_WORKER = 2
 # Tasks at all workers lost this many times in a row, without a result, are not an accident.
 _MOST_LOSSES = 3
-# A cluster that lost all its workers starts new ones in this time, or never.
+# A cluster that lost all its workers starts new workers in this time, or never.
 _CHECK_S, _RESTART_S = 5.0, 60.0
 _CONNECT_S = 10
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h

@@ -34,9 +34,9 @@ _MOST_DIGITS = 20
 _TURN_S, _TURN_POLL_S = 30.0, 0.02
 # A full disk may still take an empty file.
 _PROBE_BYTES = 4096
-#: What to do about a file that cannot be written
+#: Advice about a file that cannot be written
 MAKE_ROOM = 'make room, or choose another folder'
-#: What could not be kept in a cache by this process, see warn_not_kept
+#: Files that this process could not keep in a cache, see warn_not_kept
 NOT_KEPT: list[str] = []
 
 

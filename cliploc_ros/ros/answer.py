@@ -33,7 +33,7 @@ _LIBRARIES = ('cliploc_ros', 'numpy', 'scipy', 'numba')
 
 
 class Verdict(StrEnum):
-    """What became of a request."""
+    """The outcome of a request."""
 
     #: The pose is accepted and, for a request, delivered.
     ACCEPTED = 'accepted'
@@ -62,7 +62,7 @@ class Answer:
     map_hash: str = ''
     kind: RefusalKind | None = None  #: Of a refusal; None for other verdicts
     header: Header | None = None  #: Stamp of the image, frame of the map; None without an image
-    #: What decided, as doc/interface.md describes it
+    #: The deciding figures, as doc/interface.md describes them
     figures: Mapping[str, object] = field(default_factory=dict)
     #: Where the robot's x axis points, or the camera looks, from the map's x axis to its y axis
     heading_deg: float = 0.0
@@ -147,7 +147,7 @@ class RequestCounters:
 
 
 class CaseRecorder:
-    """The last answers to frames of requests, if it keeps any; older ones are forgotten."""
+    """The last answers to frames of requests, if it keeps any; older answers are forgotten."""
 
     def __init__(self, keeps: bool) -> None:
         self._keeps = keeps

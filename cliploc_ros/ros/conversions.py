@@ -87,7 +87,7 @@ def pose_array_msg(header: Header, poses: list[NDArray[np.float64]]) -> PoseArra
 
 
 class DetectionType(NamedTuple):
-    """A message type, and what makes a vision_msgs/Detection2DArray of it."""
+    """A message type, and its conversion to vision_msgs/Detection2DArray."""
 
     message_type: type
     converted: Callable[[Any], Detection2DArray]

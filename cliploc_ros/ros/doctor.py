@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Check all that a request needs, one after another: what works, what fails, and what to do.
+"""Check everything that a request needs, one after another; say what fails and what to do.
 
 It subscribes to the relocalizer's inputs and localizes once. It delivers no pose.
 """
@@ -69,7 +69,7 @@ class State(StrEnum):
 
 
 class Finding(NamedTuple):
-    """What was checked, and what was found; for a failure also what to do."""
+    """A check and its result; for a failure also the remedy."""
 
     what: str
     state: State

@@ -75,7 +75,7 @@ class HandOff:
         self._odometry = odometry
         self._changed = threading.Condition()
         self._stopped = threading.Event()
-        # What the localizer shows since the pose was last published.
+        # The latest message of the localizer since the pose was last published.
         self._shown: PoseWithCovarianceStamped | None = None
         self._shown_at = -math.inf  # when it was heard (monotonic clock) [s]
         self._pose_topic = ''
@@ -96,7 +96,7 @@ class HandOff:
         self._stopped.clear()
         if pose_topic:
             self._pose_topic = str(self._node.resolve_topic_name(pose_topic))
-            # Volatile: what a localizer showed before does not come late.
+            # Volatile: an earlier pose of the localizer does not come late.
             self._subscription = qos.AdaptiveSubscription(
                 self._node, PoseWithCovarianceStamped, pose_topic, self._hear, qos.POSE)
 

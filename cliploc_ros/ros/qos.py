@@ -168,7 +168,7 @@ class Listener(ABC):
 
     @abstractmethod
     def forget(self) -> None:
-        """Forget what was heard: what follows belongs to another time or run."""
+        """Forget all messages: later ones belong to another time or run."""
 
     def close(self) -> None:
         """Unsubscribe, and forget what was heard."""

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What other programs learn of a relocalizer: its diagnostics, its parameters, its topics."""
+"""A running relocalizer as other programs see it: diagnostics, parameters, topics."""
 
 import math
 import re
@@ -130,7 +130,7 @@ def ask(node: Node, name: str, patience_s: float) -> tuple[RelocalizerStatus, li
 
 
 def parameters_of_files(files: Sequence[Path], name: str) -> list[Parameter]:
-    """Return the parameters in files that ROS gives to a node; the later ones count more.
+    """Return the parameters in files that ROS gives to a node; later files count more.
 
     Parameters
     ----------

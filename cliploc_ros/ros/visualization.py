@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the relocalizer shows: markers in RViz and the debug image, while something subscribes."""
+"""Markers for RViz and the debug image, published while something subscribes."""
 
 import array
 import colorsys
@@ -211,7 +211,7 @@ def _above_bar(canvas: NDArray[np.uint8], verdict: str, color: tuple[int, int, i
 
 @dataclass(frozen=True)
 class SeenImage:
-    """An image (h, w, 3) uint8, red first, what was observed in it, and the map's keyframes."""
+    """An image (h, w, 3) uint8, red first, its observation, and the map's keyframes."""
 
     image_rgb: NDArray[np.uint8]
     observation: Observation
@@ -369,7 +369,7 @@ class Visualization:
             draw_debug_image(seen, found, landmark_map, verdict), header))
 
     def _show_map(self) -> None:
-        """Publish the map if it is new and somebody subscribes; it is kept for later ones."""
+        """Publish the map if it is new and has subscribers; it is kept for later subscribers."""
         with self._lock:
             if self._map is self._shown or self._landmarks.get_subscription_count() == 0:
                 return

@@ -77,12 +77,12 @@ _FAR = 1e9
 
 
 class CameraLook(NamedTuple):
-    """What a frame says of the errors of its camera."""
+    """The evidence of a frame about the errors of its camera."""
 
     camera_name: str
     is_new: bool  #: Whether it is of the newest instant
     map_from_camera: NDArray[np.float64]  #: (4, 4)
-    #: (7, 7), (7,): of the errors; information times the most likely ones
+    #: (7, 7), (7,): of the errors; information times the most likely errors
     information: NDArray[np.float64]
     vector: NDArray[np.float64]
     #: (3, 7): how the position of the newest camera moves with each error [m]
@@ -96,7 +96,7 @@ def _log_mean(logs: NDArray[np.float64]) -> float:
 
 
 class CameraOdds(NamedTuple):
-    """What is known of a camera: it is right, or wrong in one of k ways."""
+    """The odds that a camera is right, or wrong in one of k ways."""
 
     odds: NDArray[np.float64]  #: (1 + k,): log likelihood of each, up to a constant
     means: NDArray[np.float64]  #: (1 + k, 7): errors under each
@@ -253,7 +253,7 @@ class Extent:
 
 
 class _Record:
-    """What is known of one camera."""
+    """The knowledge about one camera."""
 
     def __init__(self, name: str, camera: Camera) -> None:
         self.name, self.camera = name, camera
@@ -339,7 +339,7 @@ class _Record:
 
 
 class CameraCheck:
-    """What the looks of a localizer say of its cameras, by their names."""
+    """The evidence of a localizer's looks about its cameras, by name."""
 
     def __init__(self) -> None:
         self._records: dict[str, _Record] = {}

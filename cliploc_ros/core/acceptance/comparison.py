@@ -77,14 +77,14 @@ def search_contenders(joined: JoinedFrames, finalists: Sequence[Finalist],
 
 
 class Comparison:
-    """The contenders, and what decides between them.
+    """The contenders, and the evidence that decides between them.
 
     Parameters
     ----------
     met : sequence of Contender
         Those that the search met.
     looks : Looks, optional
-        Earlier ones, which have to agree.
+        Earlier looks, which have to agree.
     recognizer : ImageRecognizer, optional
         Of the keyframes, for the last image: the places that it recognizes compete, too.
     """
@@ -112,7 +112,7 @@ class Comparison:
         rows = np.arange(len(contenders))
         #: (m,): probability of each, shared by those that agree
         self.likely = self._confidences(rows, [one.odds for one in contenders])
-        self.recognition = seen  #: What keyframes say
+        self.recognition = seen  #: Result of the keyframes
         #: (m,): which contenders agree with the leading one
         self.leading = SAME_ANSWER.agreeing(self.poses[:1], self.poses).ravel()
         there = [contenders[row] for row in rows[self.leading]]
@@ -249,7 +249,7 @@ class Comparison:
     def _uncontradicted(self) -> float:
         """Return the probability that keyframes are wrong which recognize another place only.
 
-        They count where they are sure. What a dozen points say is in the comparison.
+        They count where they are sure. The evidence of a dozen points is in the comparison.
         """
         chance = max((1.0 / (1.0 + math.exp(-points_utility(one.recognized)))
                       for one in self.contenders if one.recognized is not None), default=0.0)

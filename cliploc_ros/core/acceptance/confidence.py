@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What speaks for and against a pose, and the confidence of each pose that follows.
+"""The evidence for and against poses, and their confidence.
 
-The support of a pose is what in the frames speaks for it, and what speaks against it. It is
-weighed against what supports the others.
+The support of a pose is the evidence of the frames for it and against it. It is weighed against
+the support of the other poses.
 
 A conditional logit (McFadden, "Conditional Logit Analysis of Qualitative Choice Behavior", 1974):
 each distinct pose has a utility, linear in its support. The case that no pose is right has a
@@ -84,7 +84,7 @@ class Support:
 
 
 class ComparedFrame(NamedTuple):
-    """A frame to measure supports in: what all poses share of its n detections."""
+    """A frame to measure supports in: data of its n detections that all poses share."""
 
     scene: Scene
     classes: NDArray[np.int64]  #: (n,): the map's number of each class
@@ -256,7 +256,7 @@ def confidences(odds: NDArray[np.float64], poses: NDArray[np.float64], none: flo
     lost = (1.0 - sharpened[lead]) / (1.0 - likely[lead])
     if prior is None or not prior.any():
         return np.minimum(np.where(agreeing[lead], sharpened, likely * lost), most)
-    # what the prior says of each pose is no evidence of objects, and not steepened
+    # the odds of the prior are no evidence of objects, and not steepened
     kept = np.where(agreeing[lead], sharpened[lead] / likely[lead], lost)
     weighted = shares * kept * np.exp(prior)
     none_of_them = max(0.0, 1.0 - float(shares @ kept))

@@ -33,7 +33,7 @@ _NONE = np.empty(0, dtype=np.int64)
 
 
 class JoinedFrames(NamedTuple):
-    """What poses are compared on: searched frames of one camera, in a map."""
+    """The data that poses are compared on: searched frames of one camera, in a map."""
 
     landmark_map: LandmarkMap
     options: RelocalizerOptions
@@ -75,7 +75,7 @@ def without_depth(joined: JoinedFrames) -> JoinedFrames:
 
 
 class Contender(NamedTuple):
-    """A pose that may be right, and what supports it."""
+    """A pose that may be right, and its support."""
 
     finalist: Finalist  #: Of the search of objects, or the pose of keyframes as one
     pose: NDArray[np.float64]  #: (4, 4): map_from_camera
@@ -88,7 +88,7 @@ class Contender(NamedTuple):
     odds: float
     #: Log odds, 0 or less, that a region known before gives it; never steepened
     prior: float = 0.0
-    #: What keyframes show there, where they propose the pose
+    #: The place that keyframes recognize, if they propose the pose
     recognized: RecognizedPlace | None = None
     #: The odds of a pose that keyframes propose, without what objects say for it
     by_points: float = -math.inf

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the depths of a request can be right: wrong ones must not harm.
+"""Whether the depths of a request can be right: wrong depths must do no harm.
 
 Depth may have another unit or scale, another camera, or be noise. Then it fits no pose that the
 boxes allow. Right depths hardly change a pose that the boxes fix, and agree with it.

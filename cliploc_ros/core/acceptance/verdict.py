@@ -29,7 +29,7 @@ class RefusalKind(StrEnum):
     LOOK_ALIKE = auto()
     #: The covariance is too large.
     UNCERTAIN_POSITION = auto()
-    #: What was matched is too weak, or too much of the image does not fit.
+    #: The matches are too weak, or too much of the image does not fit.
     UNEXPLAINED = auto()
     #: Too few samples to have met the rivals of the pose.
     SEARCH_CUT_SHORT = auto()
@@ -51,7 +51,7 @@ class RefusalKind(StrEnum):
 
 # Factors of the confidence other than likely and found. Of equal factors, the first is named.
 _FACTORS = ('distinct', 'near', 'camera', 'genuine', 'not_mirrored', 'uncontradicted')
-# What a refusal says of an Evidence whose weakest factor names its cause.
+# Kind and message of a refusal, by the weakest factor of its Evidence.
 _ADVICE = {
     'near': (RefusalKind.UNCERTAIN_POSITION, 'position uncertain by {0.deviation_m:.2g} m; turn '
                                              'the camera to more or nearer objects'),
@@ -121,7 +121,7 @@ class Evidence:
     not_mirrored: float = 1.0
     #: Probability that keyframes are wrong which recognize another place only
     uncontradicted: float = 1.0
-    recognized: RecognizedPlace | None = None  #: What keyframes show at the pose
+    recognized: RecognizedPlace | None = None  #: The place that keyframes recognize at the pose
     prior: float = 0.0  #: Log odds, 0 or less, that a region known before gives the pose
     #: Confidence of each earlier look in this pose, see cliploc_ros.core.acceptance.looks
     earlier: tuple[float, ...] = ()

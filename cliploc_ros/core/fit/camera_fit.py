@@ -53,7 +53,7 @@ _MOST_RESIDUAL = 4.0
 class CameraFit(NamedTuple):
     """The errors of a camera by one frame, independent of its pose."""
 
-    errors: NDArray[np.float64]  #: (7,): the most likely ones, given their deviations
+    errors: NDArray[np.float64]  #: (7,): the most likely errors, given their deviations
     information: NDArray[np.float64]  #: (7, 7): of the boxes alone, about these errors
     square: float  #: Sum of the squared residuals that remain
 
@@ -165,7 +165,7 @@ def fit_camera(pairs, is_edge, vertical, rotation, translation, deviations):
 
 @compiled
 def _cost(pairs, is_edge, vertical, errors, rotation, translation, deviations):
-    """Return the residuals, and what is minimized; infinite for a landmark behind the camera."""
+    """Return the residuals and the cost; infinite for a landmark behind the camera."""
     residuals = np.zeros(5 * len(pairs) + 3)
     if not residuals_of(corrected(pairs, errors), vertical, rotation, translation, residuals):
         return residuals, np.inf

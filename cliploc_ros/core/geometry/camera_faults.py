@@ -39,7 +39,7 @@ _CACHED = 64
 
 
 class Fault(NamedTuple):
-    """What contradicts itself in an input, in one line."""
+    """A contradiction in an input, in one line."""
 
     text: str
     #: Whether poses would certainly be wrong, so that the input is refused; else it is unusual

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The depth of a landmark's centre, from the depth of what its box shows.
+"""The depth of a landmark's centre, from the depth in its box.
 
 The visible surface is nearer than the centre, by a share of half the chord that the ray through
 the centre cuts off the ellipsoid. By how much objects differ from ellipsoids makes this uncertain,

@@ -35,7 +35,7 @@ def is_rigid(transform: NDArray[np.float64], tolerance: float = 1e-4) -> bool:
 def are_rigid(transforms: NDArray[np.float64], tolerance: float = 1e-3) -> NDArray[np.bool_]:
     """Return which arrays (k, 4, 4) are finite rigid transforms."""
     finite = np.isfinite(transforms).all(axis=(1, 2))
-    # no element of a rotation exceeds 1, and squares of huge ones overflow
+    # no element of a rotation exceeds 1, and squares of huge numbers overflow
     rotations = np.clip(np.where(finite[:, None, None], transforms[:, :3, :3], 0.0), -2.0, 2.0)
     errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     return np.asarray((errors <= tolerance) & (np.linalg.det(rotations) > 0.0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The layer: keyframes with their poses, features and points, and how to find similar ones.
+"""The layer: keyframes with their poses, features and points, and search for similar ones.
 
 Images are compared by the words of their features (Sivic and Zisserman, "Video Google", 2003):
 the descriptors of a layer are clustered, each cluster is a word, and two images are as similar as

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Localize an image among keyframes: find similar ones, match them, solve for the pose."""
+"""Localize an image among keyframes: find similar keyframes, match them, solve for the pose."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -137,7 +137,7 @@ class ImageFeatures:
 
 
 class _Look(NamedTuple):
-    """An image: its features, their bearings (n, 2), the camera and what is known of it."""
+    """An image: its features, their bearings (n, 2), the camera and its constraints."""
 
     features: Features
     bearings: NDArray[np.float64]
@@ -223,7 +223,7 @@ class KeyframeLocalizer:
         matched = self._match(descriptors, chosen, deadline)
         first = _place(matched, look)
         if first is None or first.agreed < _ENOUGH_INLIERS:
-            # More keyframes: those near the pose so far, and the next similar ones.
+            # More keyframes: those near the pose so far, and the next in similarity.
             near = keyframes_near(self.layer.map_from_camera, first.map_from_camera
                                    )[:_MORE].tolist() if first else []
             more = [one for one in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
@@ -307,7 +307,7 @@ class KeyframeLocalizer:
 
     def _search_further(self, descriptors: NDArray[np.float32], look: _Look, ranks: Sequence[int],
                         deadline: float) -> list[int]:
-        """Return the keyframes near a pose that many points of less similar ones agree with."""
+        """Return the keyframes near a pose that many points of less similar keyframes support."""
         matched = self._match(descriptors[:_STRONGEST], ranks[:_FURTHER], deadline)
         place = _place(matched, look, _RIVAL_ITERATIONS)
         if place is None or place.agreed < _CLEAR:
@@ -337,7 +337,7 @@ class KeyframeLocalizer:
             is_thorough)
 
     def _choose(self, ranks: Sequence[int], guesses: Sequence[NDArray[np.float64]]) -> list[int]:
-        """Return the keyframes to match: similar ones, and those near the guesses."""
+        """Return the keyframes to match: similar keyframes, and keyframes near the guesses."""
         poses = self.layer.map_from_camera
         chosen = list(ranks[:_SIMILAR])
         others = np.array(ranks[_SIMILAR:_MOST_RANKED], dtype=np.int64)
@@ -406,7 +406,7 @@ class KeyframeLocalizer:
 
 
 def _places(first: _Place | None, matched: _Matched, look: _Look) -> list[_Place]:
-    """Return the pose that most matches agree with, and the best ones elsewhere.
+    """Return the pose that most matches agree with, and the best poses elsewhere.
 
     The one whose points lie in the most parts of the image comes first: a poster has many points,
     but shows only a part of its place.

@@ -26,7 +26,7 @@ _ROUGH, _WRONG_FOCAL, _MOST_LOGARITHM = (2.0, 1.0), (12.0, 6.0, 3.0, 1.0), np.lo
 _OF_X_AND_Y = np.array([[1.0, 1.0], [1.0, -1.0]])
 # The least deviation of a feature, as an angle: half a pixel at f = 525 px.
 _LEAST_DEVIATION = 0.5 / 525.0
-# Points behind the camera count as ones before it, so near [m].
+# Points behind the camera count as points before it at this depth [m].
 _LEAST_DEPTH = 1e-3
 # Of a normal distribution: standard deviation divided by the median of absolute values.
 _FROM_MEDIAN = 1.4826
@@ -128,7 +128,7 @@ class _Fit(NamedTuple):
 
     @property
     def ratios(self) -> NDArray[np.float64]:
-        """Return the focal lengths (2,) of x and y as multiples of the given ones."""
+        """Return the focal lengths (2,) of x and y as multiples of the given focal lengths."""
         return np.exp(_OF_X_AND_Y @ self.logarithms)
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What an image encoder saw of each landmark: ``NAME.embeddings.npz`` next to ``NAME.yaml``."""
+"""Image embeddings of the landmarks: ``NAME.embeddings.npz`` next to ``NAME.yaml``."""
 
 import os
 from collections.abc import Sequence
@@ -73,7 +73,7 @@ class LandmarkEmbeddings:
         return np.asarray(self.means.any(axis=1))
 
     def in_order(self, landmark_ids: Sequence[str]) -> 'LandmarkEmbeddings':
-        """Return the embeddings of some landmarks in the order given; missing ones are unknown."""
+        """Return the embeddings of some landmarks in the order given, unknown if missing."""
         rows_of = {landmark_id: row for row, landmark_id in enumerate(self.landmark_ids)}
         rows = np.array([rows_of.get(landmark_id, -1) for landmark_id in landmark_ids],
                         dtype=np.int64)
@@ -105,7 +105,7 @@ def load_embeddings_of_map(map_path: str | os.PathLike[str], landmark_ids: Seque
                            map_set: MapSet = NO_SET) -> LandmarkEmbeddings | None:
     """Return the embeddings of a map's landmarks, in its order; None where it has no such file.
 
-    Landmarks that were removed from the map are left out, and added ones are unknown.
+    Landmarks that were removed from the map are left out; added landmarks are unknown.
 
     MapError: the file is invalid, of another set, or has none of these landmarks.
     """

@@ -154,7 +154,7 @@ class ClassIndex:
         order : ndarray (m,) of int
             The detections in the order in which they are paired.
         limit : int, optional
-            The most pairs to return: the first ones.
+            Return at most this many pairs, from the first.
         """
         taken = self.sizes_of(classes)[order]
         if limit is not None:
@@ -202,7 +202,7 @@ class LandmarkMap:
     quats_xyzw: NDArray[np.float64]
     #: Optional fields of each landmark; empty where the map has none
     details: tuple[LandmarkDetails, ...] = ()
-    map_set: MapSet = NO_SET  #: What the files next to the map's own have to be of
+    map_set: MapSet = NO_SET  #: Identity that the files next to the map must have
 
     def __len__(self) -> int:
         """Return the number of landmarks."""

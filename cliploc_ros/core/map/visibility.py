@@ -179,7 +179,7 @@ class _Record(NamedTuple):
 
 
 class Missing:
-    """What looks said of each landmark that they expected."""
+    """Counts of looks for each landmark that they expected."""
 
     def __init__(self, landmark_map: LandmarkMap) -> None:
         self._details = landmark_map.details
@@ -187,7 +187,7 @@ class Missing:
         self._expected: deque[list[int]] = deque(maxlen=_HERE)
 
     def add(self, expected: Expected, weight: float) -> None:
-        """Count a look at a right pose, 1 for one that shares no errors with earlier ones."""
+        """Count a look at a right pose: 1 if it shares no errors with earlier looks, else less."""
         for landmark, was_seen, in_sight, side in zip(*(one.tolist() for one in expected),
                                                       strict=True):
             one = self._records.get(landmark, _Record())

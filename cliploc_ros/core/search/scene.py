@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One frame, the map and what is known of the camera, as the compiled search reads them."""
+"""One frame, the map and the constraints of the camera, as the compiled search reads them."""
 
 from math import atan2, cos, hypot, inf, pi, sqrt
 from typing import NamedTuple
@@ -31,7 +31,7 @@ class Scene(NamedTuple):
     #: = 1
     box_ellipses: NDArray[np.float64]
     bearings: NDArray[np.float64]  #: (n, 3): unit vectors through the box centres
-    #: (n, 2): depth of what each box shows and its standard deviation [m]; 0, 0 where unknown
+    #: (n, 2): depth of the object in each box and its standard deviation [m]; 0, 0 if unknown
     depths: NDArray[np.float64]
     #: (L, 3), (L, 6): of the landmarks, see cliploc_ros.core.geometry.ellipsoid
     centers: NDArray[np.float64]

@@ -82,7 +82,7 @@ class ImageFaults:
 class CameraTurn:
     """The camera is turned against its stated mount."""
 
-    #: (3,): rotation vector that turns the stated axes of the camera into the true ones [deg];
+    #: (3,): rotation vector that turns the stated axes of the camera into the true axes [deg];
     #: optical axes: x right, y down, z forward
     rotvec_deg: NDArray[np.float64]
     sigma_deg: float  #: Standard deviation on each axis

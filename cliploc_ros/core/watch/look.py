@@ -111,7 +111,7 @@ def align(joined: JoinedFrames, map_from_camera: NDArray[np.float64]) -> Alignme
 
 
 class LookEvidence(NamedTuple):
-    """What one look says of the given pose."""
+    """The evidence of one look about the given pose."""
 
     known: int  #: Detections of the map's classes
     matched: int  #: Objects that are where the pose expects them
@@ -149,7 +149,7 @@ def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
     unexplained = sum(row not in taken for row in np.nonzero(own)[0].tolist())
     found = expect(landmark_map, observation.camera, fit.pose,
                    np.array([one.landmark for one in matches], dtype=np.int64))
-    # what nothing explains is a term of its own
+    # detections that nothing explains are a term of their own
     utility, = utilities([fit.support]) - CALIBRATION.objects.unexplained * fit.support.unexplained
     in_view = index.of_landmarks[found.landmarks]
     pairs = sum(int((in_view == one).sum()) for one in classes[own])

@@ -29,7 +29,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 # of a body whose axes are forward, left, up (REP 103), and a camera that looks forward
 _BODY_FROM_CAMERA = make_transform(
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
-#: What a stored pose may be, and map_from_camera of OpenCV's axes from it.
+#: Conventions of a stored pose, and map_from_camera with OpenCV's axes from each.
 AXES: Mapping[str, Callable[[_Pose], _Pose]] = {
     'opencv': lambda pose: pose,
     'opengl': lambda pose: pose @ _FLIP,
@@ -60,7 +60,7 @@ class View(NamedTuple):
 class Reading(NamedTuple):
     """A way to read a recording."""
 
-    remedy: str  #: What to do where it fits, and the given one does not
+    remedy: str  #: Advice if it fits and the given convention does not
     pose: Callable[[_Pose], _Pose] = AXES['opencv']
     camera: Callable[[Camera], Camera] = lambda camera: camera
     upright: bool = False  #: Images are turned by their EXIF orientation
@@ -153,7 +153,7 @@ def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]
 
 def _match(pair: tuple[View, View], upright: bool
            ) -> tuple[list[Camera], list[NDArray[np.float64]]]:
-    """Return the cameras of two images, and the pixels (n, 2) of what matches in them."""
+    """Return the cameras of two images, and the pixels (n, 2) of their matches."""
     looks = [one.look(upright) for one in pair]
     features = [extract(image, _FEATURES, _LONGEST_PX) for image, _ in looks]
     ours, theirs = (unit_rows(one.descriptors) for one in features)

@@ -67,7 +67,7 @@ class BagTopics:
     #: sensor_msgs/Image of depth, 16UC1 or 32FC1, or CompressedImage of compressedDepth; '' for
     #: none
     depth: str = ''
-    intrinsics: str | None = None  #: What is used instead of camera_info, see find_camera
+    intrinsics: str | None = None  #: The camera to use in place of camera_info, see find_camera
     #: A depth image belongs to a colour image at most this far away in time [ns]
     tolerance_ns: int = STAMP_TOLERANCE_NS
     tf: str | None = None  #: That leads from depth to image, see poses_of_tf
@@ -146,7 +146,7 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
 
 
 class _Cameras(NamedTuple):
-    """The camera_info of a recording: what it says, and when."""
+    """The messages of camera_info in a recording, with their stamps."""
 
     where: str
     msgtype: str  #: Of the images

@@ -88,7 +88,7 @@ class Frames:
     varies: bool = False  #: Whether each image has a camera of its own
     #: Of what may change while the folder does not: images and their cameras, then their poses
     digest: str = ''
-    notes: tuple[str, ...] = ()  #: What the user should know about how they were read
+    notes: tuple[str, ...] = ()  #: Notes for the user about the reading
 
     @property
     def each(self) -> tuple['Frames', ...]:
@@ -177,7 +177,7 @@ def folder_frames(folder: Path, files: Sequence[ImageFile], depth: DepthFormat |
                 yield RawFrame(place, file.stamp_ns, file.pose, partial(read_color, file),
                                None if file.depth is None else partial(read_depth, file, form))
     cameras = dict.fromkeys(file.camera for file in files)
-    # pictures may be cut out of larger ones, which no file tells: no fault is certain
+    # pictures may be cut out of larger pictures without a record: no fault is certain
     notes = dict.fromkeys(f'note: {fault.text}' for one in cameras for fault in camera_faults(one))
     return Frames(folder, len(files), read_raw, varies=len(cameras) > 1,
                   notes=tuple(notes)[:_MOST_NOTES])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a map was built from: NAME.recording.json next to NAME.yaml.
+"""The recording of a map: NAME.recording.json next to NAME.yaml.
 
 ``check_map`` and the studio find observations and images by it. Paths in it are relative to the
 map, so that folders can be moved together.

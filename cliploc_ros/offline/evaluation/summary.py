@@ -184,7 +184,7 @@ def compare(one: Summary, other: Summary, limit_m: float = 1.0, seed: int = 0) -
 
 
 def find_best(summaries: Sequence[Summary], limit_m: float = 1.0) -> Summary:
-    """Return the summary of the greatest success; of equal ones that of the least error."""
+    """Return the summary of the greatest success; with equal success, of the least error."""
     return max(summaries, key=lambda one: (one.success(limit_m), -one.median_error_m))
 
 

@@ -120,7 +120,7 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
 
 def join_cameras(queries: Mapping[str, Sequence[PosedQuery]], tolerance_s: float
                  ) -> tuple[PosedQuery, ...]:
-    """Return the queries of the first camera, each with what the others saw at its instant.
+    """Return the queries of the first camera, each with the other cameras at its instant.
 
     The mounts of the cameras follow from the true poses. DatasetError: no other image is so near
     in time to one of the first camera.

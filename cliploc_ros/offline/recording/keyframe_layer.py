@@ -38,7 +38,7 @@ _IMAGE_PX, _JPEG_QUALITY = 256, 60
 _LEAST_PARALLAX = np.radians(1.5)
 # A ray misses its point by no more than 2 px at f = 525 px.
 _MOST_ERROR = 2.0 / 525.0
-# Images that each one is compared with: the nearest ones that look the same way.
+# Images that each image is compared with: the nearest images with the same direction.
 _NEIGHBOURS = 8
 _LEAST_M, _MOST_M, _MOST_COS = 0.05, 2.0, np.cos(np.radians(40.0))
 #: The points of a room or hall are this far [m].
@@ -288,7 +288,7 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float64]
                      ) -> NDArray[np.float32]:
-    """Return the depth of what single pixels show.
+    """Return the depth at single pixels.
 
     Parameters
     ----------

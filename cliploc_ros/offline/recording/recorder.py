@@ -155,7 +155,7 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
                 odometry: Mapping[str, Poses] | None = None) -> Recorded:
     """Return the observations of a source: those of an earlier run, or record them.
 
-    Odometry is no part of what the networks depend on: an earlier run without it serves as well.
+    The networks do not depend on odometry: an earlier run without it can be used as well.
 
     Parameters
     ----------

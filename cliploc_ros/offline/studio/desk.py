@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 
 
 class Desk:
-    """What the people at the page do.
+    """The actions of the people at the page.
 
     Attributes
     ----------

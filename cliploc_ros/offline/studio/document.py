@@ -154,7 +154,7 @@ class Document:
     # ---- edits ----------------------------------------------------------------------------------
 
     def apply(self, change: Change, gesture: object = None) -> None:
-        """Make a change; successive ones of one gesture, as of a drag, are undone together.
+        """Make a change; successive changes of one gesture, such as a drag, are undone together.
 
         CliplocError: the journal cannot be written.
         """

@@ -5,7 +5,7 @@
 The relocalizer refuses a map with unknown fields, since a misspelled field would be silently
 without effect. The studio opens such a map, keeps these fields, and says that they are refused.
 
-A look is what an image encoder saw of a landmark. It is a part of the landmark, so it follows its
+A look holds the image embeddings of a landmark. It is a part of the landmark, so it follows its
 landmark through merge, split, delete, undo and redo.
 """
 
@@ -34,7 +34,7 @@ LEAST_SEMI_AXIS_M = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Encoded:
-    """What an image encoder saw of one landmark."""
+    """The image embeddings of one landmark."""
 
     mean: NDArray[np.float16]  #: (d,): the mean direction of its crops, of unit length
     #: (m, d): crops that stand for all of its crops, unit rows; at most five
@@ -88,7 +88,7 @@ def looks_of(embeddings: LandmarkEmbeddings) -> dict[str, Encoded]:
 
 @dataclass(frozen=True)
 class Marks:
-    """What the studio keeps of a landmark; the map file does not hold it."""
+    """The state of a landmark in the studio, which the map file does not hold."""
 
     is_locked: bool = False  #: Edits are refused
     is_hidden: bool = False  #: The scene and the views leave it out

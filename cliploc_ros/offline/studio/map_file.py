@@ -74,7 +74,7 @@ class MapFile:
 
     @property
     def map_set(self) -> MapSet:
-        """What the files next to the map have to be of."""
+        """The identity that the files next to the map must have."""
         return set_of(self.text)
 
     @property
@@ -197,7 +197,7 @@ def patched(text: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
 
 def _patches(text: str, node: yaml.Node, old: Mapping[str, Any], new: Mapping[str, Any]
              ) -> Iterator[tuple[int, int, str]]:
-    """Yield start and end of what changes below a mapping, and the text that takes its place."""
+    """Yield start and end of each change below a mapping, and the text in its place."""
     entries = {key.value: (key, value) for key, value in node.value}
     newline = '\r\n' if '\r\n' in text else '\n'
     for name, value in old.items():

@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 
 
 class FoundPhrases(NamedTuple):
-    """The best phrases, the best one first, and what a person should know; '' for nothing."""
+    """The best phrases, best first, and a note for the user; '' for none."""
 
     phrases: tuple[str, ...]
     note: str

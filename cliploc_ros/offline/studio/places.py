@@ -43,7 +43,7 @@ class Coverage(NamedTuple):
     """The coverage and the look-alikes of a map."""
 
     landmarks: Landmarks  #: That were checked
-    grid: Grid  #: All positions, the tried ones first
+    grid: Grid  #: All positions; tried positions come first
     check: GridCheck  #: Of the tried positions
     look_alikes: tuple[LookAlike, ...]
     detector: str  #: The source of the detector's errors, in words

@@ -43,7 +43,7 @@ from cliploc_ros.offline.studio.landmark import Encoded, Landmarks, looks_of, ma
 
 #: Fewer boxes leave an ellipsoid open.
 LEAST_BOXES = 3
-# What is looked at around a box, as a share of its size.
+# Margin around a box that is examined, as a share of its size.
 _MARGIN = 0.25
 # Between the pictures of the film [s].
 _PICTURE_S = 0.2
@@ -117,7 +117,7 @@ class Recording:
             None if self.images is None else self._sharpness)
 
     def _sharpness(self, one: Sighting) -> float:
-        """Return the share of fine detail in what the view shows around the landmark."""
+        """Return the share of fine detail in the view around the landmark."""
         crop = self.crop(one.view, one.bbox_xyxy)
         if crop is None:
             return 0.0

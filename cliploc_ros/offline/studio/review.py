@@ -47,7 +47,7 @@ class ReviewQueue:
 
     @property
     def order(self) -> list[str]:
-        """The landmarks of the last check, the worst first, deleted ones included; newer ones."""
+        """The landmarks of the last check, worst first, also if deleted; then newer landmarks."""
         return list(dict.fromkeys([*self._order, *self._document.landmarks]))
 
     def decision(self, landmark_id: str) -> str:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Who may open the page, and what its port answers: our page, its images, and viser's scene.
+"""Access to the page, and the answers of its port: our page, its images, and viser's scene.
 
 viser 1.1 lets everyone in who reaches its port. On the loopback interface these include all users
 of this machine, and every page that its browsers show, since a browser opens WebSockets to any
@@ -40,7 +40,7 @@ _POLICY = ("default-src 'self'; img-src 'self' data:; style-src 'self' 'unsafe-i
 
 
 class Content(NamedTuple):
-    """What a path has: a file's content, and the ending of its name."""
+    """The content of a file, and the ending of its name."""
 
     content: bytes
     suffix: str
@@ -48,7 +48,7 @@ class Content(NamedTuple):
 
 
 class Board:
-    """What all open pages show: parts by name, as JSON. A page gets those that changed."""
+    """The content of all open pages: parts by name, as JSON. A page gets changed parts only."""
 
     def __init__(self) -> None:
         self._parts: dict[str, str] = {}

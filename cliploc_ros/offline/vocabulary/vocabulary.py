@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The phrases of each detector class: shipped ones for COCO, and those of a user's file."""
+"""The phrases of each detector class: shipped phrases for COCO, and phrases of a user's file."""
 
 import os
 import re

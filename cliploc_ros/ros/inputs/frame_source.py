@@ -35,7 +35,7 @@ _MAX_DEPTH_BYTES = 72 * 2**20
 _OF_DEPTH = ('depth', 'depth_camera_info')
 # A guess at the memory of one detection in Python.
 _DETECTION_BYTES = 2000
-# What to do about stamps.
+# Advice about stamps.
 _STAMPING = {'image': 'the driver of the camera must stamp each when it is taken',
              'detections': "the detector must copy the image's header"}
 # Bytes of an image that tell it from others.
@@ -206,7 +206,7 @@ class FrameSource:
                 and not self._node.count_publishers(self._resolved(name))]
 
     def examine(self, health: Health, stale_after_s: float) -> None:
-        """Report missing inputs, rates, and what waits or was dropped."""
+        """Report missing inputs, rates, and waiting or dropped messages."""
         now = time.monotonic()
         with self._changed:
             for name in self.topics.keys() - {'depth_camera_info'}:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is known before an image: where the robot probably is.
+"""The prior: where the robot probably is, before an image.
 
 A message on `~/prior` says where the robot is, until the next message. Without one it is where
 it was last: the pose of the last accepted request, and what the localizer showed after it, are

@@ -63,7 +63,7 @@ class NoVerticalError(CliplocError):
 
 
 class Sample(NamedTuple):
-    """What an IMU measured at one instant, in its own coordinate frame; at least one of both."""
+    """Measurements of an IMU at one instant, in its own coordinate frame; at least one of two."""
 
     stamp_ns: int
     #: A unit vector (3,), by the orientation.
@@ -270,7 +270,7 @@ class RobotStateSource:
         self._unknown = set[str]()  # coordinate frames that tf2 did not know the last time
 
     def open(self) -> None:
-        """Subscribe to what the parameters ask for."""
+        """Subscribe to the inputs that the parameters select."""
         parameters = self._node.settings.values
         self.vertical.open(parameters.gravity)
         self.prior.open(parameters)

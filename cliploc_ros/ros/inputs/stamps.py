@@ -23,7 +23,7 @@ _MAX_AHEAD_NS = NS_PER_S // 5
 _MAX_DISORDER_NS = NS_PER_S
 # Images that are expected at a time: two for each of the last two detections.
 _EXPECTED = 4
-# Detections may come this much later than the last ones.
+# Detections may come this much later than the previous detections.
 _SPARE = 1.5
 # This many messages in a row with a stamp of their own show that each has one: stamps in whole
 # seconds differ at times, too. The same message comes again twice, as relays send it, or more.
@@ -129,7 +129,7 @@ class ExactPairing:
 
     Stamps are compared for equality, not for order: frames may arrive out of order.
 
-    Images wait for their detections, and large ones may fill the memory before these come. Then
+    Images wait for their detections. Large images may fill the memory before that. Then
     each n-th stays, and the two that are the newest when detections arrive: a detector that is
     done with an image mostly takes the newest one next.
 
@@ -140,7 +140,7 @@ class ExactPairing:
     max_count : int
         How many messages of each topic are kept.
     early, late : str
-        The topics of the images and of what is made of them; without them, the oldest messages
+        The topics of the images and of the detections in them; without them, the oldest messages
         give way.
     """
 
@@ -227,7 +227,7 @@ class ExactPairing:
         return number % self.every == 0 or number in self._expected
 
     def _learn(self, stamp_ns: int) -> None:
-        """Take in how many images later detections come, and expect those of the newest ones."""
+        """Learn the delay of detections, in images, and expect those of the newest images."""
         newest, waiting = self.received[self._early], self._waiting[self._early]
         self._expected.extend([newest, newest + 1])
         if stamp_ns not in self._numbers or not waiting:

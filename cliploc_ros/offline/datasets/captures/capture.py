@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a reader of a layout takes and returns: images in the order of time, with their poses."""
+"""Input and result of a reader of a layout: images in the order of time, with their poses."""
 
 import re
 from collections import Counter
@@ -30,17 +30,17 @@ _AS_USUAL = DepthFormat()
 
 @dataclass(frozen=True)
 class FolderOptions:
-    """What a folder does not say itself."""
+    """Settings that a folder does not hold itself."""
 
     intrinsics: str | None = None  #: Name of a preset, or a camera.json; None: the folder's own
     trajectory: TimedPoses | None = None  #: Poses instead of the folder's own
     max_gap_ns: int = 0  #: Greatest gap between two poses to interpolate over [ns]
-    #: (4, 4): how the camera is mounted on what the poses are of
+    #: (4, 4): mount of the camera on the body of the poses
     body_from_camera: NDArray[np.float64] | None = None
-    depth: DepthFormat = _AS_USUAL  #: What differs from the folder's usual format
+    depth: DepthFormat = _AS_USUAL  #: Differences from the folder's usual format
     layout: str = ''  #: Key of one of LAYOUTS; '': the one whose files are there
     images: Path | None = None  #: Folder of the images of colmap and nerf
-    axes: str | None = None  #: What the stored poses are, one of AXES; None: by the layout
+    axes: str | None = None  #: Convention of the stored poses, one of AXES; None: by the layout
     scale: float | None = None  #: Metres of a stored unit
     #: Two images, and the distance between their cameras [m]: another way to say the scale
     known_distance: tuple[str, str, float] | None = None
@@ -55,7 +55,7 @@ class Capture:
     """Images in the order of time, with the poses that are stored for them."""
 
     files: tuple[ImageFile, ...]
-    axes: str = 'opencv'  #: What a stored pose is: one of placing.AXES
+    axes: str = 'opencv'  #: Convention of the stored poses: one of placing.AXES
     depth: DepthFormat = _AS_USUAL
     #: Axis of the poses' coordinate frame that points up by the definition of the layout: 'y' or
     #: 'z'; '' where it defines none

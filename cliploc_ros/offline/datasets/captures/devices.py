@@ -35,7 +35,7 @@ _MAX_GAP_NS = 200_000_000
 
 
 def read_polycam(folder: Path, options: capture.FolderOptions) -> capture.Capture:
-    """Return the keyframes of Polycam's raw data, the optimized ones where there are any."""
+    """Return the keyframes of Polycam's raw data, with optimized poses if there are any."""
     root, kind = folder / 'keyframes', 'corrected_'
     if not ((root / 'corrected_images').is_dir() and (root / 'corrected_cameras').is_dir()):
         kind = ''

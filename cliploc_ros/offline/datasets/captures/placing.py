@@ -35,7 +35,7 @@ _TRIED = 3
 
 def place_images(files: Sequence[ImageFile], axes: str, scale: float = 1.0,
                  map_from_stored: _Pose = UP['z']) -> tuple[ImageFile, ...]:
-    """Return images with poses map_from_camera instead of stored ones.
+    """Return images with poses map_from_camera in place of the stored poses.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ class QuadricError(Exception):
 
 
 class WireError(Exception):
-    """What is wrong with a protocol buffer; the caller adds the file's name."""
+    """A fault of a protocol buffer; the caller adds the file's name."""
 
 
 def read_goreloc(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
