@@ -360,9 +360,9 @@ def depths_from_msg(msg: Any, image_frame: str, camera: Camera, bboxes_xyxy: NDA
     image_frame : str
         The coordinate frame of the colour image. Depth in another one is not registered.
     camera : Camera
-        Of the colour image.
+        Camera of the colour image.
     camera_info : sensor_msgs/CameraInfo, optional
-        Of a depth camera that is not registered.
+        camera_info of a depth camera that is not registered.
     color_from_depth : ndarray (4, 4), optional
         Its pose, seen from the colour camera.
 

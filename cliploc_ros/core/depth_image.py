@@ -86,7 +86,7 @@ def depths_of_boxes(depth: DepthImage, camera: Camera, bboxes_xyxy: NDArray[np.f
     Parameters
     ----------
     camera : Camera
-        Of the colour image.
+        Camera of the colour image.
     bboxes_xyxy : ndarray (n, 4)
         Boxes in the colour image, as detected.
 

@@ -143,9 +143,9 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
     looks : Looks, optional
         Results of earlier frames, which have to agree.
     recognizer : ImageRecognizer, optional
-        Of the keyframes.
+        Recognizer of the keyframes.
     budget : TimeBudget, optional
-        Of the first search; by default a new one, as for each search after it.
+        Budget of the first search; by default a new one, as for each search after it.
     cameras : CameraCheck, optional
         What is known of the cameras.
 
@@ -204,7 +204,7 @@ class Localizer:
     Parameters
     ----------
     keyframes : KeyframeLocalizer, optional
-        Of the keyframes of the map.
+        Localizer among the keyframes of the map.
     """
 
     def __init__(self, relocalizer: Relocalizer, keyframes: KeyframeLocalizer | None = None
@@ -447,6 +447,6 @@ def instants_to_fuse(instants: Sequence[KeptInstant], observation: Observation, 
 
 
 def _steps(before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[float, float]:
-    """Return how far a camera drove and turned, in the steps that make a frame a new one."""
+    """Return the distance and turn of a camera, in units of the limits of an equal view."""
     distance_m, angle_deg = pose_error(before, after)
     return distance_m / SAME_VIEW.distance_m, angle_deg / SAME_VIEW.angle_deg

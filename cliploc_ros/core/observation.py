@@ -76,10 +76,10 @@ def check_planar(covariance: NDArray[np.float64]) -> None:
 class Region:
     """Where the robot probably is, whatever its camera shows: a Gaussian in one map."""
 
-    frame_id: str  #: Of the map
+    frame_id: str  #: frame_id of the map
     mean: NDArray[np.float64]  #: (3,): x [m], y [m] and yaw [rad] of the body
     covariance: NDArray[np.float64]  #: (3, 3): of these, positive definite
-    probability: float  #: That this is right, 0 to 1; else the robot may be anywhere
+    probability: float  #: Probability that this is right; else the robot may be anywhere
     #: (4, 4): the body, whose x axis points ahead; by default one that looks as the camera does
     camera_from_body: NDArray[np.float64] = field(default_factory=OPTICAL_FROM_BODY.copy)
 

@@ -166,7 +166,7 @@ def replace_set(path: Path, digest: str, write: WriteOfSet,
                     with suppress(FileNotFoundError):  # a reader has done it
                         _take_place(staged[other], other)
             except OSError as error:
-                raise OptionsError(f'{other}: is not of {path.name} that was written; it cannot '
+                raise OptionsError(f'{other}: belongs to an older {path.name}; it cannot '
                                    f'be removed: {error.strerror}; remove it') from error
 
 

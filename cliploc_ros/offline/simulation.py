@@ -62,12 +62,12 @@ class DetectorModel:
 
     landmark_map: LandmarkMap  #: What there is to see
     camera: Camera
-    sightings: tuple[Sightings, ...]  #: Of each landmark; empty without a recording
+    sightings: tuple[Sightings, ...]  #: Sightings of each landmark; empty without a recording
     #: (L,): share of the expected frames in which each landmark was detected, and from how far
     #: away it can be [m]
     ratios: NDArray[np.float64]
     reach_m: NDArray[np.float64]
-    edge_scale: float  #: Of the standard deviations of edges
+    edge_scale: float  #: Scale of the standard deviations of edges
     min_side_px: float  #: Smaller boxes are not detected
     #: tuple of ((k, 4), tuple of str): boxes [px] of no landmark in single frames, and their
     #: classes

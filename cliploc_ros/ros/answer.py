@@ -58,9 +58,9 @@ class Answer:
     #: Whether time was too short for all crops, which could have changed the verdict
     is_cut: bool = False
     stages_ms: Mapping[str, float] = field(default_factory=dict)  #: How long each stage took [ms]
-    #: Of the map that was searched, see frame_localizer.load_hashed_map; empty without one
+    #: Hash of the searched map, see frame_localizer.load_hashed_map; empty without one
     map_hash: str = ''
-    kind: RefusalKind | None = None  #: Of a refusal; None for other verdicts
+    kind: RefusalKind | None = None  #: Kind of a refusal; None for other verdicts
     header: Header | None = None  #: Stamp of the image, frame of the map; None without an image
     #: The deciding figures, as doc/interface.md describes them
     figures: Mapping[str, object] = field(default_factory=dict)

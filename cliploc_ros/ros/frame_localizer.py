@@ -82,7 +82,7 @@ class FrameLocalizer:
     Parameters
     ----------
     relocalizer : Relocalizer
-        Of the map, with these options.
+        Relocalizer of the map, with these options.
     device : str
         Where the observer's network runs.
     map_hash : str

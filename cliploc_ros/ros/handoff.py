@@ -137,7 +137,7 @@ class HandOff:
             When to return at the latest, and when the image arrived (monotonic clock) [s]. A
             hand-over that need not wait is made after the deadline, too.
         jumps : TimeJumps
-            Of the node's clock.
+            Time jumps of the node's clock.
 
         Raises
         ------

@@ -135,7 +135,7 @@ def parameters_of_files(files: Sequence[Path], name: str) -> list[Parameter]:
     Parameters
     ----------
     name : str
-        Of the node, with its namespace.
+        Name of the node, with its namespace.
 
     CliplocError: names the file and what is wrong with it.
     """

@@ -106,7 +106,7 @@ def match_markers(header: Header, camera_position: NDArray[np.float64],
     camera_position : ndarray (3,)
         [m].
     centers : sequence of ndarray (3,)
-        Of the landmarks [m].
+        Centres of the landmarks [m].
     accepted : bool
         Green if so, else red.
     """
@@ -158,7 +158,7 @@ def beside_keyframe(canvas: NDArray[np.uint8], seen: RecognizedPlace, layer: Key
     seen : RecognizedPlace
         With one keyframe at least.
     layer : KeyframeLayer
-        That it was recognized in.
+        Layer of the keyframe.
     """
     keyframe = seen.keyframes[0]
     height, width = canvas.shape[:2]

@@ -68,7 +68,7 @@ class _Known:
 
     state: WatchState = WatchState.UNCERTAIN
     reason: str = 'no look yet'
-    report: WatchReport | None = None  #: Of the last look; None where it says nothing any more
+    report: WatchReport | None = None  #: Report of the last look, while it holds
     looked_at: float = 0.0  #: When that was (monotonic clock) [s]
     problem: str = ''  #: The cause that prevents looks, and what to do
 
@@ -264,7 +264,7 @@ class Watcher:
             self._node.diagnostics.publish()
 
     def _miss(self, stopped: threading.Event, problem: str, since: float = float('inf')) -> None:
-        """Say that nothing can be seen; a verdict of a look since a moment stands meanwhile."""
+        """Report a problem that prevents looks, unless there was a look after `since`."""
         known = self._known
         if known.report is None or known.looked_at < since:
             self._say(_Known(reason=problem, problem=problem), stopped)

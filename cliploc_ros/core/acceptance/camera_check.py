@@ -118,7 +118,7 @@ class CameraOdds(NamedTuple):
         Parameters
         ----------
         covariance : ndarray (6, 6)
-            Of the pose, with a right camera.
+            Covariance of the pose, with a right camera.
         moves : ndarray (3, 7)
             See CameraLook.
         """

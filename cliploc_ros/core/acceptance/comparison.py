@@ -86,7 +86,7 @@ class Comparison:
     looks : Looks, optional
         Earlier looks, which have to agree.
     recognizer : ImageRecognizer, optional
-        Of the keyframes, for the last image: the places that it recognizes compete, too.
+        Recognizer of the keyframes for the last image; its places compete, too.
     """
 
     def __init__(self, joined: JoinedFrames, met: Sequence[Contender], looks: Looks = _NO_LOOKS,

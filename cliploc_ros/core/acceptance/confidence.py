@@ -77,7 +77,7 @@ class Support:
     #: Log odds of their depths, against those of objects that are somewhere else
     depth: float = 0.0
     _: KW_ONLY
-    #: Of each detection that shows an object, (frame, row): what it adds (7,) to inliers, score,
+    #: For each detection that shows an object, (frame, row): its share (7,) of inliers, score,
     #: misfit, likeness, rarity, unlabelled and depth
     shown: Mapping[tuple[int, int], NDArray[np.float64]] = field(
         default_factory=dict, compare=False, repr=False)

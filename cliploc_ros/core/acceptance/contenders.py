@@ -77,7 +77,7 @@ def without_depth(joined: JoinedFrames) -> JoinedFrames:
 class Contender(NamedTuple):
     """A pose that may be right, and its support."""
 
-    finalist: Finalist  #: Of the search of objects, or the pose of keyframes as one
+    finalist: Finalist  #: Finalist of the search of objects, or the pose of keyframes
     pose: NDArray[np.float64]  #: (4, 4): map_from_camera
     matches: list[tuple[Match, ...]]  #: Inliers in each of F frames
     support: Support  #: By objects

@@ -35,7 +35,7 @@ class DepthCheck(NamedTuple):
 
     objects: int  #: Number of matches with depth
     lacking: float  #: Log odds that they lack, against depths that agree exactly: their sum
-    spoilt: float  #: By how much less the boxes fit than they would without depth: Cauchy's sum
+    spoilt: float  #: Loss of the boxes' fit by the depth: Cauchy's sum
     ratio: float  #: Median of measured depths over those that the boxes alone say
 
     @property

@@ -35,7 +35,7 @@ SURE_MOTION = float(chi2.ppf(_TERMS.sure_motion, 6))
 class Motion(NamedTuple):
     """How well two looks agree with odometry: squared Mahalanobis distances, dof 6."""
 
-    square: float  #: Of the motion between the two poses from that by odometry
+    square: float  #: Squared distance between the motion of the two poses and odometry
     #: The least that a picture of the place, 1 to 3 m away, would have. Where it is small, the
     #: motion does not tell a picture from the place: a camera that only turns sees both move
     #: alike.
@@ -102,7 +102,7 @@ def signs_of(place: RecognizedPlace, support: Support, boxes: NDArray[np.float64
     Parameters
     ----------
     boxes : ndarray (b, 4)
-        That the pose explains: left, top, right, bottom [px].
+        Boxes that the pose explains: left, top, right, bottom [px].
     """
     size = np.array([camera.width, camera.height], dtype=np.float64)
     corners = np.clip(boxes.reshape(-1, 2), 0.0, size)

@@ -114,7 +114,7 @@ class Evidence:
     #: search that tried all samples
     meetings: float = math.inf
     unexplained: float = 0.0  #: Number of other detected objects of the map's classes
-    #: That the place is there and no picture of it; None where keyframes do not propose it
+    #: Signs that the place is real, not a picture; None if keyframes do not propose the pose
     signs: Signs | None = None
     motion: Motion | None = None  #: Since an earlier look by keyframes
     #: Probability that the image is not a mirror image, see cliploc_ros.core.acceptance.comparison

@@ -166,12 +166,12 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     Parameters
     ----------
     rotation, translation : ndarray (3, 3), (3,)
-        Of camera_from_map, with information, see refine_rig.
+        Rotation and translation of camera_from_map, with information, see refine_rig.
     instants : ndarray (F,)
         Number of the instant of each frame, in which odometry joins them: greater for later ones,
         equal for several cameras.
     shared : ndarray (L, 2), optional
-        By how much each landmark and its neighbours are displaced and turned together [m] [rad].
+        Common displacement and turn of each landmark and its neighbours [m] [rad].
     wrong_share : float
         Probability that an object is not where its match says.
     mount_deviation : tuple of float

@@ -53,7 +53,7 @@ def calibration_faults(sensor: Camera, k: NDArray[np.float64], r: NDArray[np.flo
     Parameters
     ----------
     sensor : Camera
-        Of whole images, by K and distortion or, of `rectified` images, by P.
+        Camera of the whole sensor, from K and distortion, or from P for `rectified` images.
     k, r, p : ndarray (3, 3), (3, 3), (3, 4)
         See sensor_msgs/CameraInfo. Zeros stand for no R and no P, and no K of rectified images.
     """

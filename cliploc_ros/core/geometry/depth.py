@@ -40,11 +40,11 @@ def centre_depth(measured, center, shape, sigma, rotation, translation):
     measured : ndarray (2,)
         Depth of the surface and its standard deviation [m]; 0, 0 if unknown.
     center, shape : ndarray (3,), (6,)
-        Of the landmark.
+        Centre and shape of the landmark.
     sigma : float
         Standard deviation of the centre on each axis [m].
     rotation, translation : ndarray (3, 3), (3,)
-        Of camera_from_map. It says how thick the landmark is along the ray.
+        Rotation and translation of camera_from_map. They give the thickness along the ray.
     """
     if not measured[1] > 0.0:
         return 0.0, 0.0

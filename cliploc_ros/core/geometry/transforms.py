@@ -87,7 +87,7 @@ def move_covariance(covariance: NDArray[np.float64], lever: NDArray[np.float64]
     Parameters
     ----------
     covariance : ndarray (6, 6)
-        Of x, y, z [m] and the rotations about the fixed X, Y, Z axes [rad] (ROS order).
+        Covariance of x, y, z [m] and the rotations about the fixed X, Y, Z axes [rad] (ROS order).
     lever : ndarray (3,)
         From the old origin to the new one, in the fixed frame [m].
     """

@@ -48,7 +48,7 @@ class FeatureKind:
 
     #: Identifies the descriptors: those of another kind must not be compared with these
     name: str
-    dimensions: int  #: Of a descriptor: d
+    dimensions: int  #: Dimensions of a descriptor: d
     #: Takes an image (h, w, 3), the most features, and the longest side that it is made smaller to
     extract: Callable[[NDArray[np.uint8], int, int], Features]
     #: An entry of a unit vector is stored as a byte: this plus `scale` times the entry

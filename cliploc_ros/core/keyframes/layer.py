@@ -57,7 +57,7 @@ class KeyframeLayer:
     #: The map's landmarks when the layer was made, which identify the map
     landmark_ids: tuple[str, ...]
     landmark_centers: NDArray[np.float32]  #: (L, 3): where they were [m]
-    camera: Camera  #: That took the keyframes, of the undistorted images; the first of several
+    camera: Camera  #: Camera of the undistorted images; the first of several
     map_from_camera: NDArray[np.float64]  #: (K, 4, 4)
     #: (K + 1,): keyframe k has the points from offsets[k] up to offsets[k + 1]
     offsets: NDArray[np.int64]
@@ -74,11 +74,11 @@ class KeyframeLayer:
     images: NDArray[np.uint8] | None = None
     #: (K + 1,): keyframe k has the bytes from image_offsets[k] up to image_offsets[k + 1]
     image_offsets: NDArray[np.int64] | None = None
-    other_cameras: tuple[Camera, ...] = ()  #: Of a robot with several cameras
+    other_cameras: tuple[Camera, ...] = ()  #: Further cameras of a robot with several cameras
     #: (K,): which camera took each keyframe, 0 for the first one; None: the first one took all
     camera_rows: NDArray[np.int64] | None = None
-    kind: FeatureKind = SIFT  #: Of the descriptors
-    set_digest: str = ''  #: Of the map that it was written with; '' where it is unknown
+    kind: FeatureKind = SIFT  #: Kind of the descriptors
+    set_digest: str = ''  #: Digest of the map that it was written with; '' where it is unknown
 
     def __len__(self) -> int:
         """Return the number of keyframes."""

@@ -117,9 +117,9 @@ class ImageFeatures:
     read_rgb : callable
         Returns the image (h, w, 3).
     camera : Camera
-        That took the image.
+        Camera of the image.
     kind : FeatureKind
-        Of the layer in which the image is localized.
+        Kind of features of the layer in which the image is localized.
     """
 
     def __init__(self, read_rgb: Callable[[], NDArray[np.uint8]], camera: Camera,

@@ -105,8 +105,8 @@ def free_focal(points: NDArray[np.float64], bearings: NDArray[np.float64],
     Returns
     -------
     logarithms, deviations : ndarray (2,)
-        Of the focal length as a multiple of the given one and of its aspect, x to y: the root of
-        the quotient. Their standard deviations, from those of the features alone.
+        Logarithms of the focal length, as a multiple of the given one, and of its aspect, x to y:
+        the root of the quotient. Their standard deviations, from those of the features alone.
     inliers : ndarray (k,) of int
         Rows of the points that agree.
     """

@@ -61,7 +61,7 @@ class LandmarkEmbeddings:
     #: (L + 1,): landmark l has the medoids from medoid_offsets[l] up to medoid_offsets[l + 1], at
     #: most five
     medoid_offsets: NDArray[np.int64]
-    set_digest: str = ''  #: Of the map that they were written with; '' where it is unknown
+    set_digest: str = ''  #: Digest of the map that they were written with; '' where it is unknown
 
     def __len__(self) -> int:
         """Return the number of landmarks."""
@@ -159,9 +159,9 @@ def with_images(labels: LabelEmbeddings, images: LandmarkEmbeddings, compare: st
     Parameters
     ----------
     labels : LabelEmbeddings
-        Of L landmarks.
+        Label embeddings of L landmarks.
     images : LandmarkEmbeddings
-        Of the same landmarks, at least one of them known.
+        Image embeddings of the same landmarks, at least one of them known.
     compare : str
         'image' or 'both'.
     """

@@ -87,7 +87,7 @@ class ClassIndex:
         others : sequence of (int, str)
             A landmark and another class of it, each pair once.
         weights : mapping, optional
-            Of a landmark and a class of it, see ClassIndex.
+            Weights of a landmark and a class of it, see ClassIndex.
         """
         names = [*landmark_classes, *(name for _, name in others)]
         numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}

@@ -275,7 +275,7 @@ class SearchedFrame(NamedTuple):
     """A frame and the result of the search among its samples."""
 
     observation: Observation
-    scene: Scene  #: Of the observation
+    scene: Scene  #: Scene of the observation
     vertical: NDArray[np.float64]  #: (7,): see VERTICAL_UNKNOWN
     leaders: Leaders  #: The best hypotheses, as poses of this frame's camera
     tilted: Leaders  #: The best hypotheses that ignore the vertical, where it is known; else none

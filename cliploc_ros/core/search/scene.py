@@ -59,7 +59,7 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
     bboxes : ndarray (n, 4)
         Boxes x, y, x, y on the plane z = 1 (undistorted).
     centers, shapes : ndarray (L, 3), (L, 6)
-        Of the landmarks.
+        Centres and shapes of the landmarks.
     potential : ndarray (n, L) of bool, or (p, 2) of int
         Which landmarks each detection may show: a mask, or pairs of detection and landmark.
     pairs : ndarray (c, 2)
@@ -101,7 +101,7 @@ class Constraint(NamedTuple):
     #: The vertical, unit vectors in the camera's optical frame and in the map frame
     up_in_camera: tuple[float, float, float] = (0.0, -1.0, 0.0)
     up_in_map: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    #: Of the camera's centre, along up_in_map from the map's origin [m]
+    #: Limits of the camera's centre along up_in_map, from the map's origin [m]
     min_height: float = -inf
     max_height: float = inf
     #: Greatest angle between both verticals at a pose from three points [rad]. Poses from two

@@ -114,11 +114,11 @@ class _Turn(NamedTuple):
 
 
 class TurnEstimate:
-    """The turns of the last looks. One from the spot of the last one replaces it."""
+    """The turns of the last looks. A look from the same spot replaces the last one."""
 
     def __init__(self) -> None:
         self._turns: deque[_Turn] = deque(maxlen=int(CALIBRATION.turn.most_looks))
-        #: None before it is known, or where it may be chance
+        #: None while it is unknown or may be chance
         self.turn: CameraTurn | None = None
 
     def add(self, alignment: Alignment, given: NDArray[np.float64], is_new: bool) -> None:

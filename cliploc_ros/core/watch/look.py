@@ -116,7 +116,7 @@ class LookEvidence(NamedTuple):
     known: int  #: Detections of the map's classes
     matched: int  #: Objects that are where the pose expects them
     unexplained: int  #: Other detections of the map's classes
-    utility: float  #: Of the matched objects, by the acceptance's model [log odds]
+    utility: float  #: Utility of the matched objects, by the acceptance's model [log odds]
     expected: int  #: Landmarks that the image should show
     missed: int  #: Those of them that no detection shows
     away_m: float  #: From the given pose to the best one near it

@@ -132,7 +132,8 @@ class WatchReport:
     """The verdict of the watch after a look."""
 
     state: WatchState
-    #: That the localizer's pose is right (within 1 m and 45 degrees), after all looks, 0 to 1
+    #: Probability that the localizer's pose is right (within 1 m and 45 degrees), after all looks,
+    #: 0 to 1
     probability: float
     reason: str  #: In one line: what happened, with which value, and what to do
     looks: int  #: Looks that said something since the last forget()
@@ -172,7 +173,7 @@ class Watch:
         image : ndarray (h, w, 3) of uint8, optional
             To find faults of the camera.
         recognizer : ImageRecognizer, optional
-            Of the keyframes, for this image.
+            Recognizer of the keyframes, for this image.
 
         Raises
         ------

@@ -70,7 +70,7 @@ class BagTopics:
     intrinsics: str | None = None  #: The camera to use in place of camera_info, see find_camera
     #: A depth image belongs to a colour image at most this far away in time [ns]
     tolerance_ns: int = STAMP_TOLERANCE_NS
-    tf: str | None = None  #: That leads from depth to image, see poses_of_tf
+    tf: str | None = None  #: tf from depth to image, see poses_of_tf
 
     def of_camera(self, name: str) -> 'BagTopics':
         """Return the topics of one of several cameras; '' changes nothing."""
@@ -149,7 +149,7 @@ class _Cameras(NamedTuple):
     """The messages of camera_info in a recording, with their stamps."""
 
     where: str
-    msgtype: str  #: Of the images
+    msgtype: str  #: Message type of the images
     rectified: bool
     infos: tuple[bytes, ...]  #: Those that differ; empty where a file says the camera
     #: (c,): when each message holds [ns], by its stamp or, without stamps, by its recording

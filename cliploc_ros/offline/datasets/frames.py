@@ -152,8 +152,8 @@ class ImageFile(NamedTuple):
     #: (4, 4): as the folder stores it, or map_from_camera; None where it is not known
     pose: NDArray[np.float64] | None = None
     depth: Path | None = None
-    confidence: Path | None = None  #: Of the depth: an image of its size, 0 where it is a guess
-    number: int | None = None  #: Of the image in a video
+    confidence: Path | None = None  #: Image of the depth's size, 0 for guesses
+    number: int | None = None  #: Number of the image in a video
 
 
 @dataclass(frozen=True)

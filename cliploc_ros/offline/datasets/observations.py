@@ -119,7 +119,7 @@ class Queries:
     """The content of a query file."""
 
     landmark_ids: tuple[str, ...]  #: The landmarks of the columns of the similarities
-    intrinsics_fx_fy_cx_cy: tuple[float, float, float, float]  #: Of the undistorted camera [px]
+    intrinsics_fx_fy_cx_cy: tuple[float, float, float, float]  #: Without distortion [px]
     frames: tuple[QueryFrame, ...]  #: In the file's order
 
     def __len__(self) -> int:

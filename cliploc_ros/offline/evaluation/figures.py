@@ -148,9 +148,9 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
     folder : Path
         Folder of the figures.
     summaries : sequence of Summary
-        Of the results.
+        Summaries of the results.
     sweep : mapping of str to mapping of int to Summary
-        Of each sampling method, by its number of iterations.
+        Summaries of each sampling method, by its number of iterations.
     observing_ms : mapping of str to float
         Mean times of the stages before the search, where recorded.
 

@@ -171,7 +171,7 @@ def compare(one: Summary, other: Summary, limit_m: float = 1.0, seed: int = 0) -
     Parameters
     ----------
     one, other : Summary
-        Of the same queries; the success of the other is subtracted.
+        Summaries of the same queries; the success of the other is subtracted.
     limit_m : float
         Limit of success.
     """

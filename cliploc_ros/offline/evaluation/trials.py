@@ -58,7 +58,7 @@ class Result:
     method: str
     trial: int  #: From 0; added to the seed of the run
     query: int  #: Number of the frame in its query file
-    timestamp: float  #: Of the image [s]
+    timestamp: float  #: Timestamp of the image [s]
     boxes: int  #: Number of detections
     #: Whether a pose was found, and whether it was accepted
     solved: bool
@@ -75,7 +75,7 @@ class Result:
     best_iteration: int  #: Iteration that found the best pose, from 1
     coverage: float  #: Share of its samples that the search tried
     reason: str  #: Reason of the refusal; empty when accepted
-    search_ms: float  #: Of the objects. The times are the only fields that differ from run to run.
+    search_ms: float  #: Search of objects. Only times differ from run to run.
     crops_share: float = 1.0  #: Share of the crops of its frames that were compared with labels
     #: With several maps, the map of the pose, which is in the coordinates of the first map: on
     #: another map, it is far away. Empty for a single map.
@@ -300,7 +300,7 @@ def simulate_depths(centers: NDArray[np.float64], shapes: NDArray[np.float64],
     Parameters
     ----------
     centers, shapes : ndarray (m, 3), (m, 6)
-        Of the ellipsoid that each box shows, in the map; NaN where it shows something else.
+        Ellipsoid of the object in each box, in the map; NaN for other things.
     map_from_camera : ndarray (4, 4)
     scale : float
         Measured over true depth.

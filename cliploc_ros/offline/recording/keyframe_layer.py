@@ -58,11 +58,11 @@ class LayerOptions:
     #: An image becomes a keyframe unless one of them is nearer than both. 0: every image.
     distance_m: float = 0.1
     angle_deg: float = 5.0
-    #: Of a keyframe. A point takes 146 bytes, so 600 make 4.4 MB of 50 keyframes.
+    #: Points per keyframe. A point takes 146 bytes: 600 points of 50 keyframes take 4.4 MB.
     most_points: int = 600
     #: Whether to store small images of the keyframes, too, for people to look at
     images: bool = False
-    kind: FeatureKind = SIFT  #: Of the features
+    kind: FeatureKind = SIFT  #: Kind of the features
 
     def __post_init__(self) -> None:
         """Refuse values that make no layer."""
@@ -91,7 +91,7 @@ class _Keyframe(NamedTuple):
     posed: PosedFeatures
     depths: NDArray[np.float64]
     jpeg: bytes
-    camera: Camera  #: Of the undistorted image
+    camera: Camera  #: Camera of the undistorted image
 
 
 def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions = _DEFAULT
@@ -293,7 +293,7 @@ def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float
     Parameters
     ----------
     camera : Camera
-        Of the colour image.
+        Camera of the colour image.
     pixels : ndarray (n, 2)
         In the colour image, distorted [px].
 

@@ -80,7 +80,7 @@ class LoadNetworks:
 
     detector: DetectorOptions
     clip: ClipOptions | None  #: None: classes and boxes only
-    threads: int = 0  #: Of a network on a CPU; 0 leaves its own choice
+    threads: int = 0  #: Threads of a network on a CPU; 0 leaves its own choice
 
     def __call__(self) -> Callable[[RawFrame], SeenFrame | str]:
         """Return the function that looks at a frame.

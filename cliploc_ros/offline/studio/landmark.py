@@ -92,7 +92,7 @@ class Marks:
 
     is_locked: bool = False  #: Edits are refused
     is_hidden: bool = False  #: The scene and the views leave it out
-    decision: str = ''  #: Of the review: accepted, fixed; '' for none
+    decision: str = ''  #: Decision of the review: accepted, fixed; '' for none
 
 
 @dataclass(frozen=True)

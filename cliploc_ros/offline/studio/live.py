@@ -53,14 +53,14 @@ class LivePose(NamedTuple):
     map_from_body: NDArray[np.float64]
     covariance: NDArray[np.float64]  #: (3, 3): of the position [m^2]
     frame_id: str  #: The coordinate frame of the pose
-    stamp_s: float  #: Of the image [s]
+    stamp_s: float  #: Stamp of the image [s]
 
 
 class LiveState(NamedTuple):
     """The last reports of the running relocalizer."""
 
     is_heard: bool  #: It reported within the last seconds
-    values: Mapping[str, str]  #: Of its last diagnostics
+    values: Mapping[str, str]  #: Values of its last diagnostics
     pose: LivePose | None  #: The last accepted one
 
     @property

@@ -42,12 +42,12 @@ _OPTIONS = CheckOptions(max_positions=100, headings=8)
 class Coverage(NamedTuple):
     """The coverage and the look-alikes of a map."""
 
-    landmarks: Landmarks  #: That were checked
+    landmarks: Landmarks  #: Checked landmarks
     grid: Grid  #: All positions; tried positions come first
-    check: GridCheck  #: Of the tried positions
+    check: GridCheck  #: Check of the tried positions
     look_alikes: tuple[LookAlike, ...]
     detector: str  #: The source of the detector's errors, in words
-    keyframes: KeyframeCheck | None  #: Of the tried positions; None without keyframes
+    keyframes: KeyframeCheck | None  #: Check of the tried positions; None without keyframes
 
     @property
     def figures(self) -> dict[str, str]:

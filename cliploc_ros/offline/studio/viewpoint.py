@@ -39,7 +39,7 @@ class Bounds(NamedTuple):
     """Where the map is."""
 
     middle: NDArray[np.float64]  #: (3,) [m]
-    radius_m: float  #: Of a sphere around almost all of it
+    radius_m: float  #: Radius of a sphere around almost all of it
     up: NDArray[np.float64]  #: (3,): the unit vector that points up
     floor_m: float  #: Height of the floor along ``up``
     top_m: float  #: Height of the highest landmark or camera

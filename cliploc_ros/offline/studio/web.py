@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Access to the page, and the answers of its port: our page, its images, and viser's scene.
 
-viser 1.1 lets everyone in who reaches its port. On the loopback interface these include all users
+viser 1.1 lets in everyone who reaches its port. On the loopback interface these include all users
 of this machine, and every page that its browsers show, since a browser opens WebSockets to any
 host. So each request needs the token that the studio prints, a request to this machine needs a
 loopback name as its host, and a WebSocket needs the studio's own page as its origin.

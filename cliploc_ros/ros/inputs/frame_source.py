@@ -58,7 +58,7 @@ class Frame:
     detected_at: float
     #: Depth of about the same time; None where there is none
     depth: Image | CompressedImage | None = None
-    depth_camera_info: CameraInfo | None = None  #: Of a depth camera that is not registered
+    depth_camera_info: CameraInfo | None = None  #: For unregistered depth
     camera: str = ''  #: Name of its camera; empty for the only one
     beside: tuple['Frame', ...] = ()  #: Those of other cameras at this instant
     left_out: tuple[str, ...] = ()  #: Names of the cameras without a frame of this instant
@@ -109,7 +109,7 @@ class FrameSource:
                        'depth_camera_info': 'depth_camera_info'}
         #: The relative names of the topics
         self.topics = {name: of_camera(camera, topic) for name, topic in topics.items()}
-        #: Of each topic the newest message, and when it arrived (monotonic clock) [s]
+        #: The newest message of each topic and its arrival (monotonic clock) [s]
         self.heard: dict[str, tuple[Any, float]] = {}
         #: Delay of the newest image after its stamp, and the delay nearest to 0 so far [s]
         self.lag_s, self.nearest_lag_s = math.nan, math.inf

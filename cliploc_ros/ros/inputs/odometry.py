@@ -136,10 +136,10 @@ class OdometryWindow:
         Parameters
         ----------
         position : ndarray (3,)
-            Of the robot in odometry's coordinate frame [m].
+            Position of the robot in odometry's coordinate frame [m].
         quat_xyzw : ndarray (4,)
         twist : ndarray (2, 3)
-            Of the robot in its own coordinate frame [m/s], [rad/s]. Many drivers leave it at 0.
+            Twist in the robot's coordinate frame [m/s], [rad/s]. Many drivers leave it at 0.
         """
         values = np.concatenate([position, quat_xyzw])
         length = float(np.linalg.norm(quat_xyzw))
@@ -260,7 +260,7 @@ def _step(before: _Pose, after: _Pose) -> NDArray[np.float64]:
 
 def _driven(speed: NDArray[np.float64], seconds: float, since_s: float = 0.0
             ) -> NDArray[np.float64]:
-    """Return move and turn (2, 3) at a speed, which is the mean since some time before."""
+    """Return move and turn (2, 3) at a speed, the mean since `since_s` ago."""
     move, turn = seconds * speed
     heading = cv2.Rodrigues((since_s + seconds) / 2 * speed[1])[0]
     return np.array([heading @ move, turn])
@@ -338,7 +338,7 @@ class OdometryPlace(NamedTuple):
     """Where odometry had the robot, or its camera, at the stamp of an image."""
 
     odom_from_frame: NDArray[np.float64]  #: (4, 4)
-    #: Places of one run share their odometry frame; those of different runs do not compare.
+    #: Places of one run share their odometry frame; places of different runs are not comparable.
     run: int
     way_m: float  #: Driven since the run began
     frame: str = ''  #: The coordinate frame whose pose this is

@@ -243,7 +243,7 @@ class RobotState:
     camera_from_base: NDArray[np.float64]
     #: The vertical, a unit vector (3,) in the camera's optical frame; None where it is not known.
     up_in_camera: NDArray[np.float64] | None = None
-    #: Of the camera; None where odometry does not cover the image.
+    #: Place of the camera; None where odometry does not cover the image.
     place: OdometryPlace | None = None
     #: (4, 4): the pose of a depth camera that is not registered; None where tf2 lacks it
     camera_from_depth: NDArray[np.float64] | None = None

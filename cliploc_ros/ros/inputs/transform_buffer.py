@@ -15,8 +15,8 @@ class TransformBuffer(Buffer):
 
     tf2 itself refuses transforms that are ten seconds older than the newest one, and interpolates
     between those from before and after a shorter jump. Jazzy's Buffer clears itself only where it
-    is given a node, and its first releases raise TypeError there. Also, transforms from before
-    the jump may arrive after the clock's. clear() keeps static transforms.
+    is given a node, and its first releases raise TypeError there. Transforms from before the
+    jump may also arrive after the clock's jump. clear() keeps static transforms.
     """
 
     def __init__(self, node: Node) -> None:

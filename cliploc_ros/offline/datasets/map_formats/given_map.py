@@ -250,7 +250,7 @@ def read_msgloc(path: Path, class_names: Sequence[str]) -> GivenMap:
     path : Path
         A JSON file.
     class_names : sequence of str
-        Of the class indices; a file may also name classes.
+        Names of the class indices; a file may also name classes.
     """
     given = GivenMap([], [], [])
     negative = 0

@@ -81,7 +81,7 @@ def read_oaslam(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
     path : Path
         map_objects_NAME.txt, or map_NAME.mapobjects next to map_NAME.objecttracks.
     class_names : sequence of str
-        Of the category indices.
+        Names of the category indices.
     """
     if path.suffix == '.mapobjects':
         return _read_saved_map(path, class_names)
