@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The poses of all sources compared: the likeliest one, and the evidence for and against it.
+"""Compare the poses of all sources: the most likely pose, and the evidence about it.
 
 Poses that the search of objects met and poses that keyframes recognized compete in one list. Each
-is measured on the detections of all frames and on the points of the keyframes. The likeliest one
-leads, and the evidence for it is all that decides whether it is accepted.
+is measured on the detections of all frames and on the points of the keyframes. The most likely
+pose leads, and the evidence for it is all that decides whether it is accepted.
 
 A pose may explain a mirror image well: of a room in a mirror, or of a flipped camera. A camera on
 the other side of a plane sees the points of the plane mirrored, at the same distances: objects on
@@ -256,7 +256,7 @@ class Comparison:
         return 1.0 if self.place or chance < self._joined.options.min_confidence else 1.0 - chance
 
     def _rival(self) -> Rival | None:
-        """Return the likeliest pose that does not agree with the leading one."""
+        """Return the most likely pose that disagrees with the leading pose."""
         others = np.nonzero(~self.leading)[0]
         if len(others) == 0:
             return None
@@ -281,8 +281,8 @@ class Comparison:
     def _distinct(self) -> tuple[float, Place | None]:
         """Return the probability that no place that looks alike has the leading pose's camera.
 
-        Next to it is where the camera would be at the likeliest of these places. Keyframes tell a
-        twin apart as far as they cover it.
+        Next to it is where the camera would be at the most likely of these places. Keyframes tell
+        a twin apart as far as they cover it.
         """
         joined, landmark_map = self._joined, self._joined.landmark_map
         best, (low, high) = self.contenders[0], joined.options.height_range_m

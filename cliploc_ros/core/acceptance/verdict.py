@@ -76,7 +76,7 @@ class Refusal(NamedTuple):
 
 @dataclass(frozen=True)
 class Rival:
-    """The likeliest pose that does not agree with the leading one."""
+    """The most likely pose that disagrees with the leading pose."""
 
     likely: float  #: Its probability
     place: Point  #: Where its camera is [m]
@@ -98,7 +98,7 @@ class Evidence:
     by_points: float = 0.0
     rival: Rival | None = None
     distinct: float = 1.0  #: Probability that no look-alike place is mistaken for its place
-    #: Where the camera is, and where it would be at the likeliest place that looks alike [m]
+    #: Where the camera is, and where it would be at the most likely look-alike place [m]
     place: Point = (0.0, 0.0, 0.0)
     twin: Point | None = None
     twin_map: str = ''  #: Name of the twin's map, where there are several

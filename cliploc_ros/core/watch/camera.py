@@ -145,7 +145,7 @@ class TurnEstimate:
 
 def _turn_of(pose: NDArray[np.float64], information: NDArray[np.float64],
              given: NDArray[np.float64]) -> _Turn:
-    """Return the turn from a given pose (4, 4) to the fitted pose, at the likeliest position.
+    """Return the turn from a given pose (4, 4) to the fitted pose, at the most likely position.
 
     The given position is right to within the drift of a localizer, so what moves the fit away from
     it is in part a turn: the least squares of the fit and of the given position together.

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One look at a given pose: the pose near it that fits best, and whether the given one is right.
+"""One look at a given pose: the best pose near it, and the evidence that the given pose is right.
 
 A localizer drifts by decimetres and a few degrees, and a camera may be turned on its robot. Then
-outlines miss the boxes of small objects. So a grid of turns and shifts about the given pose is
-scored, and the best few are refined; nothing else of the map is searched.
+outlines miss the boxes of small objects. A grid of turns and shifts about the given pose is
+therefore scored, and the best few are refined. The rest of the map is not searched.
 
-The evidence is the log odds that the given pose is right, against one elsewhere: a logistic model
-of looks of right and of wrong poses in simulated worlds, as many of each, so its log odds are
-those of a likelihood ratio. Right poses include those of places that changed since they were
-mapped: some objects fit, others are missing or stand where nothing is mapped. At a wrong pose of
-the same map little fits.
+The evidence is the log odds that the given pose is right rather than a pose elsewhere. They come
+from a logistic model, fitted to equal numbers of looks at right and at wrong poses in simulated
+worlds, so they are the logarithm of a likelihood ratio. Right poses include places that changed
+since they were mapped: some objects fit, others are missing or stand where nothing is mapped. At a
+wrong pose of the same map, little fits.
 """
 
 import math

@@ -48,7 +48,7 @@ _MIN_MEAN_LENGTH = 0.95
 _MAX_CONTRADICTION_DEG = 5.0
 #: Samples so near an image are averaged [ns]: vibration is faster, and robots turn slowly.
 WINDOW_NS = 100_000_000
-# A second of the fastest usual IMU.
+# Messages of the fastest usual IMU in a second.
 _MAX_SAMPLES = 1000
 # sensor_msgs/Imu: the first element of the covariance of a field that is not measured.
 _NOT_MEASURED = -1.0

@@ -28,7 +28,7 @@ _SPARE = 1.5
 # This many messages in a row with a stamp of their own show that each has one: stamps in whole
 # seconds differ at times, too. The same message comes again twice, as relays send it, or more.
 _SHOWN, _REPEATED = 3, 2
-# Ten seconds of a camera at 30 Hz.
+# Images of a camera at 30 Hz in ten seconds.
 _REMEMBERED = 300
 # Messages come so evenly after their stamps, also where a simulation or a bag runs at another
 # rate; what comes otherwise is of another clock (a guess).
@@ -198,7 +198,7 @@ class ExactPairing:
         return complete
 
     def waits_near(self, topic: str, stamp_ns: int, tolerance_ns: float) -> bool:
-        """Return whether an item of a topic waits whose stamp is near another one."""
+        """Return whether a waiting item of a topic has a stamp near a given one."""
         return any(abs(one - stamp_ns) <= tolerance_ns for one in self._waiting[topic])
 
     def oldest(self, topic: str) -> Any:
