@@ -235,7 +235,7 @@ def split_ros_args(args: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 class StageBar:
-    """A progress bar that names the stage; nothing where there is no terminal."""
+    """A progress bar that names the stage; nothing if there is no terminal."""
 
     def __enter__(self) -> Self:
         """Show the bar."""

@@ -290,7 +290,7 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
 
 
 def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':
-    """Return how the poses may be off; None where that is unknown, or not to be refined."""
+    """Return how the poses may be off; None if that is unknown, or not to be refined."""
     from cliploc_ros.offline.mapping.options import PoseErrors
 
     if options.joint is False:

@@ -158,7 +158,7 @@ def check(options: argparse.Namespace) -> int:
 
 
 def _check_keyframes(layer: 'KeyframeLayer | None', detections: 'PosedDetections | None') -> int:
-    """Say what a map without landmarks does; return the exit code of one that did not pass."""
+    """Report on a map without landmarks; return the exit code of a map that did not pass."""
     from cliploc_ros.offline.mapping.check.report import in_reach
 
     if layer is None:

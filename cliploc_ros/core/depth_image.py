@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.errors import DatasetError
 
-#: Of a 16-bit depth image, by ROS's convention and by that of the TUM RGB-D dataset [m].
+#: Units of a 16-bit depth image: the conventions of ROS and of the TUM RGB-D dataset [m].
 MILLIMETRE, TUM_UNIT = 1e-3, 1 / 5000
 # The inner part of a box that counts, in each direction, and how many values it needs.
 _INNER_SHARE = 0.5
@@ -30,7 +30,7 @@ PLAUSIBLE_DEPTH_M = (0.15, 40.0)
 class DepthCamera:
     """A depth camera whose images are not registered to the colour images."""
 
-    #: Of the depth image [px]
+    #: Focal lengths and principal point of the depth image [px]
     fx: float
     fy: float
     cx: float

@@ -106,7 +106,7 @@ def by_classes(observation: Observation, landmarks: int) -> Observation:
 def recorded_crops(observation: Observation, options: RelocalizerOptions) -> Crops | None:
     """Return the crops on demand of an observation that has all similarities.
 
-    A search gets only those that it needs; None where the options give it all at once.
+    A search gets only the crops that it needs; None if the options give it all at once.
     """
     if options.crops != 'on_demand' or not can_do_without_crops(options):
         return None

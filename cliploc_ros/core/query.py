@@ -37,7 +37,7 @@ class Query:
     #: One of each camera, with one stamp and a camera_name each; the camera to localize is last.
     #: odom_from_camera links the cameras of an instant, and the instants of one run.
     frames: tuple[Observation, ...]
-    #: (h, w, 3) uint8, red first: of each frame; empty where nothing is read from images
+    #: (h, w, 3) uint8, red first: of each frame; empty if nothing is read from images
     images: tuple[NDArray[np.uint8], ...] = ()
     #: Number of the run of odometry; None: this instant is linked to no other
     run: int | None = 0

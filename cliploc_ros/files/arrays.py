@@ -28,8 +28,7 @@ Arrays = Mapping[str, NDArray[Any]]
 # Kinds of numpy's types; any other type of a field is the name of one.
 _KINDS = {'text': 'U', 'numbers': 'fiu', 'floats': 'f', 'integers': 'iu', 'booleans': 'b'}
 _ROWS_AT_ONCE = 10_000
-# Of a member of a zip file: where the lengths of its name and of a further field stand, and where
-# the name begins.
+# Offsets in a member of a zip file: the lengths of its name and of a further field, and the name.
 _ZIP_LENGTHS, _ZIP_HEAD = 26, 30
 # Arrays may take this much memory [bytes], or this many times what the file takes on the disk: a
 # small file may declare any size, and so may one with holes.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Reading files of any origin, where files are kept, and how one takes the place of another."""
+"""Read files of any origin, find folders for files, and replace files safely."""
 
 import atexit
 import errno

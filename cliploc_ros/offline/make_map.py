@@ -60,7 +60,7 @@ class Labeller:
     #: names
     clip: ClipOptions | None = None
     weights: ClipWeights | None = None
-    note: str = ''  #: Why labels are class names; '' where they are not
+    note: str = ''  #: Why labels are class names; '' if they are not
 
     def describe(self, landmark_map: LandmarkMap, detections: PosedDetections,
                  shown: NDArray[np.int64]) -> tuple[LandmarkMap, LandmarkEmbeddings | None]:

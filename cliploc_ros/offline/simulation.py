@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What detector and CLIP of a robot would say; for check_map, the studio and studies.
+"""Simulated detector and CLIP of a robot; for check_map, the studio and studies.
 
 The detector's boxes have guessed or measured errors. CLIP's similarities of crops and labels are
 simulated: a label is a vector, a part of its class and a part of its words, each word a random
@@ -37,12 +37,12 @@ _GUESSED_RATIO = 0.6
 _GUESSED_REACH_M = 5.0
 GUESSED_MIN_SIDE_PX = 12.0
 _GUESSED_CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
-# Of the vectors of labels and crops.
+# Length of the vectors of labels and crops.
 _SIZE = 256
-#: Of a vector's square: what all objects of a class share.
+#: Part of a vector's square that all objects of a class share.
 CLASS_SHARE = 0.3
 _NOISE = 0.43
-# Of the noise's variance: what all crops of one landmark share.
+# Part of the noise's variance that all crops of one landmark share.
 _SHARED_NOISE = 0.3
 _STOP_WORDS = frozenset((
     'a', 'an', 'and', 'at', 'by', 'from', 'in', 'is', 'of', 'on', 'or', 'seen', 'standing', 'the',

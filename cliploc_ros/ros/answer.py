@@ -156,7 +156,7 @@ class CaseRecorder:
         self._last = Answer(Verdict.FAILED, 'no request yet')
 
     def add(self, answer: Answer) -> None:
-        """Keep what was found in a frame."""
+        """Keep the result of a frame."""
         if not self._keeps:
             return
         with self._lock:

@@ -60,7 +60,7 @@ _SPIN_S = 0.05
 
 
 class State(StrEnum):
-    """Whether a check passed."""
+    """The result of a check."""
 
     PASS = 'pass'
     FAIL = 'fail'
@@ -93,7 +93,7 @@ class Report:
         self.add(what, State.FAIL if problem else State.PASS, problem or text)
 
     def skip(self, what: str, text: str) -> None:
-        """Add what was not checked, and why."""
+        """Add a check that was not made, with the reason."""
         self.add(what, State.NOT_CHECKED, text)
 
     @contextmanager
@@ -200,7 +200,7 @@ def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
 
 def _check_map(node: Doctor, parameters: RelocalizerParameters, report: Report
                ) -> FrameLocalizer | None:
-    """Load map, keyframes and CLIP; return them, None where that fails."""
+    """Load map, keyframes and CLIP; return them, None if that fails."""
     began_at = time.monotonic()
     with report.failing('map'):
         localizer = node.worker.run(partial(load_localizer, node, parameters))

@@ -33,7 +33,7 @@ WATCHES = ('none', 'tf', 'amcl_pose')
 REACTIONS = ('report', 'relocalize')
 
 _FILE, _PACKAGE = 'file://', 'package://'
-# Of timeout_s, for algorithms other than auto.
+# Share of timeout_s for the search of algorithms other than auto.
 _SEARCH_SHARE = 0.5
 
 

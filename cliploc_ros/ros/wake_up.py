@@ -131,7 +131,7 @@ class Turning:
 
 
 class Outcome(IntEnum):
-    """How a wake-up ended: the exit code."""
+    """The end of a wake-up: its exit code."""
 
     ACCEPTED = 0
     REFUSED = 1

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether to accept a pose.
+"""Acceptance of a pose.
 
 The modules in the order in which a pose passes them:
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the boxes of a camera agree with its image, its camera_info, its mount and the map.
+"""Check that the boxes of a camera agree with its image, camera_info, mount and the map.
 
 A wrong camera_info, or boxes in other pixels, displace all boxes by one rule. One image hardly
 shows it, because the pose adapts. Many images do, because their poses differ and the rule stays. A
@@ -215,7 +215,7 @@ class Views(NamedTuple):
 
 
 class Extent:
-    """Where the boxes of a camera end, over some frames, accepted or not."""
+    """The borders at which the boxes of a camera end, over some frames, accepted or not."""
 
     def __init__(self) -> None:
         self.boxes = np.empty((0, 4))  #: (n, 4) [px]

@@ -213,7 +213,7 @@ class Setting(NamedTuple):
     """The setting of a pose: with the supports, it determines the chance of a wrong pose."""
 
     landmarks: int  #: Number of landmarks in the map
-    #: Standard deviation of the known vertical [deg]; infinite where none is known
+    #: Standard deviation of the known vertical [deg]; infinite if none is known
     vertical_deg: float = math.inf
 
     @property

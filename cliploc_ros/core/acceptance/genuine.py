@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a place is where the camera is, and as it was mapped: not a picture, and not changed.
+"""Check that a recognized place is genuine: neither a picture of the place nor changed.
 
 Objects and points that lie in a picture of a place agree on where it was taken. Neither judges
 the other: they see the same pixels. The differences lie around the picture, in its size and
@@ -33,7 +33,7 @@ SURE_MOTION = float(chi2.ppf(_TERMS.sure_motion, 6))
 
 
 class Motion(NamedTuple):
-    """How well two looks agree with odometry: squared Mahalanobis distances, dof 6."""
+    """Agreement of two looks with odometry: squared Mahalanobis distances, dof 6."""
 
     square: float  #: Squared distance between the motion of the two poses and odometry
     #: The least that a picture of the place, 1 to 3 m away, would have. Where it is small, the

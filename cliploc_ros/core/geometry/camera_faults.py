@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a camera is plausible: intrinsics of another resolution, unit or lens."""
+"""Check that a camera is plausible: intrinsics of another resolution, unit or lens."""
 
 import math
 from collections.abc import Iterable, Iterator

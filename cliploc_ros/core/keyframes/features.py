@@ -44,7 +44,7 @@ class Features:
 
 @dataclass(frozen=True)
 class FeatureKind:
-    """How features of a kind are found, stored and compared."""
+    """Extraction, storage and comparison of one kind of features."""
 
     #: Identifies the descriptors: those of another kind must not be compared with these
     name: str
@@ -57,8 +57,8 @@ class FeatureKind:
     #: The most similar feature of another image is at most this share as far as the second one
     ratio: float = _RATIO
     least_inliers: int = 0  #: With fewer features that agree, a pose may be one of chance
-    #: Of an image that is to be localized, at first: its longest side, and the most features. At
-    #: the size of keyframes, features take twice the time at equal success.
+    #: The fast pass: longest side of the image, and the most features. At the size of keyframes,
+    #: features take twice the time at equal success.
     query_px: int = 400
     query_most: int = 600
 

@@ -78,7 +78,7 @@ class KeyframeLayer:
     #: (K,): which camera took each keyframe, 0 for the first one; None: the first one took all
     camera_rows: NDArray[np.int64] | None = None
     kind: FeatureKind = SIFT  #: Kind of the descriptors
-    set_digest: str = ''  #: Digest of the map that it was written with; '' where it is unknown
+    set_digest: str = ''  #: Digest of the map that it was written with; '' if it is unknown
 
     def __len__(self) -> int:
         """Return the number of keyframes."""

@@ -28,7 +28,7 @@ _OF_X_AND_Y = np.array([[1.0, 1.0], [1.0, -1.0]])
 _LEAST_DEVIATION = 0.5 / 525.0
 # Points behind the camera count as points before it at this depth [m].
 _LEAST_DEPTH = 1e-3
-# Of a normal distribution: standard deviation divided by the median of absolute values.
+# Standard deviation of a normal distribution over its median of absolute values.
 _FROM_MEDIAN = 1.4826
 
 
@@ -43,7 +43,7 @@ class PointPose(NamedTuple):
 
 def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], iterations: int = 3000,
               are_best_first: bool = False) -> PointPose | None:
-    """Return the pose that most points agree with; None where there is none.
+    """Return the pose that most points agree with; None if there is none.
 
     MSAC of OpenCV finds it, and robust least squares refines it on the inliers. Its own local
     optimization, MAGSAC++ and PoseLib took longer at equal success. Points (n, 3) are in the map

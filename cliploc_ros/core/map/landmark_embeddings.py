@@ -61,7 +61,7 @@ class LandmarkEmbeddings:
     #: (L + 1,): landmark l has the medoids from medoid_offsets[l] up to medoid_offsets[l + 1], at
     #: most five
     medoid_offsets: NDArray[np.int64]
-    set_digest: str = ''  #: Digest of the map that they were written with; '' where it is unknown
+    set_digest: str = ''  #: Digest of the map that they were written with; '' if it is unknown
 
     def __len__(self) -> int:
         """Return the number of landmarks."""
@@ -103,7 +103,7 @@ def embeddings_path(map_path: str | os.PathLike[str]) -> Path:
 
 def load_embeddings_of_map(map_path: str | os.PathLike[str], landmark_ids: Sequence[str],
                            map_set: MapSet = NO_SET) -> LandmarkEmbeddings | None:
-    """Return the embeddings of a map's landmarks, in its order; None where it has no such file.
+    """Return the embeddings of a map's landmarks, in its order; None if it has no such file.
 
     Landmarks that were removed from the map are left out; added landmarks are unknown.
 

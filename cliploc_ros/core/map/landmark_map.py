@@ -73,8 +73,8 @@ class ClassIndex:
     #: (m,): landmarks grouped by class, in the map's order within a class
     landmarks: NDArray[np.int64]
     starts: NDArray[np.int64]  #: (C + 1,): where each class begins in landmarks
-    #: Of (landmark, class), its share over that of the landmark's most frequent class, 0 to 1;
-    #: missing ones count 1
+    #: Share of a class, by (landmark, class), relative to the landmark's most frequent class, 0 to
+    #: 1; missing pairs count 1
     weights: Mapping[tuple[int, int], float] = field(default_factory=dict)
 
     @staticmethod
@@ -200,7 +200,7 @@ class LandmarkMap:
     semi_axes: NDArray[np.float64]  #: (L, 3): half lengths along each landmark's own axes [m]
     #: (L, 4): unit quaternions that rotate landmark axes into map axes
     quats_xyzw: NDArray[np.float64]
-    #: Optional fields of each landmark; empty where the map has none
+    #: Optional fields of each landmark; empty if the map has none
     details: tuple[LandmarkDetails, ...] = ()
     map_set: MapSet = NO_SET  #: Identity that the files next to the map must have
 

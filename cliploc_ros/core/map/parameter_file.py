@@ -187,7 +187,7 @@ class MapSet(NamedTuple):
     digest: str = ''  #: Digest of this map
 
 
-#: Of a map that does not say it.
+#: The set of a map that names none.
 NO_SET = MapSet()
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which landmarks an image should show at a pose, and which are no longer there.
+"""Find the landmarks that an image should show at a pose, and landmarks that are gone.
 
 An image should show the landmarks that are near, large, wholly in view and not hidden. Walls are
 in no map, so an expected landmark may be hidden. If the image shows a landmark beside it, it is

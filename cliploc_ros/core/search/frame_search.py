@@ -89,8 +89,8 @@ def class_candidates(index: ClassIndex, classes: NDArray[np.int64], limit: int |
                      ) -> Candidates:
     """Return the pairs of equal class, detection by detection.
 
-    With a limit there are no more than that, beginning with the rarest classes: a pair is the more
-    probable, the fewer landmarks its class has.
+    A limit keeps the pairs of the rarest classes: pairs of a class with few landmarks are the most
+    probable.
 
     Parameters
     ----------
@@ -246,8 +246,8 @@ def _candidates(landmark_map: LandmarkMap, class_ids: Sequence[str],
                 options: RelocalizerOptions) -> tuple[Candidates, int]:
     """Return the candidates in the order of the sampler, and how many are left out.
 
-    Of pairs of equal class auto has at most MAX_CANDIDATES. Each of several maps gets an equal
-    share, and they take turns: a search that is cut short has looked for rivals on all of them.
+    auto uses at most MAX_CANDIDATES pairs of equal class. Several maps get equal shares and take
+    turns, so that a search that is cut short has looked for rivals in all of them.
     """
     index = landmark_map.classes
     if nearest is not None:

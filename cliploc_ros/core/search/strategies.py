@@ -390,7 +390,7 @@ def same_place(rotation_a, translation_a, rotation_b, translation_b):
 
 
 class Progress(NamedTuple):
-    """How far a search is."""
+    """The progress of a search."""
 
     tried: int  #: Hypotheses tried so far
     coverage: float  #: The share of its samples that were tried, 0 to 1

@@ -50,7 +50,7 @@ class ImageFaults:
     def add(self, image: NDArray[np.uint8], pose: NDArray[np.float64]) -> str:
         """Take in an image (h, w, 3) from a pose (4, 4), by odometry if known; return the fault.
 
-        The text is empty where there is none.
+        The text is empty if there is none.
         """
         terms = CALIBRATION.images
         width = int(terms.width_px)

@@ -120,7 +120,7 @@ def _correlation(one: _Look, look: _Look) -> float:
 
 
 class WatchState(StrEnum):
-    """Whether a localizer's pose is right."""
+    """State of a localizer's pose."""
 
     LOCALIZED = 'localized'
     UNCERTAIN = 'uncertain'

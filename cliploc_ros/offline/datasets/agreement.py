@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether images and poses of a recording agree, and if not, which other reading of them does.
+"""Check that images and poses of a recording agree, and find the reading of them that does.
 
 What two images both show lies on epipolar lines. Only pairs count whose matches some epipolar
 geometry explains, whatever the poses are: images that do not overlap tell nothing.
@@ -77,7 +77,7 @@ def w_first(pose: _Pose) -> _Pose:
 
 
 def check_agreement(views: Sequence[View], readings: Mapping[str, Reading], where: object) -> str:
-    """Return a note where images and poses do not fit; '' where they do, or do not tell.
+    """Return a note where images and poses do not fit; '' if they do, or do not tell.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]
                      ) -> dict[str, float]:
     """Return the median epipolar error of two images by the name of the reading [px].
 
-    Empty where no epipolar geometry explains enough matches, as those of images without overlap.
+    Empty if no epipolar geometry explains enough matches, as those of images without overlap.
     """
     errors = {}
     ways = dict.fromkeys((one.upright, one.camera) for one in readings.values())

@@ -58,7 +58,7 @@ class _Selected(NamedTuple):
 
 @dataclass(frozen=True)
 class BagTopics:
-    """Which topics of a recording hold what."""
+    """The topics of a recording by their content."""
 
     #: sensor_msgs/Image or CompressedImage, and CameraInfo
     image: str = '/image'
@@ -151,7 +151,7 @@ class _Cameras(NamedTuple):
     where: str
     msgtype: str  #: Message type of the images
     rectified: bool
-    infos: tuple[bytes, ...]  #: Those that differ; empty where a file says the camera
+    infos: tuple[bytes, ...]  #: Those that differ; empty if a file says the camera
     #: (c,): when each message holds [ns], by its stamp or, without stamps, by its recording
     times_ns: NDArray[np.int64]
     rows: NDArray[np.int64]  #: (c,): which of the infos it is
@@ -412,7 +412,7 @@ def _peek_stamp_ns(recorded: BagMessage) -> int:
 
 
 def _frame_of(data: bytes) -> str:
-    """Return the coordinate frame of a serialized message; '' where it has no header."""
+    """Return the coordinate frame of a serialized message; '' if it has no header."""
     try:
         length, = struct.unpack_from(f'{_order(data)}I', data, 12)
     except (struct.error, IndexError):

@@ -32,11 +32,11 @@ class MapRecording:
 
     observations: Path
     source: Path | None = None  #: The bag or folder with the images; None: none is known
-    #: Of a bag: topics of image and camera_info, and whether images are rectified
+    #: For a bag: topics of image and camera_info, and whether images are rectified
     image: str = ''
     camera_info: str = ''
     rectified: bool = False
-    #: Of a folder: the key of its layout, its camera, and where its images are
+    #: For a folder: the key of its layout, its camera, and the folder of its images
     layout: str = ''
     intrinsics: str | None = None
     images: Path | None = None

@@ -34,7 +34,7 @@ def _check_stamps(name: str, arrays: npz.Arrays) -> None:
               lambda stamps_ns: np.abs(stamps_ns / NS_PER_S - seconds) > 1e-6)(name, arrays)
 
 
-#: Of files of frames with boxes: F frames, n boxes.
+#: Fields of files of frames with boxes: F frames, n boxes.
 FRAME_FIELDS = {
     'intrinsics_fx_fy_cx_cy': npz.Field('numbers', (4,), (npz.FINITE,)),
     'boxes_xyxy': npz.Field('numbers', ('n', 4), (npz.FINITE, npz.BOX)),
@@ -263,7 +263,7 @@ _OBSERVATIONS = npz.Schema('observation file', {
 }, DatasetError, 'record the observations again', {'F': 'frames'},
     {'similarities': 'this is a query file: map from an observation file'})
 
-# Of PosedDetections
+# Optional fields of PosedDetections
 _OPTIONAL = ('depths', 'depth_spreads', 'embeddings', 'odom_from_camera', 'open_edges')
 
 

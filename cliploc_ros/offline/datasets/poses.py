@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a camera was: poses over time, with interpolation between them."""
+"""Poses of a camera over time, with interpolation between them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class Poses(Protocol):
     """Something that knows the pose of a camera over time."""
 
     def pose_at(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        """Return ``map_from_camera`` (4, 4) at a stamp [ns]; None where it is not known."""
+        """Return ``map_from_camera`` (4, 4) at a stamp [ns]; None if it is not known."""
 
     @property
     def span_ns(self) -> tuple[int, int] | None:

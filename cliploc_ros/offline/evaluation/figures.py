@@ -30,7 +30,7 @@ from cliploc_ros.offline.evaluation.trials import PosedQuery, Result
 
 #: Outlines text, so that it is legible on any background.
 EDGED = (withStroke(linewidth=2.0, foreground='white'),)
-# Of landmarks: more would have to be too small to be read.
+# Names of more landmarks would be too small to read; and their size [pt].
 _MOST_NAMES, _NAME_PT = 40, 8
 _NAME = 'name'
 # Steps of a name from its place, in half widths and in heights, the nearest first.
@@ -129,7 +129,7 @@ _MAX_ERROR_M = 2.0
 _SUCCESS_M = 1.0
 _BOX_BINS = ((0, 2), (3, 4), (5, 6), (7, 9), (10, 14), (15, 10_000))
 _MARGIN_M = 0.5
-# Of reliability, finer where poses are accepted
+# Bins of reliability, finer where poses are accepted
 _BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.0)
 _FREEDOM = 6  # of a pose
 _JUDGED_COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')

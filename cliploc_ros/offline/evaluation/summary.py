@@ -34,7 +34,7 @@ class Summary:
 
     method: str
     queries: tuple[int, ...]  #: Their numbers
-    #: (t, q): position error of the best pose; infinite where none was found
+    #: (t, q): position error of the best pose; infinite if none was found
     errors_m: NDArray[np.float64]
     accepted: NDArray[np.bool_]  #: (t, q)
     confidence: NDArray[np.float64]  #: (t, q)
@@ -44,7 +44,7 @@ class Summary:
     best_iterations: NDArray[np.int64]
     hypotheses: NDArray[np.int64]
     boxes: NDArray[np.int64]  #: (q,)
-    #: (t, q): infinite where no pose was found; empty where it was not recorded
+    #: (t, q): infinite if no pose was found; empty if it was not recorded
     nees: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
     #: Share of a query's crops that were compared with labels, on average
     crops_share: float = 1.0
@@ -55,7 +55,7 @@ class Summary:
     #: (t, q)
     keyframe_inliers: NDArray[np.int64] = field(
         default_factory=lambda: np.empty((0, 0), dtype=np.int64))
-    #: (t, q): the three are empty where no query was compared with keyframes
+    #: (t, q): the three are empty if no query was compared with keyframes
     keyframes_ms: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
 
     @property

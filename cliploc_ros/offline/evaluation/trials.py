@@ -63,8 +63,8 @@ class Result:
     #: Whether a pose was found, and whether it was accepted
     solved: bool
     accepted: bool
-    map_from_camera: list[list[float]] | None  #: The best pose; None where none was found
-    #: Error of the best pose; None where none was found
+    map_from_camera: list[list[float]] | None  #: The best pose; None if none was found
+    #: Error of the best pose; None if none was found
     error_m: float | None
     error_deg: float | None
     score: float  #: Sum of the IoUs of its inliers
@@ -81,7 +81,7 @@ class Result:
     #: another map, it is far away. Empty for a single map.
     map: str = ''
     refusal_kind: str = ''  #: See cliploc_ros.core.acceptance.verdict; empty when accepted
-    #: What the pose comes from: 'objects', 'keyframes' or 'both'; empty where none was found
+    #: What the pose comes from: 'objects', 'keyframes' or 'both'; empty if none was found
     source: str = ''
     #: Points of keyframes that agree on their pose, whatever the pose comes from
     keyframe_inliers: int = 0
@@ -219,8 +219,8 @@ def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: PosedQuery
         keyframe_search=found.keyframe_search)
 
 
-# Of the boxes of a kitchen, a tenth have no depth. The share of those whose depth is of something
-# else, and between which values that is [m], are guesses.
+# In a kitchen, a tenth of the boxes have no depth. The share of boxes with the depth of something
+# else, and the range of that depth [m], are guesses.
 _NO_DEPTH, _SOMETHING_ELSE, _ANY_DEPTH_M = 0.1, 0.05, (0.5, 5.0)
 
 

@@ -53,7 +53,7 @@ _BESIDE, _EDGE = np.ones((3, 3), dtype=np.uint8), 0.1
 
 @dataclass(frozen=True)
 class LayerOptions:
-    """Which images become keyframes, and how many points each keeps."""
+    """Choice of keyframes, and the number of their points."""
 
     #: An image becomes a keyframe unless one of them is nearer than both. 0: every image.
     distance_m: float = 0.1

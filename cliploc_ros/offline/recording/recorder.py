@@ -54,7 +54,7 @@ _UNKNOWN = np.full((4, 4), np.nan)
 
 @dataclass(frozen=True)
 class KeyframeOptions:
-    """How far apart keyframes are: either is enough."""
+    """Spacing of keyframes: either limit is enough."""
 
     #: [m] [deg]. 0 takes every frame with a pose.
     distance_m: float = 0.1
@@ -99,7 +99,7 @@ _DEFAULT_KEYFRAMES = KeyframeOptions()
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """How to look at a recording."""
+    """Options of reading a recording."""
 
     detector: DetectorOptions
     clip: ClipOptions | None  #: None: no embeddings

@@ -56,7 +56,7 @@ class Encoded:
 
 
 def merge_looks(looks: Sequence[Encoded | None], weights: Sequence[float]) -> Encoded | None:
-    """Return the look of one landmark that several become; None where no look is known.
+    """Return the look of one landmark that several become; None if no look is known.
 
     The weights are, for example, the numbers of boxes. Looks of another encoder than the first
     one's do not count.

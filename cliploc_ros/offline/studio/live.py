@@ -80,7 +80,7 @@ class LiveState(NamedTuple):
 
     @property
     def is_current(self) -> bool:
-        """Whether the pose is the last answer, and its node still reports."""
+        """Return whether the pose is the last answer, and its node still reports."""
         return self.is_heard and self.verdict.startswith(('accepted', 'withheld'))
 
 
@@ -114,7 +114,7 @@ class LiveRelocalizer:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a request waits for its answer."""
+        """Return whether a request waits for its answer."""
         return self._turn.locked()
 
     def lines(self, document: Document) -> list[str]:

@@ -57,7 +57,7 @@ NO_FILE = ''
 
 @dataclass(frozen=True)
 class MapFile:
-    """A map file: its text, '' where there is none, and the same as a tree.
+    """A map file: its text, '' if there is none, and the same as a tree.
 
     ``node`` is the key in the file whose parameters hold the map.
     """
@@ -273,8 +273,8 @@ def _flow(name: str, value: Any) -> str:
 class LookFile(NamedTuple):
     """The file of image embeddings next to a map, with the looks by id of the landmark.
 
-    ``encoder_key`` is '' where the file is missing or cannot be used. ``state`` tells whether
-    another program changed the file since; None where there is none.
+    ``encoder_key`` is '' if the file is missing or cannot be used. ``state`` tells whether
+    another program changed the file since; None if there is none.
     """
 
     path: Path

@@ -46,7 +46,7 @@ class NewLandmark:
     def __init__(self, document: Document, recording: Recording):
         self._document, self._recording = document, recording
         self.boxes: dict[int, list[float]] = {}
-        #: Of the detector's boxes that were taken or drawn over; '' for none
+        #: Class of the detector's boxes that were chosen or drawn over; '' for none
         self.class_id = ''
         #: The ellipsoid that fits the boxes, if there is one, and what is doubtful about it
         self.fit: Fit | None = None

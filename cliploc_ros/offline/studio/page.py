@@ -195,7 +195,7 @@ class Page:
         return draw_image(scene, image, camera, self._studio.map_from_camera)
 
     def picture(self, path: str) -> Content | None:
-        """Return the picture of a path; None where there is none."""
+        """Return the picture of a path; None if there is none."""
         try:
             return picture_of(self._studio, path)
         except CliplocError as error:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a robot would be accepted, refused or misled in the map, and places that look alike.
+"""Coverage: places where a robot would be accepted, refused or misled, and look-alike places.
 
 Both are check_map's. The positions are fewer, in an order that spreads them: where time runs out,
 those that were tried lie all over the map.

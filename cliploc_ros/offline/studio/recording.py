@@ -73,7 +73,7 @@ class Recording:
 
     @cached_property
     def film_step(self) -> int:
-        """How many views the film goes on with each picture."""
+        """Return the number of views between two pictures of the film."""
         gaps_s = np.diff(np.unique(self.detections.stamps_s))
         if not len(gaps_s):
             return 1
@@ -152,7 +152,7 @@ class Recording:
         return image[top:bottom, left:right]
 
     def look_of(self, rows: NDArray[np.int64], encoder_key: str) -> Encoded | None:
-        """Return the look that an encoder has of some boxes; None where it saw none of them."""
+        """Return the look that an encoder has of some boxes; None if it saw none of them."""
         detections = self.detections
         if detections.encoder_key != encoder_key or detections.embeddings is None or not len(rows):
             return None

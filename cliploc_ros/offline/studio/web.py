@@ -124,7 +124,7 @@ class Gate:
         return f'/{self.token}/'
 
     def admit(self, request: Request) -> str | None:
-        """Return the path below the token, '' for a ticket; None where the request is refused."""
+        """Return the path below the token, '' for a ticket; None if the request is refused."""
         try:
             host, origin = request.headers.get('Host', ''), request.headers.get('Origin')
             name, their_host = urlsplit(f'//{host}').hostname, urlsplit(origin or '').netloc

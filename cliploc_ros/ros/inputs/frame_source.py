@@ -56,7 +56,7 @@ class Frame:
     #: When the image arrived, and when its detections did (monotonic clock) [s].
     received_at: float
     detected_at: float
-    #: Depth of about the same time; None where there is none
+    #: Depth of about the same time; None if there is none
     depth: Image | CompressedImage | None = None
     depth_camera_info: CameraInfo | None = None  #: For unregistered depth
     camera: str = ''  #: Name of its camera; empty for the only one

@@ -37,7 +37,7 @@ _MAX_GAP_NS = NS_PER_S // 2
 _MAX_LATE_NS, _MOST_LATE = NS_PER_S, 5
 # For moves [m] and turns [rad]. Wheels that slip, poses that tremble and stamps are off by less.
 _SLACK = np.array([SAME_SPOT.distance_m, np.radians(SAME_SPOT.angle_deg)])
-# A robot is not faster than this [1/s] where nothing tells its speed. It changes its speed by less
+# A robot of unknown speed is not faster than this [1/s]. It changes its speed by less
 # than this [1/s^2], and between two twists by less than this; a change lasts no longer [s].
 # Guesses: no run of a Husky ends at 5 Hz or more, see python -m studies.sensors.
 _FASTEST, _CHANGE = np.array([3.0, 3.0]), np.array([3.0, 8.0])
@@ -96,7 +96,7 @@ class OdometryWindow:
         self._way_m, self._step_end = 0.0, np.zeros(3)
         # Messages in a row that are older than the newest.
         self._late = 0
-        # Of this run: moves and turns by the poses, and how far the twists are off.
+        # Sums over this run: moves and turns by the poses, and errors of the twists.
         self._motion, self._missed = np.zeros(2), np.zeros(2)
         #: The number of the present run of odometry: poses of two runs are not related.
         self.run = 0
@@ -169,7 +169,7 @@ class OdometryWindow:
     def moved_since(self, stamp_ns: int) -> tuple[float, float] | None:
         """Return how far the newest pose is from the two about an instant, at most [m], [degrees].
 
-        None where the instant is outside of all poses, or in a gap of more than 3 s.
+        None if the instant is outside of all poses, or in a gap of more than 3 s.
         """
         if not self.spans(stamp_ns, 0):
             return None
@@ -335,7 +335,7 @@ def _is_silence(poses: Sequence[_Pose], gap_ns: int) -> bool:
 
 
 class OdometryPlace(NamedTuple):
-    """Where odometry had the robot, or its camera, at the stamp of an image."""
+    """Pose of the robot, or its camera, in odometry at the stamp of an image."""
 
     odom_from_frame: NDArray[np.float64]  #: (4, 4)
     #: Places of one run share their odometry frame; places of different runs are not comparable.
@@ -434,7 +434,7 @@ class OdometrySource(qos.Listener):
 
         Many sources of poses leave the twist empty. Where the last two poses are further apart,
         up to 3 s, it is the mean speed between them. Odometry that has just begun may take
-        `patience_s`, at most 2 s, to cover that time; None where it does not, or where the
+        `patience_s`, at most 2 s, to cover that time; None if it does not, or where the
         stamps stand still.
         """
         with self._heard:
@@ -450,7 +450,7 @@ class OdometrySource(qos.Listener):
     def _last_moment(self) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
         """Return the robot's poses a moment ago and now, and the time between them [s].
 
-        None where the poses are not known.
+        None if the poses are unknown.
         """
         if self._newest is None:
             return None
@@ -466,7 +466,7 @@ class OdometrySource(qos.Listener):
     def moved_since(self, stamp: Time, patience_s: float) -> tuple[float, float] | None:
         """Return how far the robot is from where it was at an image, at most [m], [degrees].
 
-        Waits for the message that follows the image. None where odometry does not cover that
+        Waits for the message that follows the image. None if odometry does not cover that
         time, or has a gap of more than 3 s there.
         """
         at_ns = stamp_ns(stamp)

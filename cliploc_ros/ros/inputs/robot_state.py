@@ -241,11 +241,11 @@ class RobotState:
 
     #: The mount (4, 4); identity where the camera's own pose is wanted.
     camera_from_base: NDArray[np.float64]
-    #: The vertical, a unit vector (3,) in the camera's optical frame; None where it is not known.
+    #: The vertical, a unit vector (3,) in the camera's optical frame; None if it is not known.
     up_in_camera: NDArray[np.float64] | None = None
-    #: Place of the camera; None where odometry does not cover the image.
+    #: Place of the camera; None if odometry does not cover the image.
     place: OdometryPlace | None = None
-    #: (4, 4): the pose of a depth camera that is not registered; None where tf2 lacks it
+    #: (4, 4): the pose of a depth camera that is not registered; None if tf2 lacks it
     camera_from_depth: NDArray[np.float64] | None = None
 
 

@@ -152,7 +152,7 @@ class ExactPairing:
             topic: OrderedDict() for topic in max_bytes}
         self._early, self._late = early, late
         self.last_stamp_ns: dict[str, int] = {}
-        # Of the images, the number of each by its stamp, and those that stay whatever comes.
+        # Number of each image by its stamp, and the numbers of images that stay in any case.
         self._numbers: dict[int, int] = {}
         self._expected: deque[int] = deque(maxlen=_EXPECTED)
         self.clear()
@@ -258,7 +258,7 @@ class MessageStamps:
         """Forget all stamps."""
         #: Why the stamps name no messages, as in "the stamp is 0"; empty if they may.
         self.problem = ''
-        # Of each stamp the last message, and how often that came.
+        # The last message of each stamp, and how often it came.
         self._known: dict[int, tuple[int, int]] = {}
         self._own, self._lag_s = 0, math.nan
 

@@ -82,7 +82,7 @@ def find_scale(files: Sequence[ImageFile], first: str, second: str, metres: floa
 
 
 def check_axes(files: Sequence[ImageFile], axes: str, where: object) -> str:
-    """Return a note where images and stored poses do not fit; '' where they do, or do not tell.
+    """Return a note where images and stored poses do not fit; '' if they do, or do not tell.
 
     DatasetError: they fit well if read in another way; says which.
     """

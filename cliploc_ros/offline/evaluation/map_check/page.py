@@ -33,7 +33,7 @@ GRADE_COLORS = {'faulty': html.MISLED, 'minor': html.REFUSED, 'sound': '#009E73'
 GRADE_NAMES = {'faulty': 'serious fault', 'minor': 'minor fault', 'sound': 'sound'}
 _MOST_LANDMARKS = 300
 _MOST_MATCHED = 12
-# Of the first screen.
+# Numbers and advice on the first screen.
 _NUMBERS, FIRST_ADVICE = 3, 3
 # How the names of figures for large type begin, the most telling first.
 _TELLING = ('recorded frames accepted by', 'positions with a heading accepted',
