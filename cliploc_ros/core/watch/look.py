@@ -118,13 +118,13 @@ class LookEvidence(NamedTuple):
     unexplained: int  #: Other detections of the map's classes
     utility: float  #: Utility of the matched objects, by the acceptance's model [log odds]
     expected: int  #: Landmarks that the image should show
-    missed: int  #: Those of them that no detection shows
-    away_m: float  #: From the given pose to the best one near it
+    missed: int  #: Expected landmarks that no detection shows
+    away_m: float  #: From the given pose to the best pose near it
     away_deg: float
     crowd: float  #: Logarithm of the pairs of a detection and a landmark in view of its class
 
     def is_full(self, has_jumped: bool) -> bool:
-        """Return whether a wrong pose would show; one that jumped need not be at a mapped spot."""
+        """Return whether a wrong pose would show. After a jump, no mapped spot is needed."""
         return self.known >= _TERMS.full_objects and (
             has_jumped or self.expected >= _TERMS.full_mapped)
 

@@ -276,7 +276,7 @@ def _pose_after(poses: Poses, stamp_ns: int, later_ns: int) -> NDArray[np.float6
 def _readings(cameras: _Cameras, rectified: bool) -> dict[str, Reading]:
     """Return how the images and poses of a recording may be meant, the given way first."""
     given = 'rectified' if rectified else 'given'
-    mount = 'give the `mount` {} of the camera on what the poses are of, or the `camera_frame`'
+    mount = 'give the `mount` {} of the camera on the body of the poses, or the `camera_frame`'
     readings = {given: Reading('')}
     infos = [deserialize(one, bag_messages.CAMERA_INFO, cameras.where) for one in cameras.infos]
     if len(infos) == 1:

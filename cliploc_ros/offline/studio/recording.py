@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording says of landmarks: its boxes, where they lie in its views, relocalizations.
+"""The recording of a studio: boxes of landmarks, their places in its views, relocalizations.
 
 Relocalizations have the recording's boxes and poses. Similarities are simulated, as check_map does
 it. The views are not held out: a landmark that was fitted to them fits them better than new

@@ -25,13 +25,13 @@ _MAX_DISORDER_NS = NS_PER_S
 _EXPECTED = 4
 # Detections may come this much later than the previous detections.
 _SPARE = 1.5
-# This many messages in a row with a stamp of their own show that each has one: stamps in whole
-# seconds differ at times, too. The same message comes again twice, as relays send it, or more.
+# This many messages in a row with a stamp of their own show that each has its own: stamps in whole
+# seconds differ at times, too. A message that a relay repeats comes at least this often.
 _SHOWN, _REPEATED = 3, 2
 # Images of a camera at 30 Hz in ten seconds.
 _REMEMBERED = 300
-# Messages come so evenly after their stamps, also where a simulation or a bag runs at another
-# rate; what comes otherwise is of another clock (a guess).
+# Spread of the delay of messages after their stamps, also of a simulation or a bag at another
+# rate; a greater spread shows another clock (a guess).
 _UNEVEN_S = 5.0
 
 
@@ -218,7 +218,7 @@ class ExactPairing:
         self.dropped = dict.fromkeys(self.received, 0)
         self.last_stamp_ns.clear()
         self._numbers.clear()
-        self._expected.extend([1, 2, 1, 2])  # a detector that begins takes one of the first
+        self._expected.extend([1, 2, 1, 2])  # a detector that starts takes one of the first images
         self.every, self.outrun = 1, 0
 
     def _stays(self, stamp_ns: int) -> bool:
