@@ -116,8 +116,8 @@ def _decoded(msg: CompressedImageMessage) -> NDArray[np.uint8]:
                          ) from error
     if image is None:
         raise ImageError(f"compressed image ('{msg.format}', {len(data)} bytes) does not decode")
-    # 'rgb8; jpeg compressed bgr8': the encoding of the pixels that were compressed. Where it is
-    # rgb8, red went in the place of blue, as for compressed_image_transport
+    # 'rgb8; jpeg compressed bgr8': the encoding of the compressed pixels. With rgb8, red took the
+    # place of blue, as compressed_image_transport does it
     _, _, packed = msg.format.partition('compressed')
     is_red_first = packed.strip().startswith('rgb')
     return np.ascontiguousarray(image if is_red_first else image[:, :, ::-1])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``check_map``: how good a map is, and what to do about it."""
+"""The executable ``check_map``: judge a map, and advise what to improve."""
 
 import argparse
 import os

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``evaluate``: the paper's table and figures, on anyone's data."""
+"""The executable ``evaluate``: the paper's table and figures on your own data."""
 
 import argparse
 import logging

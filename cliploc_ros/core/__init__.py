@@ -7,7 +7,7 @@ Imports point downwards only, in this order (test/test_layout.py checks it):
 localizer, succession, relocalizer, warm_up, detector_check
     Frame after frame of a moving camera; frames to a result.
 watch
-    Whether a localizer's pose is right, look by look.
+    Evidence that a localizer's pose is right, look by look.
 acceptance
     Confidence, and the decision to accept or refuse.
 fit

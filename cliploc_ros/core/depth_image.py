@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Depth images, and how far the objects in boxes are.
+"""Depth images, and the depth of the objects in boxes.
 
-Depth is never exact: it has holes, its scale errs, and it does not lie quite on the colour image.
-So a box gets one robust value, from its inner half, and the spread of the values there.
+Depth is never exact: it has holes, its scale errs, and it does not quite fit the colour image. A
+box therefore gets one robust value from its inner half, and the spread of the values there.
 """
 
 from dataclasses import dataclass, field

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The answer to a request, or to one frame in continuous mode; and the case that is kept of it."""
+"""The answer to a request, or to one frame in continuous mode; and its record as a case."""
 
 import math
 import threading

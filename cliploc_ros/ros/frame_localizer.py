@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""From a frame to a relocalization: the map and the network that stay loaded between requests."""
+"""Relocalize a frame with the map and the networks that stay loaded between requests."""
 
 import hashlib
 import logging

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Handing an accepted pose over: to a running localizer, or as map -> odom to the robot itself.
+"""Deliver an accepted pose: to a running localizer, or as map -> odom to the robot itself.
 
 `initialpose` is volatile, so the publisher may have met a subscription that has not met it yet,
-and DDS takes a localizer that was killed or hangs for alive. So only the pose that the localizer
-shows reveals whether it has taken the pose.
+and for DDS a localizer that was killed or hangs is still alive. Only the pose that the localizer
+publishes proves that it took the given pose.
 """
 
 import math

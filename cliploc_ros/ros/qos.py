@@ -42,7 +42,7 @@ SERVICE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
 
 _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
                 QoSPolicyKind.DURABILITY)
-# Between two subscriptions made because of empty messages [s]: a publisher may send such, too.
+# Least time between two new subscriptions after empty messages [s]: some publishers send them.
 _RENEWAL_PERIOD_S = 1.0
 _LOG_PERIOD_S = 5.0
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Wake a robot up: request its pose, turn between the looks, until accepted or time is up.
+"""Wake a robot up: request its pose, turning between looks, until it is accepted or time is up.
 
 With --watch, do so again whenever the relocalizer finds the robot lost.
 

@@ -269,7 +269,7 @@ class _Record:
             self.odds = self.views.odds(self.by_extent)
 
     def add(self, look: CameraLook) -> None:
-        """Take in a look. Looks after a verdict of wrong decide whether it was repaired."""
+        """Take in a look. After a verdict "wrong", looks decide whether the camera is repaired."""
         if self.by_looks <= _TERMS.sure:
             self.views, self.since = self.views.with_look(look), Views()
         else:

@@ -9,7 +9,7 @@ A conditional logit (McFadden, "Conditional Logit Analysis of Qualitative Choice
 each distinct pose has a utility, linear in its support. The case that no pose is right has a
 utility, too: more landmarks in the map let more wrong poses fit by chance, and a known vertical
 leaves fewer. Probabilities are proportional to the exponentials of the utilities, so the poses of
-an ambiguous scene share the probability. Poses that agree (1 m, 45 degrees) add up theirs.
+an ambiguous scene share the probability. Poses that agree (1 m, 45 degrees) share one sum.
 
 The search of objects chooses its poses among many by their support. Keyframes propose theirs by
 points: what the objects say of such a pose counts from the utility of none being right, whatever

@@ -7,7 +7,7 @@ the other: they see the same pixels. The differences lie around the picture, in 
 aspect, which other intrinsics would explain, and how it moves.
 
 A picture of the room shows the same points as the room, but moves as a plane: where the robot
-drives sideways, the poses of its keyframes turn instead. So two looks of a moving robot tell.
+drives sideways, the poses of its keyframes turn instead. Two looks of a moving robot show that.
 """
 
 import math

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Successive looks: the best poses of the last frames, and how sure they were of the newest one.
+"""Successive looks: the best poses of the last frames, and their confidence in the newest pose.
 
 Every retry is another chance of a false accept. Odometry carries the pose of each look to the
 newest frame, and drifts on the way. The looks of a standing robot show the same, so their

@@ -297,9 +297,9 @@ class SearchedFrame(NamedTuple):
 
     @property
     def known_tried(self) -> int:
-        """Return how many samples were tried or ruled out as incompatible, of each map on average.
+        """Return the number of samples tried or ruled out as incompatible, per map on average.
 
-        Samples across maps are none: that they were not tried says nothing about rivals.
+        Samples across maps are invalid and do not count.
         """
         maps = np.searchsorted(self.firsts, self.scene.pairs[:self.progress.reach, 1], 'right')
         within = sum(comb(count, self.sample_size) for count in np.bincount(maps).tolist())

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recording of a map: NAME.recording.json next to NAME.yaml.
 
-``check_map`` and the studio find observations and images by it. Paths in it are relative to the
+It leads ``check_map`` and the studio to observations and images. Paths in it are relative to the
 map, so that folders can be moved together.
 """
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Observation and query files: recorded boxes, and where the camera was.
+"""Observation and query files: recorded boxes and camera poses.
 
 Mapping, evaluation and the map editor read the same observations, so that the networks run once.
 A query file has the similarities of a map, too: identical input for every method.

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Texts, tables and JSON of other programs, checked as they are read.
 
-Whatever a file holds, the error is a DatasetError that names the file and the line or field.
+Every error is a DatasetError that names the file and the line or field.
 """
 
 import math

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes of a recording: which images, which of their features, and where these are."""
+"""Keyframes of a recording: choice of images, features, and their places in the map."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

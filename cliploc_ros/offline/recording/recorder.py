@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Record observations once: an observation file next to the recording.
 
-The file's name depends on all that its content depends on: source, networks and keyframes. A run
-that is stopped leaves its partial results beside it, and the next run goes on.
+The file's name depends on everything that determines its content: source, networks, keyframes. A
+run that is stopped leaves its partial results beside it, and the next run continues.
 """
 
 import base64

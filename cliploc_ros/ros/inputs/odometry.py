@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The topic `odom`: how fast the robot moves, and where its camera took each image."""
+"""The topic `odom`: the speed of the robot, and the motion of its camera between images."""
 
 import math
 import threading

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The part that needs tf2_ros to be imported: tf2's buffer, made safe against time jumps."""
+"""tf2's buffer, made safe against time jumps. Importing this module needs tf2_ros."""
 
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node

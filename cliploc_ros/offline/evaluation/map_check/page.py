@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The files of a check: figures as JSON; a page whose first screen says all, the rest folded.
+"""The files of a check: figures as JSON, and a page with the main results first.
 
 Beside an advice are the room's own images: a landmark in its best view, or the nearest view.
 """
