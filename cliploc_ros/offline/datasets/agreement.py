@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check that images and poses of a recording agree, and find the reading of them that does.
 
-What two images both show lies on epipolar lines. Only pairs count whose matches some epipolar
-geometry explains, whatever the poses are: images that do not overlap tell nothing.
+Points that two images share lie on epipolar lines. Only pairs count whose matches some epipolar
+geometry explains, whatever the poses are: images that do not overlap prove nothing.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
