@@ -88,7 +88,7 @@ class HandOff:
                                            callback_group=ReentrantCallbackGroup())
 
     def on_shown(self, listener: Callable[[PoseWithCovarianceStamped], None]) -> None:
-        """Have each pose that the localizer shows reported; the callback must not block."""
+        """Call a function with each pose of the localizer; it must not block."""
         self._listeners.append(listener)
 
     def open(self, pose_topic: str) -> None:

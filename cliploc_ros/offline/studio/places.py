@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coverage: places where a robot would be accepted, refused or misled, and look-alike places.
 
-Both are check_map's. The positions are fewer, in an order that spreads them: where time runs out,
-those that were tried lie all over the map.
+Both are check_map's, with fewer positions. Their order spreads them over the map, so that the
+positions tried before time runs out cover all of it.
 """
 
 import time

@@ -211,12 +211,12 @@ def read_hololens(folder: Path, options: capture.FolderOptions) -> capture.Captu
 
 
 def _stamp_ns(time_s: float) -> int:
-    """Return a time [s] in nanoseconds; NO_STAMP where it is none."""
+    """Return a time [s] in nanoseconds; NO_STAMP if it is none."""
     return round(time_s * NS_PER_S) if abs(time_s) < 1e15 else NO_STAMP
 
 
 TRANSFORMS = 'transforms.json'
-_SAME_FOCAL = 1.02  # two fields that say it are rounded
+_SAME_FOCAL = 1.02  # the focal length is in two fields, rounded
 _PERSPECTIVE = ('PINHOLE', 'SIMPLE_PINHOLE', 'SIMPLE_RADIAL', 'RADIAL', 'OPENCV', 'PERSPECTIVE')
 _FISHEYE = ('OPENCV_FISHEYE', 'FISHEYE')
 _INTRINSICS = ('w', 'h', 'fl_x', 'fl_y', 'cx', 'cy', 'camera_angle_x', 'k1', 'k2', 'k3', 'k4',
