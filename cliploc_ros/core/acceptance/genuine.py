@@ -88,8 +88,8 @@ class Signs(NamedTuple):
     #: logarithms of ratios: 0 to 0.25
     focal: float
     aspect: float
-    #: Extent of the agreeing points and boxes, as a share of the image's width or height, whichever
-    #: is greater: a picture ends within the image
+    #: Extent of the agreeing points and boxes, as a share of the image's width or height,
+    #: whichever is greater: a picture ends within the image
     reach: float
     #: Share of the detected objects of the map's classes that the pose does not explain
     unexplained: float
