@@ -59,7 +59,7 @@ _ADVICE = {
                'another focal length or other pixels of the boxes may fit; turn the camera to '
                'nearer objects, or check camera_info'),
     'genuine': (RefusalKind.CHANGED, '{0.recognized.inliers} points of keyframes agree as in a '
-                                     'picture or a changed place; move, and request again'),
+                                     'picture or a changed place; move, request again'),
     'not_mirrored': (RefusalKind.AMBIGUOUS, 'mirrored, the image fits another pose; turn the '
                                             'camera to more objects'),
     'found': (RefusalKind.SEARCH_CUT_SHORT,
