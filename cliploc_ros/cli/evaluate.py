@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``evaluate``: the paper's table and figures, on anyone's data."""
+"""The executable ``evaluate``: the paper's table and figures on your own data."""
 
 import argparse
 import logging
@@ -102,7 +102,7 @@ def _add_paper_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('simulated sensors besides the camera')
+    group = parser.add_argument_group('simulated sensors beside the camera')
     option(group, '--gravity', f"'{AUTO}' knows the vertical, from the true poses; the paper's "
            'methods do not use it')
     option(group, '--gravity-noise-deg DEG', 'standard deviation of the vertical (0)',

@@ -41,7 +41,7 @@ _FILES = ('model', 'map_file', 'keyframes_file', 'clip_model', 'clip_pretrained'
 
 @dataclass(frozen=True)
 class Request:
-    """What one request cost."""
+    """The cost of one request."""
 
     stage_ms: dict[str, float]  #: Stage to its time [ms]
     #: How many boxes the detector found, and how many the search had

@@ -58,7 +58,7 @@ def make_parser() -> argparse.ArgumentParser:
            'folder or OWNER/NAME with ONNX files, or a tag or file of open_clip, as of build_map')
     option(parser, '--clip-model NAME', 'the architecture of a tag or file (%(default)s)')
     option(parser, '--device', 'of CLIP (%(default)s)', default='auto')
-    option(parser, '--vocabulary FILE', 'phrases by class (YAML), besides the shipped ones')
+    option(parser, '--vocabulary FILE', 'further phrases by class (YAML)')
     option(parser, '--occupancy-grid FILE', 'show the walls: the YAML file of nav2_map_server, in '
            "the map's coordinate frame")
     option(parser, '--port N', 'the next free one from this on (%(default)s)', within(0, 65535),

@@ -47,7 +47,7 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
         to options, where 'base' names a method whose options are the defaults, and 'keyframes'
         says whether keyframes are used; the paper's methods never use them.
     paper : RelocalizerOptions
-        Options of the paper's methods besides matching and algorithm. auto takes its seed,
+        Options of the paper's methods other than matching and algorithm. auto takes its seed,
         height range, deviations of vertical and tilt, crops and matching from them.
     landmarks : int
         Number of landmarks of the map; it limits k. Without any, all methods have to use

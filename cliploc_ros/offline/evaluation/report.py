@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page of compared methods: the best one first, then the table and all figures."""
+"""The page of compared methods: the best method, the table and all figures."""
 
 from collections.abc import Sequence
 from pathlib import Path

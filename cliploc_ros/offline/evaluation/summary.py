@@ -37,7 +37,7 @@ class Summary:
 
     method: str
     queries: tuple[int, ...]  #: Their numbers
-    #: (t, q): position error of the best pose; infinite where none was found
+    #: (t, q): position error of the best pose; infinite if none was found
     errors_m: NDArray[np.float64]
     accepted: NDArray[np.bool_]  #: (t, q)
     confidence: NDArray[np.float64]  #: (t, q)
@@ -47,7 +47,7 @@ class Summary:
     best_iterations: NDArray[np.int64]
     hypotheses: NDArray[np.int64]
     boxes: NDArray[np.int64]  #: (q,)
-    #: (t, q): infinite where no pose was found; empty where it was not recorded
+    #: (t, q): infinite if no pose was found; empty if it was not recorded
     nees: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
     #: Share of a query's crops that were compared with labels, on average
     crops_share: float = 1.0
@@ -58,7 +58,7 @@ class Summary:
     #: (t, q)
     keyframe_inliers: NDArray[np.int64] = field(
         default_factory=lambda: np.empty((0, 0), dtype=np.int64))
-    #: (t, q): the three are empty where no query was compared with keyframes
+    #: (t, q): the three are empty if no query was compared with keyframes
     keyframes_ms: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
 
     @property
@@ -191,7 +191,7 @@ def compare(one: Summary, other: Summary, limit_m: float = 1.0, seed: int = 0) -
     Parameters
     ----------
     one, other : Summary
-        Of the same queries; the success of the other is subtracted.
+        Summaries of the same queries; the success of the other is subtracted.
     limit_m : float
         Limit of success.
     """
@@ -204,7 +204,7 @@ def compare(one: Summary, other: Summary, limit_m: float = 1.0, seed: int = 0) -
 
 
 def find_best(summaries: Sequence[Summary], limit_m: float = 1.0) -> Summary:
-    """Return the summary of the greatest success; of equal ones that of the least error."""
+    """Return the summary of the greatest success; with equal success, of the least error."""
     return max(summaries, key=lambda one: (one.success(limit_m), -one.median_error_m))
 
 
@@ -268,7 +268,7 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
               for one in summaries if 0.0 < one.crops_share < 1.0]
     if any(one.has_keyframes for one in summaries):
         lines.append('Keyframes: number of poses from each source, median of the points that '
-                     'agree, and mean time besides the search; --no-keyframes leaves them out.')
+                     'agree, and mean time outside the search; --no-keyframes leaves them out.')
     if len(summaries) > 1:
         lines.append(f'{_WITHIN_NOISE}: the queries are too few to separate it from {best.method} '
                      '(at 1 m; paired bootstrap, 95 %).')

@@ -96,7 +96,7 @@ def _alternatives(name: str, rules: Rules, chosen: dict[str, str]) -> Sequence[s
 class Vocabulary:
     """Phrases by class."""
 
-    added: Mapping[str, tuple[str, ...]]  #: Phrases of a user besides the shipped ones
+    added: Mapping[str, tuple[str, ...]]  #: Phrases of a user, in addition to the shipped phrases
 
     def phrases(self, class_name: str) -> tuple[str, ...]:
         """Return the phrases of a class, each once; the user's come first.
@@ -107,7 +107,7 @@ class Vocabulary:
 
 
 def load_vocabulary(path: str | os.PathLike[str] | None = None) -> Vocabulary:
-    """Return the shipped vocabulary, with the phrases of a file besides.
+    """Return the shipped vocabulary, and the phrases of a file if one is given.
 
     Parameters
     ----------
