@@ -10,7 +10,8 @@ from setuptools import find_packages, setup
 PACKAGE = 'cliploc_ros'
 # colcon puts these into lib/cliploc_ros for ros2 run. pip puts executables into bin/, where all
 # programs share one name space: there they are named cliploc_evaluate and so on.
-COMMANDS = ('build_map', 'check_map', 'evaluate', 'import_map', 'studio', 'tum_to_bag')
+COMMANDS = ('build_map', 'check_map', 'evaluate', 'export_network', 'import_map', 'studio',
+            'tum_to_bag')
 # These need ROS. Without it they would only print that, so a wheel has none of them.
 ROS_COMMANDS = ('doctor', 'prepare', 'replay', 'wake_up')
 NODES = ('detector', 'relocalizer')
@@ -21,16 +22,16 @@ BUILDS_WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel'}.isdisjoint(sys
 REQUIRED = ['PyYAML>=6,<7', 'numba>=0.59,<1', 'numpy>=1.26,<3', 'scipy>=1.11,<2', 'setuptools',
             'tqdm>=4.66,<5']
 OPENCV = 'opencv-python-headless>=4.6,<6'
+RUNTIME = [OPENCV, 'ftfy>=6,<7', 'huggingface_hub>=0.30,<4', 'openvino>=2025.0,<2028',
+           'pillow>=10,<15', 'tokenizers>=0.20,<1']
 EXTRAS = {
-    # Detector and CLIP as networks that were converted: all that looks at images on a robot.
-    'runtime': [OPENCV, 'openvino>=2025.0,<2028', 'pillow>=10,<15'],
-    # The same from their weights, on a GPU or to convert them.
+    # Detector and CLIP as ONNX networks: all that looks at images.
+    'runtime': RUNTIME,
+    # The same in PyTorch: to export networks, to train, and for a GPU.
     'models': [
-        OPENCV, 'huggingface_hub>=0.30,<4', 'open_clip_torch>=3.0,<4', 'openvino>=2025.0,<2028',
-        'pillow>=10,<15', 'safetensors>=0.4,<1', 'torch>=2.4,<3', 'torchvision>=0.19,<1',
-        'ultralytics-opencv-headless>=8.4,<9',
+        *RUNTIME, 'onnx>=1.17,<2', 'open_clip_torch>=3.0,<4', 'safetensors>=0.4,<1',
+        'torch>=2.4,<3', 'torchvision>=0.19,<1', 'ultralytics-opencv-headless>=8.4,<9',
     ],
-    'transformers': ['transformers>=5,<6'],  # an Apache-licensed detector, beside 'models'
     # The programs that make, check and measure maps.
     'evaluate': [OPENCV, 'matplotlib>=3.8,<4', 'rosbags>=0.11,<0.12'],
     'studio': [OPENCV, 'rosbags>=0.11,<0.12', 'viser==1.1.1'],

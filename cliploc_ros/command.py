@@ -32,7 +32,7 @@ def run_main(parser: argparse.ArgumentParser, command: Callable[[argparse.Namesp
     Parameters
     ----------
     parser : argparse.ArgumentParser
-        Of the arguments that are not for ROS; those go to the options as ``ros_args``.
+        Parser of the arguments that are not for ROS; those go to the options as ``ros_args``.
     command : callable
         Takes the options and returns the exit code, see run_command.
     args : sequence of str, optional
@@ -235,7 +235,7 @@ def split_ros_args(args: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 class StageBar:
-    """A progress bar that names the stage; nothing where there is no terminal."""
+    """A progress bar that names the stage; nothing if there is no terminal."""
 
     def __enter__(self) -> Self:
         """Show the bar."""

@@ -49,7 +49,7 @@ def misspelt_classes(class_ids: Iterable[str], known: Iterable[str], all_known: 
     Parameters
     ----------
     class_ids : iterable of str
-        Of the landmarks.
+        Classes of the landmarks.
     known : iterable of str
         Classes that are right: of the detector, of a vocabulary.
     all_known : bool

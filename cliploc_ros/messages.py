@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Images, cameras and detections from messages, read by rclpy or by rosbags.
 
-No field of a message is taken for valid.
+No field of a message is assumed valid.
 """
 
 import math
@@ -116,8 +116,8 @@ def _decoded(msg: CompressedImageMessage) -> NDArray[np.uint8]:
                          ) from error
     if image is None:
         raise ImageError(f"compressed image ('{msg.format}', {len(data)} bytes) does not decode")
-    # 'rgb8; jpeg compressed bgr8': the encoding of the pixels that were compressed. Where it is
-    # rgb8, red went in the place of blue, as for compressed_image_transport
+    # 'rgb8; jpeg compressed bgr8': the encoding of the compressed pixels. With rgb8, red took the
+    # place of blue, as compressed_image_transport does it
     _, _, packed = msg.format.partition('compressed')
     is_red_first = packed.strip().startswith('rgb')
     return np.ascontiguousarray(image if is_red_first else image[:, :, ::-1])
@@ -360,9 +360,9 @@ def depths_from_msg(msg: Any, image_frame: str, camera: Camera, bboxes_xyxy: NDA
     image_frame : str
         The coordinate frame of the colour image. Depth in another one is not registered.
     camera : Camera
-        Of the colour image.
+        Camera of the colour image.
     camera_info : sensor_msgs/CameraInfo, optional
-        Of a depth camera that is not registered.
+        camera_info of a depth camera that is not registered.
     color_from_depth : ndarray (4, 4), optional
         Its pose, seen from the colour camera.
 

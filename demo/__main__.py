@@ -42,8 +42,8 @@ def make_parser() -> argparse.ArgumentParser:
         help='a method of the paper, such as class_bf or clip_prosac (default: %(default)s)')
     parser.add_argument(
         '--assets', type=Path, default=ASSETS, metavar='DIR',
-        help='another world than the shipped one: sequence/ (a TUM folder), map.yaml, yolo.pt, '
-        'for --map mapping/, and except for class_* clip.json and clip.safetensors')
+        help='another world than the shipped one: sequence/ (a TUM folder), map.yaml, '
+        'yolo.onnx, for --map mapping/, and except for class_* clip/')
     parser.add_argument(
         '--map', action='store_true',
         help="build the map from the assets' mapping walk (mapping/), and wake up in it")

@@ -70,9 +70,8 @@ def run_map_demo(options: DemoOptions) -> None:
 def _build(options: DemoOptions, walk: Path, files: Mapping[str, Path]) -> None:
     """Write map, report and detections as a user does, with the installed executable."""
     arguments = ['build_map', '--tum', walk, '--out', files['yaml'], '--report', files['json'],
-                 '--record-to', files['npz'], '--model', options.assets / 'yolo.pt',
-                 '--clip-model', options.assets / 'clip.json',
-                 '--clip-pretrained', options.assets / 'clip.safetensors']
+                 '--record-to', files['npz'], '--model', options.assets / 'yolo.onnx',
+                 '--clip-pretrained', options.assets / 'clip']
     print('$ ' + ' '.join(map(str, arguments)), flush=True)
     done = subprocess.run([str(find_executable('build_map')), *map(str, arguments[1:])],
                           check=False)
@@ -82,11 +81,10 @@ def _build(options: DemoOptions, walk: Path, files: Mapping[str, Path]) -> None:
 
 def _judge(options: DemoOptions, built_map_file: Path) -> dict[str, Summary]:
     """Return the success of one look at each image of the wake-ups, in the built and true map."""
-    clip = ClipOptions(model=str(options.assets / 'clip.json'),
-                       pretrained=str(options.assets / 'clip.safetensors'))
+    clip = ClipOptions(pretrained=str(options.assets / 'clip'))
     sequence = read_tum(options.assets / 'sequence')
     print(f'localizing all {len(sequence)} images of the wake-ups in both maps', flush=True)
-    look = LoadNetworks(DetectorOptions(model=str(options.assets / 'yolo.pt')), clip)()
+    look = LoadNetworks(DetectorOptions(model=str(options.assets / 'yolo.onnx')), clip)()
     recorded = record_every_frame(
         tum_frames(sequence, find_camera(None, sequence.folder)[0]), look)
     method = Method(options.method, options.values.options())

@@ -171,11 +171,14 @@ def _list_matches(panel: Axes, review: Review, landmark_map: LandmarkMap, number
 
 def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
                   path_xyz: NDArray[np.float64], path: Path) -> None:
-    """Draw map, the camera's walk (t, 3) [m], and a line from each estimate to its truth."""
+    """Draw map, the camera's walk (t, 3) [m], and a line from each estimate to its truth.
+
+    A refused hypothesis beyond the map is not drawn; its number is red all the same.
+    """
     points = np.concatenate([landmark_map.centers[:, :2], path_xyz[:, :2]])
     low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
     width, height = high - low
-    scale = min(7.5 / width, 6.5 / height)
+    scale = min(5.5 / width, 4.8 / height)
     figure = Figure(figsize=(width * scale + 3.2, height * scale + 0.9), dpi=_TOP_VIEW_DPI,
                     layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08))
     axes = figure.add_subplot()
@@ -187,7 +190,10 @@ def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
     class_colors = draw_map(axes, landmark_map)
     axes.plot(path_xyz[:, 0], path_xyz[:, 1], color='#999999', linewidth=1.0, zorder=2)
     for one in judged:
-        _draw_wake_up(axes, one)
+        pose = one.pose
+        if pose is not None and not ((low <= pose[:2, 3]) & (pose[:2, 3] <= high)).all():
+            pose = None
+        _draw_wake_up(axes, one, pose)
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=_TRUTH, marker='o', markersize=9, markerfacecolor='none',
                label='ground truth and view'),
@@ -203,9 +209,9 @@ def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
     write_file(path, figure.savefig)
 
 
-def _draw_wake_up(axes: Axes, judged: Judged) -> None:
-    """Draw truth and estimate as arrows along the view, with a line between them."""
-    accepted, truth, pose = judged.wake_up.accepted, judged.truth, judged.pose
+def _draw_wake_up(axes: Axes, judged: Judged, pose: NDArray[np.float64] | None) -> None:
+    """Draw truth and estimated pose as arrows along the view, with a line between them."""
+    accepted, truth = judged.wake_up.accepted, judged.truth
     color = ACCEPTED if accepted else BAD
     seen_from = pose if truth is None else truth
     if seen_from is not None:

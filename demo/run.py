@@ -53,8 +53,8 @@ class WakeUpMap:
 class DemoOptions:
     """Options of the demo."""
 
-    #: Folder with sequence/ (a TUM folder), map.yaml, yolo.pt and, unless the method matches
-    #: classes only, clip.json and clip.safetensors
+    #: Folder with sequence/ (a TUM folder), map.yaml, yolo.onnx and, unless the method matches
+    #: classes only, clip/ (see export_network)
     assets: Path
     out: Path  #: Folder for the pictures
     wake_ups: int = 10  #: Number of wake-ups
@@ -101,8 +101,7 @@ class DemoOptions:
             parameters |= {'watch': 'amcl_pose', 'watch_period_s': 1.0, 'on_lost': 'relocalize',
                            'require_localizer': True}
         if matching != 'class':
-            parameters |= {'clip_model': self.assets / 'clip.json',
-                           'clip_pretrained': self.assets / 'clip.safetensors'}
+            parameters['clip_pretrained'] = self.assets / 'clip'
         if self.has_rig:
             # the pose of the first camera
             parameters |= {**self.of_detector, 'base_frame': 'camera_optical_frame',
@@ -173,7 +172,7 @@ def prepare(options: DemoOptions) -> None:
     for picture in options.out.glob(page.PICTURES):
         picture.unlink()
     needed = [options.assets / ('rig' if options.has_rig else 'sequence'),
-              options.assets / 'yolo.pt',
+              options.assets / 'yolo.onnx',
               *(value for value in options.parameters.values() if isinstance(value, Path))]
     for path in needed:
         if not path.exists():
@@ -209,7 +208,7 @@ def nodes(options: DemoOptions, domain: int) -> Iterator[Callable[[], None]]:
     start = time.monotonic()
     print(f'starting detector and relocalizer ({options.method}); to see their topics: export '
           f'ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', flush=True)
-    with (running(node_command('detector', {'model': options.assets / 'yolo.pt',
+    with (running(node_command('detector', {'model': options.assets / 'yolo.onnx',
                                             **options.of_detector}),
                   options.out / 'detector.log') as detector,
           running(node_command('relocalizer', options.parameters),

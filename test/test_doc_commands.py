@@ -42,7 +42,7 @@ class _CaughtError(Exception):
 @cache
 def parser_of(module: str) -> argparse.ArgumentParser:
     """Return the parser that a program makes for itself, by its module."""
-    if module.startswith(('cliploc_ros.cli.', 'demo.__')):
+    if module.startswith(('cliploc_ros.cli.', 'demo.__', 'studies.reproduce')):
         return importlib.import_module(module).make_parser()
 
     def caught(parser, *_):
@@ -71,6 +71,8 @@ def program_of(command: Command) -> tuple[str, list[str]]:
         return rest[1], rest[2:]
     elif first == 'script/demo':
         return 'demo.__main__', rest
+    elif first == 'script/reproduce':
+        return 'studies.reproduce', rest
     name = re.sub('^(install/lib/cliploc_ros/|cliploc_(?!ros))', '', first)
     if name in EXECUTABLES:
         return f'cliploc_ros.cli.{name}', rest

@@ -71,7 +71,7 @@ def make_parser() -> argparse.ArgumentParser:
            'into NAME_check; the exit code is that of the build (%(default)s)', default=True,
            action=argparse.BooleanOptionalAction)
     labels = parser.add_argument_group('labels')
-    option(labels, '--vocabulary FILE', 'phrases by class (YAML), besides the shipped ones')
+    option(labels, '--vocabulary FILE', 'further phrases by class (YAML)')
     option(parser, '--object-size CLASS METRES', 'the longest extent of the objects of a class, '
            'which says the scale of the poses')
     map_layer.add_layer_options(parser)
@@ -290,7 +290,7 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
 
 
 def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':
-    """Return how the poses may be off; None where that is unknown, or not to be refined."""
+    """Return how the poses may be off; None if that is unknown, or not to be refined."""
     from cliploc_ros.offline.mapping.options import PoseErrors
 
     if options.joint is False:

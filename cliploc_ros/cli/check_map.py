@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``check_map``: how good a map is, and what to do about it."""
+"""The executable ``check_map``: judge a map, and advise what to improve."""
 
 import argparse
 import os
@@ -158,7 +158,7 @@ def check(options: argparse.Namespace) -> int:
 
 
 def _check_keyframes(layer: 'KeyframeLayer | None', detections: 'PosedDetections | None') -> int:
-    """Say what a map without landmarks does; return the exit code of one that did not pass."""
+    """Report on a map without landmarks; return the exit code of a map that did not pass."""
     from cliploc_ros.offline.mapping.check.report import in_reach
 
     if layer is None:

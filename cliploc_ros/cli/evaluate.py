@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``evaluate``: the paper's table and figures, on anyone's data."""
+"""The executable ``evaluate``: the paper's table and figures on your own data."""
 
 import argparse
 import logging
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from cliploc_ros.offline.evaluation.trials import PosedQuery
 
 EPILOG = f"""\
-methods: {', '.join(PAPER_METHODS)};
-  '{ALL}': these ten; '{AUTO}': the relocalizer's defaults;
+methods: {', '.join(PAPER_METHODS)}: the paper's ten;
+  '{AUTO}': the relocalizer's defaults; '{ALL}': these eleven;
   FILE.yaml: named sets of options, such as
     wide: {{base: hybrid_b-prosac, k: 5, iterations: 2000}}
 
@@ -60,8 +60,8 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='evaluate', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Compare methods on the same input. Writes the paper's table, results.json, "
-        'summary.csv, figures and trajectories. Needs no sourced ROS.')
+        description="Compare methods on the same input. Writes the paper's table as a page, text, "
+        'LaTeX and CSV, results.json, figures and trajectories. Needs no sourced ROS.')
     group = parser.add_mutually_exclusive_group(required=True)
     option(group, '--queries NPZ', 'recorded boxes and similarities')
     option(group, '--bag', 'a rosbag2 recording with ground truth; or a request that ~/record '
@@ -102,7 +102,7 @@ def _add_paper_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('simulated sensors besides the camera')
+    group = parser.add_argument_group('simulated sensors beside the camera')
     option(group, '--gravity', f"'{AUTO}' knows the vertical, from the true poses; the paper's "
            'methods do not use it')
     option(group, '--gravity-noise-deg DEG', 'standard deviation of the vertical (0)',

@@ -52,7 +52,7 @@ def check_layer_options(options: argparse.Namespace) -> None:
 
 
 def _problem(options: argparse.Namespace) -> str:
-    """Return the option that leaves no keyframes, and what to do; '' where there is none."""
+    """Return the option that leaves no keyframes, and what to do; '' if there is none."""
     for name in ('observations', 'update'):
         if getattr(options, name) is not None:
             return (f'--{name}: keyframes need the images of the recording that the map is built '
@@ -103,7 +103,7 @@ def add_use_option(parser: argparse.ArgumentParser, what: str) -> None:
 
 def read_layer(map_file: Path, landmark_map: 'LandmarkMap', wanted: bool | None
                ) -> 'KeyframeLayer | None':
-    """Return the layer next to a map; None where there is none, or none is wanted.
+    """Return the layer next to a map; None if there is none, or none is wanted.
 
     With `wanted` None a bad layer is left out with a note, as the relocalizer does. MapError,
     ModelError: the layer is wanted, and is missing or bad, or the network of its features is.

@@ -11,7 +11,7 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES
 
-# Of folders only.
+# Options of folders only.
 _PLACING = ('images', 'axes', 'scale', 'known_distance')
 
 
@@ -104,13 +104,7 @@ def add_network_options(group: Any) -> None:
     option(group, '--profile', 'detector and CLIP: that of the robot, as image embeddings are of '
            'one CLIP (%(default)s: accurate on a GPU, balanced on a CPU)', default='auto',
            choices=PROFILE_NAMES)
-    option(group, '--model', 'YOLO weights, or a detector of transformers: folder or OWNER/NAME '
-           "(the profile's)", default='')
-    option(group, '--detector-vocabulary NAMES', "what a YOLO-World or YOLOE looks for: 'mug, "
-           "chair', or a map (.yaml) with its classes and labels", default='')
-    option(group, '--text-model FILE', 'text tower of that detector (downloaded once)', str, '')
-    option(group, '--clip-model', "(the profile's)", default='')
-    option(group, '--clip-pretrained', "tag or file (the profile's)", default='')
+    add_weights_options(group)
     option(group, '--device', '(%(default)s)', default='auto')
     option(group, '--inference', '(%(default)s: OpenVINO on a CPU where it is installed)',
            default='auto', choices=INFERENCES)
@@ -118,6 +112,18 @@ def add_network_options(group: Any) -> None:
            action='store_false')
     option(group, '--scheduler ADDRESS', 'of a Dask cluster, instead of local processes',
            default='')
+
+
+def add_weights_options(group: Any) -> None:
+    """Add the options that name the weights of detector and CLIP to a group of a parser."""
+    option(group, '--model', 'a detector: ONNX file, folder or OWNER/NAME of the hub, or YOLO '
+           "weights (the profile's)", default='')
+    option(group, '--detector-vocabulary NAMES', "what a YOLO-World or YOLOE looks for: 'mug, "
+           "chair', or a map (.yaml) with its classes and labels", default='')
+    option(group, '--text-model FILE', 'text tower of that detector (downloaded once)', str, '')
+    option(group, '--clip-model', "architecture of open_clip (the profile's)", default='')
+    option(group, '--clip-pretrained', 'folder with ONNX files or OWNER/NAME of the hub, or a tag '
+           "or file of open_clip (the profile's)", default='')
 
 
 def folder_of(options: argparse.Namespace) -> tuple[Path, str] | None:

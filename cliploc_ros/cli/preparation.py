@@ -22,14 +22,10 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.query import Query
 from cliploc_ros.errors import ImageError, OptionsError
 from cliploc_ros.files.storage import NOT_KEPT
-from cliploc_ros.models.clip_towers import keep_text_tower
-from cliploc_ros.models.clip_weights import resolve_clip_weights
-from cliploc_ros.models.devices import import_openvino
-from cliploc_ros.models.openvino_networks import ConversionError
 from cliploc_ros.models.protocols import ObjectDetector
 from cliploc_ros.nodes.detector import DetectorNode
 from cliploc_ros.nodes.relocalizer import RelocalizerNode
-from cliploc_ros.ros.frame_localizer import FrameLocalizer, clip_options_of, load_localizer
+from cliploc_ros.ros.frame_localizer import FrameLocalizer, load_localizer
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import CommonParameters, RelocalizerParameters, map_files
@@ -45,7 +41,7 @@ _FILES = ('model', 'map_file', 'keyframes_file', 'clip_model', 'clip_pretrained'
 
 @dataclass(frozen=True)
 class Request:
-    """What one request cost."""
+    """The cost of one request."""
 
     stage_ms: dict[str, float]  #: Stage to its time [ms]
     #: How many boxes the detector found, and how many the search had
@@ -81,14 +77,6 @@ def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bo
         parameters = node.settings.snapshot()
         used.append(parameters)
         localizer = load_localizer(node, parameters)
-    if (localizer.observer is not None and localizer.device == 'cpu'
-            and parameters.inference != 'pytorch' and import_openvino() is not None):
-        with _step("CLIP's text tower, for the labels of other maps"):
-            clip = clip_options_of(parameters)
-            try:
-                keep_text_tower(resolve_clip_weights(clip), clip)
-            except ConversionError as error:
-                print(f'    {error}: without PyTorch, a robot knows the labels of this map only')
     with _step(f'{_REQUESTS} requests for {picture or "a drawn picture"}'):
         requests = [answer(image_rgb, detector, localizer, parameters) for _ in range(_REQUESTS)]
     print(cost_table(requests), flush=True)
@@ -175,7 +163,6 @@ def carrying(cache_dir: Path, used: list[CommonParameters]) -> list[str]:
     names |= maps | {str(beside(name)) for name in maps
                      for beside in (embeddings_path, layer_path)}
     files = sorted({Path(name).expanduser().absolute() for name in names})
-    files += sorted({file.parent / 'openvino' for file in files})  # networks beside their weights
     return lines + [f'carry as well, for a parameter names it: {file}' for file in files
                     if file.exists()]
 

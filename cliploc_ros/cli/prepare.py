@@ -11,8 +11,8 @@ from cliploc_ros.command import needs_ros, option, run_main, running_ros
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 
 EPILOG = """\
-It loads what detector and relocalizer load with these parameters: weights are downloaded, networks
-converted, the map's labels embedded, and kernels compiled. A robot needs no PyTorch then.
+It loads what detector and relocalizer load with these parameters: networks are downloaded and
+compiled, the map's labels embedded, and kernels compiled.
 It answers a request for one picture, and prints what that costs on this machine.
 
 With --cache-dir, what was downloaded and computed lies in a folder. Copy it to a robot, and set

@@ -31,7 +31,7 @@ from cliploc_ros.offline.datasets.tum import read_tum_trajectory
 from cliploc_ros.offline.recording import recorder
 from cliploc_ros.units import NS_PER_S
 
-# Of a recording, these change how its frames are read.
+# Options that change how the frames of a recording are read.
 _READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'max_gap', 'image',
             'camera_info', 'rectified', 'depth', 'depth_unit', 'depth_intrinsics',
             'depth_baseline', 'intrinsics')
@@ -85,7 +85,7 @@ def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
 
 
 class Source(NamedTuple):
-    """What a source says: observations, the file that has them, and its images if there are."""
+    """The content of a source: observations, their file, and images if there are any."""
 
     recorded: Recorded
     file: Path
@@ -223,7 +223,7 @@ def camera_names(options: argparse.Namespace) -> list[str]:
 
 
 def _mounts(options: argparse.Namespace) -> dict[str, NDArray[np.float64] | None]:
-    """Return the mount (4, 4) of each camera by its name; None where it is not given."""
+    """Return the mount (4, 4) of each camera by its name; None if it is not given."""
     names, numbers = camera_names(options), options.mount
     if numbers is None:
         return dict.fromkeys(names)
@@ -236,7 +236,7 @@ def _mounts(options: argparse.Namespace) -> dict[str, NDArray[np.float64] | None
 
 def _frames_of(options: argparse.Namespace, name: str, mount: NDArray[np.float64] | None,
                gap_ns: int) -> Frames:
-    """Return the images of one camera of a bag; its name is '' where it is the only one."""
+    """Return the images of one camera of a bag; its name is '' if it is the only one."""
     topics = bag_frames.BagTopics(options.image, options.camera_info, options.rectified,
                                   options.depth or '', options.intrinsics,
                                   round(options.stamp_tolerance * NS_PER_S), options.tf)
@@ -291,7 +291,7 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.floa
 
 
 def _odometry(options: argparse.Namespace) -> dict[str, Poses] | None:
-    """Return the cameras of a bag by odometry, by name; None where none is asked for."""
+    """Return the cameras of a bag by odometry, by name; None if none is asked for."""
     max_gap_ns = round(options.max_gap * NS_PER_S)
     if options.odometry_frame is None and options.odometry_topic is None:
         return None

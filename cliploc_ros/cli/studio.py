@@ -54,11 +54,11 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--images BAG|DIR', 'a rosbag2 recording, or a folder as of build_map '
            '--folder, with the images of the views')
     add_topic_options(parser)
-    option(parser, '--clip-model NAME|JSON', 'offer the five phrases that this CLIP finds best, '
-           'as build_map')
-    option(parser, '--clip-pretrained TAG|FILE', 'its weights')
+    option(parser, '--clip-pretrained NAME', 'offer the five phrases that this CLIP finds best: a '
+           'folder or OWNER/NAME with ONNX files, or a tag or file of open_clip, as of build_map')
+    option(parser, '--clip-model NAME', 'the architecture of a tag or file (%(default)s)')
     option(parser, '--device', 'of CLIP (%(default)s)', default='auto')
-    option(parser, '--vocabulary FILE', 'phrases by class (YAML), besides the shipped ones')
+    option(parser, '--vocabulary FILE', 'further phrases by class (YAML)')
     option(parser, '--occupancy-grid FILE', 'show the walls: the YAML file of nav2_map_server, in '
            "the map's coordinate frame")
     option(parser, '--port N', 'the next free one from this on (%(default)s)', within(0, 65535),
@@ -172,15 +172,13 @@ def _phrase_finder(options: argparse.Namespace, recording: 'Recording | None'
     from cliploc_ros.offline.studio.phrases import PhraseFinder
     from cliploc_ros.offline.vocabulary.vocabulary import load_vocabulary
 
-    if (options.clip_model is None) != (options.clip_pretrained is None):
-        raise OptionsError('give both --clip-model and --clip-pretrained, or neither')
-    if options.clip_model is None:
-        if options.vocabulary is not None:
-            raise OptionsError('--vocabulary: CLIP chooses the phrases; give --clip-model and '
+    if options.clip_pretrained is None:
+        if options.clip_model is not None or options.vocabulary is not None:
+            raise OptionsError('--clip-model and --vocabulary are for a CLIP: give '
                                '--clip-pretrained, too')
         return None
-    clip = ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
-                       device=options.device)
+    clip = ClipOptions(model=options.clip_model or ClipOptions.model,
+                       pretrained=options.clip_pretrained, device=options.device)
     return PhraseFinder(clip, load_vocabulary(options.vocabulary), recording)
 
 

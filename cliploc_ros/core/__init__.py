@@ -7,7 +7,7 @@ Imports point downwards only, in this order (test/test_layout.py checks it):
 localizer, succession, relocalizer, warm_up, detector_check
     Frame after frame of a moving camera; frames to a result.
 watch
-    Whether a localizer's pose is right, look by look.
+    Evidence that a localizer's pose is right, look by look.
 acceptance
     Confidence, and the decision to accept or refuse.
 fit
@@ -17,7 +17,7 @@ keyframes
 search
     Observation and map to candidates, minimal samples, and the best hypotheses of one frame.
 observation, options
-    Inputs: the frame, and what the caller chooses.
+    Inputs: the frame, and the caller's options.
 map
     One map or several with their files; landmarks by class, by similarity of labels, by place.
 geometry

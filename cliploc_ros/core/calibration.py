@@ -32,22 +32,22 @@ class Calibration(NamedTuple):
     #: Share of each class among the things of any building; classes that are missing are rare
     common: Terms
     keyframes: Terms  #: Utility of a pose by the points of keyframes
-    #: Log odds that a recognized place is there, and no picture of it
+    #: Log odds that a recognized place is real, not a picture of it
     genuine: Terms
     attitude: Terms  #: The evidence of an attitude against a pose
-    mirror: Terms  #: How a pose of the mirrored image is found
+    mirror: Terms  #: Search for a pose of the mirrored image
     places: Terms  #: Log odds between places that look alike
-    twins: Terms  #: Which places of a map look alike
-    prior: Terms  #: What a region says
-    search: Terms  #: When a search is enough
-    refusals: Terms  #: Which cause a refusal names
-    looks: Terms  #: What successive looks must agree on
+    twins: Terms  #: Limits within which places of a map look alike
+    prior: Terms  #: Log odds of a pose outside the region of the prior
+    search: Terms  #: Condition that ends a search
+    refusals: Terms  #: Choice of the cause that a refusal names
+    looks: Terms  #: Agreement of successive looks
     camera: Terms  #: Errors of a camera and its boxes, and when they are too large
-    covariance: Terms  #: How covariances count
+    covariance: Terms  #: Weights of covariances
     watch: Terms  #: Log odds of a look of the watch, and how its looks add up
     images: Terms  #: Faults of a camera by its images
-    turn: Terms  #: How a camera is turned against its mount
-    depth: Terms  #: Whether depths can be right
+    turn: Terms  #: Turn of a camera against its mount
+    depth: Terms  #: Limits of plausible depths
 
 
 #: The installed numbers; a missing or unknown section is a defect of the installation.

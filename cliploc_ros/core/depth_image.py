@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Depth images, and how far the objects in boxes are.
+"""Depth images, and the depth of the objects in boxes.
 
-Depth is never exact: it has holes, its scale errs, and it does not lie quite on the colour image.
-So a box gets one robust value, from its inner half, and the spread of the values there.
+Depth is never exact: it has holes, its scale errs, and it does not quite fit the colour image. A
+box therefore gets one robust value from its inner half, and the spread of the values there.
 """
 
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.errors import DatasetError
 
-#: Of a 16-bit depth image, by ROS's convention and by that of the TUM RGB-D dataset [m].
+#: Units of a 16-bit depth image: the conventions of ROS and of the TUM RGB-D dataset [m].
 MILLIMETRE, TUM_UNIT = 1e-3, 1 / 5000
 # The inner part of a box that counts, in each direction, and how many values it needs.
 _INNER_SHARE = 0.5
@@ -30,7 +30,7 @@ PLAUSIBLE_DEPTH_M = (0.15, 40.0)
 class DepthCamera:
     """A depth camera whose images are not registered to the colour images."""
 
-    #: Of the depth image [px]
+    #: Focal lengths and principal point of the depth image [px]
     fx: float
     fy: float
     cx: float
@@ -81,12 +81,12 @@ def depth_from_counts(counts: NDArray[np.generic], unit_m: float | None, where: 
 
 def depths_of_boxes(depth: DepthImage, camera: Camera, bboxes_xyxy: NDArray[np.float64]
                     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the depth of what boxes show, and its spread.
+    """Return the depth of the objects in boxes, and its spread.
 
     Parameters
     ----------
     camera : Camera
-        Of the colour image.
+        Camera of the colour image.
     bboxes_xyxy : ndarray (n, 4)
         Boxes in the colour image, as detected.
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the detections of a camera can be of use: their classes, scores and boxes."""
+"""Check the detections of a camera: their classes, scores and boxes."""
 
 from collections import Counter, deque
 from collections.abc import Iterable
@@ -106,7 +106,7 @@ class DetectorCheck:
             sum((one.classes for one in frames), Counter()))
 
     def _certain(self, tally: _Tally) -> list[Fault]:
-        """Return why no detection of some frames is of use; nothing where one is."""
+        """Return why no detection of some frames is of use; nothing if one is."""
         text = ''
         if tally.given and not tally.scored:
             text = f'none of its {tally.given} scores is a number'

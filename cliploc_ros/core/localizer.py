@@ -95,7 +95,7 @@ def can_do_without_crops(options: RelocalizerOptions) -> bool:
 
 
 def by_classes(observation: Observation, landmarks: int) -> Observation:
-    """Return an observation of which CLIP saw no crop, for a map with a number of landmarks.
+    """Return an observation whose crops CLIP did not see, for a map with a number of landmarks.
 
     The node compares crops of one camera only; this is what the others of a rig saw.
     """
@@ -106,7 +106,7 @@ def by_classes(observation: Observation, landmarks: int) -> Observation:
 def recorded_crops(observation: Observation, options: RelocalizerOptions) -> Crops | None:
     """Return the crops on demand of an observation that has all similarities.
 
-    A search gets only those that it needs; None where the options give it all at once.
+    A search gets only the crops that it needs; None if the options give it all at once.
     """
     if options.crops != 'on_demand' or not can_do_without_crops(options):
         return None
@@ -143,9 +143,9 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
     looks : Looks, optional
         Results of earlier frames, which have to agree.
     recognizer : ImageRecognizer, optional
-        Of the keyframes.
+        Recognizer of the keyframes.
     budget : TimeBudget, optional
-        Of the first search; by default a new one, as for each search after it.
+        Budget of the first search; by default a new one, as for each search after it.
     cameras : CameraCheck, optional
         What is known of the cameras.
 
@@ -204,7 +204,7 @@ class Localizer:
     Parameters
     ----------
     keyframes : KeyframeLocalizer, optional
-        Of the keyframes of the map.
+        Localizer among the keyframes of the map.
     """
 
     def __init__(self, relocalizer: Relocalizer, keyframes: KeyframeLocalizer | None = None
@@ -332,7 +332,7 @@ class Localizer:
 
     def _crops_of(self, query: Query, row: int, source: CropSource | None, remembers: bool,
                   begin_stage: Callable[[str], None]) -> Crops | None:
-        """Return the crops of a frame, recorded ones or those of its image; None without both."""
+        """Return the crops of a frame, recorded or cut from its image; None without both."""
         frame = query.frames[row]
         given, rows = frame.similarities, frame.similarity_rows
         if given is not None and (source is None or not query.images
@@ -447,6 +447,6 @@ def instants_to_fuse(instants: Sequence[KeptInstant], observation: Observation, 
 
 
 def _steps(before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[float, float]:
-    """Return how far a camera drove and turned, in the steps that make a frame a new one."""
+    """Return the distance and turn of a camera, in units of the limits of an equal view."""
     distance_m, angle_deg = pose_error(before, after)
     return distance_m / SAME_VIEW.distance_m, angle_deg / SAME_VIEW.angle_deg

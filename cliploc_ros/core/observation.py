@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One frame of the camera, and what is known at its stamp.
+"""One frame of the camera, and all other input at its stamp.
 
-Detections and how similar they are to each label, depth, vertical, odometry, and where the robot
-probably is.
+Detections and their similarity to each label, depth, vertical, odometry, and the prior.
 """
 
 from dataclasses import dataclass, field
@@ -74,12 +73,12 @@ def check_planar(covariance: NDArray[np.float64]) -> None:
 
 @dataclass(frozen=True)
 class Region:
-    """Where the robot probably is, whatever its camera shows: a Gaussian in one map."""
+    """The prior of the robot's pose: a Gaussian in one map."""
 
-    frame_id: str  #: Of the map
+    frame_id: str  #: frame_id of the map
     mean: NDArray[np.float64]  #: (3,): x [m], y [m] and yaw [rad] of the body
     covariance: NDArray[np.float64]  #: (3, 3): of these, positive definite
-    probability: float  #: That this is right, 0 to 1; else the robot may be anywhere
+    probability: float  #: Probability that this is right; else the robot may be anywhere
     #: (4, 4): the body, whose x axis points ahead; by default one that looks as the camera does
     camera_from_body: NDArray[np.float64] = field(default_factory=OPTICAL_FROM_BODY.copy)
 
@@ -98,7 +97,7 @@ class Observation:
     camera: Camera
     detections: Detections  #: n of them
     #: (n, L): cosine similarity of each compared detection's crop with the label
-    #: of each of the map's L landmarks, in the map's order. None where only classes are known.
+    #: of each of the map's L landmarks, in the map's order. None if only classes are known.
     similarities: Similarities | None = None
     stamp_ns: int = 0  #: Time of the image [ns]
     camera_name: str = ''  #: Which of several cameras took it
@@ -117,7 +116,7 @@ class Observation:
     depths: NDArray[np.float64] | None = None
     #: (n,): standard deviation of each depth [m]; None for those of a usual RGB-D camera
     depth_deviations: NDArray[np.float64] | None = None
-    region: Region | None = None  #: Where the robot probably is; None where nothing is known
+    region: Region | None = None  #: Where the robot probably is; None if nothing is known
 
     @property
     def similarity_rows(self) -> NDArray[np.int64]:

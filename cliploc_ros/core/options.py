@@ -75,8 +75,8 @@ class RelocalizerOptions:
     #: Standard deviation of a known vertical [deg]. With one, auto samples two candidates instead
     #: of three.
     vertical_deviation_deg: float = 1.0
-    #: Refine the best hypotheses on all their inliers, then choose the likeliest one. The paper
-    #: does not refine, and chooses the one with the greatest score.
+    #: Refine the best hypotheses on all their inliers, then choose the most likely pose. The paper
+    #: does not refine, and chooses the pose with the greatest score.
     refine: bool = True
     #: Standard deviations of the mounts of several cameras, against each other, on each axis
     #: [m] [deg]

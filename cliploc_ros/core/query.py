@@ -32,12 +32,12 @@ from cliploc_ros.files.storage import parse_json
 
 @dataclass(frozen=True)
 class Query:
-    """The frames of one instant, and what is known besides."""
+    """The frames of one instant, with mount, vertical and prior."""
 
     #: One of each camera, with one stamp and a camera_name each; the camera to localize is last.
     #: odom_from_camera links the cameras of an instant, and the instants of one run.
     frames: tuple[Observation, ...]
-    #: (h, w, 3) uint8, red first: of each frame; empty where nothing is read from images
+    #: (h, w, 3) uint8, red first: of each frame; empty if nothing is read from images
     images: tuple[NDArray[np.uint8], ...] = ()
     #: Number of the run of odometry; None: this instant is linked to no other
     run: int | None = 0
@@ -46,7 +46,7 @@ class Query:
     length_s: float = 0.0
     by_keyframes: bool = True  #: Whether there is time for keyframes
     is_thorough: bool = True  #: Whether to search them thoroughly where a fast pass is refused
-    #: What looks before said of the cameras; None: the localizer knows it
+    #: Evidence of earlier looks about the cameras; None: the localizer knows it
     cameras: CameraCheck | None = None
     #: How many crops of the last frame the first search had, and how many each further search was
     #: given room for: 0 where time ended. Empty: as the options and the time allow.
@@ -60,14 +60,14 @@ class Query:
 
 @dataclass(frozen=True)
 class Case:
-    """The queries of a request, the oldest first, and a report of its answer."""
+    """The queries of a request, oldest first, and a report of its answer."""
 
     queries: tuple[Query, ...]
     report: Mapping[str, Any]
 
     @property
     def options(self) -> RelocalizerOptions:
-        """Return the options of the case; no clock cuts the search. DatasetError: bad ones."""
+        """Return the options of the case; no clock cuts the search. DatasetError: they are bad."""
         defaults = vars(RelocalizerOptions())
         try:
             given: dict[str, Any] = {

@@ -78,10 +78,10 @@ class Relocalization:
     coverage: float = 1.0  #: Share of its samples that the search tried, 0 to 1
     search_ms: float = 0.0  #: Time of association, search and verification [ms]
     stamp_ns: int = 0  #: Stamp of the newest observation [ns]
-    source: str = 'objects'  #: What proposes the best pose: 'objects', 'keyframes' or 'both'
+    source: str = 'objects'  #: The source of the best pose: 'objects', 'keyframes' or 'both'
     #: Kind of the refusal, which programs compare; None when accepted
     refusal_kind: RefusalKind | None = None
-    #: What keyframes say, whatever the best pose comes from; None without keyframes
+    #: Result of the keyframes, whatever the source of the best pose; None without keyframes
     recognition: Recognition | None = None
     #: Whether the depths of the objects can be right; None without depth
     depth: DepthCheck | None = None

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The covariance of an answer for a filter that fuses successive answers.
 
-Answers share images, landmarks and their errors. A filter that fuses ten of them as independent
-measurements is three times more certain of the pose than of one answer, and wrongly so. So a
-filter is given as much information as the answers before, carried on by odometry, did not give: in
-each direction it ends up as certain as the better of both, never more. That is safe fusion
-(Gustafsson, "Statistical Sensor Fusion", 2010), seen from the sensor.
+Answers share images, landmarks and their errors. A filter that fuses ten answers as independent
+measurements is three times too certain of the pose. A filter therefore gets only the information
+that the earlier answers, carried on by odometry, did not give. In each direction it ends up as
+certain as the better of the two, never more. That is safe fusion (Gustafsson, "Statistical Sensor
+Fusion", 2010), seen from the sensor.
 """
 
 from typing import NamedTuple
@@ -28,7 +28,7 @@ from cliploc_ros.core.geometry.transforms import (
 # cliploc_ros.core.fit.covariance. A filter that trusts its odometry less is less certain, not
 # wrong.
 _DRIFT = CALIBRATION.covariance.odometry_drift
-# These are not in calibration.yaml: what a filter is given decides about no pose.
+# These are not in calibration.yaml: the input of a filter decides about no pose.
 # Answers further apart than this quantile contradict each other.
 _CONTRADICTION = float(chi2.ppf(0.99, 6))
 # An answer keeps this share of its information in directions in which it says nothing new: a

@@ -5,9 +5,9 @@
 arrays
     The one schema of npz files: names, types, shapes, checks.
 log
-    A file to which only is appended, for what a killed run has done.
+    An append-only file with the results of a run, also of a killed one.
 storage
     A file in the place of another one in one step, and the cache folder.
 parallel
-    Tasks on processes or on a cluster, some of which die.
+    Tasks on processes or on a cluster, some of whose workers die.
 """

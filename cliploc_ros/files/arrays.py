@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The schema of an npz file: which arrays it holds, of which type and shape, with which values.
+"""The schema of an npz file: its arrays, with their types, shapes and values.
 
 A reader is a table of fields. An untrusted file ends in an error that names file, array and row:
 pickles are refused, check sums are compared, and no array is larger than the file says.
@@ -28,10 +28,9 @@ Arrays = Mapping[str, NDArray[Any]]
 # Kinds of numpy's types; any other type of a field is the name of one.
 _KINDS = {'text': 'U', 'numbers': 'fiu', 'floats': 'f', 'integers': 'iu', 'booleans': 'b'}
 _ROWS_AT_ONCE = 10_000
-# Of a member of a zip file: where the lengths of its name and of a further field stand, and where
-# the name begins.
+# Offsets in a member of a zip file: the lengths of its name and of a further field, and the name.
 _ZIP_LENGTHS, _ZIP_HEAD = 26, 30
-# Arrays may take this much memory [bytes], or so many times what the file takes on the disk: a
+# Arrays may take this much memory [bytes], or this many times what the file takes on the disk: a
 # small file may declare any size, and so may one with holes.
 _MOST_BYTES, _MOST_GROWTH = 512 * 2**20, 8
 # Beyond any pixel, coordinate [m] and time [s].
@@ -39,14 +38,14 @@ _MOST = 1e10
 
 
 class ArrayError(Exception):
-    """What is wrong with an array; the schema adds the file's name."""
+    """A fault of an array; the schema adds the file's name."""
 
 
 @dataclass(frozen=True)
 class Check:
     """A condition that each row of an array meets."""
 
-    what: str  #: What is wrong with a row that fails, such as 'is not finite'
+    what: str  #: The fault of a row that fails, such as 'is not finite'
     #: Takes the array (n, ...), returns whether each row (n,) fails
     is_wrong: Callable[[NDArray[Any]], NDArray[np.bool_]]
 
@@ -116,8 +115,8 @@ class Schema:
 
     kind: str  #: Names the file, as in 'no such query file'
     fields: Mapping[str, Field]  #: Other arrays of a file are not read
-    error: type[CliplocError]  #: What is raised
-    advice: str = ''  #: What to do about an invalid file
+    error: type[CliplocError]  #: The exception to raise
+    advice: str = ''  #: Advice about an invalid file
     #: Lengths that must be above 0, and what they count
     not_empty: Mapping[str, str] = field(default_factory=dict)
     #: Arrays of other kinds of files, and what a file is that has one where a field is missing
@@ -128,7 +127,7 @@ class Schema:
     largest_read: int = 0
 
     def read(self, path: Path) -> dict[str, NDArray[Any]]:
-        """Return the arrays of a file, validated; optional ones that it lacks are missing.
+        """Return the arrays of a file, validated, without the optional arrays that it lacks.
 
         CliplocError: names the file, the array, what is wrong with it, and what to do.
         """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A file of entries to which only is appended: what a process that was killed has done."""
+"""An append-only file of entries, which survives the end of its process."""
 
 import errno
 import fcntl
@@ -73,7 +73,7 @@ class Log:
         return entries, False
 
     def append(self, entry: Any) -> None:
-        """Add an entry; it is on the disk after at most half a second of further ones.
+        """Add an entry; it is on the disk after at most half a second of further entries.
 
         CliplocError: the disk is full or gone, and the entry is not there.
         """

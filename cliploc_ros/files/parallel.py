@@ -31,9 +31,9 @@ logger = logging.getLogger(__name__)
 
 # Tasks at each worker: the next one waits there, and few are held in memory.
 _TASKS_A_WORKER = 2
-# So many times the tasks at all workers lost in a row, without a result, are not an accident.
+# Tasks at all workers lost this many times in a row, without a result, are not an accident.
 _MOST_LOSSES = 3
-# A cluster that lost all its workers starts new ones in this time, or never.
+# A cluster that lost all its workers starts new workers in this time, or never.
 _CHECK_S, _RESTART_S = 5.0, 60.0
 _CONNECT_S = 10
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Reading files of any origin, where files are kept, and how one takes the place of another."""
+"""Read files of any origin, find folders for files, and replace files safely."""
 
 import atexit
 import errno
@@ -34,9 +34,9 @@ _MOST_DIGITS = 20
 _TURN_S, _TURN_POLL_S = 30.0, 0.02
 # A full disk may still take an empty file.
 _PROBE_BYTES = 4096
-#: What to do about a file that cannot be written
+#: Advice about a file that cannot be written
 MAKE_ROOM = 'make room, or choose another folder'
-#: What could not be kept in a cache by this process, see warn_not_kept
+#: Files that this process could not keep in a cache, see warn_not_kept
 NOT_KEPT: list[str] = []
 
 
@@ -166,7 +166,7 @@ def replace_set(path: Path, digest: str, write: WriteOfSet,
                     with suppress(FileNotFoundError):  # a reader has done it
                         _take_place(staged[other], other)
             except OSError as error:
-                raise OptionsError(f'{other}: is not of {path.name} that was written; it cannot '
+                raise OptionsError(f'{other}: belongs to an older {path.name}; it cannot '
                                    f'be removed: {error.strerror}; remove it') from error
 
 

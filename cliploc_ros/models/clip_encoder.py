@@ -5,21 +5,37 @@
 import logging
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_details import WeightedLabels
 from cliploc_ros.core.map.similarities import LabelEmbeddings
-from cliploc_ros.errors import ModelError
+from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.clip_towers import TextTower, load_image_tower
-from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
-from cliploc_ros.models.devices import free_memory, resolve_device
+from cliploc_ros.models.clip_weights import (
+    WITHOUT_CLIP,
+    ClipOptions,
+    ClipWeights,
+    resolve_clip_weights,
+    runs_in_openvino,
+)
+from cliploc_ros.models.devices import (
+    free_memory,
+    needs_pytorch,
+    resolve_device,
+    resolve_precision,
+)
+from cliploc_ros.models.exports import ExportError, keep_export
 from cliploc_ros.models.images import check_image_rgb, crop_bounds
 from cliploc_ros.models.label_embeddings import LabelCache, mixed_rows
+from cliploc_ros.models.onnx_clip import OnnxTextTower, OnnxTower
+
+if TYPE_CHECKING:  # needs PyTorch
+    from cliploc_ros.models.clip_towers import TorchTextTower, TorchTower
 
 Label = str | WeightedLabels
 
@@ -90,7 +106,7 @@ class ClipEncoder:
         self._weights = weights
         self._options = options
         self.device = resolve_device(options.device)
-        self._tower = load_image_tower(weights, options, self.device)
+        self._tower = _load_image_tower(weights, options, self.device)
         #: Equal keys (model and weights) give equal label embeddings.
         self.key = weights.key
         self.inference = self._tower.inference  #: 'pytorch' or 'openvino'
@@ -140,13 +156,60 @@ def encode_labels(weights: ClipWeights, labels: Sequence[str], options: ClipOpti
 
 def _run_text_tower(weights: ClipWeights, labels: Sequence[str], options: ClipOptions
                     ) -> NDArray[np.float32]:
-    tower = TextTower(weights, options)
-    room = tower.context - 2  # between the start and end tokens
+    tower = _load_text_tower(weights, options)
+    ends = 2  # the tokens of start and end
     for label in labels:
-        if (count := len(tower.encode(label))) > room:
+        if (count := tower.count(label)) > tower.context:
             logger.warning("label '%s' has %d tokens: CLIP reads the first %d and ignores the "
-                           'rest', label, count, room)
+                           'rest', label, count - ends, tower.context - ends)
     return tower(labels, _LABEL_BATCH)
+
+
+def _load_image_tower(weights: ClipWeights, options: ClipOptions, device: str
+                      ) -> 'TorchTower | OnnxTower':
+    exported = _as_onnx(weights, options)
+    if exported is not None:
+        return OnnxTower(exported, options)
+    from cliploc_ros.models.clip_towers import TorchTower
+
+    return TorchTower(weights, device, resolve_precision(options.precision, device))
+
+
+def _load_text_tower(weights: ClipWeights, options: ClipOptions
+                     ) -> 'TorchTextTower | OnnxTextTower':
+    exported = _as_onnx(weights, options)
+    if exported is not None:
+        return OnnxTextTower(exported, options)
+    from cliploc_ros.models.clip_towers import TorchTextTower
+
+    return TorchTextTower(weights, resolve_device(options.device))
+
+
+def _as_onnx(weights: ClipWeights, options: ClipOptions) -> ClipWeights | None:
+    """Return weights in ONNX files, exported once; None where PyTorch is to run them.
+
+    With 'auto', PyTorch runs a CLIP that cannot be exported. ExportError: with 'openvino'.
+    OptionsError: a GPU or PyTorch is asked for where there are ONNX files alone.
+    """
+    if not runs_in_openvino(options):
+        if weights.is_onnx and not (options.device == 'auto' and options.inference == 'auto'):
+            raise OptionsError(f"{weights.file} runs in OpenVINO: set device to 'cpu', precision "
+                               "and inference to 'auto', or name weights of open_clip for a GPU")
+        return weights if weights.is_onnx else None
+    if weights.is_onnx:
+        return weights
+    with needs_pytorch(f'CLIP {weights.model}, which is no ONNX network,', WITHOUT_CLIP):
+        from cliploc_ros.models.export import export_clip
+
+        try:
+            folder = keep_export(options.cache_dir, weights.model, weights.identity,
+                                 partial(export_clip, weights))
+        except ExportError as error:
+            if options.inference == 'openvino':
+                raise
+            logger.warning('%s; PyTorch runs it (inference: pytorch saves the attempt)', error)
+            return None
+    return replace(weights, file=folder, is_onnx=True)
 
 
 def _unit_rows(features: Sequence[NDArray[np.float32]], weights: ClipWeights

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The image tower or the text tower of CLIP alone, in PyTorch or OpenVINO."""
+"""The image tower or the text tower of CLIP alone, in PyTorch."""
 
 import contextlib
 import logging
 import pickle
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,32 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.errors import ModelError
-from cliploc_ros.models.clip_weights import (
-    WITHOUT_CLIP,
-    ClipOptions,
-    ClipWeights,
-    is_torchscript,
-)
+from cliploc_ros.models.clip_weights import ClipWeights, is_torchscript
 from cliploc_ros.models.crops import CropPreparation
-from cliploc_ros.models.devices import (
-    needs_pytorch,
-    resolve_device,
-    resolve_inference,
-    resolve_precision,
-)
 from cliploc_ros.models.files import check_weights_file, damaged, first_line
-from cliploc_ros.models.openvino_networks import (
-    FASTEST,
-    FP32,
-    Conversion,
-    ConversionError,
-    Network,
-    convert_module,
-    load_network,
-    open_stored,
-    stored_folders,
-)
-from cliploc_ros.models.tokenizer import ClipTokenizer
 
 if TYPE_CHECKING:
     import torch
@@ -49,10 +26,6 @@ if TYPE_CHECKING:
 _FOREIGN_PREFIX = 'image_encoder.'
 _FOREIGN_SUFFIXES = ('.npz', '.npy')
 
-logger = logging.getLogger(__name__)
-
-
-# ---- the image tower with what runs it ----------------------------------------------------------
 
 class TorchTower:
     """An image tower in PyTorch; the precision is 'fp16' or 'fp32'."""
@@ -81,144 +54,30 @@ class TorchTower:
                              'lower max_batch or choose a smaller model') from error
 
 
-class OpenVinoTower:
-    """An image tower in OpenVINO on a CPU, for batches of any size."""
+class TorchTextTower:
+    """A text tower with its tokenizer in PyTorch, in fp32."""
 
-    inference = 'openvino'
+    def __init__(self, weights: ClipWeights, device: str) -> None:
+        import open_clip
 
-    def __init__(self, network: Network) -> None:
-        self._network = network
-        self.prepare = CropPreparation(network.about['crops'])
+        with quiet_root_logger():
+            self._tokenizer = open_clip.get_tokenizer(weights.model)
+        self.context = int(self._tokenizer.context_length)  #: The most tokens of a label
+        self._device, self._model = device, load_one_tower(weights, 'text', device, 'fp32')[0]
 
-    def __call__(self, batch: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the features (n, d) of prepared crops (n, 3, s, s)."""
-        return self._network(batch)
-
-
-def load_image_tower(weights: ClipWeights, options: ClipOptions, device: str
-                     ) -> TorchTower | OpenVinoTower:
-    """Load the image tower for the inference engine that the options choose.
-
-    With 'auto', PyTorch runs a tower that OpenVINO cannot run as PyTorch does.
-
-    ModelError, OptionsError: see ClipEncoder.
-    """
-    precision = resolve_precision(options.precision, device)
-    with needs_pytorch(f'CLIP {weights.model}, which is not converted for OpenVINO,',
-                       WITHOUT_CLIP):
-        if resolve_inference(options.inference, device, precision) == 'openvino':
-            try:
-                return OpenVinoTower(load_network(
-                    options.cache_dir, weights.model, weights.identity,
-                    lambda: convert_image_tower(weights),
-                    FP32 if options.precision == 'fp32' else FASTEST, weights.file))
-            except ConversionError as error:
-                if options.inference == 'openvino':
-                    raise
-                logger.warning('%s; PyTorch runs it (inference: pytorch saves the attempt)', error)
-        return TorchTower(weights, device, precision)
-
-
-def convert_image_tower(weights: ClipWeights) -> Conversion:
-    """Return the image tower for OpenVINO, with all that replaces open_clip where it runs."""
-    import torch
-
-    model, crops = load_one_tower(weights, 'visual', 'cpu', 'fp32')
-    size: Any = crops['size']
-    shape = (3, size, size) if isinstance(size, int) else (3, *size)
-    probe = np.random.default_rng(0).standard_normal((3, *shape)).astype(np.float32)
-    with torch.inference_mode():
-        expected = model.visual(torch.from_numpy(probe)).numpy()
-    network = convert_module(model.visual, torch.zeros(2, *shape), (-1, *shape))
-    return Conversion(network, probe, expected, {'clip': weights.described(), 'crops': crops})
-
-
-# ---- the text tower with what runs it -----------------------------------------------------------
-
-class TextTower:
-    """A text tower with its tokenizer, in PyTorch or OpenVINO."""
-
-    def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
-        self._network = None
-        device = resolve_device(options.device)
-        if resolve_inference(options.inference, device, 'fp32' if device == 'cpu' else 'fp16'
-                             ) == 'openvino':
-            self._network = _stored_text_tower(weights, options)
-        if self._network is not None:
-            self.context = int(self._network.about['context'])
-            tokenizer = ClipTokenizer(self._network.arrays['merges'].tobytes(), self.context)
-            self.encode: Callable[[str], Sequence[int]] = tokenizer.encode
-            self._tokens: Callable[[list[str]], Any] = tokenizer
-            return
-        with needs_pytorch(f'the text tower of CLIP {weights.model}, which is not converted for '
-                           'OpenVINO,', WITHOUT_CLIP):
-            import open_clip
-
-            with quiet_root_logger():
-                self._tokens = tokenizer = open_clip.get_tokenizer(weights.model)
-            self.context, self.encode = int(tokenizer.context_length), tokenizer.encode
-            self._device, self._model = device, load_one_tower(weights, 'text', device, 'fp32')[0]
+    def count(self, label: str) -> int:
+        """Return the number of tokens of a label, with start and end."""
+        return len(self._tokenizer.encode(label)) + 2
 
     def __call__(self, labels: Sequence[str], batch: int) -> NDArray[np.float32]:
         """Return the features (L, d) of labels, some of them at once."""
-        tokens = self._tokens(list(labels))
-        if self._network is not None:
-            return np.concatenate([self._network(tokens[start:start + batch])
-                                   for start in range(0, len(tokens), batch)])
         import torch
 
-        tokens = cut_padding(self._model, tokens)
+        tokens = cut_padding(self._model, self._tokenizer(list(labels)))
         with torch.inference_mode():
             return np.concatenate([
                 self._model.encode_text(part.to(self._device), normalize=False).cpu().numpy()
                 for part in tokens.split(batch)])
-
-
-def text_identity(weights: ClipWeights) -> tuple[str, ...]:
-    """Return what the text tower of some weights is stored under."""
-    return (*weights.identity, 'text')
-
-
-def _stored_text_tower(weights: ClipWeights, options: ClipOptions) -> Network | None:
-    """Return the text tower that `keep_text_tower` stored, if one is there and sound."""
-    for folder in stored_folders(options.cache_dir, weights.model, text_identity(weights),
-                                 weights.file):
-        try:
-            return open_stored(folder, identity=text_identity(weights))
-        except Exception as error:  # OpenVINO has no exceptions of its own
-            logger.warning('%s cannot be used: %s', folder, first_line(error))
-    return None
-
-
-def keep_text_tower(weights: ClipWeights, options: ClipOptions) -> None:
-    """Convert the text tower for machines without PyTorch, unless the cache has it.
-
-    A ConversionError: OpenVINO cannot run it, or it has a tokenizer of its own. Then machines
-    without PyTorch know the labels that the cache has, and no others.
-    """
-    load_network(options.cache_dir, weights.model, text_identity(weights),
-                 lambda: convert_text_tower(weights), beside=weights.file)
-
-
-def convert_text_tower(weights: ClipWeights) -> Conversion:
-    """Return the text tower for OpenVINO, with the merges of its tokenizer."""
-    import open_clip
-    import torch
-
-    with quiet_root_logger():
-        tokenizer = open_clip.get_tokenizer(weights.model)
-    merges = Path(open_clip.tokenizer.default_bpe()).read_bytes()
-    tokens = tokenizer(['a photo of a red mug', "the dog's 2 bowls!", ''])
-    if not np.array_equal(tokens.numpy(), ClipTokenizer(merges, tokenizer.context_length)(
-            ['a photo of a red mug', "the dog's 2 bowls!", ''])):
-        raise ConversionError(f'CLIP {weights.model} has a tokenizer of its own, which needs '
-                              'PyTorch')
-    model, _ = load_one_tower(weights, 'text', 'cpu', 'fp32')
-    with torch.inference_mode():
-        expected = model.text(tokens).numpy()
-    network = convert_module(model.text, tokens[:2], (-1, tokenizer.context_length))
-    return Conversion(network, tokens.numpy(), expected, {'context': tokenizer.context_length},
-                      {'merges': np.frombuffer(merges, dtype=np.uint8)})
 
 
 # ---- one tower in PyTorch -----------------------------------------------------------------------

@@ -4,25 +4,34 @@
 
 import os
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from cliploc_ros.errors import ModelError, OptionsError, did_you_mean
 from cliploc_ros.files.storage import parse_json, read_file, resolve_cache_dir
-from cliploc_ros.models.devices import check_run, needs_pytorch
-from cliploc_ros.models.files import check_weights_file, download, fingerprint_file
-from cliploc_ros.models.openvino_networks import (
-    ABOUT,
-    stored_about,
-    stored_folders,
-    stored_identity,
+from cliploc_ros.models.devices import (
+    check_run,
+    needs_pytorch,
+    resolve_device,
+    resolve_inference,
+    resolve_precision,
 )
+from cliploc_ros.models.exports import export_key, find_export
+from cliploc_ros.models.files import check_weights_file, download, fingerprint_file
+from cliploc_ros.models.hub import find_network, is_hub_name, resolve_folder
+from cliploc_ros.models.onnx_network import read_config
 
 #: What those without CLIP can do, in the words of the nodes and of the programs.
 WITHOUT_CLIP = ", or do without CLIP ('matching: class', --no-clip)"
 #: How messages name the option for a file of weights.
 CHECKPOINT = 'clip_checkpoint_path (of programs: --clip-pretrained) to the file'
+#: The files of a published CLIP, those of transformers' layout first, then those of open_clip's.
+IMAGE_TOWERS = ('vision_model.onnx', 'onnx/vision_model.onnx', 'visual/model.onnx')
+TEXT_TOWERS = ('text_model.onnx', 'onnx/text_model.onnx', 'textual/model.onnx')
+CONFIG, PREPROCESSOR, PREPROCESS, TOKENIZER = (
+    'config.json', 'preprocessor_config.json', 'visual/preprocess_cfg.json', 'tokenizer.json')
+BESIDE = (CONFIG, PREPROCESSOR, PREPROCESS, TOKENIZER, f'textual/{TOKENIZER}')
 _CONFIG_PARTS = ('embed_dim', 'vision_cfg', 'text_cfg')
 _WEIGHT_SUFFIXES = ('.pt', '.pth', '.bin', '.safetensors', '.npz', '.npy')
 
@@ -37,9 +46,9 @@ class ClipOptions:
     #: Architecture: a name of ``open_clip.list_models()``, or the path of an open_clip model
     #: config (.json), whose name is then the file's
     model: str = 'ViT-L-14'
-    #: A tag of ``open_clip.list_pretrained()``, or the path of a checkpoint, or of a folder with a
-    #: converted image tower, which knows its model. A tag also determines activation and colour
-    #: normalization; with a path the architecture's own values hold.
+    #: A folder with ONNX files, or OWNER/NAME[@REVISION] of the hub: it needs no model. Else a tag
+    #: of ``open_clip.list_pretrained()``, or the path of a checkpoint. A tag also determines
+    #: activation and colour normalization; with a checkpoint the architecture's own values hold.
     pretrained: str = 'openai'
     #: Local file with the weights of the tag, instead of a download; '' downloads
     checkpoint_path: str = ''
@@ -48,7 +57,7 @@ class ClipOptions:
     #: 'fp32'; of the image tower
     precision: str = 'auto'
     max_batch: int = 64  #: Greatest number of crops in one forward pass; bounds the memory
-    #: Folder for downloads, label embeddings and converted networks; '' is the user's cache
+    #: Folder for downloads, label embeddings and compiled networks; '' is the user's cache
     cache_dir: str = ''
     #: 'auto' (OpenVINO on a CPU where it is installed), 'pytorch' or 'openvino'; of the image
     #: tower
@@ -63,53 +72,67 @@ class ClipOptions:
 
 @dataclass(frozen=True)
 class ClipWeights:
-    """A file of CLIP weights and what is needed to use it."""
+    """The weights of a CLIP, in ONNX files or for PyTorch, and what is needed to use them."""
 
-    model: str  #: Architecture, a name of ``open_clip.list_models()``
-    file: Path  #: The weights
-    quick_gelu: bool  #: Whether the weights were trained with OpenAI's approximate GELU
-    #: ``image_mean``, ``image_std``, ``image_interpolation`` and ``image_resize_mode`` as
-    #: ``open_clip.create_model_and_transforms`` takes them; empty for its defaults
-    preprocess: dict[str, Any]
+    model: str  #: Architecture, a name of ``open_clip.list_models()``, or the folder's
+    file: Path  #: The weights, or the folder with ONNX files
     embed_dim: int  #: Length of an embedding
     key: str  #: Identifies model and weights
-    #: The same for the folders of converted networks: known without open_clip
-    identity: tuple[str, ...] = ()
-
-    def described(self) -> dict[str, Any]:
-        """Return all that open_clip knows of the weights, as JSON."""
-        return {name: value for name, value in vars(self).items()
-                if name not in ('file', 'identity')}
+    is_onnx: bool = False
+    #: The rest is of weights for PyTorch. Whether they were trained with OpenAI's approximate GELU
+    quick_gelu: bool = False
+    #: ``image_mean``, ``image_std``, ``image_interpolation`` and ``image_resize_mode`` as
+    #: ``open_clip.create_model_and_transforms`` takes them; empty for its defaults
+    preprocess: dict[str, Any] = field(default_factory=dict)
+    identity: tuple[str, ...] = ()  #: What an export of them is kept under
 
 
 def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
     """Find the weights that the options name; download them if they are not here yet.
 
     ModelError: for an unknown model or tag (the message lists the nearest names), a missing or
-    damaged file, and a failed download. A network that was converted for OpenVINO knows its
-    weights: then neither open_clip nor the file of a tag is needed.
+    damaged file, and a failed download. Where an earlier start has exported the weights, neither
+    open_clip nor the file of a tag is needed.
     """
-    given = Path(options.checkpoint_path or options.pretrained).expanduser().absolute()
-    if (given / ABOUT).exists():
-        return _stored_weights(given)
+    named = options.checkpoint_path or options.pretrained
+    given = Path(named).expanduser().absolute()
+    if names_onnx(options):
+        return _of_onnx(resolve_folder(named, [IMAGE_TOWERS, TEXT_TOWERS], BESIDE,
+                                       options.cache_dir), named)
     identity = _identity_of(options, given)
-    if options.inference != 'pytorch':
-        for folder in stored_folders(options.cache_dir, identity[1], identity, given):
-            if described := stored_about(folder).get('clip'):
-                return ClipWeights(file=given if given.is_file() else folder.parent,
-                                   identity=identity, **described)
-    with needs_pytorch(f'CLIP {identity[1]}, which is not converted for OpenVINO,',
-                       WITHOUT_CLIP):
+    if runs_in_openvino(options):
+        folder = find_export(options.cache_dir, identity[1], identity)
+        if folder is not None:
+            return _of_onnx(folder, identity[1])
+    with needs_pytorch(f'CLIP {identity[1]}, which is no ONNX network,', WITHOUT_CLIP):
         return _resolve_by_open_clip(options, identity)
 
 
-def _stored_weights(folder: Path) -> ClipWeights:
-    """Return the weights of a folder that holds a converted image tower."""
-    described = stored_about(folder).get('clip')
-    if not described:
-        raise ModelError(f'{folder} holds no image tower of CLIP: name the folder of one')
-    # its text tower is a neighbour
-    return ClipWeights(file=folder.parent, identity=tuple(stored_identity(folder)), **described)
+def names_onnx(options: ClipOptions) -> bool:
+    """Return whether the options name ONNX files: a folder, or OWNER/NAME of the hub."""
+    named = options.checkpoint_path or options.pretrained
+    return Path(named).expanduser().is_dir() or is_hub_name(named)
+
+
+def runs_in_openvino(options: ClipOptions) -> bool:
+    """Return whether OpenVINO runs the towers; OptionsError: see resolve_inference."""
+    device = resolve_device(options.device)
+    return resolve_inference(options.inference, device,
+                             resolve_precision(options.precision, device)) == 'openvino'
+
+
+def _of_onnx(folder: Path, name: str) -> ClipWeights:
+    """Return the weights of a folder with ONNX files; ModelError: something is missing."""
+    files = [find_network(folder, name, towers) for towers in (IMAGE_TOWERS, TEXT_TOWERS)]
+    config = read_config(folder / CONFIG, 'it has the length of an embedding')
+    vision = config.get('vision_config')
+    embed_dim = (config.get('projection_dim') or config.get('embed_dim')
+                 or (vision.get('hidden_size') if isinstance(vision, dict) else None))
+    if not isinstance(embed_dim, int) or not 0 < embed_dim < 2**16:
+        raise ModelError(f"{folder / CONFIG} names the length of an embedding neither in "
+                         "'projection_dim' nor in 'embed_dim': add it")
+    key = export_key(folder) or 'onnx:' + ':'.join(map(fingerprint_file, files))
+    return ClipWeights(name, folder, embed_dim, key, is_onnx=True)
 
 
 def _identity_of(options: ClipOptions, given: Path) -> tuple[str, ...]:
@@ -150,11 +173,11 @@ def _resolve_by_open_clip(options: ClipOptions, identity: tuple[str, ...]) -> Cl
     check_weights_file(file)
     quick_gelu = bool(config.get('quick_gelu') or tag.get('quick_gelu') or is_torchscript(file))
     return ClipWeights(
-        model=model, file=file, quick_gelu=quick_gelu,
+        model, file, config['embed_dim'],
+        f'{model}:{"quick_gelu" if quick_gelu else "gelu"}:{fingerprint_file(file)}',
+        quick_gelu=quick_gelu, identity=identity,
         preprocess={f'image_{name}': tag[name] for name in
-                    ('mean', 'std', 'interpolation', 'resize_mode') if name in tag},
-        embed_dim=config['embed_dim'], identity=identity,
-        key=f'{model}:{"quick_gelu" if quick_gelu else "gelu"}:{fingerprint_file(file)}')
+                    ('mean', 'std', 'interpolation', 'resize_mode') if name in tag})
 
 
 def _add_config(name: str) -> str:

@@ -63,15 +63,16 @@ def resolve_device(device: str) -> str:
 def needs_pytorch(what: str, otherwise: str = '') -> Iterator[None]:
     """Raise a ModelError in place of a missing library's error; it names what needs PyTorch.
 
-    ``otherwise`` is a remedy besides converted networks and PyTorch.
+    ``otherwise`` is a remedy besides ONNX networks and PyTorch.
     """
     try:
         yield
     except ModuleNotFoundError as error:
         raise ModelError(
-            f"{error.name} is not installed, and {what} needs it: carry the folder of 'prepare "
-            "--cache-dir' here from a machine with the extra 'models', or install that extra "
-            f'(script/setup models){otherwise}, see doc/install.md') from error
+            f'{error.name} is not installed, and {what} needs it: name ONNX files instead (a '
+            f"published network, or export_network on a machine with the extra 'models'), or "
+            f'install that extra (script/setup models){otherwise}, see doc/install.md'
+        ) from error
 
 
 def count_threads() -> int:

@@ -5,8 +5,10 @@
 import errno
 import hashlib
 import logging
+import os
 import shutil
 import struct
+import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterable
@@ -19,6 +21,8 @@ _BLOCK_BYTES = 64 * 1024
 _BLOCK_COUNT = 66
 # A zip archive, a bare pickle (PyTorch before 1.6), a NumPy array.
 _HEADS = (b'PK', b'\x80', b'\x93NUMPY')
+# The first field of an ONNX file: the version of the format.
+_ONNX_HEAD = b'\x08'
 # A writer that takes longer than this was killed [s].
 _STALE_S = 24 * 3600.0
 
@@ -66,9 +70,10 @@ def check_weights_file(path: Path) -> None:
         raise ModelError(f'{path} is a web page, not weights: download the file behind it')
     if head.startswith(b'PK') and not zipfile.is_zipfile(path):
         raise damaged(path, 'the end of the archive is missing')
-    if path.suffix != '.safetensors' and not head.startswith(_HEADS):
+    heads = _ONNX_HEAD if path.suffix == '.onnx' else _HEADS
+    if path.suffix != '.safetensors' and not head.startswith(heads):
         raise ModelError(f'{path} holds no weights: it is neither a file of PyTorch nor, by its '
-                         'name, of safetensors')
+                         'name, of ONNX or safetensors')
     # The format: eight bytes with the length of a JSON header, the header, the tensors.
     if path.suffix == '.safetensors' and (
             len(head) < 8 or struct.unpack('<Q', head[:8])[0] + 8 > size):
@@ -80,23 +85,52 @@ def damaged(path: Path, reason: object) -> ModelError:
     return ModelError(f'{path} is truncated or corrupt ({reason}): download it again')
 
 
-def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Path]) -> Path:
+def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Path],
+             setting: str = 'cache_dir') -> Path:
     """Download a file with a library's own function; ModelError: that fails.
 
-    ``fetch`` returns the file's path and must leave no partial file there. The folder is made if
-    it does not exist. The error names ``what`` was to be downloaded, and as a remedy what the user
-    can do without a network.
+    ``fetch`` returns the file's path and must leave no partial file under that name. The folder is
+    made if it does not exist. The error names ``what`` was to be downloaded, and as a remedy what
+    the user can do without a network. ``setting`` names what chooses the folder.
     """
     logger.info('downloading %s into %s', what, folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         return Path(fetch())
+    except ModelError:
+        raise
     except Exception as error:  # each library raises exceptions of its own
         reason = f'{type(error).__name__}: {first_line(error).rstrip(".")}'
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            reason = f'the disk of {folder} is full: make room, or set cache_dir to another disk'
-        raise ModelError(f'cannot download {what}: {reason}. {remedy}; or run prepare --cache-dir '
-                         'there, and set cache_dir to a copy of its folder') from error
+            reason = f'the disk of {folder} is full: make room, or set {setting} to another disk'
+        if setting == 'cache_dir':
+            remedy += ('; or run prepare --cache-dir there, and set cache_dir to a copy of its '
+                       'folder')
+        raise ModelError(f'cannot download {what}: {reason}. {remedy}') from error
+
+
+def download_file(url: str, file: Path, remedy: str, setting: str) -> Path:
+    """Download a file from its address; the rest of it, where a part is there.
+
+    The part is NAME.partial, until it is whole. ModelError, remedy and setting: see download.
+    """
+    partial = file.with_name(f'{file.name}.partial')
+
+    def fetch() -> Path:
+        os.environ.setdefault('HF_HUB_DISABLE_TELEMETRY', '1')
+        from huggingface_hub.errors import HfHubHTTPError
+        from huggingface_hub.file_download import http_get
+
+        try:
+            with partial.open('ab') as opened:
+                http_get(url, opened, resume_size=opened.tell(), displayed_filename=file.name)
+        except HfHubHTTPError as error:
+            if error.response.status_code == 416:  # the part is longer than the file
+                partial.unlink()
+            raise
+        return partial.replace(file)
+
+    return download(url, file.parent, remedy, fetch, setting)
 
 
 def remove_unused(entries: Iterable[Path], partial: Iterable[Path], most: int) -> None:
@@ -113,6 +147,23 @@ def remove_unused(entries: Iterable[Path], partial: Iterable[Path], most: int) -
             shutil.rmtree(entry, ignore_errors=True)
         else:
             entry.unlink(missing_ok=True)
+
+
+def keep_folder(folder: Path, most: int, write: Callable[[Path], object]) -> None:
+    """Write a folder of a cache, which appears as a whole; keep so many that were used last.
+
+    ``write`` gets the path of a folder to make. Any number of processes may share the cache.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    remove_unused([each for each in folder.parent.iterdir() if not each.name.startswith('.')],
+                  folder.parent.glob('.*.tmp'), most - 1)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix='.', suffix='.tmp',
+                                     ignore_cleanup_errors=True) as desk:
+        whole = Path(desk) / folder.name
+        write(whole)
+        if folder.exists():  # damaged, or of another process
+            folder.rename(Path(desk) / 'old')
+        whole.rename(folder)
 
 
 def first_line(error: Exception) -> str:

@@ -2,11 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Profiles: which detector and which encoder suit a device."""
 
+import logging
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.models.devices import resolve_device
+from cliploc_ros.models.devices import (
+    needs_pytorch,
+    resolve_device,
+    resolve_inference,
+    resolve_precision,
+)
 
 if TYPE_CHECKING:  # nodes know the names of profiles before they load a network
     from cliploc_ros.models.clip_weights import ClipOptions
@@ -17,19 +25,22 @@ if TYPE_CHECKING:  # nodes know the names of profiles before they load a network
 class Profile:
     """A detector and an encoder."""
 
-    detector: str  #: A published YOLO model
-    #: See ClipOptions
+    detector: str  #: See DetectorOptions.model
+    #: See ClipOptions; an ONNX network needs no model
     clip_model: str
     clip_pretrained: str
 
 
+# OpenAI's ViT-B-32.
+_CLIP = 'Xenova/clip-vit-base-patch32'
 #: doc/install.md has their accuracy, time, memory and licences.
 PROFILES = {
     'accurate': Profile('yolov8x.pt', 'ViT-L-14', 'openai'),  # the paper's
-    'balanced': Profile('yolov8m.pt', 'ViT-B-32-256', 'datacomp_s34b_b86k'),
-    'fast': Profile('yolov8n.pt', 'ViT-B-32', 'datacomp_xl_s13b_b90k'),
+    'balanced': Profile('onnx-community/dfine_m_obj365-ONNX', '', _CLIP),
+    'fast': Profile('onnx-community/dfine_n_coco-ONNX', '', _CLIP),
 }
 PROFILE_NAMES = ('auto', *PROFILES)
+logger = logging.getLogger(__name__)
 
 
 def resolve_profile(profile: str, device: str) -> Profile:
@@ -75,10 +86,52 @@ def load_detector(options: 'DetectorOptions') -> 'ObjectDetector':
     OptionsError
         The device or the inference engine is missing.
     """
-    from cliploc_ros.models.transformers_detector import TransformersDetector, is_of_transformers
+    from cliploc_ros.models.hub import is_hub_name
+    from cliploc_ros.models.onnx_detector import OnnxDetector
 
-    if is_of_transformers(options.model):
-        return TransformersDetector(options)
-    from cliploc_ros.models.yolo_detector import YoloDetector
+    path = Path(options.model).expanduser()
+    if path.suffix == '.onnx' or path.is_dir() or is_hub_name(options.model):
+        return OnnxDetector(options)
+    from cliploc_ros.models.yolo_weights import resolve_published
 
-    return YoloDetector(options)
+    file = resolve_published(options.model, options.cache_dir, 'model')
+    device = resolve_device(options.device)
+    if resolve_inference(options.inference, device,
+                         resolve_precision(options.precision, device)) == 'openvino':
+        exported = _exported(file, options)
+        if exported is not None:
+            return OnnxDetector(exported)
+    with needs_pytorch(f'{file}, which is no ONNX network,'):
+        from cliploc_ros.models.yolo_detector import YoloDetector
+
+        return YoloDetector(file, options)
+
+
+def _exported(file: Path, options: 'DetectorOptions') -> 'DetectorOptions | None':
+    """Return options that name an ONNX file of the weights, exported once.
+
+    With 'auto', None for a network that cannot be exported; ExportError with 'openvino'.
+    """
+    from cliploc_ros.models.exports import (
+        DETECTOR,
+        ExportError,
+        detector_identity,
+        find_export,
+        keep_export,
+    )
+
+    identity = detector_identity(file, options)
+    folder = find_export(options.cache_dir, 'YOLO', identity)
+    if folder is None:
+        with needs_pytorch(f'{file}, which is no ONNX network,'):
+            from cliploc_ros.models.yolo_detector import export_detector
+
+            try:
+                folder = keep_export(options.cache_dir, 'YOLO', identity,
+                                     partial(export_detector, file, options))
+            except ExportError as error:
+                if options.inference == 'openvino':
+                    raise
+                logger.warning('%s; PyTorch runs it (inference: pytorch saves the attempt)', error)
+                return None
+    return replace(options, model=str(folder / DETECTOR), prompts=())

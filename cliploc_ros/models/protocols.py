@@ -26,8 +26,8 @@ class DetectorOptions:
     OptionsError: for values out of range.
     """
 
-    #: Path of a ``.pt`` file or of a folder with an OpenVINO export or a model of transformers, or
-    #: a name that is downloaded once: of a published ``.pt`` file, or OWNER/NAME of the hub
+    #: Path of an ONNX file, of a folder with one or of a ``.pt`` file; or what is downloaded once:
+    #: OWNER/NAME[@REVISION][:FILE] of the hub, or a published ``.pt`` file
     model: str = 'yolov8x.pt'
     conf: float = 0.1  #: Least confidence of a detection, 0 to 1
     iou: float = 0.7  #: IoU from which the weaker of two boxes of a class is dropped, 0 to 1
@@ -35,7 +35,7 @@ class DetectorOptions:
     max_det: int = 300  #: Greatest number of detections in an image; the most confident are kept
     device: str = 'auto'  #: 'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'
     precision: str = 'auto'  #: 'auto' (fp16 on a GPU, fp32 on a CPU), 'fp16' or 'fp32'
-    cache_dir: str = ''  #: Folder for downloads and converted networks; '' is the user's cache
+    cache_dir: str = ''  #: Folder for downloads and compiled networks; '' is the user's cache
     #: 'auto' (OpenVINO on a CPU where it is installed), 'pytorch' or 'openvino'
     inference: str = 'auto'
     #: What a YOLO-World or YOLOE looks for; empty: the classes that it was saved with

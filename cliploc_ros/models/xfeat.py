@@ -28,7 +28,7 @@ from cliploc_ros.models.devices import import_openvino
 from cliploc_ros.models.files import download, first_line
 
 if TYPE_CHECKING:  # loaded where a layer has these features
-    from cliploc_ros.models.openvino_networks import Network
+    from cliploc_ros.models.onnx_network import CompiledNetwork
 
 XFEAT = 'xfeat-64-uint8'
 FILE_NAME = 'xfeat.onnx'
@@ -88,9 +88,9 @@ def _is_published(content: bytes) -> bool:
 
 
 @cache
-def _network(file: Path) -> 'Network':
+def _network(file: Path) -> 'CompiledNetwork':
     """Return the network of a file; ModelError: see load_xfeat."""
-    from cliploc_ros.models.openvino_networks import Network
+    from cliploc_ros.models.onnx_network import CompiledNetwork
 
     if import_openvino() is None:
         raise ModelError(f'{file} needs OpenVINO: pip install openvino, {WITHOUT_XFEAT}')
@@ -102,7 +102,7 @@ def _network(file: Path) -> 'Network':
         raise ModelError(f'{file} is not the published XFeat, whose SHA-256 is {_SHA256}: remove '
                          f'it, {WITHOUT_XFEAT}')
     try:
-        return Network(any_size(import_openvino().Core().read_model(file)), {})
+        return CompiledNetwork.of(any_size(import_openvino().Core().read_model(file)))
     except Exception as error:  # OpenVINO has no exceptions of its own
         raise ModelError(f'OpenVINO does not run {file}: {first_line(error)}; update OpenVINO, '
                          f'{WITHOUT_XFEAT}') from error
@@ -142,7 +142,7 @@ def _extract(file: Path, image_rgb: NDArray[np.uint8], most: int, longest_side_p
     scale = min(1.0, longest_side_px / sides.max())
     size = np.maximum(1, (scale * sides).astype(np.int64) // _STEP) * _STEP
     image = cv2.resize(image_rgb, size.tolist(), interpolation=cv2.INTER_AREA)
-    found = _network(file)(np.asarray(cv2.dnn.blobFromImage(image, 1.0 / 255.0)))[0]
+    found = _network(file)(np.asarray(cv2.dnn.blobFromImage(image, 1.0 / 255.0)))[0][0]
     columns, rows = size // _CELL
     likely = found[_DIMENSIONS:-2].reshape(_CELL, _CELL, rows, columns)
     likely = np.ascontiguousarray(likely.transpose(2, 0, 3, 1)).reshape(size[::-1])

@@ -20,7 +20,6 @@ from cliploc_ros.errors import ModelError, did_you_mean
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.devices import needs_pytorch
 from cliploc_ros.models.files import check_weights_file, download, first_line
-from cliploc_ros.models.protocols import DetectorOptions
 
 _LEAST_STRIDE = 32
 
@@ -67,20 +66,11 @@ def _is_restricted(ultralytics: Any) -> bool:
             and hasattr(torch.serialization, 'get_unsafe_globals_in_checkpoint'))
 
 
-def resolve_yolo_weights(options: DetectorOptions) -> Path:
-    """Return the file or folder that the options name; download the file if necessary.
-
-    ModelError: when it is missing, damaged or unknown, or the download fails.
-    """
-    file = Path(options.model).expanduser().absolute()
-    return file if is_export(file) else resolve_published(options.model, options.cache_dir,
-                                                          'model')
-
-
 def resolve_published(given: str, cache_dir: str, option: str) -> Path:
     """Return a file of weights, by its path or the name under which ultralytics published it.
 
-    Errors as of resolve_yolo_weights; they name the option.
+    ModelError: it is missing, damaged or unknown, or the download fails; the message names the
+    option.
     """
     file = Path(given).expanduser().absolute()
     if file.exists() or Path(given).name != given:
@@ -120,11 +110,6 @@ def _refuse_code(file: Path) -> None:
 def stride_of(model: Any) -> int:
     """Return what height and width of an input must be multiples of, as ultralytics has it."""
     return max(int(model.stride.max()), _LEAST_STRIDE)
-
-
-def is_export(path: Path) -> bool:
-    """Return whether a path is a folder with an OpenVINO export."""
-    return path.is_dir() and any(path.glob('*.xml'))
 
 
 def load_yolo(file: Path, is_download: bool = False) -> Any:

@@ -101,7 +101,7 @@ def _image_ns(image: TimedImage) -> int:
 
 
 class _Camera:
-    """The images of a camera while its detections have a subscriber, and what is published."""
+    """Images of a camera while its detections have a subscriber, and the detections published."""
 
     def __init__(self, node: ManagedNode[DetectorParameters], name: str, newest: NewestInstant,
                  on_match: Callable[[], None]) -> None:
@@ -173,7 +173,7 @@ class DetectorNode(ManagedNode[DetectorParameters]):
         self._cameras = {name: _Camera(self, name, self._newest, self._update)
                          for name in self.settings.values.camera_names or ('',)}
         self._last_error = ''
-        # Since when boxes are awaited (monotonic clock) [s], and how long the first ones took.
+        # Since when boxes are awaited (monotonic clock) [s], and how long the first boxes took.
         self._awaited_since = math.inf
         self._first_boxes_s: float | None = None
 
@@ -212,7 +212,7 @@ class DetectorNode(ManagedNode[DetectorParameters]):
         self._update()
 
     def examine(self, health: Health) -> None:
-        """Report the input, rates, what was dropped, and the device."""
+        """Report the input, rates, dropped messages and the device."""
         for camera in self._cameras.values():
             camera.examine(health, self.settings.values.stale_after_s)
         if self._last_error:

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What no robot runs: maps from recordings, their check and update, evaluation, the studio."""
+"""Programs that no robot runs: mapping, checks and updates of maps, evaluation, the studio."""

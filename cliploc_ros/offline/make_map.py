@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Mapping as a library: what a recording shows becomes a map with labels, images and keyframes."""
+"""Mapping as a library: a recording becomes a map with labels, embeddings and keyframes."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -16,7 +16,12 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import load_removed, removed_path, write_landmarks, write_map
 from cliploc_ros.errors import MappingError, ModelError
 from cliploc_ros.files.storage import WriteOfSet
-from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
+from cliploc_ros.models.clip_weights import (
+    ClipOptions,
+    ClipWeights,
+    names_onnx,
+    resolve_clip_weights,
+)
 from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.datasets.map_recording import (
     MapRecording,
@@ -41,14 +46,14 @@ _TRIALS, _SAME_SIZE = 4, 0.01
 
 @dataclass(frozen=True)
 class MadeMap:
-    """A map and what belongs next to it."""
+    """A map and the files next to it."""
 
     landmark_map: LandmarkMap
-    report: MappingReport | UpdateReport  #: What was found and left out, and why
-    embeddings: LandmarkEmbeddings | None = None  #: What CLIP saw of each landmark
+    report: MappingReport | UpdateReport  #: Landmarks found and objects left out, with reasons
+    embeddings: LandmarkEmbeddings | None = None  #: Embeddings of the crops of each landmark
     layer: KeyframeLayer | None = None
     mount: MountCorrection | None = None  #: Where a correction was asked for
-    removed: LandmarkMap | None = None  #: What updates took out of the map
+    removed: LandmarkMap | None = None  #: Landmarks that updates took out of the map
 
 
 @dataclass(frozen=True)
@@ -60,7 +65,7 @@ class Labeller:
     #: names
     clip: ClipOptions | None = None
     weights: ClipWeights | None = None
-    note: str = ''  #: Why labels are class names; '' where they are not
+    note: str = ''  #: Why labels are class names; '' if they are not
 
     def describe(self, landmark_map: LandmarkMap, detections: PosedDetections,
                  shown: NDArray[np.int64]) -> tuple[LandmarkMap, LandmarkEmbeddings | None]:
@@ -76,7 +81,7 @@ class Labeller:
             return landmark_map, embeddings
         names = sorted({name for row in range(len(landmark_map))
                         for name in classes_of(landmark_map, row)})
-        # in two parts: the user's phrases change more often than the shipped ones
+        # in two parts: the user's phrases change more often than the shipped phrases
         phrases = phrases_of_classes(self.weights, self.clip, [
             {name: shipped_phrases(name) for name in names},
             {name: texts for name, texts in self.vocabulary.added.items() if name in names}])
@@ -93,7 +98,7 @@ def find_labeller(detections: PosedDetections, clip: Callable[[], ClipOptions] |
         Returns the CLIP of the recording; called only where the recording has embeddings. None:
         labels are class names.
     vocabulary : Path, optional
-        Phrases by class (YAML), besides the shipped ones.
+        Phrases by class (YAML), in addition to the shipped phrases.
 
     Raises
     ------
@@ -121,7 +126,7 @@ def _weights_of(detections: PosedDetections, clip: ClipOptions) -> ClipWeights:
     theirs = detections.encoder_key.split(':')[0]
     ours = Path(clip.model).stem if clip.model.endswith('.json') else clip.model.replace('/', '-')
     # compared first, since the weights of another model would be downloaded in vain
-    if ours != theirs:
+    if not names_onnx(clip) and ours != theirs:
         raise ModelError(f"the embeddings are of CLIP model '{theirs}', not '{ours}'; {hint}")
     weights = resolve_clip_weights(clip)
     if weights.key != detections.encoder_key:
@@ -234,7 +239,7 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
 
 def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording: MapRecording,
                    updated: Path | None = None) -> list[str]:
-    """Write a map and what lies next to it as one set; return lines about its keyframes.
+    """Write a map and the files next to it as one set; return lines about its keyframes.
 
     Those of a map that is updated in its place stay, those of any other map before go.
 

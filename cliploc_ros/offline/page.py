@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pages of HTML: one style and the parts of all pages. They have no scripts and ask for nothing.
+"""Pages of HTML: one style and the parts of all pages. They have no scripts and request nothing.
 
 A function that takes texts escapes them; one that takes parts takes HTML.
 """

@@ -44,7 +44,7 @@ _INFINITE_S = 2**31 - 1
 
 @dataclass(frozen=True)
 class PlayOptions:
-    """How to play a recording."""
+    """Options of playing a recording."""
 
     #: Speed; 1 is as recorded.
     rate: float = 1.0
@@ -64,7 +64,7 @@ class PlayOptions:
 
 @dataclass(frozen=True)
 class PlayReport:
-    """What was published."""
+    """Counts of published messages."""
 
     #: Messages by recorded topic name.
     counts: Counter[str]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What detector and CLIP of a robot would say; for check_map, the studio and studies.
+"""Simulated detector and CLIP of a robot; for check_map, the studio and studies.
 
 The detector's boxes have guessed or measured errors. CLIP's similarities of crops and labels are
 simulated: a label is a vector, a part of its class and a part of its words, each word a random
@@ -37,12 +37,12 @@ _GUESSED_RATIO = 0.6
 _GUESSED_REACH_M = 5.0
 GUESSED_MIN_SIDE_PX = 12.0
 _GUESSED_CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
-# Of the vectors of labels and crops.
+# Length of the vectors of labels and crops.
 _SIZE = 256
-#: Of a vector's square: what all objects of a class share.
+#: Part of a vector's square that all objects of a class share.
 CLASS_SHARE = 0.3
 _NOISE = 0.43
-# Of the noise's variance: what all crops of one landmark share.
+# Part of the noise's variance that all crops of one landmark share.
 _SHARED_NOISE = 0.3
 _STOP_WORDS = frozenset((
     'a', 'an', 'and', 'at', 'by', 'from', 'in', 'is', 'of', 'on', 'or', 'seen', 'standing', 'the',
@@ -62,12 +62,12 @@ class DetectorModel:
 
     landmark_map: LandmarkMap  #: What there is to see
     camera: Camera
-    sightings: tuple[Sightings, ...]  #: Of each landmark; empty without a recording
+    sightings: tuple[Sightings, ...]  #: Sightings of each landmark; empty without a recording
     #: (L,): share of the expected frames in which each landmark was detected, and from how far
     #: away it can be [m]
     ratios: NDArray[np.float64]
     reach_m: NDArray[np.float64]
-    edge_scale: float  #: Of the standard deviations of edges
+    edge_scale: float  #: Scale of the standard deviations of edges
     min_side_px: float  #: Smaller boxes are not detected
     #: tuple of ((k, 4), tuple of str): boxes [px] of no landmark in single frames, and their
     #: classes
@@ -177,7 +177,7 @@ class LabelModel:
 
 
 def shared_noise(biases: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the noise (n, D) of crops, a part of which all crops of an object share."""
+    """Return the noise (n, D) of crops. All crops of an object share a part of it."""
     return np.asarray(np.sqrt(1.0 - _SHARED_NOISE) * noise + np.sqrt(_SHARED_NOISE) * biases)
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The answer to a request, or to one frame in continuous mode; and the case that is kept of it."""
+"""The answer to a request, or to one frame in continuous mode; and its record as a case."""
 
 import math
 import threading
@@ -33,7 +33,7 @@ _LIBRARIES = ('cliploc_ros', 'numpy', 'scipy', 'numba')
 
 
 class Verdict(StrEnum):
-    """What became of a request."""
+    """The outcome of a request."""
 
     #: The pose is accepted and, for a request, delivered.
     ACCEPTED = 'accepted'
@@ -58,11 +58,11 @@ class Answer:
     #: Whether time was too short for all crops, which could have changed the verdict
     is_cut: bool = False
     stages_ms: Mapping[str, float] = field(default_factory=dict)  #: How long each stage took [ms]
-    #: Of the map that was searched, see frame_localizer.load_hashed_map; empty without one
+    #: Hash of the searched map, see frame_localizer.load_hashed_map; empty without one
     map_hash: str = ''
-    kind: RefusalKind | None = None  #: Of a refusal; None for other verdicts
+    kind: RefusalKind | None = None  #: Kind of a refusal; None for other verdicts
     header: Header | None = None  #: Stamp of the image, frame of the map; None without an image
-    #: What decided, as doc/interface.md describes it
+    #: The deciding figures, as doc/interface.md describes them
     figures: Mapping[str, object] = field(default_factory=dict)
     #: Where the robot's x axis points, or the camera looks, from the map's x axis to its y axis
     heading_deg: float = 0.0
@@ -147,7 +147,7 @@ class RequestCounters:
 
 
 class CaseRecorder:
-    """The last answers to frames of requests, if it keeps any; older ones are forgotten."""
+    """The last answers to frames of requests, if it keeps any; older answers are forgotten."""
 
     def __init__(self, keeps: bool) -> None:
         self._keeps = keeps
@@ -156,7 +156,7 @@ class CaseRecorder:
         self._last = Answer(Verdict.FAILED, 'no request yet')
 
     def add(self, answer: Answer) -> None:
-        """Keep what was found in a frame."""
+        """Keep the result of a frame."""
         if not self._keeps:
             return
         with self._lock:

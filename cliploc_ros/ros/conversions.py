@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Conversion of messages to values and back. No field of a message is taken for valid."""
+"""Conversion of messages to values and back. No field of a message is assumed valid."""
 
 import importlib
 from collections.abc import Callable
@@ -87,7 +87,7 @@ def pose_array_msg(header: Header, poses: list[NDArray[np.float64]]) -> PoseArra
 
 
 class DetectionType(NamedTuple):
-    """A message type, and what makes a vision_msgs/Detection2DArray of it."""
+    """A message type, and its conversion to vision_msgs/Detection2DArray."""
 
     message_type: type
     converted: Callable[[Any], Detection2DArray]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Check all that a request needs, one after another: what works, what fails, and what to do.
+"""Check everything that a request needs, one after another; say what fails and what to do.
 
 It subscribes to the relocalizer's inputs and localizes once. It delivers no pose.
 """
@@ -60,7 +60,7 @@ _SPIN_S = 0.05
 
 
 class State(StrEnum):
-    """Whether a check passed."""
+    """The result of a check."""
 
     PASS = 'pass'
     FAIL = 'fail'
@@ -69,7 +69,7 @@ class State(StrEnum):
 
 
 class Finding(NamedTuple):
-    """What was checked, and what was found; for a failure also what to do."""
+    """A check and its result; for a failure also the remedy."""
 
     what: str
     state: State
@@ -93,7 +93,7 @@ class Report:
         self.add(what, State.FAIL if problem else State.PASS, problem or text)
 
     def skip(self, what: str, text: str) -> None:
-        """Add what was not checked, and why."""
+        """Add a check that was not made, with the reason."""
         self.add(what, State.NOT_CHECKED, text)
 
     @contextmanager
@@ -111,11 +111,11 @@ class Doctor(ManagedNode[RelocalizerParameters]):
     Parameters
     ----------
     given : sequence of Parameter
-        Of the relocalizer.
+        Parameters of the relocalizer.
     topics : sequence of str
-        Its remappings, NAME:=TOPIC.
+        Remappings of the relocalizer, NAME:=TOPIC.
     wrong_cameras : str
-        What its looks have shown to be wrong with its cameras.
+        Faults of the relocalizer's cameras, by its looks.
     """
 
     def __init__(self, given: Sequence[Parameter], topics: Sequence[str], wrong_cameras: str = ''
@@ -200,7 +200,7 @@ def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
 
 def _check_map(node: Doctor, parameters: RelocalizerParameters, report: Report
                ) -> FrameLocalizer | None:
-    """Load map, keyframes and CLIP; return them, None where that fails."""
+    """Load map, keyframes and CLIP; return them, None if that fails."""
     began_at = time.monotonic()
     with report.failing('map'):
         localizer = node.worker.run(partial(load_localizer, node, parameters))

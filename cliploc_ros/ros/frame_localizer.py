@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""From a frame to a relocalization: the map and the network that stay loaded between requests."""
+"""Relocalize a frame with the map and the networks that stay loaded between requests."""
 
 import hashlib
 import logging
@@ -61,7 +61,7 @@ class Localized(NamedTuple):
 
     #: In the coordinate frame of the map.
     found: Relocalization
-    #: Of several maps, the one of the best pose.
+    #: With several maps, the map of the best pose.
     landmark_map: LandmarkMap
     #: With the crops that were compared, and their similarities to this map.
     seen: SeenImage
@@ -82,7 +82,7 @@ class FrameLocalizer:
     Parameters
     ----------
     relocalizer : Relocalizer
-        Of the map, with these options.
+        Relocalizer of the map, with these options.
     device : str
         Where the observer's network runs.
     map_hash : str
@@ -118,7 +118,7 @@ class FrameLocalizer:
                  times: StageTimes, deadline: float = math.inf) -> Localized:
         """Find where the camera was, with a frame and those that odometry links to it.
 
-        `parameters` are as they are now, `known` is what is known besides. No crops are compared
+        `parameters` are as they are now, `known` is the prior knowledge. No crops are compared
         after `deadline` (monotonic clock) [s].
 
         CliplocError: names what to fix in the frame or in the parameters.

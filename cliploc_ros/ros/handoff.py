@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Handing an accepted pose over: to a running localizer, or as map -> odom to the robot itself.
+"""Deliver an accepted pose: to a running localizer, or as map -> odom to the robot itself.
 
 `initialpose` is volatile, so the publisher may have met a subscription that has not met it yet,
-and DDS takes a localizer that was killed or hangs for alive. So only the pose that the localizer
-shows tells whether it has taken one.
+and for DDS a localizer that was killed or hangs is still alive. Only the pose that the localizer
+publishes proves that it took the given pose.
 """
 
 import math
@@ -75,7 +75,7 @@ class HandOff:
         self._odometry = odometry
         self._changed = threading.Condition()
         self._stopped = threading.Event()
-        # What the localizer shows since the pose was last published.
+        # The latest message of the localizer since the pose was last published.
         self._shown: PoseWithCovarianceStamped | None = None
         self._shown_at = -math.inf  # when it was heard (monotonic clock) [s]
         self._pose_topic = ''
@@ -88,7 +88,7 @@ class HandOff:
                                            callback_group=ReentrantCallbackGroup())
 
     def on_shown(self, listener: Callable[[PoseWithCovarianceStamped], None]) -> None:
-        """Have each pose that the localizer shows reported; the callback must not block."""
+        """Call a function with each pose of the localizer; it must not block."""
         self._listeners.append(listener)
 
     def open(self, pose_topic: str) -> None:
@@ -96,7 +96,7 @@ class HandOff:
         self._stopped.clear()
         if pose_topic:
             self._pose_topic = str(self._node.resolve_topic_name(pose_topic))
-            # Volatile: what a localizer showed before does not come late.
+            # Volatile: an earlier pose of the localizer does not come late.
             self._subscription = qos.AdaptiveSubscription(
                 self._node, PoseWithCovarianceStamped, pose_topic, self._hear, qos.POSE)
 
@@ -116,10 +116,10 @@ class HandOff:
         """Return that there is no localizer, and what to do; empty if there is one."""
         if not self._publisher.get_subscription_count():
             return (f'nobody subscribes {self._publisher.topic_name}: start the localizer (AMCL); '
-                    'if it has just started, ask again; without one set require_localizer: false')
+                    'if it has just started, request again; without AMCL require_localizer: false')
         if self._subscription is not None and not self._node.count_publishers(self._pose_topic):
             return (f'nobody publishes {self._pose_topic}: start the localizer (AMCL); if it has '
-                    'just started, ask again; name the topic of its pose by localizer_pose')
+                    'just started, request again; name the topic of its pose by localizer_pose')
         return ''
 
     def hand_over(self, pose: PoseWithCovarianceStamped, parameters: RelocalizerParameters,
@@ -137,7 +137,7 @@ class HandOff:
             When to return at the latest, and when the image arrived (monotonic clock) [s]. A
             hand-over that need not wait is made after the deadline, too.
         jumps : TimeJumps
-            Of the node's clock.
+            Time jumps of the node's clock.
 
         Raises
         ------
@@ -170,7 +170,7 @@ class HandOff:
         silent = self._settle(parameters.nomotion_updates, deadline)
         if must_show and (gone := silent or self.missing()):
             raise NoLocalizerError(f'the localizer took the pose and has ended or hangs since: '
-                                   f'{gone}: see its log, ask again')
+                                   f'{gone}: see its log, request again')
         if must_show and not is_taken(given, self._shown):
             raise NoLocalizerError(self._not_taken(given, times, begun_at))
         if silent:
@@ -213,7 +213,7 @@ class HandOff:
         """Describe the localizer's pose, or its silence, where it did not take the given pose."""
         shown, why = self._shown, 'the localizer did not take the pose: '
         if not times:
-            return 'too little time is left to see whether the localizer takes the pose: ask again'
+            return 'too little time is left for the localizer to take the pose: request again'
         if shown is None:
             return (f'{why}{self._pose_topic} shows nothing since initialpose was published '
                     f'{times} times in {time.monotonic() - begun_at:.0f} s: see whether the '
@@ -243,7 +243,7 @@ class HandOff:
         by_poses = self._odometry.speeds_by_poses(left_s)
         if by_poses is None and left_s < MOMENT_PATIENCE_S:
             raise HandOffError(f'{self._odometry.topic} has just begun, and too little time is '
-                               'left to see whether the robot moves: ask again')
+                               'left to see whether the robot moves: request again')
         v, w = odometry.twist.twist.linear, odometry.twist.twist.angular
         by_twist = math.hypot(v.x, v.y, v.z), math.hypot(w.x, w.y, w.z)
         if by_poses is None and by_twist == (0.0, 0.0):
@@ -267,12 +267,12 @@ class HandOff:
         if moved is None and is_published:
             raise HandOffError(f'{self._odometry.topic} does not tell whether the robot has moved '
                                'since its image: stamp both by one clock, send at 1 Hz or more; '
-                               'ask again')
+                               'request again')
         distance_m, angle_deg = moved or (0.0, 0.0)
         if distance_m > SAME_SPOT.distance_m or angle_deg > SAME_SPOT.angle_deg:
             raise HandOffError(f'the robot has moved by {distance_m:.2f} m and {angle_deg:.0f} '
                                f'degrees since its image (limits {SAME_SPOT.distance_m:g} and '
-                               f'{SAME_SPOT.angle_deg:g}): ask again while it stands')
+                               f'{SAME_SPOT.angle_deg:g}): request again while it stands')
 
     def _settle(self, updates: int, deadline: float) -> str:
         """Have AMCL take in some scans though the robot rests, as far as time allows.

@@ -33,7 +33,7 @@ WATCHES = ('none', 'tf', 'amcl_pose')
 REACTIONS = ('report', 'relocalize')
 
 _FILE, _PACKAGE = 'file://', 'package://'
-# Of timeout_s, for algorithms other than auto.
+# Share of timeout_s for the search of algorithms other than auto.
 _SEARCH_SHARE = 0.5
 
 
@@ -45,18 +45,18 @@ class CommonParameters(Parameters):
         "Where the network runs: 'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'.",
         read_only=True)
     inference: str = parameter('auto',
-        "What runs the network: 'auto' (OpenVINO on a CPU where it is installed, else "
-        "PyTorch), 'pytorch' or 'openvino'.", choices=INFERENCES, read_only=True)
+        "Engine of the network; 'auto': OpenVINO on a CPU, PyTorch on a GPU.",
+        choices=INFERENCES, read_only=True)
     cache_dir: str = parameter('',
-        'Folder of downloads, label embeddings, converted networks and compiled kernels; '
-        'empty: ~/.cache/cliploc_ros.', read_only=True)
+        'Folder of downloads, label embeddings, compiled networks and kernels; empty: '
+        '~/.cache/cliploc_ros.', read_only=True)
     image_transport: str = parameter('raw',
-        "Subscribe to 'image' or to 'image/compressed'.", choices=TRANSPORTS, read_only=True)
+        'Subscribe to image or to image/compressed.', choices=TRANSPORTS, read_only=True)
     cameras: list[str] = parameter([''],
         'Names of several cameras, the namespaces of their topics; empty: one camera.',
         read_only=True)
     stale_after_s: float = parameter(2.0,
-        'The diagnostics warn of an input that is silent for longer.', unit='s', low=0.1,
+        'Warn in the diagnostics of an input that is silent for longer.', unit='s', low=0.1,
         high=3600.0)
 
     @property
@@ -81,28 +81,28 @@ class DetectorParameters(CommonParameters):
     """The parameters of the detector."""
 
     profile: str = parameter('auto',
-        "Detector of a profile: 'accurate', 'balanced' or 'fast'; 'auto': accurate on a GPU, "
-        'balanced on a CPU.', choices=PROFILE_NAMES, read_only=True)
+        "Detector; 'auto': accurate on a GPU, balanced on a CPU.", choices=PROFILE_NAMES,
+        read_only=True)
     model: str = parameter('',
-        'Weights: a local file, a folder with an OpenVINO export or a model of transformers, or a '
-        'name that is downloaded once: of ultralytics, or OWNER/NAME of the Hugging Face hub; '
-        "empty: the profile's.", read_only=True)
+        'An ONNX file or a folder with one, OWNER/NAME of the Hugging Face hub, or YOLO weights '
+        "(.pt); empty: the profile's.", read_only=True)
     vocabulary: str = parameter('',
-        "What a YOLO-World or YOLOE looks for: 'map', the classes and labels of map_file, or "
-        "names such as 'mug, office chair'; empty: the classes of its file.", read_only=True)
+        "What a YOLO-World or YOLOE detects: 'map' (the classes and labels of map_file), or "
+        "names such as 'mug, office chair'; empty: its own classes.", read_only=True)
     map_file: str = parameter('',
-        "Map of the vocabulary 'map', read when the node is configured; as of the relocalizer.")
+        "Map of the vocabulary 'map', read when the node is configured.")
     text_model: str = parameter('',
-        'File of the text tower of a YOLO-World (CLIP ViT-B-32) or YOLOE (mobileclip_blt.ts); '
+        'Text tower of a YOLO-World (CLIP ViT-B-32) or YOLOE (mobileclip_blt.ts), a file; '
         'empty: download it once.', read_only=True)
-    conf: float = parameter(0.1, 'Drop detections below this confidence.', low=0.0, high=1.0)
+    conf: float = parameter(0.1,
+        'Drop detections below this confidence.', low=0.0, high=1.0)
     iou: float = parameter(0.7,
         'Drop the weaker of two boxes of one class that overlap more.', low=0.0, high=1.0)
     imgsz: int = parameter(640,
-        'Longer side of the image as the network sees it. Memory grows with its square.',
-        unit='px', low=32, high=2560)
+        "Longer side of the network's input. Memory grows with its square.", unit='px', low=32,
+        high=2560)
     max_det: int = parameter(100,
-        'Publish only the most confident detections, this many.', low=1, high=1000)
+        'Most detections published, by confidence.', low=1, high=1000)
 
     def check(self) -> None:
         """Raise OptionsError where values do not fit together; the message names the parameter."""
@@ -116,144 +116,142 @@ class RelocalizerParameters(CommonParameters):
     """The parameters of the relocalizer."""
 
     map_file: str = parameter('',
-        'Map file, read when the node is configured and by reload_map: a path, or '
-        "package://PACKAGE/PATH in a package's share folder; empty: map_files, or the "
-        "parameters below 'map', hold the map.")
+        'Map file, a path or package://PACKAGE/PATH, read when the node is configured and by '
+        "reload_map; empty: map_files, or the parameters below 'map'.")
     map_files: list[str] = parameter([''],
-        'Map files of floors and buildings instead of map_file: a request searches all of '
-        'them. Each has a frame_id of its own, which names the map in answers and poses.')
+        'Map files of floors and buildings, each with its own frame_id, in place of map_file.')
     keyframes_file: str = parameter('auto',
-        "Layer of keyframes of the map, read with it: a file, or 'auto': NAME.keyframes.npz "
-        'next to map_file NAME.yaml, where there is one; empty: none.')
+        "Layer of keyframes; 'auto': NAME.keyframes.npz next to map_file NAME.yaml, if it "
+        'exists; empty: none.')
     prior_probability: float = parameter(0.9,
-        'Probability that what ~/prior tells is right.', low=0.0, high=0.99)
+        'Probability that ~/prior is right.', low=0.0, high=0.99)
     last_pose_file: str = parameter('',
-        'Keep the last pose in this file; after a restart the robot is probably still there. '
-        'Empty: keep none.', read_only=True)
+        'File that keeps the last pose, a prior after a restart; empty: none.', read_only=True)
     last_pose_probability: float = parameter(0.8,
-        'Probability of that.', low=0.0, high=0.99)
+        'Probability that the robot is still there after a restart.', low=0.0, high=0.99)
     mode: str = parameter('on_request',
         'Localize on request, or with every frame.', choices=MODES, read_only=True)
     timeout_s: float = parameter(10.0,
-        'A request is answered within this time.', unit='s', low=0.1, high=3600.0)
+        'Answer a request within this time.', unit='s', low=0.1, high=3600.0)
     matching: str = parameter('hybrid',
-        'Correspondence candidates: equal classes, similarity by CLIP, or CLIP with classes '
-        'for verification.', choices=MATCHINGS, read_only=True)
+        'Correspondences from classes, from CLIP, or from CLIP with verification by classes.',
+        choices=MATCHINGS, read_only=True)
     algorithm: str = parameter('auto',
-        'How minimal samples are chosen: auto tries all compatible ones, the likeliest first; '
-        "bf tries all; the others are the paper's.", choices=ALGORITHMS)
-    k: int = parameter(3, 'Landmarks retrieved for each crop.', low=1, high=1000)
+        'Choice of minimal samples; auto: all compatible samples, most likely first; bf: all; '
+        "the others are the paper's.", choices=ALGORITHMS)
+    k: int = parameter(3,
+        'Landmarks retrieved for each crop.', low=1, high=1000)
     iterations: int = parameter(10_000,
-        'Try at most this many minimal samples per frame.', low=1, high=1_000_000)
+        'Most minimal samples per frame.', low=1, high=1_000_000)
     iou_threshold: float = parameter(0.2,
         'IoU above which a detection matches a landmark.', low=0.0, high=1.0)
-    random_seed: int = parameter(0, 'Equal seeds repeat results; below 0, every search differs.')
+    random_seed: int = parameter(0,
+        'Equal seeds repeat results; below 0, every search differs.')
     time_budget_ms: float = parameter(50.0,
-        'Limit of search and refinement with auto, for each camera, in processor time. The other '
-        'algorithms have half of timeout_s; a search that is cut short is refused.', unit='ms',
-        low=1.0, high=3.6e6)
+        'Processor time of search and refinement for each camera, with auto. The other '
+        'algorithms have half of timeout_s.', unit='ms', low=1.0, high=3.6e6)
     gravity: str = parameter('none',
-        'Source of the vertical: base_frame (the robot stands upright) or the topic imu. auto '
-        'then needs two objects instead of three.', choices=VERTICAL_SOURCES, read_only=True)
+        'Source of the vertical: base_frame (the robot stands upright) or the topic imu. Two '
+        'objects then suffice.', choices=VERTICAL_SOURCES, read_only=True)
     tilt_deviation_deg: float = parameter(40.0,
-        'Standard deviation of the tilt of the camera off upright, where no vertical is known; '
-        "0: any tilt is as likely, as where the map's z axis is not up.", unit='deg', low=0.0,
-        high=60.0)
+        "Standard deviation of the camera's tilt where no vertical is known; 0: any tilt is "
+        'equally likely.', unit='deg', low=0.0, high=60.0)
     vertical_deviation_deg: float = parameter(1.0,
-        'Standard deviation of that vertical; 2 for an accelerometer alone that moves.',
+        'Standard deviation of the vertical; 2 for an accelerometer alone that moves.',
         unit='deg', low=0.01, high=45.0)
     height_range_m: list[float] = parameter([0.0, 0.0],
-        'Least and greatest height of the camera in the map; equal values: any height.', unit='m')
+        'Least and greatest height of the camera in the map; equal values: any.', unit='m')
     max_tilt_deg: float = parameter(180.0,
         'Greatest tilt of the camera off upright; 180: any.', unit='deg', low=0.0, high=180.0)
     refine: bool = parameter(True,
-        'Refine the best poses on all of their inliers; the paper does not.')
-    min_inliers: int = parameter(3, 'Refuse a pose with fewer inliers.', low=3, high=1000)
+        'Refine the best poses on all inliers; the paper does not.')
+    min_inliers: int = parameter(3,
+        'Refuse a pose with fewer inliers.', low=3, high=1000)
     min_confidence: float = parameter(0.9,
         'Refuse a pose that is less likely to be within 1 m of the truth.', low=0.0, high=1.0)
     fuse_frames: int = parameter(5,
-        'Localize with up to this many frames together where odom links them; 1: each frame '
-        'alone.', low=1, high=MAX_FRAMES)
+        'Most frames localized together where odom links them; 1: each alone.', low=1,
+        high=MAX_FRAMES)
     fuse_window_s: float = parameter(5.0,
-        'Drop frames older than this from fusion.', unit='s', low=0.1, high=60.0)
+        'Fuse no frames older than this.', unit='s', low=0.1, high=60.0)
     detections_type: str = parameter('vision_msgs',
-        'Package of the type of detections: vision_msgs/Detection2DArray or '
-        'yolo_msgs/DetectionArray (yolo_ros).', choices=DETECTION_TYPES, read_only=True)
+        'Detection2DArray of vision_msgs, or DetectionArray of yolo_msgs (yolo_ros).',
+        choices=DETECTION_TYPES, read_only=True)
     sync_tolerance_s: float = parameter(0.05,
-        'Images of several cameras within this time are of one instant.', unit='s', low=0.0,
+        'Images of several cameras within this time belong to one instant.', unit='s', low=0.0,
         high=1.0, read_only=True)
     mount_deviation: list[float] = parameter([0.01, 0.5],
         'Standard deviations of the mounts of several cameras on each axis [m] [deg].')
     depth_transport: str = parameter('none',
-        "Use depth of an RGB-D camera: 'raw' on the topic depth, or 'compressed' on "
-        "depth/compressedDepth.", choices=('none', 'raw', 'compressed'),
-        read_only=True)
+        "Depth of an RGB-D camera: 'raw' on the topic depth, 'compressed' on "
+        'depth/compressedDepth.', choices=('none', 'raw', 'compressed'), read_only=True)
     depth_tolerance_s: float = parameter(0.02,
-        'Use depth whose stamp is at most this far from that of the image.', unit='s', low=0.0,
-        high=1.0, read_only=True)
+        'Greatest difference between the stamps of depth and image.', unit='s', low=0.0, high=1.0,
+        read_only=True)
     class_map: str = parameter('',
-        "The map's names for another detector's classes, such as 'tvmonitor=tv, "
-        "pottedplant=potted plant'.")
+        "The map's names for another detector's classes: 'tvmonitor=tv, pottedplant=potted "
+        "plant'.")
     crops: str = parameter('on_demand',
-        'Crops that CLIP sees: all, or on demand: the most informative first, until the pose '
-        'is accepted. matching hybrid with algorithm auto only; else all.', choices=CROPS)
+        'Crops that CLIP sees; on_demand: the most informative first, until the pose is '
+        'accepted (matching hybrid with algorithm auto only).', choices=CROPS)
     max_detections: int = parameter(50,
-        'Use only the most confident detections, this many.', low=3, high=1000)
+        'Most detections used, by confidence.', low=3, high=1000)
     profile: str = parameter('auto',
-        "Encoder of a profile: 'accurate', 'balanced' or 'fast'; 'auto': accurate on a GPU, "
-        'balanced on a CPU.', choices=PROFILE_NAMES, read_only=True)
+        "Encoder; 'auto': accurate on a GPU, balanced on a CPU.", choices=PROFILE_NAMES,
+        read_only=True)
     clip_model: str = parameter('',
-        "Architecture: an open_clip name, or a model config (.json); empty: the profile's.",
+        'Architecture of weights of open_clip, or a model config (.json); ONNX files need none.',
         read_only=True)
     clip_pretrained: str = parameter('',
-        "Weights: a tag of open_clip, or a local file; empty: the profile's, or openai with a "
-        'clip_model.', read_only=True)
+        'A folder with ONNX files, OWNER/NAME of the Hugging Face hub, or a tag or file of '
+        "open_clip; empty: the profile's, or openai with a clip_model.", read_only=True)
     clip_checkpoint_path: str = parameter('',
-        'Local file with the weights of that tag; empty: download them once.', read_only=True)
-    landmark_embeddings: str = parameter('image',
-        "What crops are compared with: the map's labels ('text'), the images next to map_file "
-        "('image'), or both. Without images of this CLIP: labels.", choices=COMPARED,
+        'Local file with the weights of the tag clip_pretrained; empty: download them once.',
         read_only=True)
+    landmark_embeddings: str = parameter('image',
+        "Crops are compared with the map's labels, the images next to map_file, or both. "
+        'Without images of this CLIP: labels.', choices=COMPARED, read_only=True)
     record_folder: str = parameter('',
         'Folder where ~/record stores the last request; empty: keep no frames.', read_only=True)
     record_limit_mb: int = parameter(1000,
-        'Record nothing more once that folder holds this much.', unit='MiB', low=1,
-        high=1_000_000)
+        'Most that record_folder holds.', unit='MiB', low=1, high=1_000_000)
     rectified: bool = parameter(False,
         'The image is rectified: use P of camera_info and no distortion.')
-    base_frame: str = parameter('', 'Coordinate frame to publish the pose of; empty: the camera.')
+    base_frame: str = parameter('',
+        'Coordinate frame to publish the pose of; empty: the camera.')
     base_from_camera: list[float] = parameter([0.0] * 7,
-        'Mount of the camera on base_frame: x, y, z [m] and quaternion x, y, z, w, of several '
-        'cameras one behind the other; all zeros: ask tf2.', unit='m', repeats=True)
+        'Mount of the camera on base_frame: x, y, z [m] and quaternion x, y, z, w; seven '
+        'numbers for each of several cameras; all zeros: ask tf2.', unit='m', repeats=True)
     max_speed_m_s: float = parameter(0.1,
         'Withhold initialpose while odom shows a faster robot.', unit='m/s', low=0.0, high=100.0)
     max_turn_rad_s: float = parameter(0.2,
         'Withhold initialpose while odom shows a faster turn.', unit='rad/s', low=0.0, high=100.0)
     nomotion_updates: int = parameter(10,
-        'Call request_nomotion_update this often after initialpose, where it is served, so '
-        "that AMCL's particles converge.", low=0, high=100)
+        "Calls of request_nomotion_update after initialpose, where it is served, so that AMCL's"
+        ' particles converge.', low=0, high=100)
     require_localizer: bool = parameter(True,
         'A request succeeds only if a localizer such as AMCL takes its pose; false: without '
-        'one, for ~/pose or publish_tf.')
+        'one.')
     localizer_pose: str = parameter('amcl_pose',
-        'Topic where the localizer shows its pose: it has to agree with the one on '
-        'initialpose. Empty: any subscriber of initialpose will do.', read_only=True)
+        'Topic where the localizer shows its pose, which has to agree with initialpose; empty: '
+        'any subscriber of initialpose will do.', read_only=True)
     publish_tf: bool = parameter(False,
         'Broadcast map -> odom_frame (REP 105) after an accepted pose; only where no other '
         'localizer does.', read_only=True)
-    odom_frame: str = parameter('odom', 'Coordinate frame of odometry, for publish_tf.')
+    odom_frame: str = parameter('odom',
+        'Coordinate frame of odometry, for publish_tf.')
     watch: str = parameter('none',
         "Watch whether the localizer's pose is right: map -> base_frame of tf2, or the topic "
         'localizer_pose.', choices=WATCHES, read_only=True)
     watch_period_s: float = parameter(2.0,
-        'Look this often; also after each metre or quarter turn of odom, at most once a second.',
-        unit='s', low=1.0, high=5.0)
+        'Time between looks. A metre or a quarter turn of odom brings the next one forward, to '
+        'once a second at most.', unit='s', low=1.0, high=5.0)
     on_lost: str = parameter('report',
-        'When the watch finds the robot lost: only report it, or relocalize once odom shows that '
-        'it stands.', choices=REACTIONS)
+        'When the watch finds the robot lost: report it only, or relocalize once odom shows '
+        'that it stands.', choices=REACTIONS)
     tf_timeout_s: float = parameter(0.5,
-        "Wait this long for a transform at the image's stamp. A request waits for the camera's "
-        'mount on base_frame until timeout_s.', unit='s', low=0.0, high=60.0)
+        "Longest wait for a transform at the image's stamp. A request waits for the camera's "
+        'mount until timeout_s.', unit='s', low=0.0, high=60.0)
 
     def of_camera(self, name: str) -> 'RelocalizerParameters':
         """Return the parameters with the mount of one of several cameras."""

@@ -42,7 +42,7 @@ SERVICE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
 
 _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
                 QoSPolicyKind.DURABILITY)
-# Between two subscriptions made because of empty messages [s]: a publisher may send such, too.
+# Least time between two new subscriptions after empty messages [s]: some publishers send them.
 _RENEWAL_PERIOD_S = 1.0
 _LOG_PERIOD_S = 5.0
 
@@ -111,7 +111,7 @@ class AdaptiveSubscription:
 
     def _create(self) -> Subscription:
         # A group of its own: if a subscription is destroyed before its event is taken, rclpy
-        # leaves the group busy for ever. Besides, a group keeps a reference to each of its former
+        # leaves the group busy for ever. A group also keeps a reference to each of its former
         # members.
         group = MutuallyExclusiveCallbackGroup()
         profile = QoSProfile(history=self._profile.history, depth=self._profile.depth,
@@ -168,7 +168,7 @@ class Listener(ABC):
 
     @abstractmethod
     def forget(self) -> None:
-        """Forget what was heard: what follows belongs to another time or run."""
+        """Forget all messages: later ones belong to another time or run."""
 
     def close(self) -> None:
         """Unsubscribe, and forget what was heard."""

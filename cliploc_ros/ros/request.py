@@ -44,7 +44,7 @@ _GRACE_S = 0.2
 _WITHOUT_OBJECTS = (RefusalKind.TOO_FEW_OBJECTS, RefusalKind.WRONG_DETECTIONS)
 
 _SMALLER = 'choose a faster profile or a smaller'
-# Of each stage its name in a message, and what makes it faster.
+# For each stage: its name in a message, and how to make it faster.
 _STAGES = {'image': 'waiting for an image with detections', 'detection': 'the detector',
            'waiting': 'waiting for earlier work or for /tf', 'decoding': 'reading the image',
            'CLIP': 'CLIP', 'search': 'the search', 'keyframes': 'matching keyframes'}

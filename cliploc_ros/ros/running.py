@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What other programs learn of a relocalizer: its diagnostics, its parameters, its topics."""
+"""A running relocalizer as other programs see it: diagnostics, parameters, topics."""
 
 import math
 import re
@@ -21,7 +21,7 @@ from rclpy.validate_topic_name import validate_topic_name
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import CliplocError, OptionsError
 
-#: The diagnostics come once a second; a relocalizer that is silent for longer is taken for dead.
+#: The diagnostics come once a second; a relocalizer that is silent for longer counts as dead.
 SILENT_S = 5.0
 _SPIN_S = 0.05
 
@@ -130,12 +130,12 @@ def ask(node: Node, name: str, patience_s: float) -> tuple[RelocalizerStatus, li
 
 
 def parameters_of_files(files: Sequence[Path], name: str) -> list[Parameter]:
-    """Return the parameters in files that ROS gives to a node; the later ones count more.
+    """Return the parameters in files that ROS gives to a node; later files count more.
 
     Parameters
     ----------
     name : str
-        Of the node, with its namespace.
+        Name of the node, with its namespace.
 
     CliplocError: names the file and what is wrong with it.
     """

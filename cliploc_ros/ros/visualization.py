@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the relocalizer shows: markers in RViz and the debug image, while something subscribes."""
+"""Markers for RViz and the debug image, published while something subscribes."""
 
 import array
 import colorsys
@@ -41,18 +41,19 @@ _ACCEPTED = ColorRGBA(r=0.0, g=0.62, b=0.45, a=0.9)
 _REFUSED = ColorRGBA(r=0.84, g=0.37, b=0.0, a=0.9)
 _KEYFRAMES = ColorRGBA(r=0.0, g=0.59, b=0.53, a=0.9)
 _FRUSTUM_M = 0.12
-_BLANK, _OTHER, _TEXT = (40, 40, 40), (120, 120, 120), (255, 255, 255)
+_TEXT = (255, 255, 255)
 _RADIUS_PX = 3
 # Lines between more points hide the images.
 _MOST_LINES = 20
 _UNMATCHED, _BOX, _ELLIPSE = (255, 255, 255), (86, 180, 233), (230, 159, 0)
 # White text on them has a contrast of 5 and more.
-_ACCEPTED_BAND, _REFUSED_BAND = (0, 114, 178), (176, 70, 0)
+_ACCEPTED_BAR, _REFUSED_BAR = (0, 114, 178), (176, 70, 0)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _LABEL_CHARS = 40
-# The scale of text, by the width of the image [1/px]; the width of a character, at most, and the
-# height of a line of scale 1 [px].
-_LEAST_SCALE, _SCALE_PER_PX, _CHAR_PX, _LINE_PX = 0.45, 1 / 1400, 20, 44
+# The scale of text, by the width of the image [1/px], and the height of a line of scale 1 [px].
+_LEAST_SCALE, _SCALE_PER_PX, _LINE_PX = 0.45, 1 / 1400, 44
+# The text of the bar, beside other text, and its lines, at most: a longer verdict is cut.
+_BAR_SCALE, _BAR_LINES = 0.8, 2
 
 
 def landmark_markers(landmark_map: LandmarkMap, layer: KeyframeLayer | None = None) -> MarkerArray:
@@ -105,7 +106,7 @@ def match_markers(header: Header, camera_position: NDArray[np.float64],
     camera_position : ndarray (3,)
         [m].
     centers : sequence of ndarray (3,)
-        Of the landmarks [m].
+        Centres of the landmarks [m].
     accepted : bool
         Green if so, else red.
     """
@@ -147,8 +148,8 @@ def beside_keyframe(canvas: NDArray[np.uint8], seen: RecognizedPlace, layer: Key
                     ) -> NDArray[np.uint8]:
     """Return the image (h, w, 3) with the keyframe that fits it best to the right of it.
 
-    Points that agree have the same colour in both, and some are joined by lines. A layer without
-    images has a blank panel with the points of the keyframe.
+    Points that agree have the same colour in both, and some are joined by lines. If the layer
+    stores no images, only the points in the localized image are drawn.
 
     Parameters
     ----------
@@ -157,22 +158,21 @@ def beside_keyframe(canvas: NDArray[np.uint8], seen: RecognizedPlace, layer: Key
     seen : RecognizedPlace
         With one keyframe at least.
     layer : KeyframeLayer
-        That it was recognized in.
+        Layer of the keyframe.
     """
     keyframe = seen.keyframes[0]
     height, width = canvas.shape[:2]
     rows = layer.rows(keyframe)
     camera, image = layer.camera_of(keyframe), layer.image_rgb(keyframe)
     scale = height / camera.height
-    size = max(1, round(scale * camera.width)), height
-    panel = np.full((*size[::-1], 3), _BLANK, dtype=np.uint8) if image is None else \
-        cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
     own = np.nonzero((seen.rows >= rows.start) & (seen.rows < rows.stop))[0]
-    both = np.concatenate([canvas, panel], axis=1)
-    pixels = np.asarray(layer.pixels[rows]) / PIXEL_SCALE * scale + np.array([width, 0])
     if image is None:
-        for there in _pixels(pixels).tolist():
-            cv2.circle(both, there, 1, _OTHER, cv2.FILLED)
+        both = canvas.copy()
+    else:
+        size = max(1, round(scale * camera.width)), height
+        both = np.concatenate([canvas, cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)],
+                              axis=1)
+    pixels = np.asarray(layer.pixels[rows]) / PIXEL_SCALE * scale + np.array([width, 0])
     ours, theirs = (_pixels(some).tolist() for some in (
         seen.pixels[own], pixels[seen.rows[own] - rows.start]))
     # neighbours in a row have similar colours
@@ -183,18 +183,35 @@ def beside_keyframe(canvas: NDArray[np.uint8], seen: RecognizedPlace, layer: Key
     joined = set(np.linspace(0, len(own) - 1, min(len(own), _MOST_LINES)).astype(int).tolist())
     for row, (here, there, color) in enumerate(zip(ours, theirs, colors[:, 0].tolist(),
                                                    strict=True)):
-        if row in joined:
+        if image is not None and row in joined:
             cv2.line(both, here, there, color, 1, cv2.LINE_AA)
-        for point in (here, there):
+        for point in (here,) if image is None else (here, there):
             cv2.circle(both, point, _RADIUS_PX, color, cv2.FILLED, cv2.LINE_AA)
     _write(both, f'keyframe {keyframe}: {len(own)} of {seen.inliers} inliers',
-           np.array([width + 6, height - 8], dtype=np.int32), _TEXT)
+           np.array([6 if image is None else width + 6, height - 8], dtype=np.int32), _TEXT)
     return both
+
+
+def _above_bar(canvas: NDArray[np.uint8], verdict: str, color: tuple[int, int, int]
+               ) -> NDArray[np.uint8]:
+    """Return an image (h, w, 3) above a bar with the verdict, which covers none of it."""
+    scale = _BAR_SCALE * _scale(canvas)
+    verdict = verdict.encode('ascii', 'replace').decode()  # OpenCV has no other characters
+    (width, _), _ = cv2.getTextSize(verdict, _FONT, scale, 1)
+    lines = textwrap.wrap(verdict, max(8, len(verdict) * (canvas.shape[1] - 24) // max(1, width)),
+                          max_lines=_BAR_LINES, placeholder=' ...', break_long_words=False,
+                          break_on_hyphens=False)
+    bar = np.full((int((len(lines) + 0.3) * _LINE_PX * scale), canvas.shape[1], 3), color,
+                  dtype=np.uint8)
+    for line, text in enumerate(lines):
+        at = 6, int((line + 0.85) * _LINE_PX * scale)
+        cv2.putText(bar, text, at, _FONT, scale, _TEXT, 1, cv2.LINE_AA)
+    return np.concatenate([canvas, bar], axis=0)
 
 
 @dataclass(frozen=True)
 class SeenImage:
-    """An image (h, w, 3) uint8, red first, what was observed in it, and the map's keyframes."""
+    """An image (h, w, 3) uint8, red first, its observation, and the map's keyframes."""
 
     image_rgb: NDArray[np.uint8]
     observation: Observation
@@ -205,14 +222,15 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
                      verdict: str) -> NDArray[np.uint8]:
     """Return the image with every usable box, its depth, and the outlines of matched landmarks.
 
-    Where keyframes had something to say, the best one is to the right of it.
+    The best keyframe is to the right of it, if its image is stored. The upper left (h, w) are the
+    image, so boxes and points keep their pixels.
 
     Parameters
     ----------
     found : Relocalization
         Its matches refer to the detections of the image.
     verdict : str
-        Written at the top, on a band of its own.
+        Written on a bar below the image; an empty one has no bar.
     """
     canvas = np.ascontiguousarray(seen.image_rgb).copy()
     boxes = seen.observation.detections.bboxes_xyxy
@@ -241,16 +259,10 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
             similarity = _similarity(seen.observation, match.detection, match.landmark)
             _write_near(canvas, f'{label} {similarity}IoU {match.iou:.2f}',
                         boxes[match.detection], taken)
-    scale = _scale(canvas)
-    lines = textwrap.wrap(verdict, max(1, int(canvas.shape[1] / (_CHAR_PX * scale))),
-                          break_long_words=False, break_on_hyphens=False)
-    canvas[:int((len(lines) + 0.3 * bool(lines)) * _LINE_PX * scale)] = (
-        _ACCEPTED_BAND if found.accepted else _REFUSED_BAND)
-    for line, text in enumerate(lines):
-        _write(canvas, text, np.array([6, int((line + 0.85) * _LINE_PX * scale)]), _TEXT)
-    if seen.layer is None or found.recognized is None:
-        return canvas
-    return beside_keyframe(canvas, found.recognized, seen.layer)
+    if seen.layer is not None and found.recognized is not None:
+        canvas = beside_keyframe(canvas, found.recognized, seen.layer)
+    return canvas if not verdict else _above_bar(
+        canvas, verdict, _ACCEPTED_BAR if found.accepted else _REFUSED_BAR)
 
 
 def _similarity(observation: Observation, detection: int, landmark: int) -> str:
@@ -357,7 +369,7 @@ class Visualization:
             draw_debug_image(seen, found, landmark_map, verdict), header))
 
     def _show_map(self) -> None:
-        """Publish the map if it is new and somebody subscribes; it is kept for later ones."""
+        """Publish the map if it is new and has subscribers; it is kept for later subscribers."""
         with self._lock:
             if self._map is self._shown or self._landmarks.get_subscription_count() == 0:
                 return

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Wake a robot up: request its pose, turn between the looks, until accepted or time is up.
+"""Wake a robot up: request its pose, turning between looks, until it is accepted or time is up.
 
 With --watch, do so again whenever the relocalizer finds the robot lost.
 
@@ -28,7 +28,7 @@ from cliploc_ros.command import Interruption
 from cliploc_ros.ros.answer import Verdict
 from cliploc_ros.ros.running import SILENT_S, RelocalizerStatus
 
-# Nav2's default limit of a turn, and what its answer may take beyond [s].
+# Nav2's default time limit of a turn, and the further time for its answer [s].
 _ALLOWANCE_S = 10.0
 _GRACE_S = 3.0
 _STOP_S = 4.0
@@ -38,20 +38,20 @@ _ENDS = {GoalStatus.STATUS_ABORTED: 'aborted', GoalStatus.STATUS_CANCELED: 'canc
 Wait = Callable[[Callable[[], bool], float], bool]
 _SPIN_S = 0.05
 _SERVICE = 'relocalize_fields'
-# What is there is not seen at once.
+# Discovery takes time: nodes and topics appear late.
 _DISCOVERY_S = 2.0
-# What the relocalizer knows is reported within this time.
+# The diagnostics report a change within this time.
 _ON_DIAGNOSTICS_S = 1.5
 # A person who waits is told so again after this time.
 _AGAIN_S = 5.0
 # Between looks of a robot that does not turn.
 _PAUSE_S = 1.0
-# What an answer may take on its way beyond the relocalizer's own limit.
+# Time for an answer to arrive, after the relocalizer's own limit.
 _ON_ITS_WAY_S = 5.0
 
 
 class Turning:
-    """Turns a robot by a step at a time; to the other side after a turn that failed.
+    """Turns a robot one step at a time, and to the other side after a turn that failed.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ class Turning:
 
 
 class Outcome(IntEnum):
-    """How a wake-up ended: the exit code."""
+    """The end of a wake-up: its exit code."""
 
     ACCEPTED = 0
     REFUSED = 1

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The watch of a running localizer: a look now and then, a verdict, and what follows from it.
+"""The watch of a running localizer: looks, verdicts and reactions.
 
 A thread of its own waits for frames and transforms; only the look itself runs in the node's
 worker, and none begins while a request is under way. So a watch never delays a request.
@@ -64,13 +64,13 @@ _SILENT_WAY_M = 2.0
 
 @dataclass(frozen=True)
 class _Known:
-    """What the watch says now."""
+    """The current verdict of the watch."""
 
     state: WatchState = WatchState.UNCERTAIN
     reason: str = 'no look yet'
-    report: WatchReport | None = None  #: Of the last look; None where it says nothing any more
+    report: WatchReport | None = None  #: Report of the last look, while it holds
     looked_at: float = 0.0  #: When that was (monotonic clock) [s]
-    problem: str = ''  #: What prevents looks, and what to do
+    problem: str = ''  #: The cause that prevents looks, and what to do
 
 
 class Watcher:
@@ -99,7 +99,7 @@ class Watcher:
         # Looks at a pose from before this number changed do not count.
         self._age = 0
         self._cost_s = 0.0
-        # What became of a robot that is lost, and whether it stands.
+        # State of a robot that is lost, and whether it stands.
         self._reaction, self._is_at_rest = '', False
         self._rest_stamp: Time | None = None
         # The image of the look that began last, and whether the localizer had a pose at one.
@@ -143,7 +143,7 @@ class Watcher:
             self._drop('the localizer was given another pose')
 
     def examine(self, health: Health) -> None:
-        """Report the verdict and what prevents looks."""
+        """Report the verdict and the cause that prevents looks."""
         if not self.is_on:
             return
         known = self._known
@@ -264,7 +264,7 @@ class Watcher:
             self._node.diagnostics.publish()
 
     def _miss(self, stopped: threading.Event, problem: str, since: float = float('inf')) -> None:
-        """Say that nothing can be seen; a verdict of a look since a moment stands meanwhile."""
+        """Report a problem that prevents looks, unless there was a look after `since`."""
         known = self._known
         if known.report is None or known.looked_at < since:
             self._say(_Known(reason=problem, problem=problem), stopped)

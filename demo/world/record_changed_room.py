@@ -57,9 +57,8 @@ def record_changed_room(room: Path, out: Path) -> None:
 
 def _look(walk: Path) -> PosedDetections:
     """Return what the demo's networks say of each image of a walk."""
-    clip = ClipOptions(model=str(ASSETS / 'clip.json'),
-                       pretrained=str(ASSETS / 'clip.safetensors'))
-    networks = RecordingOptions(DetectorOptions(model=str(ASSETS / 'yolo.pt')), clip,
+    clip = ClipOptions(pretrained=str(ASSETS / 'clip'))
+    networks = RecordingOptions(DetectorOptions(model=str(ASSETS / 'yolo.onnx')), clip,
                                 KeyframeOptions(0.0, 0.0), '')
     return record_once(tum_frames(read_tum(walk), find_camera(None, walk)[0]), networks,
                        walk.with_suffix('.npz')).detections

@@ -226,7 +226,7 @@ def read_places(where: str, model: str) -> Iterator[Place]:
     folder = Path(where)
     if (folder / 'mapping').is_dir():
         for walks in _ROOM_WALKS:
-            yield Place(folder.name, f'{folder.name}/{walks[1]}', str(ASSETS / 'yolo.pt'),
+            yield Place(folder.name, f'{folder.name}/{walks[1]}', str(ASSETS / 'yolo.onnx'),
                         _walk(folder / walks[0]), _walk(folder / walks[1]),
                         _walk(folder / walks[2]), folder / 'map.yaml')
         return

@@ -15,7 +15,7 @@ from demo.truth import read_objects
 
 ASSETS = RIG.parent
 ALL = tuple(MOUNTS)
-NETWORKS = ('--model', ASSETS / 'yolo.pt', '--no-clip', '--image', 'image/compressed',
+NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--no-clip', '--image', 'image/compressed',
             '--keyframes', 0, 0)
 
 

@@ -16,8 +16,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets.observations import load_observations
 
 ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
-CLIP = ('--clip-model', ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'clip.safetensors',
-        '--device', 'cpu')
+CLIP = ('--clip-pretrained', ASSETS / 'clip', '--device', 'cpu')
 # a short walk sees objects from one side
 SHORT = ('--min-baseline', '0.5', '--no-check')
 IMAGES = 10
@@ -51,7 +50,7 @@ def observations(walk):
     """What the networks said of the walk, and a map labelled with the shipped vocabulary."""
     file = walk.parent / 'walk.npz'
     with contextlib.redirect_stdout(io.StringIO()):
-        code = build('--tum', walk, '--model', ASSETS / 'yolo.pt', *CLIP, '--keyframes', 0, 0,
+        code = build('--tum', walk, '--model', ASSETS / 'yolo.onnx', *CLIP, '--keyframes', 0, 0,
                      '--record-to', file, '--out', walk.parent / 'shipped.yaml')
     assert code == 0
     return file

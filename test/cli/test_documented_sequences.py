@@ -69,8 +69,7 @@ def drive(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param)
     if request.param == 'rendered':
         write_drive(folder / 'drive', ASSETS / 'mapping', 1)
-        found, more = {'model': ASSETS / 'yolo.pt', 'clip_model': ASSETS / 'clip.json',
-                       'clip_pretrained': ASSETS / 'clip.safetensors'}, []
+        found, more = {'model': ASSETS / 'yolo.onnx', 'clip_pretrained': ASSETS / 'clip'}, []
     else:
         shared = request.getfixturevalue('shared_data')
         write_drive(folder / 'drive', shared / 'seven_scenes_kitchen', 1)

@@ -25,8 +25,8 @@ from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
 from cliploc_ros.offline.mapping.views import make_views
 
 pytestmark = [pytest.mark.full, pytest.mark.needs('pycolmap')]
-NETWORKS = ('--model', ASSETS / 'yolo.pt', '--device', 'cpu')
-CLIP = ('--clip-model', ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'clip.safetensors')
+NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--device', 'cpu')
+CLIP = ('--clip-pretrained', ASSETS / 'clip')
 
 
 def run(main, *arguments):
@@ -111,8 +111,8 @@ def test_a_scaled_and_levelled_map_is_evaluated_on_its_own_recording(tmp_path, c
     finally:
         studio.document.close()
     caplog.clear()
-    assert run(build_map, '--colmap', folder, '--model', ASSETS / 'yolo.pt', *NETWORKS[2:], *CLIP,
-               '--level', '--scale', 0.8, '--out', tmp_path / 'twice.yaml') == 0
+    assert run(build_map, '--colmap', folder, *NETWORKS, *CLIP, '--level', '--scale', 0.8,
+               '--out', tmp_path / 'twice.yaml') == 0
     assert any('other poses or keyframes' in one for one in caplog.messages)
     twice, once = (load_recording(path).load() for path in (tmp_path / 'twice.yaml', built))
     again = np.isin(once.stamps_s, twice.stamps_s)
@@ -125,8 +125,8 @@ def test_a_scaled_and_levelled_map_is_evaluated_on_its_own_recording(tmp_path, c
         camera.focal_length_x *= 1.01
     model.write_binary(str(folder / 'sparse/0'))
     caplog.clear()
-    assert run(build_map, '--colmap', folder, '--model', ASSETS / 'yolo.pt', *NETWORKS[2:], *CLIP,
-               '--level', '--scale', 0.8, '--out', tmp_path / 'longer.yaml') < 2
+    assert run(build_map, '--colmap', folder, *NETWORKS, *CLIP, '--level', '--scale', 0.8,
+               '--out', tmp_path / 'longer.yaml') < 2
     assert not any('other poses or keyframes' in one for one in caplog.messages)
 
 

@@ -43,7 +43,7 @@ OPTIONS = MappingOptions(min_baseline_deg=5.0, estimate_pose_errors=False)
 @pytest.fixture(scope='session')
 def look():
     """The demo's detector, which looks once at equal pixels."""
-    detect, seen = load_detector(DetectorOptions(model=str(ASSETS / 'yolo.pt'))).detect, {}
+    detect, seen = load_detector(DetectorOptions(model=str(ASSETS / 'yolo.onnx'))).detect, {}
 
     def once(image):
         key = image.tobytes()

@@ -7,8 +7,8 @@ import re
 import numpy as np
 import pytest
 
+from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.models.yolo_detector import YoloDetector
 from demo.world import train_detector
 from demo.world.appearance import CLASSES
 
@@ -22,7 +22,7 @@ def test_the_command_writes_a_detector(worlds, tmp_path, capsys):
     assert re.search(r'1 worlds held out: mAP50 0\.\d+', capsys.readouterr().out)
     assert file.stat().st_size < 3e6
     assert str(tmp_path).encode() not in file.read_bytes()
-    detector = YoloDetector(DetectorOptions(model=str(file), conf=0.0, max_det=5))
+    detector = load_detector(DetectorOptions(model=str(file), conf=0.0, max_det=5))
     assert detector.class_names == CLASSES
     found = detector.detect(np.full((480, 640, 3), 128, dtype=np.uint8))
     assert found.bboxes_xyxy.shape[1] == 4

@@ -25,8 +25,8 @@ from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
 
 PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'demo/assets'
-NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
-            '--clip-pretrained', ASSETS / 'clip.safetensors', '--map', ASSETS / 'map.yaml')
+NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--clip-pretrained', ASSETS / 'clip', '--map',
+            ASSETS / 'map.yaml')
 FIGURES = ('success_over_threshold', 'success_over_iterations', 'best_iteration', 'top_view',
            'reliability', 'consistency',
            'time_by_stage', 'success_by_boxes', 'precision_over_recall')
@@ -86,7 +86,8 @@ def test_the_papers_table_on_real_queries(shared_data, tmp_path):
           f'{used_s:.0f} s of processors')
     assert used_s < 80
     table = yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['table']
-    rows = {f'{matching}_{algorithm}': [float(rate) for rate in rates.split(' / ')]
+    rows = {f'{matching}_{algorithm}': [float(rate.partition('±')[0])
+                                        for rate in rates.split(' / ')]
             for matching, algorithm, rates in re.findall(
                 r'^(\w+) +([\w-]+) +(\S+ / \S+ / \S+)', done.stdout, re.MULTILINE)}
     assert tuple(rows) == PAPER_METHODS
@@ -97,7 +98,7 @@ def test_the_papers_table_on_real_queries(shared_data, tmp_path):
         tolerance = table['tolerance']['bf' if method.endswith('_bf') else 'sampled']
         assert rows[method] == pytest.approx(expected, abs=tolerance + 0.005), method
     assert {path.name for path in tmp_path.iterdir()} == {
-        'results.json', 'summary.csv', 'table.md', 'trajectories', 'report.html',
+        'results.json', 'summary.csv', 'table.md', 'table.tex', 'trajectories', 'report.html',
         *(f'{name}.{kind}' for name in FIGURES for kind in ('png', 'svg'))}
     for name in FIGURES:
         image = cv2.imread(str(tmp_path / f'{name}.png'))
@@ -199,7 +200,7 @@ def test_a_map_of_the_same_images_is_noted(walk, evaluated_bag, evaluate_here):
     own = walk / 'own.yaml'
     shutil.copy(ASSETS / 'map.yaml', own)
     cache, = walk.glob('bag.cliploc-*.npz')
-    given = ('--no-clip', '--model', ASSETS / 'yolo.pt', '--map', own, '--methods',
+    given = ('--no-clip', '--model', ASSETS / 'yolo.onnx', '--map', own, '--methods',
              'class_ransac', '--trials', 1, '--no-figures')
     for source, is_noted in (('bag', True), ('tum', False)):
         save_recording(own, MapRecording(cache, walk / source))

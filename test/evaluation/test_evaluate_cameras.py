@@ -12,8 +12,8 @@ from rig_bag import write_rig_bag
 from cliploc_ros.cli.evaluate import main as evaluate
 
 ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
-NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
-            '--clip-pretrained', ASSETS / 'clip.safetensors', '--map', ASSETS / 'map.yaml')
+NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--clip-pretrained', ASSETS / 'clip', '--map',
+            ASSETS / 'map.yaml')
 CAMERAS = ('front', 'left', 'back')
 
 

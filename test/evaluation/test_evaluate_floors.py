@@ -14,9 +14,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from demo import ASSETS
 
-NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
-            '--clip-pretrained', ASSETS / 'clip.safetensors', '--methods', 'auto', '--trials', 1,
-            '--no-figures', '--workers', 1)
+NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--clip-pretrained', ASSETS / 'clip', '--methods',
+            'auto', '--trials', 1, '--no-figures', '--workers', 1)
 
 
 @pytest.fixture(scope='module')

@@ -19,8 +19,7 @@ from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from demo import ASSETS
 
-NETWORKS = ('--model', ASSETS / 'yolo.pt', '--clip-model', ASSETS / 'clip.json',
-            '--clip-pretrained', ASSETS / 'clip.safetensors')
+NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--clip-pretrained', ASSETS / 'clip')
 QUICK = ('--trials', 1, '--sweep', '--no-figures', '--workers', 1)
 
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs of methods: on any number of processes, broken off and resumed; their names and figures."""
 
+import csv
 import multiprocessing
 import os
 import signal
@@ -15,6 +16,7 @@ import pytest
 from matplotlib.figure import Figure
 from scene import make_room
 
+from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.files.log import Log
@@ -29,11 +31,14 @@ from cliploc_ros.offline.evaluation.methods import PAPER_METHODS, parse_methods
 from cliploc_ros.offline.evaluation.run import count_trials, read_results, run_methods
 from cliploc_ros.offline.evaluation.summary import (
     Summary,
+    as_csv,
+    as_latex,
     as_markdown,
     as_text,
     compare,
     find_best,
     notes,
+    relative_errors,
     summarize,
     table_rows,
 )
@@ -172,8 +177,9 @@ def test_crops_on_demand_are_a_part_of_all(room, questions):
 FIVE = RelocalizerOptions(iterations=500, k=5, random_seed=4)
 
 
-def test_all_are_the_papers_ten():
-    methods = parse_methods(['all'], FIVE, 40)
+def test_all_are_the_papers_ten_and_auto():
+    *methods, auto = parse_methods(['all'], FIVE, 40)
+    assert (auto,) == parse_methods(['auto'], FIVE, 40)
     assert tuple(method.name for method in methods) == PAPER_METHODS
     for method in methods:
         assert f'{method.options.matching}_{method.options.algorithm}' == method.name
@@ -287,14 +293,50 @@ def test_the_table_marks_noise_and_cut_searches():
     bad = make_summary([[2.0] * 40] * 2, 'mine')
     assert find_best([bad, near, good]) is good
     rows = table_rows([good, near, bad])
-    assert rows[1][:3] == ('hybrid', 'bf', '1.00 / 1.00 / 1.00 ± .00')
+    assert rows[1][:3] == ('hybrid', 'bf', '1.00±.00 / 1.00±.00 / 1.00±.00')
     assert rows[2][2].endswith(' ~')
-    assert rows[3][:3] == ('mine', '', '.00 / .00 / .00 ± .00')
+    assert rows[3][:3] == ('mine', '', '.00±.00 / .00±.00 / .00±.00')
     assert as_markdown(rows).splitlines()[2].startswith('| hybrid | bf | 1.00')
-    assert all(len(line) < 130 for line in as_text(rows).splitlines())
+    assert all(len(line) < 140 for line in as_text(rows).splitlines())
     assert rows[1][-2:] == ('1.00 (.00 to 1.00)', '0 of 0')
     assert 'fitted on simulated' in notes([good, near])[1]
     assert 'hybrid_bf' in notes([good, near])[2]
+
+
+def test_the_spread_over_trials():
+    one = make_summary([[0.1, 0.3, np.inf], [0.2, 0.3, 0.7]], 'clip_ransac')
+    assert one.error_deviations_m == pytest.approx((0.0, 0.1))
+    assert table_rows([one])[1][2:4] == (
+        '.33±.00 / .67±.00 / .83±.17', '0.300±0.000, 0.32±0.10')
+    row, = csv.DictReader(as_csv([one]).splitlines())
+    assert float(row['success_1m_std']) == pytest.approx(1 / 6, abs=1e-5)
+    assert float(row['mean_error_m_std']) == pytest.approx(0.1)
+    half = make_summary([[0.1, np.inf], [np.inf, np.inf]])
+    assert np.isnan(half.error_deviations_m).all()
+    assert '±' not in table_rows([half])[1][3]
+
+
+def test_the_table_in_latex():
+    text = as_latex([('method', 'success (95 %)'), ('my_own{}', '.10±.02 ~ a\\b & c')])
+    assert text.splitlines() == [
+        r'\begin{tabular}{ll}', r'\toprule', r'method & success (95 \%) \\', r'\midrule',
+        r'my\_own\{\} & .10$\pm$.02 \textasciitilde{} a\textbackslash{}b \& c \\',
+        r'\bottomrule', r'\end{tabular}']
+
+
+def test_errors_of_the_motion_between_queries():
+    """A common offset of all poses is no relative error."""
+    truth = {query: make_transform(np.eye(3), np.array([float(query), 0.0, 0.0]))
+             for query in range(4)}
+    shift = {0: 0.5, 1: 0.5, 3: 0.7}  # the third query has no pose
+    results = [make_result(query=query, timestamp=float(query), map_from_camera=None
+                           if query not in shift else make_transform(
+                               np.eye(3), np.array([query + shift[query], 0.0, 0.0])).tolist(),
+                           solved=query in shift)
+               for query in range(4)]
+    found, = relative_errors(results, truth).values()
+    assert found == pytest.approx((0.1, 0.0))
+    assert relative_errors(results[2:], truth) == {}
 
 
 def test_precision_falls_as_recall_rises():

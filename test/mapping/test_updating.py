@@ -439,7 +439,7 @@ def test_an_exact_map_hardly_moves_and_errors_of_poses_are_estimated(sigma_m, no
 
 ROOM = Path(__file__).parent / 'changed_room'
 CHANGES = json.loads((ROOM / 'changes.json').read_text())
-CLIP = ['--clip-model', ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'clip.safetensors']
+CLIP = ['--clip-pretrained', ASSETS / 'clip']
 
 
 def update(folder, *options):

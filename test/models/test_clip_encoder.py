@@ -30,8 +30,8 @@ from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.files import fingerprint_file
 from cliploc_ros.models.images import crop_bounds
 from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
+from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.models.yolo_detector import YoloDetector
 
 pytestmark = pytest.mark.full
 
@@ -263,7 +263,7 @@ def test_pickled_code_is_never_run(tmp_path, zipped):
     torch.save({'visual.proj': Hostile(proof)}, file, _use_new_zipfile_serialization=zipped)
     assert 'no checkpoint' in refusal(options_of('ViT-B-32', file, tmp_path))
     with pytest.raises(ModelError, match='no detection'):
-        YoloDetector(DetectorOptions(str(file), device='cpu'))
+        load_detector(DetectorOptions(str(file), device='cpu'))
     assert not proof.exists()
 
 

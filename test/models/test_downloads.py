@@ -36,10 +36,10 @@ else:
 LOAD_YOLO = """
 import json, sys
 from cliploc_ros.errors import ModelError
-from cliploc_ros.models.yolo_detector import YoloDetector
+from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 try:
-    YoloDetector(DetectorOptions('yolov8n', device='cpu', cache_dir=sys.argv[1]))
+    load_detector(DetectorOptions('yolov8n', device='cpu', cache_dir=sys.argv[1]))
 except ModelError as error:
     print(json.dumps({'error': str(error)}))
 """

@@ -109,8 +109,7 @@ PHRASES = {'mug': ('a red mug', 'a blue mug with white dots'), 'box': ('a box',)
 @pytest.fixture
 def clip(tmp_path):
     assets = PROJECT / 'demo/assets'
-    return ClipOptions(model=str(assets / 'clip.json'), device='cpu', cache_dir=str(tmp_path),
-                       pretrained=str(assets / 'clip.safetensors'))
+    return ClipOptions(pretrained=str(assets / 'clip'), device='cpu', cache_dir=str(tmp_path))
 
 
 def test_each_class_is_encoded_once(clip, caplog):
@@ -185,8 +184,7 @@ def noisy(seed, deviation=3.0):
 
 @pytest.fixture(scope='module')
 def encoder():
-    options = ClipOptions(model=str(ASSETS / 'clip.json'), device='cpu',
-                          pretrained=str(ASSETS / 'clip.safetensors'))
+    options = ClipOptions(pretrained=str(ASSETS / 'clip'), device='cpu')
     return ClipEncoder(resolve_clip_weights(options), options)
 
 

@@ -215,9 +215,9 @@ def test_programs_take_the_kind_from_the_layer(cache_dir, tmp_path, monkeypatch,
     layer = read_layer(options.out, landmark_map, wanted=True)
     assert layer.kind.dimensions == 64
     asked = run_here(evaluate.main, '--tum', ASSETS / 'sequence', '--every', 24, '--map',
-                     options.out, '--model', ASSETS / 'yolo.pt', '--no-clip', '--methods', 'auto',
-                     '--trials', 1, '--sweep', '--no-figures', '--workers', 1, '--keyframes',
-                     '--out', tmp_path / 'out')
+                     options.out, '--model', ASSETS / 'yolo.onnx', '--no-clip', '--methods',
+                     'auto', '--trials', 1, '--sweep', '--no-figures', '--workers', 1,
+                     '--keyframes', '--out', tmp_path / 'out')
     assert asked.returncode == 0, asked.stderr
     assert '"source": "keyframes"' in (tmp_path / 'out' / 'results.json').read_text() or \
         '"source": "both"' in (tmp_path / 'out' / 'results.json').read_text()

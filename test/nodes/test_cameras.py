@@ -130,7 +130,7 @@ def test_a_camera_that_is_late_or_silent_is_left_out_and_named(four_cameras, wor
 def test_one_detector_serves_all_cameras_in_turn(start, tester):
     """With one network: images of one instant, more of them than it can look at."""
     process = start('nodes.detector', parameters={
-        'model': PROJECT / 'demo/assets/yolo.pt', 'cameras': list(NAMES)})
+        'model': PROJECT / 'demo/assets/yolo.onnx', 'cameras': list(NAMES)})
     process.wait_for_output('ready after')
     publishers = {name: tester.create_publisher(Image, f'{name}/image', RELIABLE)
                   for name in NAMES}

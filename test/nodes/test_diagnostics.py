@@ -78,7 +78,7 @@ def test_what_contradicts_itself_is_named_until_it_is_gone(own_relocalizer, test
 
 def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):
     detector = start('nodes.detector', parameters={
-        'model': PROJECT / 'demo/assets/yolo.pt', 'stale_after_s': 1.0})
+        'model': PROJECT / 'demo/assets/yolo.onnx', 'stale_after_s': 1.0})
     detector.wait_for_output('ready after')
     values = status.wait(OK, 'active')
     assert values['listened to'] == 'False'

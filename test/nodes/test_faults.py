@@ -19,12 +19,12 @@ def test_a_detector_that_is_killed_and_restarted_while_a_request_waits(start, te
     tester.connect()
     tester.destroy_publisher(tester.detections)
     try:
-        first = start('nodes.detector', parameters={'model': ASSETS / 'yolo.pt'})
+        first = start('nodes.detector', parameters={'model': ASSETS / 'yolo.onnx'})
         first.wait_for_output('ready after')
         future = tester.ask()
         tester.wait(lambda: tester.images.get_subscription_count() == 2, 'both to listen')
         first.stop(signal.SIGKILL)
-        second = start('nodes.detector', parameters={'model': ASSETS / 'yolo.pt'})
+        second = start('nodes.detector', parameters={'model': ASSETS / 'yolo.onnx'})
         stamps = iter(range(1, 100_000))
 
         def answered():

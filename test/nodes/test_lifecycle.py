@@ -78,9 +78,9 @@ def manage(start, tester):
 def with_networks(name, folder):
     """Parameters that make a node load its real, small networks."""
     if name == 'detector':
-        return {'model': ASSETS / 'yolo.pt'}
-    return {'map_file': ASSETS / 'map.yaml', 'clip_model': ASSETS / 'clip.json',
-            'clip_pretrained': ASSETS / 'clip.safetensors', 'cache_dir': folder}
+        return {'model': ASSETS / 'yolo.onnx'}
+    return {'map_file': ASSETS / 'map.yaml', 'clip_pretrained': ASSETS / 'clip',
+            'cache_dir': folder}
 
 
 @pytest.mark.full

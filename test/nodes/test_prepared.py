@@ -23,16 +23,15 @@ OFFLINE = ('unshare', '--map-root-user', '--net', 'sh', '-c', 'ip link set lo up
 # Mounts a folder on itself, read-only, as a robot of a fleet mounts the cache of all.
 READ_ONLY = ('unshare', '--mount', 'sh', '-c',
              'mount --bind "$0" "$0" && mount -o remount,bind,ro "$0" && exec "$@"')
-WEIGHTS = ('yolo.pt', 'clip.json', 'clip.safetensors')
+WEIGHTS = ('yolo.onnx', 'clip')
 ROBOT = f"""\
 detector:
   ros__parameters:
-    model: {ASSETS}/yolo.pt
+    model: {ASSETS}/yolo.onnx
 relocalizer:
   ros__parameters:
     map_file: {ASSETS}/map.yaml
-    clip_model: {ASSETS}/clip.json
-    clip_pretrained: {ASSETS}/clip.safetensors
+    clip_pretrained: {ASSETS}/clip
     require_localizer: false
     time_budget_ms: 10000.0  # the verdict must not depend on the load of this machine
 """
@@ -133,9 +132,10 @@ def test_kernels_that_the_folder_does_not_take_are_missed(robot, prepared, tmp_p
 
 
 @pytest.mark.parametrize(('old', 'new', 'named'), [
-    (f'{ASSETS}/yolo.pt', 'yolov8n.pt', 'yolov8n.pt'),
-    (f'{ASSETS}/clip.json\n    clip_pretrained: {ASSETS}/clip.safetensors',
-     'ViT-B-32\n    clip_pretrained: openai', "the weights 'openai' of CLIP model 'ViT-B-32'")])
+    (f'{ASSETS}/yolo.onnx', 'yolov8n.pt', 'yolov8n.pt'),
+    (f'clip_pretrained: {ASSETS}/clip',
+     'clip_model: ViT-B-32\n    clip_pretrained: openai',
+     "the weights 'openai' of CLIP model 'ViT-B-32'")])
 def test_missing_weights_are_named_with_the_remedy(offline, tmp_path, old, new, named):
     assert old in ROBOT
     robot = tmp_path / 'robot.yaml'

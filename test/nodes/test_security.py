@@ -63,7 +63,7 @@ def test_the_relocalizer_does_what_its_policy_allows(own_relocalizer, tester):
     ({}, ('/image/compressed', '/clock')),
     ({'image_transport': 'compressed', 'use_sim_time': 'true'}, ('/image',))])
 def test_the_detector_does_what_its_policy_allows(start, tester, parameters, absent):
-    weights = PROJECT / 'demo/assets/yolo.pt'
+    weights = PROJECT / 'demo/assets/yolo.onnx'
     start('nodes.detector', parameters={'model': weights, **parameters}).wait_for_output(
         'ready after')
     with tester.hearing_detections():

@@ -59,8 +59,8 @@ def test_matches_and_debug_image_of_each_result(own_relocalizer, tester):
         assert (lines.header.frame_id, lines.header.stamp.sec) == ('map', 42)
         assert images[-1].header == frame[0].header
         drawn, shown = image_from_msg(images[-1]), image_from_msg(frame[0])
-        assert drawn.shape == shown.shape
-        changed = (drawn != shown).any(axis=2).mean()
+        assert drawn.shape[1] == shown.shape[1]
+        changed = (drawn[:len(shown)] != shown).any(axis=2).mean()
         assert 0.01 < changed < 0.5
         frame[2].detections = frame[2].detections[:3]
         assert not tester.relocalize(frame).success

@@ -23,7 +23,7 @@ from cliploc_ros.offline.recording.networks import RunNetworks
 from demo.truth import read_objects
 
 ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
-NETWORKS = ('--model', ASSETS / 'yolo.pt', '--device', 'cpu')
+NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--device', 'cpu')
 # That of the TUM sequences fr1.
 LENS = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, 'plumb_bob',
               (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
@@ -111,9 +111,9 @@ def test_a_recording_is_localized_in_the_map_of_the_room(folder):
     bend(ASSETS / 'sequence', folder / 'sequence', every=4)
     assert tum_to_bag(arguments(folder / 'sequence', folder / 'bag')) == 0
     assert evaluate(arguments(
-        '--bag', folder / 'bag', '--map', ASSETS / 'map.yaml', *NETWORKS, '--clip-model',
-        ASSETS / 'clip.json', '--clip-pretrained', ASSETS / 'clip.safetensors', '--methods',
-        'auto', '--trials', 1, '--workers', 1, '--no-figures', '--out', folder / 'out')) == 0
+        '--bag', folder / 'bag', '--map', ASSETS / 'map.yaml', *NETWORKS, '--clip-pretrained',
+        ASSETS / 'clip', '--methods', 'auto', '--trials', 1, '--workers', 1, '--no-figures',
+        '--out', folder / 'out')) == 0
     results = json.loads((folder / 'out/results.json').read_text())
     right = [one['solved'] and one['error_m'] < 0.5 for one in results]
     accepted = [one['accepted'] for one in results]

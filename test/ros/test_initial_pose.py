@@ -23,7 +23,7 @@ from cliploc_ros.ros.inputs.stamps import TimeJumpError
 @pytest.mark.clock
 def test_without_a_localizer_the_pose_is_withheld_once_time_is_up(robot):
     start = time.monotonic()
-    with pytest.raises(NoLocalizerError, match=r'/initialpose.*ask again'):
+    with pytest.raises(NoLocalizerError, match=r'/initialpose.*request again'):
         robot.hand_over(4.0)
     assert 3.0 < time.monotonic() - start < 5.0
     robot.localizer.subscribe()

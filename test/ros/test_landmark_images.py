@@ -70,8 +70,8 @@ def world(tmp_path_factory):
     count = len(named)
     write_map(folder / 'map.yaml',
               replace(named, labels=('a thing',) * count, class_ids=('thing',) * count))
-    clip = ClipOptions(model=str(ASSETS / 'clip.json'), device='cpu', cache_dir=str(folder),
-                       pretrained=str(ASSETS / 'clip.safetensors'))
+    clip = ClipOptions(device='cpu', cache_dir=str(folder),
+                       pretrained=str(ASSETS / 'clip'))
     images = images_of(named, ClipEncoder(resolve_clip_weights(clip), clip))
     save_landmark_embeddings(embeddings_path(folder / 'map.yaml'), images)
     return RelocalizerParameters(

@@ -29,7 +29,7 @@ def asked(tmp_path_factory):
                     cv2.resize(coarse, (640, 480)))
     done = subprocess.run(
         [sys.executable, '-m', 'studies.rooms', folder / 'demo', folder / 'elsewhere', '--model',
-         ASSETS / 'yolo.pt', '--kinds', 'in turn', 'phone to robot', '--images', '3',
+         ASSETS / 'yolo.onnx', '--kinds', 'in turn', 'phone to robot', '--images', '3',
          '--elsewhere', '2', '--out', folder / 'out'], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return folder / 'out', done.stdout

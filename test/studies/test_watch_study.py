@@ -101,7 +101,7 @@ def observations(tmp_path_factory):
                     stamp, 'map', make_transform(np.eye(3), np.array([jump, 0.1, 0.0])) @ pose))
     frames = bag_frames(folder / 'bag', BagTopics('/image/compressed', '/camera_info'),
                         poses_of_topic('/localizer', 10**9))
-    record_once(frames, RecordingOptions(DetectorOptions(str(ASSETS / 'yolo.pt')), None,
+    record_once(frames, RecordingOptions(DetectorOptions(str(ASSETS / 'yolo.onnx')), None,
                                          EVERY_FRAME, ''), folder / 'seen.npz',
                 {'': bag_odometry(folder / 'bag', '/image/compressed',
                                   poses_of_topic('/wheels', 10**9))})

@@ -20,8 +20,7 @@ from cliploc_ros.offline.studio import edits
 from demo.truth import read_frames
 
 WALK = ASSETS / 'mapping'
-CLIP = ('--clip-model', str(ASSETS / 'clip.json'),
-        '--clip-pretrained', str(ASSETS / 'clip.safetensors'))
+CLIP = ('--clip-pretrained', str(ASSETS / 'clip'))
 PATIENCE_S = 120.0
 
 
@@ -67,7 +66,7 @@ def test_clip_offers_phrases_for_what_the_images_show(path):
 
 def observed(tmp_path, object_id):
     """Write an observation file: the true boxes of one object, with their embeddings."""
-    options = ClipOptions(model=CLIP[1], pretrained=CLIP[3])
+    options = ClipOptions(pretrained=CLIP[1])
     encoder = ClipEncoder(resolve_clip_weights(options), options)
     views, images = views_of_folder(WALK), open_images(WALK, None)
     boxes = [[box.bbox_xyxy for box in frame.boxes if box.object_id == object_id]

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether to accept a pose.
+"""Acceptance of a pose.
 
 The modules in the order in which a pose passes them:
 
 contenders
     The poses that may be right, of objects and of keyframes, and the odds of each.
 depth_check
-    Whether the depths of a request can be right.
+    Check of the depths of a request.
 confidence
     The evidence of the objects for a pose, what a region known before says, and from these odds to
     the probability of each pose, given its rivals.

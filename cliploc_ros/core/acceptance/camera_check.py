@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the boxes of a camera agree with its image, its camera_info, its mount and the map.
+"""Check that the boxes of a camera agree with its image, camera_info, mount and the map.
 
 A wrong camera_info, or boxes in other pixels, displace all boxes by one rule. One image hardly
 shows it, because the pose adapts. Many images do, because their poses differ and the rule stays. A
@@ -77,12 +77,12 @@ _FAR = 1e9
 
 
 class CameraLook(NamedTuple):
-    """What a frame says of the errors of its camera."""
+    """The evidence of a frame about the errors of its camera."""
 
     camera_name: str
     is_new: bool  #: Whether it is of the newest instant
     map_from_camera: NDArray[np.float64]  #: (4, 4)
-    #: (7, 7), (7,): of the errors; information times the most likely ones
+    #: (7, 7), (7,): of the errors; information times the most likely errors
     information: NDArray[np.float64]
     vector: NDArray[np.float64]
     #: (3, 7): how the position of the newest camera moves with each error [m]
@@ -96,7 +96,7 @@ def _log_mean(logs: NDArray[np.float64]) -> float:
 
 
 class CameraOdds(NamedTuple):
-    """What is known of a camera: it is right, or wrong in one of k ways."""
+    """The odds that a camera is right, or wrong in one of k ways."""
 
     odds: NDArray[np.float64]  #: (1 + k,): log likelihood of each, up to a constant
     means: NDArray[np.float64]  #: (1 + k, 7): errors under each
@@ -118,7 +118,7 @@ class CameraOdds(NamedTuple):
         Parameters
         ----------
         covariance : ndarray (6, 6)
-            Of the pose, with a right camera.
+            Covariance of the pose, with a right camera.
         moves : ndarray (3, 7)
             See CameraLook.
         """
@@ -205,7 +205,7 @@ class Views(NamedTuple):
         return Views(self.poses, counts, informations, vectors)
 
     def joined(self, other: 'Views') -> 'Views':
-        """Return these views and others, of which the last ones remain."""
+        """Return these views and others; only the last views remain."""
         return Views(*(np.concatenate(both)[-int(_TERMS.most_views):]
                        for both in zip(self, other, strict=True)))
 
@@ -215,7 +215,7 @@ class Views(NamedTuple):
 
 
 class Extent:
-    """Where the boxes of a camera end, over some frames, accepted or not."""
+    """The borders at which the boxes of a camera end, over some frames, accepted or not."""
 
     def __init__(self) -> None:
         self.boxes = np.empty((0, 4))  #: (n, 4) [px]
@@ -253,7 +253,7 @@ class Extent:
 
 
 class _Record:
-    """What is known of one camera."""
+    """The knowledge about one camera."""
 
     def __init__(self, name: str, camera: Camera) -> None:
         self.name, self.camera = name, camera
@@ -269,7 +269,7 @@ class _Record:
             self.odds = self.views.odds(self.by_extent)
 
     def add(self, look: CameraLook) -> None:
-        """Take in a look. Those after a camera was called wrong tell whether it was mended."""
+        """Take in a look. After a verdict "wrong", looks decide whether the camera is repaired."""
         if self.by_looks <= _TERMS.sure:
             self.views, self.since = self.views.with_look(look), Views()
         else:
@@ -339,7 +339,7 @@ class _Record:
 
 
 class CameraCheck:
-    """What the looks of a localizer say of its cameras, by their names."""
+    """The evidence of a localizer's looks about its cameras, by name."""
 
     def __init__(self) -> None:
         self._records: dict[str, _Record] = {}

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The poses of all sources compared: the likeliest one, and the evidence for and against it.
+"""Compare the poses of all sources: the most likely pose, and the evidence about it.
 
 Poses that the search of objects met and poses that keyframes recognized compete in one list. Each
-is measured on the detections of all frames and on the points of the keyframes. The likeliest one
-leads, and the evidence for it is all that decides whether it is accepted.
+is measured on the detections of all frames and on the points of the keyframes. The most likely
+pose leads, and the evidence for it is all that decides whether it is accepted.
 
 A pose may explain a mirror image well: of a room in a mirror, or of a flipped camera. A camera on
 the other side of a plane sees the points of the plane mirrored, at the same distances: objects on
@@ -77,16 +77,16 @@ def search_contenders(joined: JoinedFrames, finalists: Sequence[Finalist],
 
 
 class Comparison:
-    """The contenders, and what decides between them.
+    """The contenders, and the evidence that decides between them.
 
     Parameters
     ----------
     met : sequence of Contender
         Those that the search met.
     looks : Looks, optional
-        Earlier ones, which have to agree.
+        Earlier looks, which have to agree.
     recognizer : ImageRecognizer, optional
-        Of the keyframes, for the last image: the places that it recognizes compete, too.
+        Recognizer of the keyframes for the last image; its places compete, too.
     """
 
     def __init__(self, joined: JoinedFrames, met: Sequence[Contender], looks: Looks = _NO_LOOKS,
@@ -112,7 +112,7 @@ class Comparison:
         rows = np.arange(len(contenders))
         #: (m,): probability of each, shared by those that agree
         self.likely = self._confidences(rows, [one.odds for one in contenders])
-        self.recognition = seen  #: What keyframes say
+        self.recognition = seen  #: Result of the keyframes
         #: (m,): which contenders agree with the leading one
         self.leading = SAME_ANSWER.agreeing(self.poses[:1], self.poses).ravel()
         there = [contenders[row] for row in rows[self.leading]]
@@ -249,14 +249,14 @@ class Comparison:
     def _uncontradicted(self) -> float:
         """Return the probability that keyframes are wrong which recognize another place only.
 
-        They count where they are sure. What a dozen points say is in the comparison.
+        They count where they are sure. The evidence of a dozen points is in the comparison.
         """
         chance = max((1.0 / (1.0 + math.exp(-points_utility(one.recognized)))
                       for one in self.contenders if one.recognized is not None), default=0.0)
         return 1.0 if self.place or chance < self._joined.options.min_confidence else 1.0 - chance
 
     def _rival(self) -> Rival | None:
-        """Return the likeliest pose that does not agree with the leading one."""
+        """Return the most likely pose that disagrees with the leading pose."""
         others = np.nonzero(~self.leading)[0]
         if len(others) == 0:
             return None
@@ -281,8 +281,8 @@ class Comparison:
     def _distinct(self) -> tuple[float, Place | None]:
         """Return the probability that no place that looks alike has the leading pose's camera.
 
-        Next to it is where the camera would be at the likeliest of these places. Keyframes tell a
-        twin apart as far as they cover it.
+        Next to it is where the camera would be at the most likely of these places. Keyframes tell
+        a twin apart as far as they cover it.
         """
         joined, landmark_map = self._joined, self._joined.landmark_map
         best, (low, high) = self.contenders[0], joined.options.height_range_m

@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What speaks for and against a pose, and the confidence of each pose that follows.
+"""The evidence for and against poses, and their confidence.
 
-The support of a pose is what in the frames speaks for it, and what speaks against it. It is
-weighed against what supports the others.
+The support of a pose is the evidence of the frames for it and against it. It is weighed against
+the support of the other poses.
 
 A conditional logit (McFadden, "Conditional Logit Analysis of Qualitative Choice Behavior", 1974):
-each distinct pose has a utility, linear in its support. So has the case that none of them is
-right: the more landmarks the map has, the more wrong poses fit by chance; a known vertical leaves
-fewer. Probabilities are proportional to the exponentials of the utilities, so the poses of an
-ambiguous scene share the probability. Poses that agree (1 m, 45 degrees) add up theirs.
+each distinct pose has a utility, linear in its support. The case that no pose is right has a
+utility, too: more landmarks in the map let more wrong poses fit by chance, and a known vertical
+leaves fewer. Probabilities are proportional to the exponentials of the utilities, so the poses of
+an ambiguous scene share the probability. Poses that agree (1 m, 45 degrees) share one sum.
 
 The search of objects chooses its poses among many by their support. Keyframes propose theirs by
 points: what the objects say of such a pose counts from the utility of none being right, whatever
@@ -77,20 +77,20 @@ class Support:
     #: Log odds of their depths, against those of objects that are somewhere else
     depth: float = 0.0
     _: KW_ONLY
-    #: Of each detection that shows an object, (frame, row): what it adds (7,) to inliers, score,
+    #: For each detection that shows an object, (frame, row): its share (7,) of inliers, score,
     #: misfit, likeness, rarity, unlabelled and depth
     shown: Mapping[tuple[int, int], NDArray[np.float64]] = field(
         default_factory=dict, compare=False, repr=False)
 
 
 class ComparedFrame(NamedTuple):
-    """A frame to measure supports in: what all poses share of its n detections."""
+    """A frame to measure supports in: data of its n detections that all poses share."""
 
     scene: Scene
     classes: NDArray[np.int64]  #: (n,): the map's number of each class
     #: (n,): the logarithm of the number of things for each thing of this class
     rarities: NDArray[np.float64]
-    #: (n,): whether the class is some landmark's own, not only what it is taken for
+    #: (n,): whether the class is a landmark's own, not only a class that it is mistaken for
     are_own: NDArray[np.bool_]
     similarities: Similarities | None  #: None where classes alone are matched
     #: (n,): row of similarities of each detection; -1 where its class alone is matched
@@ -146,8 +146,8 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
                     landmark_map, frame, map_from_camera, distinct), strict=True):
                 rows.setdefault(int(landmark_map.objects[match.landmark]), {})[
                     number, match.detection] = row
-        # A class that a landmark is only taken for does not count: a real person is not expected
-        # in a map because a teddy bear sometimes looks like one.
+        # A class that a landmark is only mistaken for does not count: a real person is not
+        # expected in a map because a teddy bear sometimes looks like one.
         matched, others = [match.detection for match in found], frame.are_own.copy()
         others[matched] = False
         alone = 1.0 - frame.same[others][:, matched].max(axis=1, initial=0.0)
@@ -210,10 +210,10 @@ def one_thing(bboxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class Setting(NamedTuple):
-    """The setting of a pose: besides the supports, the chance of a wrong pose depends on it."""
+    """The setting of a pose: with the supports, it determines the chance of a wrong pose."""
 
     landmarks: int  #: Number of landmarks in the map
-    #: Standard deviation of the known vertical [deg]; infinite where none is known
+    #: Standard deviation of the known vertical [deg]; infinite if none is known
     vertical_deg: float = math.inf
 
     @property
@@ -256,7 +256,7 @@ def confidences(odds: NDArray[np.float64], poses: NDArray[np.float64], none: flo
     lost = (1.0 - sharpened[lead]) / (1.0 - likely[lead])
     if prior is None or not prior.any():
         return np.minimum(np.where(agreeing[lead], sharpened, likely * lost), most)
-    # what the prior says of each pose is no evidence of objects, and not steepened
+    # the odds of the prior are no evidence of objects, and not steepened
     kept = np.where(agreeing[lead], sharpened[lead] / likely[lead], lost)
     weighted = shares * kept * np.exp(prior)
     none_of_them = max(0.0, 1.0 - float(shares @ kept))

@@ -33,7 +33,7 @@ _NONE = np.empty(0, dtype=np.int64)
 
 
 class JoinedFrames(NamedTuple):
-    """What poses are compared on: searched frames of one camera, in a map."""
+    """The data that poses are compared on: searched frames of one camera, in a map."""
 
     landmark_map: LandmarkMap
     options: RelocalizerOptions
@@ -48,14 +48,14 @@ class JoinedFrames(NamedTuple):
 
     @property
     def setting(self) -> Setting:
-        """Return the setting: besides the supports, the chance of a wrong pose depends on it."""
+        """Return the setting: with the supports, it determines the chance of a wrong pose."""
         return Setting(len(self.landmark_map),
                        self.options.vertical_deviation_deg if self.knows_vertical else math.inf)
 
 
 def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
                 frames: Sequence[SearchedFrame]) -> JoinedFrames:
-    """Return some searched frames, the last one of which is to be localized.
+    """Return some searched frames, of which the last is to be localized.
 
     OptionsError: odom_from_camera is missing or no rigid transform; there are no frames or too
     many.
@@ -75,9 +75,9 @@ def without_depth(joined: JoinedFrames) -> JoinedFrames:
 
 
 class Contender(NamedTuple):
-    """A pose that may be right, and what supports it."""
+    """A pose that may be right, and its support."""
 
-    finalist: Finalist  #: Of the search of objects, or the pose of keyframes as one
+    finalist: Finalist  #: Finalist of the search of objects, or the pose of keyframes
     pose: NDArray[np.float64]  #: (4, 4): map_from_camera
     matches: list[tuple[Match, ...]]  #: Inliers in each of F frames
     support: Support  #: By objects
@@ -88,7 +88,7 @@ class Contender(NamedTuple):
     odds: float
     #: Log odds, 0 or less, that a region known before gives it; never steepened
     prior: float = 0.0
-    #: What keyframes show there, where they propose the pose
+    #: The place that keyframes recognize, if they propose the pose
     recognized: RecognizedPlace | None = None
     #: The odds of a pose that keyframes propose, without what objects say for it
     by_points: float = -math.inf

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the depths of a request can be right: wrong ones must not harm.
+"""Check the depths of a request: wrong depths must do no harm.
 
 Depth may have another unit or scale, another camera, or be noise. Then it fits no pose that the
 boxes allow. Right depths hardly change a pose that the boxes fix, and agree with it.
@@ -35,7 +35,7 @@ class DepthCheck(NamedTuple):
 
     objects: int  #: Number of matches with depth
     lacking: float  #: Log odds that they lack, against depths that agree exactly: their sum
-    spoilt: float  #: By how much less the boxes fit than they would without depth: Cauchy's sum
+    spoilt: float  #: Loss of the boxes' fit by the depth: Cauchy's sum
     ratio: float  #: Median of measured depths over those that the boxes alone say
 
     @property
@@ -45,7 +45,7 @@ class DepthCheck(NamedTuple):
 
 
 class DepthScale:
-    """Whether depth is off by a factor, as accepted poses of one camera show."""
+    """The scale of a camera's depth, from its accepted poses."""
 
     def __init__(self) -> None:
         self._ratios: deque[float] = deque(maxlen=int(_TERMS.most_poses))

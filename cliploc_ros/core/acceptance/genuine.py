@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a place is where the camera is, and as it was mapped: not a picture, and not changed.
+"""Check that a recognized place is genuine: neither a picture of the place nor changed.
 
 Objects and points that lie in a picture of a place agree on where it was taken. Neither judges
-the other: they see the same pixels. What tells is what lies around the picture, its size and
+the other: they see the same pixels. The differences lie around the picture, in its size and
 aspect, which other intrinsics would explain, and how it moves.
 
 A picture of the room shows the same points as the room, but moves as a plane: where the robot
-drives sideways, the poses of its keyframes turn instead. So two looks of a moving robot tell.
+drives sideways, the poses of its keyframes turn instead. Two looks of a moving robot show that.
 """
 
 import math
@@ -28,14 +28,14 @@ from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import find_pose
 
 _TERMS = CALIBRATION.genuine
-#: Motions of right poses are no further off, in squared deviations (dof 6).
+#: Largest squared Mahalanobis distance of the motion between right poses (dof 6).
 SURE_MOTION = float(chi2.ppf(_TERMS.sure_motion, 6))
 
 
 class Motion(NamedTuple):
-    """How well two looks agree with odometry: squared Mahalanobis distances, dof 6."""
+    """Agreement of two looks with odometry: squared Mahalanobis distances, dof 6."""
 
-    square: float  #: Of the motion between the two poses from that by odometry
+    square: float  #: Squared distance between the motion of the two poses and odometry
     #: The least that a picture of the place, 1 to 3 m away, would have. Where it is small, the
     #: motion does not tell a picture from the place: a camera that only turns sees both move
     #: alike.
@@ -88,8 +88,8 @@ class Signs(NamedTuple):
     #: logarithms of ratios: 0 to 0.25
     focal: float
     aspect: float
-    #: Share of the image's width or height, the greater one, over which the points and the boxes
-    #: lie that agree: a picture ends within the image
+    #: Extent of the agreeing points and boxes, as a share of the image's width or height,
+    #: whichever is greater: a picture ends within the image
     reach: float
     #: Share of the detected objects of the map's classes that the pose does not explain
     unexplained: float
@@ -102,7 +102,7 @@ def signs_of(place: RecognizedPlace, support: Support, boxes: NDArray[np.float64
     Parameters
     ----------
     boxes : ndarray (b, 4)
-        That the pose explains: left, top, right, bottom [px].
+        Boxes that the pose explains: left, top, right, bottom [px].
     """
     size = np.array([camera.width, camera.height], dtype=np.float64)
     corners = np.clip(boxes.reshape(-1, 2), 0.0, size)

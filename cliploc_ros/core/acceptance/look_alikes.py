@@ -91,7 +91,7 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
     matched : ndarray (n,) of int, optional
         Landmarks that belong to the place wherever they are.
     moves : ndarray (k, 4, 4), optional
-        Moves to try besides those that the map suggests.
+        Moves to try in addition to those that the map suggests.
     """
     # those matched, then those around, the nearest first
     ranks = [*range(1, min(int(_TERMS.around), len(landmark_map)) + 1)]

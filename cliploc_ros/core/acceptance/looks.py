@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Successive looks: the best poses of the last frames, and how sure they were of the newest one.
+"""Successive looks: the best poses of the last frames, and their confidence in the newest pose.
 
 Every retry is another chance of a false accept. Odometry carries the pose of each look to the
 newest frame, and drifts on the way. The looks of a standing robot show the same, so their
@@ -33,7 +33,7 @@ class Look(NamedTuple):
     observation: Observation
     map_from_camera: NDArray[np.float64]  #: (4, 4)
     confidence: float  #: From the frames of this look alone
-    recognized: RecognizedPlace | None = None  #: What keyframes recognize
+    recognized: RecognizedPlace | None = None  #: The place that keyframes recognize
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Looks:
     """The last looks of one run of odometry, oldest first."""
 
     past: tuple[Look, ...] = ()  #: Those that led to no accepted pose
-    recognized: tuple[Look, ...] = ()  #: The last ones by keyframes, accepted or not
+    recognized: tuple[Look, ...] = ()  #: The last looks by keyframes, accepted or not
 
     def __len__(self) -> int:
         """Return the number of looks."""

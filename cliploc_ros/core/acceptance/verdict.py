@@ -29,7 +29,7 @@ class RefusalKind(StrEnum):
     LOOK_ALIKE = auto()
     #: The covariance is too large.
     UNCERTAIN_POSITION = auto()
-    #: What was matched is too weak, or too much of the image does not fit.
+    #: The matches are too weak, or too much of the image does not fit.
     UNEXPLAINED = auto()
     #: Too few samples to have met the rivals of the pose.
     SEARCH_CUT_SHORT = auto()
@@ -49,9 +49,9 @@ class RefusalKind(StrEnum):
     WRONG_DETECTIONS = auto()
 
 
-# Factors of the confidence besides likely and found, in the order in which equal ones are named.
+# Factors of the confidence other than likely and found. Of equal factors, the first is named.
 _FACTORS = ('distinct', 'near', 'camera', 'genuine', 'not_mirrored', 'uncontradicted')
-# What a refusal says of an Evidence whose weakest factor names its cause.
+# Kind and message of a refusal, by the weakest factor of its Evidence.
 _ADVICE = {
     'near': (RefusalKind.UNCERTAIN_POSITION, 'position uncertain by {0.deviation_m:.2g} m; turn '
                                              'the camera to more or nearer objects'),
@@ -59,7 +59,7 @@ _ADVICE = {
                'another focal length or other pixels of the boxes may fit; turn the camera to '
                'nearer objects, or check camera_info'),
     'genuine': (RefusalKind.CHANGED, '{0.recognized.inliers} points of keyframes agree as in a '
-                                     'picture or a changed place; move, and ask again'),
+                                     'picture or a changed place; move, request again'),
     'not_mirrored': (RefusalKind.AMBIGUOUS, 'mirrored, the image fits another pose; turn the '
                                             'camera to more objects'),
     'found': (RefusalKind.SEARCH_CUT_SHORT,
@@ -76,7 +76,7 @@ class Refusal(NamedTuple):
 
 @dataclass(frozen=True)
 class Rival:
-    """The likeliest pose that does not agree with the leading one."""
+    """The most likely pose that disagrees with the leading pose."""
 
     likely: float  #: Its probability
     place: Point  #: Where its camera is [m]
@@ -97,8 +97,8 @@ class Evidence:
     #: The same without the objects; 0 where keyframes do not propose it
     by_points: float = 0.0
     rival: Rival | None = None
-    distinct: float = 1.0  #: Probability that its place is not mistaken for one that looks alike
-    #: Where the camera is, and where it would be at the likeliest place that looks alike [m]
+    distinct: float = 1.0  #: Probability that no look-alike place is mistaken for its place
+    #: Where the camera is, and where it would be at the most likely look-alike place [m]
     place: Point = (0.0, 0.0, 0.0)
     twin: Point | None = None
     twin_map: str = ''  #: Name of the twin's map, where there are several
@@ -114,14 +114,14 @@ class Evidence:
     #: search that tried all samples
     meetings: float = math.inf
     unexplained: float = 0.0  #: Number of other detected objects of the map's classes
-    #: That the place is there and no picture of it; None where keyframes do not propose it
+    #: Signs that the place is real, not a picture; None if keyframes do not propose the pose
     signs: Signs | None = None
     motion: Motion | None = None  #: Since an earlier look by keyframes
     #: Probability that the image is not a mirror image, see cliploc_ros.core.acceptance.comparison
     not_mirrored: float = 1.0
     #: Probability that keyframes are wrong which recognize another place only
     uncontradicted: float = 1.0
-    recognized: RecognizedPlace | None = None  #: What keyframes show at the pose
+    recognized: RecognizedPlace | None = None  #: The place that keyframes recognize at the pose
     prior: float = 0.0  #: Log odds, 0 or less, that a region known before gives the pose
     #: Confidence of each earlier look in this pose, see cliploc_ros.core.acceptance.looks
     earlier: tuple[float, ...] = ()
@@ -144,7 +144,7 @@ class Evidence:
 
     @property
     def certainty(self) -> float:
-        """Return the probability that nothing besides the poses found makes it wrong."""
+        """Return the probability that nothing makes it wrong but the poses found."""
         return math.prod(getattr(self, name) for name in _FACTORS)
 
     @property

@@ -18,7 +18,7 @@ the others are logarithms. A turn about the axis of the camera is a turn of the 
 
 Pose and errors are fitted to the edges of one frame (Levenberg and Marquardt, see refinement).
 Eliminating the pose leaves the information of the errors alone (Schur's complement). A frame of
-eight objects knows its focal length to 15 to 25 %: many frames tell what one does not.
+eight objects determines its focal length to 15 to 25 %; many frames determine it better.
 """
 
 from math import exp
@@ -53,7 +53,7 @@ _MOST_RESIDUAL = 4.0
 class CameraFit(NamedTuple):
     """The errors of a camera by one frame, independent of its pose."""
 
-    errors: NDArray[np.float64]  #: (7,): the most likely ones, given their deviations
+    errors: NDArray[np.float64]  #: (7,): the most likely errors, given their deviations
     information: NDArray[np.float64]  #: (7, 7): of the boxes alone, about these errors
     square: float  #: Sum of the squared residuals that remain
 
@@ -165,7 +165,7 @@ def fit_camera(pairs, is_edge, vertical, rotation, translation, deviations):
 
 @compiled
 def _cost(pairs, is_edge, vertical, errors, rotation, translation, deviations):
-    """Return the residuals, and what is minimized; infinite for a landmark behind the camera."""
+    """Return the residuals and the cost; infinite for a landmark behind the camera."""
     residuals = np.zeros(5 * len(pairs) + 3)
     if not residuals_of(corrected(pairs, errors), vertical, rotation, translation, residuals):
         return residuals, np.inf

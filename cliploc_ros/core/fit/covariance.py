@@ -17,7 +17,7 @@ covariance is H^-1 M H^-1, and M is a sum over sources of error:
 * odometry, a random walk: the error of a step displaces all frames beyond it;
 * the mounts of several cameras, between whose frames of one instant there is no such step.
 
-Cauchy's weight w of an edge stands for a variance of 1 / w. Besides, each object may be wrong:
+Cauchy's weight w of an edge stands for a variance of 1 / w. Each object may also be wrong:
 moved, or matched by mistake. Then the pose without this object is the right one, and how far it is
 away, and how much less certain it is, adds to the covariance.
 """
@@ -51,7 +51,7 @@ _STANDS_STILL = 1e-9
 _WEIGHTS = np.linspace(0.0, 1.0, 11)
 #: Deviations of the errors of a perfect camera.
 EXACT = np.zeros(ERRORS)
-#: Of a pose whose boxes do not fix it.
+#: Covariance of a pose that the boxes do not fix.
 POSE_UNKNOWN = np.diag(PRIOR_VARIANCES)
 
 
@@ -166,12 +166,12 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     Parameters
     ----------
     rotation, translation : ndarray (3, 3), (3,)
-        Of camera_from_map, with information, see refine_rig.
+        Rotation and translation of camera_from_map, with information, see refine_rig.
     instants : ndarray (F,)
         Number of the instant of each frame, in which odometry joins them: greater for later ones,
         equal for several cameras.
     shared : ndarray (L, 2), optional
-        By how much each landmark and its neighbours are displaced and turned together [m] [rad].
+        Common displacement and turn of each landmark and its neighbours [m] [rad].
     wrong_share : float
         Probability that an object is not where its match says.
     mount_deviation : tuple of float

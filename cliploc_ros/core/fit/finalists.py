@@ -45,7 +45,7 @@ class Match:
 
 
 class Finalist(NamedTuple):
-    """One of the best hypotheses; refined ones may be different minima at one place."""
+    """One of the best hypotheses; refined hypotheses may be different minima at one place."""
 
     #: (3, 3), (3,): camera_from_map of the reference frame
     rotation: NDArray[np.float64]

@@ -64,9 +64,9 @@ def residuals_of(pairs, vertical, rotation, translation, residuals):
     vertical : ndarray (7,)
         See VERTICAL_UNKNOWN.
     rotation, translation : ndarray (3, 3), (3,)
-        Of camera_from_map.
+        Rotation and translation of camera_from_map.
     residuals : ndarray (5 * m + 3,)
-        Of left, right, top and bottom edge and of the depth of each match, and of the vertical.
+        Residuals of left, right, top and bottom edge and depth of each match, and of the vertical.
     """
     for row in range(len(pairs)):
         box = pairs[row]
@@ -108,7 +108,7 @@ def edge_deviation(box, center, sigma, rotation, translation):
     sigma : float
         Standard deviation of the centre on each axis [m].
     rotation, translation : ndarray (3, 3), (3,)
-        Of camera_from_map.
+        Rotation and translation of camera_from_map.
     """
     # the sum of the semi-axes is the mean of the sides
     own = RELATIVE_DEVIATION * (box[2] + box[3]) + LEAST_DEVIATION

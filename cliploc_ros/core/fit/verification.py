@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How well a pose explains the detections of one frame or several.
+"""Verification of a pose: its inliers among the detections of one or several frames.
 
 Every detection takes the potential landmark whose outline overlaps its box's ellipse most, if
 their IoU exceeds the threshold. The score is the sum of these IoUs (Matsuzaki et al. 2024,
@@ -32,7 +32,7 @@ MAX_FRAMES = 10
 
 
 class FrameStarts(NamedTuple):
-    """Where each frame's rows begin in the arrays of a rig: arrays (F + 1,)."""
+    """Index of the first row of each frame in the arrays of a rig: arrays (F + 1,)."""
 
     #: (F + 1,): in the box ellipses, and in the landmarks and detections of potential
     boxes: NDArray[np.int64]

@@ -186,7 +186,7 @@ def frusta(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64], dept
     Parameters
     ----------
     cameras : sequence of Camera
-        Of each pose.
+        Camera of each pose.
     map_from_camera : ndarray (f, 4, 4)
     depth_m : float
         From the tip to the base [m].

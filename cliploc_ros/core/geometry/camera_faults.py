@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a camera is plausible: intrinsics of another resolution, unit or lens."""
+"""Check that a camera is plausible: intrinsics of another resolution, unit or lens."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -39,7 +39,7 @@ _CACHED = 64
 
 
 class Fault(NamedTuple):
-    """What contradicts itself in an input, in one line."""
+    """A contradiction in an input, in one line."""
 
     text: str
     #: Whether poses would certainly be wrong, so that the input is refused; else it is unusual
@@ -53,7 +53,7 @@ def calibration_faults(sensor: Camera, k: NDArray[np.float64], r: NDArray[np.flo
     Parameters
     ----------
     sensor : Camera
-        Of whole images, by K and distortion or, of `rectified` images, by P.
+        Camera of the whole sensor, from K and distortion, or from P for `rectified` images.
     k, r, p : ndarray (3, 3), (3, 3), (3, 4)
         See sensor_msgs/CameraInfo. Zeros stand for no R and no P, and no K of rectified images.
     """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The depth of a landmark's centre, from the depth of what its box shows.
+"""The depth of a landmark's centre, from the depth in its box.
 
 The visible surface is nearer than the centre, by a share of half the chord that the ray through
 the centre cuts off the ellipsoid. By how much objects differ from ellipsoids makes this uncertain,
@@ -40,11 +40,11 @@ def centre_depth(measured, center, shape, sigma, rotation, translation):
     measured : ndarray (2,)
         Depth of the surface and its standard deviation [m]; 0, 0 if unknown.
     center, shape : ndarray (3,), (6,)
-        Of the landmark.
+        Centre and shape of the landmark.
     sigma : float
         Standard deviation of the centre on each axis [m].
     rotation, translation : ndarray (3, 3), (3,)
-        Of camera_from_map. It says how thick the landmark is along the ray.
+        Rotation and translation of camera_from_map. They give the thickness along the ray.
     """
     if not measured[1] > 0.0:
         return 0.0, 0.0

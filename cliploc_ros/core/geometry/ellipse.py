@@ -7,7 +7,7 @@ unit circle and turn it so that the second is parallel to the axes: then
 
     x^2 + y^2 = 1   and   a (x - h)^2 + b (y - k)^2 = 1,   a <= b.
 
-Among the conics (second) + lambda (first) the one with the largest root lambda in [-b, -a] of
+Among the conics (second) + lambda (first), the conic with the largest root lambda in [-b, -a] of
 its determinant is a pair of real lines through the common points of both outlines, in pairs that
 do not cross. Each line cuts a cap off both ellipses, one cap inside the other. The shared area is
 one whole ellipse minus the difference of the caps.

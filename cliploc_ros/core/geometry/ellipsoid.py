@@ -56,9 +56,9 @@ def project_ellipsoid(rotation, translation, center, shape):
     Parameters
     ----------
     rotation, translation : ndarray (3, 3), (3,)
-        Of camera_from_map.
+        Rotation and translation of camera_from_map.
     center, shape : ndarray (3,), (6,)
-        Of the ellipsoid in the map.
+        Centre and shape of the ellipsoid in the map.
 
     Returns
     -------
@@ -117,7 +117,7 @@ def project_ellipsoids(camera_from_map: NDArray[np.float64], centers: NDArray[np
     camera_from_map : ndarray (4, 4)
         Pose of the map in the camera's optical frame.
     centers, shapes : ndarray (n, 3), (n, 6)
-        Of the ellipsoids in the map. Rows of those not wholly in front are NaN.
+        Centres and shapes of the ellipsoids in the map. Rows of those not wholly in front are NaN.
     """
     ellipses = np.empty((len(centers), 5))
     _project_all(np.ascontiguousarray(camera_from_map[:3, :3]),

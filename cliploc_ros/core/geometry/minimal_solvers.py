@@ -335,7 +335,8 @@ def two_point(bearings, points, verticals, rotations, translations):
     verticals : ndarray (6,) or more
         Up in the camera and up in the map, unit vectors.
     rotations, translations : ndarray (2, 3, 3), (2, 3)
-        Of camera_from_map [m]. Both points lie in front of the camera along their bearings.
+        Rotations and translations of camera_from_map [m]. Both points lie in front of
+        the camera along their bearings.
 
     Returns
     -------

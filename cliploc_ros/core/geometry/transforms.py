@@ -35,7 +35,7 @@ def is_rigid(transform: NDArray[np.float64], tolerance: float = 1e-4) -> bool:
 def are_rigid(transforms: NDArray[np.float64], tolerance: float = 1e-3) -> NDArray[np.bool_]:
     """Return which arrays (k, 4, 4) are finite rigid transforms."""
     finite = np.isfinite(transforms).all(axis=(1, 2))
-    # no element of a rotation exceeds 1, and squares of huge ones overflow
+    # no element of a rotation exceeds 1, and squares of huge numbers overflow
     rotations = np.clip(np.where(finite[:, None, None], transforms[:, :3, :3], 0.0), -2.0, 2.0)
     errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     return np.asarray((errors <= tolerance) & (np.linalg.det(rotations) > 0.0)
@@ -87,7 +87,7 @@ def move_covariance(covariance: NDArray[np.float64], lever: NDArray[np.float64]
     Parameters
     ----------
     covariance : ndarray (6, 6)
-        Of x, y, z [m] and the rotations about the fixed X, Y, Z axes [rad] (ROS order).
+        Covariance of x, y, z [m] and the rotations about the fixed X, Y, Z axes [rad] (ROS order).
     lever : ndarray (3,)
         From the old origin to the new one, in the fixed frame [m].
     """
@@ -140,7 +140,7 @@ class Tolerance(NamedTuple):
         return Tolerance(self.distance_m + distance_m, min(180.0, self.angle_deg + angle_deg))
 
 
-#: Two poses are the same answer to where the camera is; a right pose is so near to the truth.
+#: Two poses count as the same answer, and a pose this near to the truth as right.
 SAME_ANSWER = Tolerance(1.0, 45.0)
 #: A pose further from the truth than this is wrong [m].
 RIGHT_M = SAME_ANSWER.distance_m
@@ -154,14 +154,14 @@ SAME_NEIGHBOURHOOD = Tolerance(0.7, 20.0)
 SAME_MINIMUM = Tolerance(0.05, 2.0)
 #: A camera that moved less sees the same again.
 SAME_VIEW = Tolerance(0.05, 3.0)
-#: Boxes of an object share their errors between poses so near to each other.
+#: Boxes of an object share their errors between poses this near to each other.
 SAME_BOXES = Tolerance(0.25, 10.0)
 #: A keyframe sees what a camera sees; the shares of both tolerances add up.
 SAME_SIGHT = Tolerance(2.0, 40.0)
 #: A robot that moved less since its image is still where its pose says.
 SAME_SPOT = Tolerance(0.1, 5.0)
-#: A localizer that shows a pose so near to the given one has taken it. Its particles scatter by
+#: A localizer that shows a pose this near to the given pose has taken it. Its particles scatter by
 #: the given covariance, so the tolerance is wider by three standard deviations.
 TAKEN = Tolerance(0.3, 10.0)
-#: Moves of a place onto another one that differ by less are one move, about the vertical.
+#: Two moves of a place onto another place that differ by less are the same move.
 SAME_MOVE = Tolerance(1.0, 30.0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How numerical kernels are compiled, and the compiled code on disk.
+"""Compile numerical kernels, and keep the compiled code on disk.
 
 numba's own cache misses a change of a kernel that another one calls, compiles again after a copy,
 and fails on a damaged file. Here the name of a file holds a digest of all that decides the machine
@@ -53,7 +53,7 @@ logger = logging.getLogger(__name__)
 
 
 class KernelFolders:
-    """Where compiled kernels lie: the folders of this process, the preferred one first.
+    """The folders of compiled kernels, in the order of preference.
 
     NUMBA_CACHE_DIR replaces all others.
 
@@ -62,7 +62,7 @@ class KernelFolders:
     found, missing : int
         How many kernels were read, and how many were looked for in vain.
     kept_in : Path or None
-        Where the last new kernel was stored; None where no folder takes them.
+        Where the last new kernel was stored; None if no folder takes them.
     """
 
     def __init__(self) -> None:

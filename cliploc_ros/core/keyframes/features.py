@@ -44,11 +44,11 @@ class Features:
 
 @dataclass(frozen=True)
 class FeatureKind:
-    """How features of a kind are found, stored and compared."""
+    """Extraction, storage and comparison of one kind of features."""
 
     #: Identifies the descriptors: those of another kind must not be compared with these
     name: str
-    dimensions: int  #: Of a descriptor: d
+    dimensions: int  #: Dimensions of a descriptor: d
     #: Takes an image (h, w, 3), the most features, and the longest side that it is made smaller to
     extract: Callable[[NDArray[np.uint8], int, int], Features]
     #: An entry of a unit vector is stored as a byte: this plus `scale` times the entry
@@ -57,8 +57,8 @@ class FeatureKind:
     #: The most similar feature of another image is at most this share as far as the second one
     ratio: float = _RATIO
     least_inliers: int = 0  #: With fewer features that agree, a pose may be one of chance
-    #: Of an image that is to be localized, at first: its longest side, and the most features. At
-    #: the size of keyframes, features take twice the time at equal success.
+    #: The fast pass: longest side of the image, and the most features. At the size of keyframes,
+    #: features take twice the time at equal success.
     query_px: int = 400
     query_most: int = 600
 

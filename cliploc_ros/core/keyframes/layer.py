@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The layer: keyframes with their poses, features and points, and how to find similar ones.
+"""The layer: keyframes with their poses, features and points, and search for similar ones.
 
 Images are compared by the words of their features (Sivic and Zisserman, "Video Google", 2003):
 the descriptors of a layer are clustered, each cluster is a word, and two images are as similar as
@@ -57,7 +57,7 @@ class KeyframeLayer:
     #: The map's landmarks when the layer was made, which identify the map
     landmark_ids: tuple[str, ...]
     landmark_centers: NDArray[np.float32]  #: (L, 3): where they were [m]
-    camera: Camera  #: That took the keyframes, of the undistorted images; the first of several
+    camera: Camera  #: Camera of the undistorted images; the first of several
     map_from_camera: NDArray[np.float64]  #: (K, 4, 4)
     #: (K + 1,): keyframe k has the points from offsets[k] up to offsets[k + 1]
     offsets: NDArray[np.int64]
@@ -74,11 +74,11 @@ class KeyframeLayer:
     images: NDArray[np.uint8] | None = None
     #: (K + 1,): keyframe k has the bytes from image_offsets[k] up to image_offsets[k + 1]
     image_offsets: NDArray[np.int64] | None = None
-    other_cameras: tuple[Camera, ...] = ()  #: Of a robot with several cameras
+    other_cameras: tuple[Camera, ...] = ()  #: Further cameras of a robot with several cameras
     #: (K,): which camera took each keyframe, 0 for the first one; None: the first one took all
     camera_rows: NDArray[np.int64] | None = None
-    kind: FeatureKind = SIFT  #: Of the descriptors
-    set_digest: str = ''  #: Of the map that it was written with; '' where it is unknown
+    kind: FeatureKind = SIFT  #: Kind of the descriptors
+    set_digest: str = ''  #: Digest of the map that it was written with; '' if it is unknown
 
     def __len__(self) -> int:
         """Return the number of keyframes."""
@@ -194,10 +194,10 @@ _SCHEMA = Schema('file of keyframes', {
     'descriptors': Field('uint8', ('n', 'd'), stays=True),
     'words': Field('uint16', ('n',), (_check_words,)),
     'vocabulary': Field('uint8', ('W', 'd')),
-    # only there where images were asked for, both of them
+    # both are missing unless images were requested
     'images': Field('uint8', ('b',), is_optional=True, stays=True),
     'image_offsets': Field('int64', ('K+1',), (Offsets('images', 'bytes'),), is_optional=True),
-    # only there for several cameras, which the header has
+    # missing for a single camera; the header holds the cameras
     'camera_rows': Field('int64', ('K',), is_optional=True),
 }, MapError, 'make the layer again with build_map --keyframe-layer, or remove the file',
     {'K': 'keyframes', 'W': 'keyframes'}, is_stored=True,
@@ -210,7 +210,7 @@ def layer_path(map_path: str | os.PathLike[str]) -> Path:
 
 
 def removed_layer(map_path: str | os.PathLike[str]) -> str:
-    """Return that the layer of a map went with it, for the user."""
+    """Return a message for the user: the layer of a replaced map was removed."""
     return f'removed {layer_path(map_path)}: its keyframes belonged to the map before'
 
 

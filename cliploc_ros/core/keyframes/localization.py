@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Localize an image among keyframes: find similar ones, match them, solve for the pose."""
+"""Localize an image among keyframes: find similar keyframes, match them, solve for the pose."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -41,7 +41,7 @@ _FURTHER, _STRONGEST, _CLEAR = 25, 600, 20
 _THOROUGH_FEATURES, _THOROUGH_PX = 3000, 1600
 _CANDIDATES, _VOTERS, _VOTED = 100, 300, 20
 # Then the points of keyframes near the pose are looked for where it puts them: within this angle
-# (8 px at f = 525 px), among so many nearest features: a camera with a long lens has all of them
+# (8 px at f = 525 px), among this many nearest features: a camera with a long lens has all of them
 # there. Their descriptors are at least so similar.
 _GUIDED_RADIUS, _GUIDED_NEAREST = 8.0 / 525.0, 10
 _GUIDED_COSINE, _GUIDED_KEYFRAMES = 0.8, 12
@@ -51,7 +51,7 @@ _GUIDED_LEAST_M, _GUIDED_MOST_BEARING = 0.1, 5.0
 LEAST_S = 0.5
 #: Places of an image that do not agree with each other.
 MOST_PLACES = 3
-# Similar keyframes of which those elsewhere are chosen.
+# Similar keyframes; the search chooses among those elsewhere.
 _MOST_RANKED = 500
 #: A keyframe sees the same as a pose if it looks the same way from near enough: the shares of the
 #: two that it is away are less than 1 together.
@@ -62,7 +62,7 @@ _ITERATIONS, _RIVAL_ITERATIONS = 3000, 1000
 _RIVAL_TOLERANCE = 3.0
 #: Nothing is known of the camera.
 NOTHING_KNOWN = Constraint()
-# Cells of the image (columns, rows). A cell is comparable from so many points of keyframes and
+# Cells of the image (columns, rows). A cell is comparable from this many points of keyframes and
 # features of the image on; an image has half as many features as a keyframe.
 _CELLS = (8, 6)
 _LEAST_EXPECTED, _LEAST_SEEN = 4, 2
@@ -117,9 +117,9 @@ class ImageFeatures:
     read_rgb : callable
         Returns the image (h, w, 3).
     camera : Camera
-        That took the image.
+        Camera of the image.
     kind : FeatureKind
-        Of the layer in which the image is localized.
+        Kind of features of the layer in which the image is localized.
     """
 
     def __init__(self, read_rgb: Callable[[], NDArray[np.uint8]], camera: Camera,
@@ -137,7 +137,7 @@ class ImageFeatures:
 
 
 class _Look(NamedTuple):
-    """An image: its features, their bearings (n, 2), the camera and what is known of it."""
+    """An image: its features, their bearings (n, 2), the camera and its constraints."""
 
     features: Features
     bearings: NDArray[np.float64]
@@ -223,7 +223,7 @@ class KeyframeLocalizer:
         matched = self._match(descriptors, chosen, deadline)
         first = _place(matched, look)
         if first is None or first.agreed < _ENOUGH_INLIERS:
-            # More keyframes: those near the pose so far, and the next similar ones.
+            # More keyframes: those near the pose so far, and the next in similarity.
             near = keyframes_near(self.layer.map_from_camera, first.map_from_camera
                                    )[:_MORE].tolist() if first else []
             more = [one for one in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
@@ -307,7 +307,7 @@ class KeyframeLocalizer:
 
     def _search_further(self, descriptors: NDArray[np.float32], look: _Look, ranks: Sequence[int],
                         deadline: float) -> list[int]:
-        """Return the keyframes near a pose that many points of less similar ones agree with."""
+        """Return the keyframes near a pose that many points of less similar keyframes support."""
         matched = self._match(descriptors[:_STRONGEST], ranks[:_FURTHER], deadline)
         place = _place(matched, look, _RIVAL_ITERATIONS)
         if place is None or place.agreed < _CLEAR:
@@ -337,7 +337,7 @@ class KeyframeLocalizer:
             is_thorough)
 
     def _choose(self, ranks: Sequence[int], guesses: Sequence[NDArray[np.float64]]) -> list[int]:
-        """Return the keyframes to match: similar ones, and those near the guesses."""
+        """Return the keyframes to match: similar keyframes, and keyframes near the guesses."""
         poses = self.layer.map_from_camera
         chosen = list(ranks[:_SIMILAR])
         others = np.array(ranks[_SIMILAR:_MOST_RANKED], dtype=np.int64)
@@ -406,7 +406,7 @@ class KeyframeLocalizer:
 
 
 def _places(first: _Place | None, matched: _Matched, look: _Look) -> list[_Place]:
-    """Return the pose that most matches agree with, and the best ones elsewhere.
+    """Return the pose that most matches agree with, and the best poses elsewhere.
 
     The one whose points lie in the most parts of the image comes first: a poster has many points,
     but shows only a part of its place.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What keyframes say about an image: places, and the evidence for and against each."""
+"""Places that keyframes recognize in an image, and the evidence for and against each."""
 
 from typing import NamedTuple
 

@@ -26,9 +26,9 @@ _ROUGH, _WRONG_FOCAL, _MOST_LOGARITHM = (2.0, 1.0), (12.0, 6.0, 3.0, 1.0), np.lo
 _OF_X_AND_Y = np.array([[1.0, 1.0], [1.0, -1.0]])
 # The least deviation of a feature, as an angle: half a pixel at f = 525 px.
 _LEAST_DEVIATION = 0.5 / 525.0
-# Points behind the camera count as ones before it, so near [m].
+# Points behind the camera count as points before it at this depth [m].
 _LEAST_DEPTH = 1e-3
-# Of a normal distribution: standard deviation divided by the median of absolute values.
+# Standard deviation of a normal distribution over its median of absolute values.
 _FROM_MEDIAN = 1.4826
 
 
@@ -43,7 +43,7 @@ class PointPose(NamedTuple):
 
 def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], iterations: int = 3000,
               are_best_first: bool = False) -> PointPose | None:
-    """Return the pose that most points agree with; None where there is none.
+    """Return the pose that most points agree with; None if there is none.
 
     MSAC of OpenCV finds it, and robust least squares refines it on the inliers. Its own local
     optimization, MAGSAC++ and PoseLib took longer at equal success. Points (n, 3) are in the map
@@ -105,8 +105,8 @@ def free_focal(points: NDArray[np.float64], bearings: NDArray[np.float64],
     Returns
     -------
     logarithms, deviations : ndarray (2,)
-        Of the focal length as a multiple of the given one and of its aspect, x to y: the root of
-        the quotient. Their standard deviations, from those of the features alone.
+        Logarithms of the focal length, as a multiple of the given one, and of its aspect, x to y:
+        the root of the quotient. Their standard deviations, from those of the features alone.
     inliers : ndarray (k,) of int
         Rows of the points that agree.
     """
@@ -128,7 +128,7 @@ class _Fit(NamedTuple):
 
     @property
     def ratios(self) -> NDArray[np.float64]:
-        """Return the focal lengths (2,) of x and y as multiples of the given ones."""
+        """Return the focal lengths (2,) of x and y as multiples of the given focal lengths."""
         return np.exp(_OF_X_AND_Y @ self.logarithms)
 
 

@@ -6,11 +6,11 @@ landmark_map
     The map, its landmarks by class, and how its file is read; landmark_details has its optional
     fields.
 landmark_embeddings
-    Images of each landmark, as an encoder saw them, and how crops are compared with them.
+    Image embeddings of each landmark, and their comparison with crops.
 joined_map
     Several maps, searched as one.
 map_file, parameter_file
-    Writing a map, reading what was written in a second, and any parameter file without ROS.
+    Write a map, read it fast, and read any parameter file without ROS.
 similarities, pairs, culling
     The landmarks by similarity of their labels, by pairs, and by place.
 visibility

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Frustum culling with a tree of bounding spheres: a pose is compared with what it may see.
+"""Frustum culling with a tree of bounding spheres: only landmarks in view are compared.
 
 A landmark can overlap a box by more than the threshold only if it reaches into the frustum
 through the boxes of its class, and if it is near enough to appear large enough. Culling drops
@@ -118,7 +118,7 @@ def make_groups(sorted_landmarks: SortedLandmarks, classes: NDArray[np.int64],
 
 
 def _members(classes: NDArray[np.int32], shown: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return row and group (w, 2) of each landmark whose class is one of the sorted shown ones."""
+    """Return row and group (w, 2) of each landmark whose class is among the sorted classes."""
     if not len(shown):
         return np.empty((0, 2), dtype=np.int32)
     of_classes = np.full(max(classes.max(initial=0), shown[-1]) + 1, -1, dtype=np.int32)
@@ -143,7 +143,7 @@ def _make_tree(centers: NDArray[np.float64], radii: NDArray[np.float64],
 
 
 def morton_codes(centers: NDArray[np.float64]) -> NDArray[np.uint64]:
-    """Return the place (u,) of points (u, 3) on a Morton curve through their bounding cube."""
+    """Return the Morton codes (u,) of points (u, 3) in their bounding cube."""
     offsets = centers - centers.min(axis=0, initial=np.inf)
     extent = max(offsets.max(initial=0.0), 1e-9)
     cells = (offsets / extent * (2**_MORTON_BITS - 1)).astype(np.uint64)

@@ -40,7 +40,7 @@ class Place(NamedTuple):
 
     part: MapPart
     map_from_camera: NDArray[np.float64]  #: (4, 4): in the coordinate frame of that map
-    name: str  #: Of the map; empty where there is only one
+    name: str  #: Name of the map; empty if there is only one
 
     @property
     def position(self) -> tuple[float, float, float]:

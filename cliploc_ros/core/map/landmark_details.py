@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a map may say of a landmark besides its ellipsoid: optional fields of the map file."""
+"""Optional fields of a landmark in the map file."""
 
 import sys
 from collections import defaultdict
@@ -18,14 +18,14 @@ WeightedLabels = tuple[tuple[str, float], ...]
 
 @dataclass(frozen=True)
 class LandmarkDetails:
-    """Optional fields of one landmark. Each is None where the map has none."""
+    """Optional fields of a landmark. A field that the map lacks is None."""
 
     labels: WeightedLabels | None = None  #: Phrases with their weights, all above 0
     #: Detector classes with their share of the landmark's boxes, all above 0
     class_weights: tuple[tuple[str, float], ...] | None = None
     position_sigma: float | None = None  #: Standard deviation of the centre on each axis [m]
-    #: Besides, the landmark and its neighbours are displaced together, and turned together about
-    #: the cameras near them: standard deviations on each axis [m] [deg]
+    #: In addition, the landmark and its neighbours are displaced together, and turned together
+    #: about the cameras near them: standard deviations on each axis [m] [deg]
     shared_sigma: float | None = None
     shared_sigma_deg: float | None = None
     support: int | None = None  #: Frames that the landmark was fitted to

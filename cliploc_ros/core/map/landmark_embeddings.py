@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What an image encoder saw of each landmark: ``NAME.embeddings.npz`` next to ``NAME.yaml``."""
+"""Image embeddings of the landmarks: ``NAME.embeddings.npz`` next to ``NAME.yaml``."""
 
 import os
 from collections.abc import Sequence
@@ -61,7 +61,7 @@ class LandmarkEmbeddings:
     #: (L + 1,): landmark l has the medoids from medoid_offsets[l] up to medoid_offsets[l + 1], at
     #: most five
     medoid_offsets: NDArray[np.int64]
-    set_digest: str = ''  #: Of the map that they were written with; '' where it is unknown
+    set_digest: str = ''  #: Digest of the map that they were written with; '' if it is unknown
 
     def __len__(self) -> int:
         """Return the number of landmarks."""
@@ -73,7 +73,7 @@ class LandmarkEmbeddings:
         return np.asarray(self.means.any(axis=1))
 
     def in_order(self, landmark_ids: Sequence[str]) -> 'LandmarkEmbeddings':
-        """Return the embeddings of some landmarks in the order given; missing ones are unknown."""
+        """Return the embeddings of some landmarks in the order given, unknown if missing."""
         rows_of = {landmark_id: row for row, landmark_id in enumerate(self.landmark_ids)}
         rows = np.array([rows_of.get(landmark_id, -1) for landmark_id in landmark_ids],
                         dtype=np.int64)
@@ -103,9 +103,9 @@ def embeddings_path(map_path: str | os.PathLike[str]) -> Path:
 
 def load_embeddings_of_map(map_path: str | os.PathLike[str], landmark_ids: Sequence[str],
                            map_set: MapSet = NO_SET) -> LandmarkEmbeddings | None:
-    """Return the embeddings of a map's landmarks, in its order; None where it has no such file.
+    """Return the embeddings of a map's landmarks, in its order; None if it has no such file.
 
-    Landmarks that were removed from the map are left out, and added ones are unknown.
+    Landmarks that were removed from the map are left out; added landmarks are unknown.
 
     MapError: the file is invalid, of another set, or has none of these landmarks.
     """
@@ -159,9 +159,9 @@ def with_images(labels: LabelEmbeddings, images: LandmarkEmbeddings, compare: st
     Parameters
     ----------
     labels : LabelEmbeddings
-        Of L landmarks.
+        Label embeddings of L landmarks.
     images : LandmarkEmbeddings
-        Of the same landmarks, at least one of them known.
+        Image embeddings of the same landmarks, at least one of them known.
     compare : str
         'image' or 'both'.
     """

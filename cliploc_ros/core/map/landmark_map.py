@@ -73,8 +73,8 @@ class ClassIndex:
     #: (m,): landmarks grouped by class, in the map's order within a class
     landmarks: NDArray[np.int64]
     starts: NDArray[np.int64]  #: (C + 1,): where each class begins in landmarks
-    #: Of (landmark, class), its share over that of the landmark's most frequent class, 0 to 1;
-    #: missing ones count 1
+    #: Share of a class, by (landmark, class), relative to the landmark's most frequent class, 0 to
+    #: 1; missing pairs count 1
     weights: Mapping[tuple[int, int], float] = field(default_factory=dict)
 
     @staticmethod
@@ -87,7 +87,7 @@ class ClassIndex:
         others : sequence of (int, str)
             A landmark and another class of it, each pair once.
         weights : mapping, optional
-            Of a landmark and a class of it, see ClassIndex.
+            Weights of a landmark and a class of it, see ClassIndex.
         """
         names = [*landmark_classes, *(name for _, name in others)]
         numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
@@ -107,7 +107,7 @@ class ClassIndex:
         return np.column_stack([self.landmarks[order], classes[order]])
 
     def are_own(self, classes: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether each class (n,) is a landmark's own, not one that it is taken for."""
+        """Return whether each class (n,) is the own class of a landmark, not a confusion."""
         return np.asarray((classes >= 0) & (classes <= self.of_landmarks.max(initial=-1)))
 
     def have(self, landmarks: NDArray[np.int64], classes: NDArray[np.int64]
@@ -154,7 +154,7 @@ class ClassIndex:
         order : ndarray (m,) of int
             The detections in the order in which they are paired.
         limit : int, optional
-            The most pairs to return: the first ones.
+            Return at most this many pairs, from the first.
         """
         taken = self.sizes_of(classes)[order]
         if limit is not None:
@@ -200,9 +200,9 @@ class LandmarkMap:
     semi_axes: NDArray[np.float64]  #: (L, 3): half lengths along each landmark's own axes [m]
     #: (L, 4): unit quaternions that rotate landmark axes into map axes
     quats_xyzw: NDArray[np.float64]
-    #: Optional fields of each landmark; empty where the map has none
+    #: Optional fields of each landmark; empty if the map has none
     details: tuple[LandmarkDetails, ...] = ()
-    map_set: MapSet = NO_SET  #: What the files next to the map's own have to be of
+    map_set: MapSet = NO_SET  #: Identity that the files next to the map must have
 
     def __len__(self) -> int:
         """Return the number of landmarks."""
@@ -279,7 +279,7 @@ class LandmarkMap:
 
     @cached_property
     def classes(self) -> ClassIndex:
-        """Return the landmarks by class: by their own, and by others that they are taken for."""
+        """Return the landmarks by class: their own, and classes that they are mistaken for."""
         others = [(row, name) for row, one in enumerate(self.details)
                   for name in one.likely_classes() if name != self.class_ids[row]]
         weights = {(row, name): share for row, one in enumerate(self.details)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Write a map as a ROS 2 parameter file, see LandmarkMap.from_file, and what lies next to it."""
+"""Write a map as a ROS 2 parameter file, see LandmarkMap.from_file, and the files next to it."""
 
 import hashlib
 import json
@@ -30,7 +30,7 @@ _INDENT = ' ' * 10
 def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
               comments: Iterable[str] = (), embeddings: LandmarkEmbeddings | None = None,
               besides: Mapping[Path, WriteOfSet | None] | None = None) -> None:
-    """Write a map file and what lies next to it: the old set is replaced complete, or stays.
+    """Write a map file and the files next to it: the old set is replaced complete, or stays.
 
     Comments are lines for the head of the file. Image embeddings are written next to the map;
     those of a map that is replaced are removed: they are not of the new one. `besides` are further

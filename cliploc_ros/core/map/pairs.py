@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs of neighbouring landmarks by what they look like: where else a map has the same pairs.
+"""Pairs of neighbouring landmarks by their appearance: find the same pairs elsewhere in a map.
 
 A turn about the vertical and a shift keep the classes of two landmarks, their horizontal distance
 and their difference in height. So landmarks whose pairs a map has twice may stand at places that
@@ -44,7 +44,7 @@ class LandmarkPairs(NamedTuple):
     #: (L, 3), (L,): of the landmarks
     centers: NDArray[np.float64]
     classes: NDArray[np.int64]
-    keys: NDArray[np.int64]  #: (p,): what each pair looks like, ascending
+    keys: NDArray[np.int64]  #: (p,): key of the appearance of each pair, ascending
     landmarks: NDArray[np.int32]  #: (p,): first landmark of each pair
     #: (p, 3): horizontal distance and difference in height [m], and direction [rad] of each pair
     offsets: NDArray[np.float32]

@@ -181,13 +181,13 @@ _LANDMARK = re.compile(''.join([
 
 
 class MapSet(NamedTuple):
-    """Which files belong to a map, by what its head says; '' where it says nothing."""
+    """The files that belong to a map, named in its head; '' if the head names none."""
 
-    family: str = ''  #: Of the first map, which updates kept: keyframes hold for all of them
-    digest: str = ''  #: Of this map
+    family: str = ''  #: Digest of the first map, which updates keep: its keyframes hold for all
+    digest: str = ''  #: Digest of this map
 
 
-#: Of a map that does not say it.
+#: The set of a map that names none.
 NO_SET = MapSet()
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which landmarks an image should show at a pose, and which are no longer there.
+"""Find the landmarks that an image should show at a pose, and landmarks that are gone.
 
 An image should show the landmarks that are near, large, wholly in view and not hidden. Walls are
 in no map, so an expected landmark may be hidden. If the image shows a landmark beside it, it is
@@ -61,7 +61,7 @@ _HERE, _LEAST_GONE, _LEAST_SHARE = 10, 2.0, 0.25
 
 def is_in_image(box: NDArray[np.float64], bounds: NDArray[np.float64], least_share: float
                 ) -> NDArray[np.bool_]:
-    """Tell whether an image shows more than a share of a box (4,), or of each of n boxes (4, n).
+    """Return whether an image shows more than a share of a box (4,), or of each of n boxes (4, n).
 
     Box and bounds (4,) of the image are left, top, right, bottom.
     """
@@ -73,7 +73,7 @@ def is_in_image(box: NDArray[np.float64], bounds: NDArray[np.float64], least_sha
 
 def is_beside(cosine: NDArray[np.float64], distance: NDArray[np.float64],
               of_place: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell whether an image that shows a landmark shows a place, too: no wall is before it.
+    """Return whether an image that shows a landmark also shows a place: no wall is before it.
 
     The landmark is beside the place or behind it, by the cosine between their directions, its
     distance and that of the place.
@@ -179,7 +179,7 @@ class _Record(NamedTuple):
 
 
 class Missing:
-    """What looks said of each landmark that they expected."""
+    """Counts of looks for each landmark that they expected."""
 
     def __init__(self, landmark_map: LandmarkMap) -> None:
         self._details = landmark_map.details
@@ -187,7 +187,7 @@ class Missing:
         self._expected: deque[list[int]] = deque(maxlen=_HERE)
 
     def add(self, expected: Expected, weight: float) -> None:
-        """Count a look at a right pose, 1 for one that shares no errors with earlier ones."""
+        """Count a look at a right pose: 1 if it shares no errors with earlier looks, else less."""
         for landmark, was_seen, in_sight, side in zip(*(one.tolist() for one in expected),
                                                       strict=True):
             one = self._records.get(landmark, _Record())

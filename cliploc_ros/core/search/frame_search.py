@@ -89,8 +89,8 @@ def class_candidates(index: ClassIndex, classes: NDArray[np.int64], limit: int |
                      ) -> Candidates:
     """Return the pairs of equal class, detection by detection.
 
-    With a limit there are no more than that, beginning with the rarest classes: a pair is the more
-    probable, the fewer landmarks its class has.
+    A limit keeps the pairs of the rarest classes: pairs of a class with few landmarks are the most
+    probable.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ def _depths(observation: Observation, options: RelocalizerOptions) -> NDArray[np
 
 def _potential(landmark_map: LandmarkMap, classes: NDArray[np.int64], nearest: Candidates | None
                ) -> tuple[NDArray[np.int64], SortedLandmarks | None]:
-    """Return the pairs (p, 2) to verify, and the landmarks to verify by class besides.
+    """Return the pairs (p, 2) to verify, and further landmarks to verify by class.
 
     In a small map the pairs are complete: culling costs more there than it saves.
     """
@@ -246,8 +246,8 @@ def _candidates(landmark_map: LandmarkMap, class_ids: Sequence[str],
                 options: RelocalizerOptions) -> tuple[Candidates, int]:
     """Return the candidates in the order of the sampler, and how many are left out.
 
-    Of pairs of equal class auto has at most MAX_CANDIDATES. Each of several maps gets an equal
-    share, and they take turns: a search that is cut short has looked for rivals on all of them.
+    auto uses at most MAX_CANDIDATES pairs of equal class. Several maps get equal shares and take
+    turns, so that a search that is cut short has looked for rivals in all of them.
     """
     index = landmark_map.classes
     if nearest is not None:
@@ -275,7 +275,7 @@ class SearchedFrame(NamedTuple):
     """A frame and the result of the search among its samples."""
 
     observation: Observation
-    scene: Scene  #: Of the observation
+    scene: Scene  #: Scene of the observation
     vertical: NDArray[np.float64]  #: (7,): see VERTICAL_UNKNOWN
     leaders: Leaders  #: The best hypotheses, as poses of this frame's camera
     tilted: Leaders  #: The best hypotheses that ignore the vertical, where it is known; else none
@@ -297,9 +297,9 @@ class SearchedFrame(NamedTuple):
 
     @property
     def known_tried(self) -> int:
-        """Return how many samples were tried or ruled out as incompatible, of each map on average.
+        """Return the number of samples tried or ruled out as incompatible, per map on average.
 
-        Samples across maps are none: that they were not tried says nothing about rivals.
+        Samples across maps are invalid and do not count.
         """
         maps = np.searchsorted(self.firsts, self.scene.pairs[:self.progress.reach, 1], 'right')
         within = sum(comb(count, self.sample_size) for count in np.bincount(maps).tolist())

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One frame, the map and what is known of the camera, as the compiled search reads them."""
+"""One frame, the map and the constraints of the camera, as the compiled search reads them."""
 
 from math import atan2, cos, hypot, inf, pi, sqrt
 from typing import NamedTuple
@@ -31,7 +31,7 @@ class Scene(NamedTuple):
     #: = 1
     box_ellipses: NDArray[np.float64]
     bearings: NDArray[np.float64]  #: (n, 3): unit vectors through the box centres
-    #: (n, 2): depth of what each box shows and its standard deviation [m]; 0, 0 where unknown
+    #: (n, 2): depth of the object in each box and its standard deviation [m]; 0, 0 if unknown
     depths: NDArray[np.float64]
     #: (L, 3), (L, 6): of the landmarks, see cliploc_ros.core.geometry.ellipsoid
     centers: NDArray[np.float64]
@@ -40,8 +40,8 @@ class Scene(NamedTuple):
     #: (c, 2): detection and landmark of each correspondence candidate, in order of preference
     pairs: NDArray[np.int64]
     iou_threshold: float  #: A detection and a landmark match only if their IoU is above this
-    #: Of a large map, the landmarks that detections may show because of their class. In a small
-    #: map both are empty, and these pairs are in potential.
+    #: For a large map: the landmarks of the detected classes. For a small map both are empty,
+    #: and potential holds these pairs.
     sorted_landmarks: SortedLandmarks
     groups: Groups
 
@@ -59,7 +59,7 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
     bboxes : ndarray (n, 4)
         Boxes x, y, x, y on the plane z = 1 (undistorted).
     centers, shapes : ndarray (L, 3), (L, 6)
-        Of the landmarks.
+        Centres and shapes of the landmarks.
     potential : ndarray (n, L) of bool, or (p, 2) of int
         Which landmarks each detection may show: a mask, or pairs of detection and landmark.
     pairs : ndarray (c, 2)
@@ -101,7 +101,7 @@ class Constraint(NamedTuple):
     #: The vertical, unit vectors in the camera's optical frame and in the map frame
     up_in_camera: tuple[float, float, float] = (0.0, -1.0, 0.0)
     up_in_map: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    #: Of the camera's centre, along up_in_map from the map's origin [m]
+    #: Limits of the camera's centre along up_in_map, from the map's origin [m]
     min_height: float = -inf
     max_height: float = inf
     #: Greatest angle between both verticals at a pose from three points [rad]. Poses from two

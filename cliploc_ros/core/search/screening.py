@@ -26,7 +26,7 @@ from cliploc_ros.core.search.scene import Constraint, Scene
 
 
 class Targets(NamedTuple):
-    """What poses are verified against."""
+    """The data that poses are verified against."""
 
     boxes: NDArray[np.float64]  #: (n, 4): box ellipses of the detections
     iou_threshold: float  #: See Scene

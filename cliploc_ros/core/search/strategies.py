@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Minimal samples, and which of them a search tries: drawn ones, all, or the likeliest first.
+"""Minimal samples, and the order of a search: random, all, or most likely first.
 
 A sample is three candidates with three different detections and three different landmarks.
 
@@ -345,7 +345,7 @@ def worst_score(leaders):
 
 @compiled
 def remember(leaders, score, iteration, sample, rotation, translation):
-    """Add a hypothesis, unless a better one leads at its place; drop worse ones there."""
+    """Add a hypothesis, unless a better hypothesis leads at its place; drop worse ones there."""
     scores = leaders.scores
     free = -1
     for row in range(scores.shape[0]):
@@ -390,7 +390,7 @@ def same_place(rotation_a, translation_a, rotation_b, translation_b):
 
 
 class Progress(NamedTuple):
-    """How far a search is."""
+    """The progress of a search."""
 
     tried: int  #: Hypotheses tried so far
     coverage: float  #: The share of its samples that were tried, 0 to 1

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a localizer's pose is right, look by look.
+"""The watch: evidence that a localizer's pose is right, look by look.
 
 look
     The pose near the given one that fits the detections best, and the log odds that the given pose

@@ -50,7 +50,7 @@ class ImageFaults:
     def add(self, image: NDArray[np.uint8], pose: NDArray[np.float64]) -> str:
         """Take in an image (h, w, 3) from a pose (4, 4), by odometry if known; return the fault.
 
-        The text is empty where there is none.
+        The text is empty if there is none.
         """
         terms = CALIBRATION.images
         width = int(terms.width_px)
@@ -82,7 +82,7 @@ class ImageFaults:
 class CameraTurn:
     """The camera is turned against its stated mount."""
 
-    #: (3,): rotation vector that turns the stated axes of the camera into the true ones [deg];
+    #: (3,): rotation vector that turns the stated axes of the camera into the true axes [deg];
     #: optical axes: x right, y down, z forward
     rotvec_deg: NDArray[np.float64]
     sigma_deg: float  #: Standard deviation on each axis
@@ -114,11 +114,11 @@ class _Turn(NamedTuple):
 
 
 class TurnEstimate:
-    """The turns of the last looks. One from the spot of the last one replaces it."""
+    """The turns of the last looks. A look from the same spot replaces the last one."""
 
     def __init__(self) -> None:
         self._turns: deque[_Turn] = deque(maxlen=int(CALIBRATION.turn.most_looks))
-        #: None before it is known, or where it may be chance
+        #: None while it is unknown or may be chance
         self.turn: CameraTurn | None = None
 
     def add(self, alignment: Alignment, given: NDArray[np.float64], is_new: bool) -> None:
@@ -145,7 +145,7 @@ class TurnEstimate:
 
 def _turn_of(pose: NDArray[np.float64], information: NDArray[np.float64],
              given: NDArray[np.float64]) -> _Turn:
-    """Return the turn from a given pose (4, 4) to the fitted pose, at the likeliest position.
+    """Return the turn from a given pose (4, 4) to the fitted pose, at the most likely position.
 
     The given position is right to within the drift of a localizer, so what moves the fit away from
     it is in part a turn: the least squares of the fit and of the given position together.

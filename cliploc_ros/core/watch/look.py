@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One look at a given pose: the pose near it that fits best, and whether the given one is right.
+"""One look at a given pose: the best pose near it, and the evidence that the given pose is right.
 
 A localizer drifts by decimetres and a few degrees, and a camera may be turned on its robot. Then
-outlines miss the boxes of small objects. So a grid of turns and shifts about the given pose is
-scored, and the best few are refined; nothing else of the map is searched.
+outlines miss the boxes of small objects. A grid of turns and shifts about the given pose is
+therefore scored, and the best few are refined. The rest of the map is not searched.
 
-The evidence is the log odds that the given pose is right, against one elsewhere: a logistic model
-of looks of right and of wrong poses in simulated worlds, as many of each, so its log odds are
-those of a likelihood ratio. Right poses include those of places that changed since they were
-mapped: some objects fit, others are missing or stand where nothing is mapped. At a wrong pose of
-the same map little fits.
+The evidence is the log odds that the given pose is right rather than a pose elsewhere. They come
+from a logistic model, fitted to equal numbers of looks at right and at wrong poses in simulated
+worlds, so they are the logarithm of a likelihood ratio. Right poses include places that changed
+since they were mapped: some objects fit, others are missing or stand where nothing is mapped. At a
+wrong pose of the same map, little fits.
 """
 
 import math
@@ -59,7 +59,7 @@ _STEPS = np.array([*product(_TURNS_DEG, _TURNS_DEG, (0.0,), _SHIFTS_M, _SHIFTS_M
 _GRID = np.tile(np.eye(4), (len(_STEPS), 1, 1))
 _GRID[:, :3, :3] = Rotation.from_rotvec(_STEPS[:, :3], degrees=True).as_matrix()
 _GRID[:, [0, 2], 3] = _STEPS[:, 3:]
-# Those that are refined are no nearer to each other.
+# Least distance between poses that are refined.
 _APART = Tolerance(_TERMS.apart_m, _TERMS.apart_deg)
 
 
@@ -111,20 +111,20 @@ def align(joined: JoinedFrames, map_from_camera: NDArray[np.float64]) -> Alignme
 
 
 class LookEvidence(NamedTuple):
-    """What one look says of the given pose."""
+    """The evidence of one look about the given pose."""
 
     known: int  #: Detections of the map's classes
     matched: int  #: Objects that are where the pose expects them
     unexplained: int  #: Other detections of the map's classes
-    utility: float  #: Of the matched objects, by the acceptance's model [log odds]
+    utility: float  #: Utility of the matched objects, by the acceptance's model [log odds]
     expected: int  #: Landmarks that the image should show
-    missed: int  #: Those of them that no detection shows
-    away_m: float  #: From the given pose to the best one near it
+    missed: int  #: Expected landmarks that no detection shows
+    away_m: float  #: From the given pose to the best pose near it
     away_deg: float
     crowd: float  #: Logarithm of the pairs of a detection and a landmark in view of its class
 
     def is_full(self, has_jumped: bool) -> bool:
-        """Return whether a wrong pose would show; one that jumped need not be at a mapped spot."""
+        """Return whether a wrong pose would show. After a jump, no mapped spot is needed."""
         return self.known >= _TERMS.full_objects and (
             has_jumped or self.expected >= _TERMS.full_mapped)
 
@@ -149,7 +149,7 @@ def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
     unexplained = sum(row not in taken for row in np.nonzero(own)[0].tolist())
     found = expect(landmark_map, observation.camera, fit.pose,
                    np.array([one.landmark for one in matches], dtype=np.int64))
-    # what nothing explains is a term of its own
+    # detections that nothing explains are a term of their own
     utility, = utilities([fit.support]) - CALIBRATION.objects.unexplained * fit.support.unexplained
     in_view = index.of_landmarks[found.landmarks]
     pairs = sum(int((in_view == one).sum()) for one in classes[own])

@@ -42,14 +42,14 @@ from cliploc_ros.core.watch.look import (
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 
-# Rounding of a pose that is given: what is further from a rigid transform is refused as input.
+# Rounding of a given pose: a matrix further from a rigid transform is refused as input.
 _RIGID = 1e-3
 
 
 class _Look(NamedTuple):
     observation: Observation
     log_odds: float
-    is_full: bool  #: Whether a wrong pose would show: enough objects, and enough mapped ones
+    is_full: bool  #: Whether a wrong pose would show: enough objects, and enough mapped objects
 
 
 class Belief:
@@ -120,7 +120,7 @@ def _correlation(one: _Look, look: _Look) -> float:
 
 
 class WatchState(StrEnum):
-    """Whether a localizer's pose is right."""
+    """State of a localizer's pose."""
 
     LOCALIZED = 'localized'
     UNCERTAIN = 'uncertain'
@@ -129,10 +129,11 @@ class WatchState(StrEnum):
 
 @dataclass(frozen=True)
 class WatchReport:
-    """What the watch says after a look."""
+    """The verdict of the watch after a look."""
 
     state: WatchState
-    #: That the localizer's pose is right (within 1 m and 45 degrees), after all looks, 0 to 1
+    #: Probability that the localizer's pose is right (within 1 m and 45 degrees), after all looks,
+    #: 0 to 1
     probability: float
     reason: str  #: In one line: what happened, with which value, and what to do
     looks: int  #: Looks that said something since the last forget()
@@ -160,7 +161,7 @@ class Watch:
     def look(self, observation: Observation, map_from_camera: NDArray[np.float64],
              image: NDArray[np.uint8] | None = None, recognizer: ImageRecognizer | None = None
              ) -> WatchReport:
-        """Compare what a camera sees with what it should see at the pose of a localizer.
+        """Compare a camera's view with the expected view at the pose of a localizer.
 
         Parameters
         ----------
@@ -172,7 +173,7 @@ class Watch:
         image : ndarray (h, w, 3) of uint8, optional
             To find faults of the camera.
         recognizer : ImageRecognizer, optional
-            Of the keyframes, for this image.
+            Recognizer of the keyframes, for this image.
 
         Raises
         ------

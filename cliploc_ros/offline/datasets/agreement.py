@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether images and poses of a recording agree, and if not, which other reading of them does.
+"""Check that images and poses of a recording agree, and find the reading of them that does.
 
-What two images both show lies on epipolar lines. Only pairs count whose matches some epipolar
-geometry explains, whatever the poses are: images that do not overlap tell nothing.
+Points that two images share lie on epipolar lines. Only pairs count whose matches some epipolar
+geometry explains, whatever the poses are: images that do not overlap prove nothing.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,7 +29,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 # of a body whose axes are forward, left, up (REP 103), and a camera that looks forward
 _BODY_FROM_CAMERA = make_transform(
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
-#: What a stored pose may be, and map_from_camera of OpenCV's axes from it.
+#: Conventions of a stored pose, and map_from_camera with OpenCV's axes from each.
 AXES: Mapping[str, Callable[[_Pose], _Pose]] = {
     'opencv': lambda pose: pose,
     'opengl': lambda pose: pose @ _FLIP,
@@ -41,7 +41,7 @@ AXES: Mapping[str, Callable[[_Pose], _Pose]] = {
 _PAIRS, _TRIED, _REACH = 4, 12, 20
 _TURN_DEG = (4.0, 30.0)
 _FEATURES, _LONGEST_PX = 500, 480
-# Matches that one epipolar geometry explains to within so many pixels, and their least share.
+# Matches that one epipolar geometry explains to within this many pixels, and their least share.
 _LEAST_MATCHES, _LEAST_SHARE, _GATE_PX = 25, 0.5, 2.0
 # Median epipolar errors at an image _LONGEST_PX wide [px]: a true choice has 0.3 to 2 of them.
 _GOOD_PX, _WRONG_PX, _BETTER = 3.0, 4.0, 0.35
@@ -60,7 +60,7 @@ class View(NamedTuple):
 class Reading(NamedTuple):
     """A way to read a recording."""
 
-    remedy: str  #: What to do where it fits, and the given one does not
+    remedy: str  #: Advice if it fits and the given convention does not
     pose: Callable[[_Pose], _Pose] = AXES['opencv']
     camera: Callable[[Camera], Camera] = lambda camera: camera
     upright: bool = False  #: Images are turned by their EXIF orientation
@@ -77,7 +77,7 @@ def w_first(pose: _Pose) -> _Pose:
 
 
 def check_agreement(views: Sequence[View], readings: Mapping[str, Reading], where: object) -> str:
-    """Return a note where images and poses do not fit; '' where they do, or do not tell.
+    """Return a note where images and poses do not fit; '' if they do, or do not tell.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]
                      ) -> dict[str, float]:
     """Return the median epipolar error of two images by the name of the reading [px].
 
-    Empty where no epipolar geometry explains enough matches, as those of images without overlap.
+    Empty if no epipolar geometry explains enough matches, as those of images without overlap.
     """
     errors = {}
     ways = dict.fromkeys((one.upright, one.camera) for one in readings.values())
@@ -153,7 +153,7 @@ def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]
 
 def _match(pair: tuple[View, View], upright: bool
            ) -> tuple[list[Camera], list[NDArray[np.float64]]]:
-    """Return the cameras of two images, and the pixels (n, 2) of what matches in them."""
+    """Return the cameras of two images, and the pixels (n, 2) of their matches."""
     looks = [one.look(upright) for one in pair]
     features = [extract(image, _FEATURES, _LONGEST_PX) for image, _ in looks]
     ours, theirs = (unit_rows(one.descriptors) for one in features)

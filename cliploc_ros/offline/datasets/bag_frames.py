@@ -58,7 +58,7 @@ class _Selected(NamedTuple):
 
 @dataclass(frozen=True)
 class BagTopics:
-    """Which topics of a recording hold what."""
+    """The topics of a recording by their content."""
 
     #: sensor_msgs/Image or CompressedImage, and CameraInfo
     image: str = '/image'
@@ -67,10 +67,10 @@ class BagTopics:
     #: sensor_msgs/Image of depth, 16UC1 or 32FC1, or CompressedImage of compressedDepth; '' for
     #: none
     depth: str = ''
-    intrinsics: str | None = None  #: What is used instead of camera_info, see find_camera
+    intrinsics: str | None = None  #: The camera to use in place of camera_info, see find_camera
     #: A depth image belongs to a colour image at most this far away in time [ns]
     tolerance_ns: int = STAMP_TOLERANCE_NS
-    tf: str | None = None  #: That leads from depth to image, see poses_of_tf
+    tf: str | None = None  #: tf from depth to image, see poses_of_tf
 
     def of_camera(self, name: str) -> 'BagTopics':
         """Return the topics of one of several cameras; '' changes nothing."""
@@ -146,12 +146,12 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
 
 
 class _Cameras(NamedTuple):
-    """The camera_info of a recording: what it says, and when."""
+    """The messages of camera_info in a recording, with their stamps."""
 
     where: str
-    msgtype: str  #: Of the images
+    msgtype: str  #: Message type of the images
     rectified: bool
-    infos: tuple[bytes, ...]  #: Those that differ; empty where a file says the camera
+    infos: tuple[bytes, ...]  #: Those that differ; empty if a file says the camera
     #: (c,): when each message holds [ns], by its stamp or, without stamps, by its recording
     times_ns: NDArray[np.int64]
     rows: NDArray[np.int64]  #: (c,): which of the infos it is
@@ -276,7 +276,7 @@ def _pose_after(poses: Poses, stamp_ns: int, later_ns: int) -> NDArray[np.float6
 def _readings(cameras: _Cameras, rectified: bool) -> dict[str, Reading]:
     """Return how the images and poses of a recording may be meant, the given way first."""
     given = 'rectified' if rectified else 'given'
-    mount = 'give the `mount` {} of the camera on what the poses are of, or the `camera_frame`'
+    mount = 'give the `mount` {} of the camera on the body of the poses, or the `camera_frame`'
     readings = {given: Reading('')}
     infos = [deserialize(one, bag_messages.CAMERA_INFO, cameras.where) for one in cameras.infos]
     if len(infos) == 1:
@@ -412,7 +412,7 @@ def _peek_stamp_ns(recorded: BagMessage) -> int:
 
 
 def _frame_of(data: bytes) -> str:
-    """Return the coordinate frame of a serialized message; '' where it has no header."""
+    """Return the coordinate frame of a serialized message; '' if it has no header."""
     try:
         length, = struct.unpack_from(f'{_order(data)}I', data, 12)
     except (struct.error, IndexError):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where the camera of a rosbag2 recording was: by a topic of poses, or by its tf.
+"""Poses of the camera of a rosbag2 recording, from a topic of poses or from tf.
 
 Each transform of the tf's chain is interpolated at the stamp on its own, as tf2 does. Beyond tf2,
 a gap between two samples has a limit.
@@ -41,7 +41,7 @@ ReadPoses = Callable[[BagReader, str], Poses]
 GROUND_TRUTH, MAP_FRAME = '/ground_truth', 'map'
 _TF, _TF_STATIC = '/tf', '/tf_static'
 _TF_TYPE = 'tf2_msgs/msg/TFMessage'
-# Poses of two sources are compared at so many stamps, and are the same within this [m] [deg].
+# Poses of two sources are compared at this many stamps, and are the same within this [m] [deg].
 _COMPARED, _SAME_M, _SAME_DEG = 50, 0.05, 2.0
 
 
@@ -123,7 +123,7 @@ def find_poses(max_gap_ns: int, ground_truth: str = GROUND_TRUTH,
 
 
 def _difference(one: Poses, other: Poses) -> str:
-    """Return how far poses of two sources differ, in words; '' where they do not."""
+    """Return how far poses of two sources differ, in words; '' if they do not."""
     (first, last), errors = one.span_ns or (0, 0), []
     for stamp in np.linspace(first, last, _COMPARED).astype(np.int64).tolist():
         pair = one.pose_at(stamp), other.pose_at(stamp)
@@ -165,7 +165,7 @@ class TransformChain:
         return max(span[0] for span in spans if span), min(span[1] for span in spans if span)
 
     def pose_at(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        """Return ``map_from_camera`` (4, 4) at a stamp [ns]; None where it is not known."""
+        """Return ``map_from_camera`` (4, 4) at a stamp [ns]; None if it is not known."""
         ancestor_from = [np.eye(4), np.eye(4)]
         for end, links in enumerate((self.up, self.down)):
             for link in links:
@@ -189,7 +189,7 @@ class ChainedPoses:
         return self.body.span_ns
 
     def pose_at(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        """Return ``map_from_camera`` (4, 4) at a stamp [ns]; None where it is not known."""
+        """Return ``map_from_camera`` (4, 4) at a stamp [ns]; None if it is not known."""
         first, second = self.body.pose_at(stamp_ns), self.chain.pose_at(stamp_ns)
         return None if first is None or second is None else np.asarray(first @ second)
 

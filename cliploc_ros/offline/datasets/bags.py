@@ -82,7 +82,7 @@ class BagTopic:
     name: str
     msgtype: str
     message_count: int  #: Number of messages that the recording lists
-    #: What its publishers offered during the recording; empty if unknown
+    #: QoS of its publishers during the recording; empty if unknown
     offered_qos: tuple[Qos, ...] = ()
     type_hash: str = ''  #: RIHS01 hash of the type; empty if not recorded
 
@@ -110,7 +110,7 @@ class BagReader:
         self._topics: dict[str, BagTopic] = {}
         #: Messages that cannot be used, by topic: why, and when
         self.left_out: dict[str, dict[str, None]] = {}
-        self.notes: list[str] = []  #: What the user should know of what was read
+        self.notes: list[str] = []  #: Notes for the user about the recording
 
     def __enter__(self) -> Self:
         """Open the recording."""
@@ -245,7 +245,7 @@ class BagReader:
         if topic.type_hash and topic.type_hash != store.hash_rihs01(topic.msgtype):
             raise DatasetError(
                 f'{self.path}: {topic.name} was recorded with another definition of '
-                f'{topic.msgtype} than the one of Jazzy')
+                f'{topic.msgtype} than in Jazzy')
         return deserialize(message.data, topic.msgtype,
                            f'{self.path}: {topic.name} at {message.stamp_ns}')
 

@@ -106,7 +106,7 @@ def _unread(folder: Path) -> str:
 
 
 def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Camera, str]:
-    """Return images and poses of a folder of one camera, the camera, and what says it.
+    """Return images and poses of a folder of one camera, the camera, and its source.
 
     DatasetError: it has several cameras, a video, or no unit.
     """

@@ -3,7 +3,7 @@
 """Images with their cameras, poses and depth, out of folders and recordings alike.
 
 The one reader of evaluation, mapping and map editor. A source is read as a stream of raw frames:
-what is not wanted is never decoded, and a raw frame can be decoded in another process.
+unwanted frames are never decoded, and a raw frame can be decoded in another process.
 """
 
 import math
@@ -25,8 +25,8 @@ from cliploc_ros.core.geometry.transforms import move_poses
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.units import NS_PER_S
 
-_MOST_NOTES = 5  # on cameras, of which each image may have its own
-# An undistorted image has so many places computed, which take 0.6 kB each.
+_MOST_NOTES = 5  # on cameras; each image may have its own
+# Places computed for an undistorted image, of 0.6 kB each.
 _MOST_PLACES = 1_000_000
 
 
@@ -34,7 +34,7 @@ _MOST_PLACES = 1_000_000
 class PosedImage:
     """An image (h, w, 3) uint8, red first, with its camera, pose and depth.
 
-    ``map_from_camera`` is None where no pose is known at ``stamp_ns``.
+    ``map_from_camera`` is None if no pose is known at ``stamp_ns``.
     """
 
     stamp_ns: int
@@ -70,7 +70,7 @@ class RawFrame:
                           None if self.depth is None else self.depth())
 
 
-#: Tells whether the frame of a place, stamp [ns] and pose is to be read.
+#: Returns whether to read the frame of a place, stamp [ns] and pose.
 Wanted = Callable[[int, int, 'NDArray[np.float64] | None'], bool]
 
 
@@ -86,9 +86,9 @@ class Frames:
     #: The frames of each of several cameras; empty for one
     of_cameras: tuple['Frames', ...] = ()
     varies: bool = False  #: Whether each image has a camera of its own
-    #: Of what may change while the folder does not: images and their cameras, then their poses
+    #: Digest of images and cameras, then of poses, which may change while the folder stays
     digest: str = ''
-    notes: tuple[str, ...] = ()  #: What the user should know about how they were read
+    notes: tuple[str, ...] = ()  #: Notes for the user about the reading
 
     @property
     def each(self) -> tuple['Frames', ...]:
@@ -139,7 +139,7 @@ def join_frames(of_cameras: Mapping[str, Frames]) -> Frames:
         notes=tuple(note for part in parts for note in part.notes))
 
 
-#: The stamp of an image whose time nothing says.
+#: The stamp of an image of unknown time.
 NO_STAMP = -2**63
 
 
@@ -149,16 +149,16 @@ class ImageFile(NamedTuple):
     stamp_ns: int  #: NO_STAMP where the layout has none
     color: Path  #: An image, or a video
     camera: Camera
-    #: (4, 4): as the folder stores it, or map_from_camera; None where it is not known
+    #: (4, 4): as the folder stores it, or map_from_camera; None if it is not known
     pose: NDArray[np.float64] | None = None
     depth: Path | None = None
-    confidence: Path | None = None  #: Of the depth: an image of its size, 0 where it is a guess
-    number: int | None = None  #: Of the image in a video
+    confidence: Path | None = None  #: Image of the depth's size, 0 for guesses
+    number: int | None = None  #: Number of the image in a video
 
 
 @dataclass(frozen=True)
 class DepthFormat:
-    """How depth images are to be read."""
+    """Format of depth images."""
 
     #: Metres of one count. None: 1 mm for 16-bit integers, 1 m for floats.
     unit_m: float | None = None
@@ -177,7 +177,7 @@ def folder_frames(folder: Path, files: Sequence[ImageFile], depth: DepthFormat |
                 yield RawFrame(place, file.stamp_ns, file.pose, partial(read_color, file),
                                None if file.depth is None else partial(read_depth, file, form))
     cameras = dict.fromkeys(file.camera for file in files)
-    # pictures may be cut out of larger ones, which no file tells: no fault is certain
+    # pictures may be cut out of larger pictures without a record: no fault is certain
     notes = dict.fromkeys(f'note: {fault.text}' for one in cameras for fault in camera_faults(one))
     return Frames(folder, len(files), read_raw, varies=len(cameras) > 1,
                   notes=tuple(notes)[:_MOST_NOTES])
@@ -211,7 +211,7 @@ def read_color(file: ImageFile, upright: bool = False) -> tuple[NDArray[np.uint8
 
 
 def _read_image(path: Path, upright: bool) -> Any:
-    """Return an image (h, w, 3), blue first; None where it cannot be read."""
+    """Return an image (h, w, 3), blue first; None if it cannot be read."""
     return cv2.imread(str(path), cv2.IMREAD_COLOR | (0 if upright
                                                      else cv2.IMREAD_IGNORE_ORIENTATION))
 
@@ -229,7 +229,7 @@ class _Video:
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
 
     def image(self, number: int) -> NDArray[np.uint8] | None:
-        """Return an image (h, w, 3), blue first; None where there is none."""
+        """Return an image (h, w, 3), blue first; None if there is none."""
         if number < self._next:
             self._open()
         while self._next < number:

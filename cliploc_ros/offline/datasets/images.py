@@ -84,7 +84,7 @@ class Images:
 
 
 def images_of_recording(recording: MapRecording, cameras: Sequence[str]) -> Images | None:
-    """Open the images that a map was built from; None where they are gone."""
+    """Open the images that a map was built from; None if they are gone."""
     if recording.source is None:
         return None
     return open_images(recording.source, BagTopics(

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a map was built from: NAME.recording.json next to NAME.yaml.
+"""The recording of a map: NAME.recording.json next to NAME.yaml.
 
-``check_map`` and the studio find observations and images by it. Paths in it are relative to the
+It leads ``check_map`` and the studio to observations and images. Paths in it are relative to the
 map, so that folders can be moved together.
 """
 
@@ -32,11 +32,11 @@ class MapRecording:
 
     observations: Path
     source: Path | None = None  #: The bag or folder with the images; None: none is known
-    #: Of a bag: topics of image and camera_info, and whether images are rectified
+    #: For a bag: topics of image and camera_info, and whether images are rectified
     image: str = ''
     camera_info: str = ''
     rectified: bool = False
-    #: Of a folder: the key of its layout, its camera, and where its images are
+    #: For a folder: the key of its layout, its camera, and the folder of its images
     layout: str = ''
     intrinsics: str | None = None
     images: Path | None = None

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Observation and query files: recorded boxes, and where the camera was.
+"""Observation and query files: recorded boxes and camera poses.
 
 Mapping, evaluation and the map editor read the same observations, so that the networks run once.
 A query file has the similarities of a map, too: identical input for every method.
@@ -34,7 +34,7 @@ def _check_stamps(name: str, arrays: npz.Arrays) -> None:
               lambda stamps_ns: np.abs(stamps_ns / NS_PER_S - seconds) > 1e-6)(name, arrays)
 
 
-#: Of files of frames with boxes: F frames, n boxes.
+#: Fields of files of frames with boxes: F frames, n boxes.
 FRAME_FIELDS = {
     'intrinsics_fx_fy_cx_cy': npz.Field('numbers', (4,), (npz.FINITE,)),
     'boxes_xyxy': npz.Field('numbers', ('n', 4), (npz.FINITE, npz.BOX)),
@@ -119,7 +119,7 @@ class Queries:
     """The content of a query file."""
 
     landmark_ids: tuple[str, ...]  #: The landmarks of the columns of the similarities
-    intrinsics_fx_fy_cx_cy: tuple[float, float, float, float]  #: Of the undistorted camera [px]
+    intrinsics_fx_fy_cx_cy: tuple[float, float, float, float]  #: Without distortion [px]
     frames: tuple[QueryFrame, ...]  #: In the file's order
 
     def __len__(self) -> int:
@@ -263,7 +263,7 @@ _OBSERVATIONS = npz.Schema('observation file', {
 }, DatasetError, 'record the observations again', {'F': 'frames'},
     {'similarities': 'this is a query file: map from an observation file'})
 
-# Of PosedDetections
+# Optional fields of PosedDetections
 _OPTIONAL = ('depths', 'depth_spreads', 'embeddings', 'odom_from_camera', 'open_edges')
 
 

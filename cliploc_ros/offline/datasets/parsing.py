@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Texts, tables and JSON of other programs, checked as they are read.
 
-Whatever a file holds, the error is a DatasetError that names the file and the line or field.
+Every error is a DatasetError that names the file and the line or field.
 """
 
 import math
@@ -139,7 +139,7 @@ def unit_quaternion(quat: Sequence[float], where: str, tolerance: float
 
 def pose_of(position: Sequence[float], quat_xyzw: Sequence[float], where: str
             ) -> NDArray[np.float64] | None:
-    """Return the transform (4, 4) of a position and a quaternion; None where they are not finite.
+    """Return the transform (4, 4) of a position and a quaternion; None if they are not finite.
 
     DatasetError: the quaternion is far from unit.
     """
@@ -235,7 +235,7 @@ class Fields:
         return self._typed(name, list, 'a list')
 
     def mapping(self, name: str) -> dict[str, Any]:
-        """Return a mapping, which is empty where it is missing."""
+        """Return a mapping, which is empty if it is missing."""
         return self._typed(name, dict, 'a mapping', {})
 
     def size(self, width: str, height: str) -> tuple[int, int]:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a camera was: poses over time, with interpolation between them."""
+"""Poses of a camera over time, with interpolation between them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from cliploc_ros.units import NS_PER_S
 
 #: A stamp has a pose only if a sample lies this close to it, unless the user says otherwise.
 STAMP_TOLERANCE_NS = 20_000_000
-#: Of a quaternion that is taken for a unit one.
+#: Greatest deviation of the length of a unit quaternion from 1.
 MAX_NORM_ERROR = 0.01
 # A clock that is off by less than this is a late start of the recording, not another clock.
 _OTHER_CLOCK_S = 60.0
@@ -29,7 +29,7 @@ class Poses(Protocol):
     """Something that knows the pose of a camera over time."""
 
     def pose_at(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        """Return ``map_from_camera`` (4, 4) at a stamp [ns]; None where it is not known."""
+        """Return ``map_from_camera`` (4, 4) at a stamp [ns]; None if it is not known."""
 
     @property
     def span_ns(self) -> tuple[int, int] | None:

@@ -53,7 +53,7 @@ class ConversionOptions:
 
 @dataclass(frozen=True)
 class ConversionResult:
-    """Counts of what was written."""
+    """Counts of written messages."""
 
     images: int  #: Images, each with a camera_info
     poses: int  #: Images with ground truth

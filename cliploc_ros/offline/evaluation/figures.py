@@ -30,7 +30,8 @@ from cliploc_ros.offline.evaluation.trials import PosedQuery, Result
 
 #: Outlines text, so that it is legible on any background.
 EDGED = (withStroke(linewidth=2.0, foreground='white'),)
-_MOST_NAMES = 100
+# Names of more landmarks would be too small to read; and their size [pt].
+_MOST_NAMES, _NAME_PT = 40, 8
 _NAME = 'name'
 # Steps of a name from its place, in half widths and in heights, the nearest first.
 _STEPS = sorted(product((0.0, 1.1, -1.1, 2.2, -2.2), np.arange(-4, 5) * 1.05),
@@ -60,7 +61,8 @@ def draw_map(axes: Axes, landmark_map: LandmarkMap) -> dict[str, tuple[float, ..
     if len(landmark_map) <= _MOST_NAMES:
         # the highest first: they hide the others
         for row in np.argsort(-landmark_map.centers[:, 2], kind='stable'):
-            write_name(axes, landmark_map.centers[row, :2], landmark_map.landmark_ids[row], 6)
+            write_name(axes, landmark_map.centers[row, :2], landmark_map.landmark_ids[row],
+                       _NAME_PT)
     return colors
 
 
@@ -127,7 +129,7 @@ _MAX_ERROR_M = 2.0
 _SUCCESS_M = 1.0
 _BOX_BINS = ((0, 2), (3, 4), (5, 6), (7, 9), (10, 14), (15, 10_000))
 _MARGIN_M = 0.5
-# Of reliability, finer where poses are accepted
+# Bins of reliability, finer where poses are accepted
 _BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.0)
 _FREEDOM = 6  # of a pose
 _JUDGED_COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
@@ -146,9 +148,9 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
     folder : Path
         Folder of the figures.
     summaries : sequence of Summary
-        Of the results.
+        Summaries of the results.
     sweep : mapping of str to mapping of int to Summary
-        Of each sampling method, by its number of iterations.
+        Summaries of each sampling method, by its number of iterations.
     observing_ms : mapping of str to float
         Mean times of the stages before the search, where recorded.
 
@@ -212,6 +214,7 @@ def new_axes(xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
     figure = Figure(figsize=_SIZE, layout='constrained')
     axes = figure.add_subplot()
     axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.set_prop_cycle(color=_JUDGED_COLORS)
     axes.grid(alpha=0.3)
     axes.set_axisbelow(True)
     return figure, axes

@@ -43,11 +43,11 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
     Parameters
     ----------
     words : iterable of str
-        Names of the paper's methods, 'all' of these, 'auto', or YAML files: a mapping of names
+        Names of the paper's methods, 'auto', 'all' of these, or YAML files: a mapping of names
         to options, where 'base' names a method whose options are the defaults, and 'keyframes'
         says whether keyframes are used; the paper's methods never use them.
     paper : RelocalizerOptions
-        Options of the paper's methods besides matching and algorithm. auto takes its seed,
+        Options of the paper's methods other than matching and algorithm. auto takes its seed,
         height range, deviations of vertical and tilt, crops and matching from them.
     landmarks : int
         Number of landmarks of the map; it limits k. Without any, all methods have to use
@@ -56,7 +56,7 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
     methods: dict[str, Method] = {}
     for word in words:
         if word == ALL:
-            found = [_named(name, paper, landmarks) for name in PAPER_METHODS]
+            found = [_named(name, paper, landmarks) for name in (*PAPER_METHODS, AUTO)]
         elif word.endswith(('.yaml', '.yml')):
             content = read_parameter_file(word)
             if not content:

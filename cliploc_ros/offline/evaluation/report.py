@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page of compared methods: the best one first, then the table and all figures."""
+"""The page of compared methods: the best method, the table and all figures."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +13,7 @@ PAGE = 'report.html'
 _TOP_VIEW = 'top_view'
 # Columns of the first screen: method, success, accepted, false accepts.
 _BRIEF = (0, 1, 2, 5, 7)
-_CAPTIONS = {
+CAPTIONS = {
     _TOP_VIEW: 'The map from above. A line joins each estimate of the best method to its truth.',
     'success_over_threshold': 'Share of poses within a distance of the truth, accepted or not.',
     'success_by_boxes': 'Success by the number of detections in the image.',
@@ -37,7 +37,7 @@ def write_report(folder: Path, summaries: Sequence[Summary], rows: Sequence[Sequ
         (f'{100 * best.success(1.0):.0f} %', 'of the poses within 1 m of the truth', True),
         (f'{int(best.accepted.sum())} of {count}', 'accepted', bool(best.accepted.any())),
         (str(wrong), 'accepted, but wrong by more than 1 m', not wrong)])
-    drawn = {one.stem: html.figure(one.read_bytes(), _CAPTIONS[one.stem], one.stem)
+    drawn = {one.stem: html.figure(one.read_bytes(), CAPTIONS[one.stem], one.stem)
              for one in pictures}
     head, *brief = [[row[column] for column in _BRIEF] for row in rows]
     top_view = drawn.pop(_TOP_VIEW, '')

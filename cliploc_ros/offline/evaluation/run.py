@@ -195,7 +195,9 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
         print('\n'.join(['', summary.as_text(rows), *remarks, '']), flush=True)
         write_text(out / 'table.md', '\n\n'.join([summary.as_markdown(rows), *remarks]) + '\n')
         write_text(out / 'results.json', summary.as_json(own))
-        write_text(out / 'summary.csv', summary.as_csv(summaries))
+        write_text(out / 'table.tex', summary.as_latex(rows))
+        write_text(out / 'summary.csv', summary.as_csv(summaries, summary.relative_errors(
+            own, {query.number: query.map_from_camera for query in queries})))
         pictures = _draw(out, parts_of(landmark_map)[0].landmark_map, queries, results,
                          summaries, methods, frames) if figures else []
         write_report(out, summaries, rows, remarks, pictures)

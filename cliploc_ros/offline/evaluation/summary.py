@@ -6,14 +6,15 @@ import csv
 import io
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import groupby, pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
 from cliploc_ros.offline.evaluation.trials import Result
 
@@ -26,6 +27,8 @@ _WITHIN_NOISE = '~'
 # Columns of methods that use keyframes; the other methods leave them empty.
 _KEYFRAMES = ('pose by objects / keyframes / both', 'keyframe inliers', 'keyframes [ms]')
 _SOURCES = ('objects', 'keyframes', 'both')
+_OF_LATEX = {'\\': r'\textbackslash{}', '~': r'\textasciitilde{}', '^': r'\textasciicircum{}',
+             '±': r'$\pm$', **{char: rf'\{char}' for char in '&%$#_{}'}}
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class Summary:
 
     method: str
     queries: tuple[int, ...]  #: Their numbers
-    #: (t, q): position error of the best pose; infinite where none was found
+    #: (t, q): position error of the best pose; infinite if none was found
     errors_m: NDArray[np.float64]
     accepted: NDArray[np.bool_]  #: (t, q)
     confidence: NDArray[np.float64]  #: (t, q)
@@ -44,7 +47,7 @@ class Summary:
     best_iterations: NDArray[np.int64]
     hypotheses: NDArray[np.int64]
     boxes: NDArray[np.int64]  #: (q,)
-    #: (t, q): infinite where no pose was found; empty where it was not recorded
+    #: (t, q): infinite if no pose was found; empty if it was not recorded
     nees: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
     #: Share of a query's crops that were compared with labels, on average
     crops_share: float = 1.0
@@ -55,7 +58,7 @@ class Summary:
     #: (t, q)
     keyframe_inliers: NDArray[np.int64] = field(
         default_factory=lambda: np.empty((0, 0), dtype=np.int64))
-    #: (t, q): the three are empty where no query was compared with keyframes
+    #: (t, q): the three are empty if no query was compared with keyframes
     keyframes_ms: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
 
     @property
@@ -83,9 +86,26 @@ class Summary:
         return float(found.mean()) if len(found) else float('nan')
 
     @property
+    def error_deviations_m(self) -> tuple[float, float]:
+        """Return the standard deviations of median and mean error over trials [m].
+
+        NaN where a trial has no finite one.
+        """
+        with np.errstate(invalid='ignore'):
+            medians = np.median(self.errors_m, axis=1)
+            means = [errors[np.isfinite(errors)].mean() if np.isfinite(errors).any() else np.nan
+                     for errors in self.errors_m]
+            return float(np.std(medians)), float(np.std(means))
+
+    @property
     def mean_search_ms(self) -> float:
         """Return the mean time of a search [ms]."""
         return float(self.search_ms.mean())
+
+    @property
+    def search_deviation_ms(self) -> float:
+        """Return the standard deviation of the time over queries and trials [ms]."""
+        return float(self.search_ms.std())
 
     def false_accepts(self, limit_m: float = 1.0) -> int:
         """Return how many accepted poses are farther from the truth than a limit."""
@@ -171,7 +191,7 @@ def compare(one: Summary, other: Summary, limit_m: float = 1.0, seed: int = 0) -
     Parameters
     ----------
     one, other : Summary
-        Of the same queries; the success of the other is subtracted.
+        Summaries of the same queries; the success of the other is subtracted.
     limit_m : float
         Limit of success.
     """
@@ -184,7 +204,7 @@ def compare(one: Summary, other: Summary, limit_m: float = 1.0, seed: int = 0) -
 
 
 def find_best(summaries: Sequence[Summary], limit_m: float = 1.0) -> Summary:
-    """Return the summary of the greatest success; of equal ones that of the least error."""
+    """Return the summary of the greatest success; with equal success, of the least error."""
     return max(summaries, key=lambda one: (one.success(limit_m), -one.median_error_m))
 
 
@@ -211,14 +231,20 @@ def table_rows(summaries: Sequence[Summary]) -> list[tuple[str, ...]]:
 def _row(one: Summary, best: Summary) -> tuple[str, ...]:
     matching, algorithm = (one.method.split('_', 1) if one.method in PAPER_METHODS
                            else (one.method, ''))
-    rates = ' / '.join(_rate(one.success(limit)) for limit in LIMITS_M)
-    if len(one.errors_m) > 1:
-        rates += f' ± {_rate(one.success_deviation(LIMITS_M[-1]))}'
+    several = len(one.errors_m) > 1
+    rates = ' / '.join(
+        _rate(one.success(limit)) + (f'±{_rate(one.success_deviation(limit))}' if several else '')
+        for limit in LIMITS_M)
     if one is not best and compare(one, best).is_noise:
         rates += f' {_WITHIN_NOISE}'
+    errors = ', '.join(
+        f'{value:.{digits}f}' + (f'±{off:.{digits}f}' if several and np.isfinite(off) else '')
+        for value, off, digits in zip((one.median_error_m, one.mean_error_m),
+                                      one.error_deviations_m, (3, 2), strict=True))
     cut = '' if one.coverage.min() == 1.0 else f' ({one.coverage.mean():.0%} tried)'
-    return (matching, algorithm, rates, f'{one.median_error_m:.3f}, {one.mean_error_m:.2f}',
-            f'{one.mean_search_ms:.1f}{cut}', _rate(float(one.accepted.mean())),
+    return (matching, algorithm, rates, errors,
+            f'{one.mean_search_ms:.1f}±{one.search_deviation_ms:.1f}{cut}',
+            _rate(float(one.accepted.mean())),
             f'{_rate(one.precision())} ({" to ".join(map(_rate, one.precision_interval()))})',
             f'{one.false_accepts()} of {int(one.accepted.sum())}')
 
@@ -232,8 +258,9 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
     best = find_best(summaries)
     counts = [len(one.errors_m) for one in summaries]
     alone = ' (one of bf and auto, which draw no samples)' if min(counts) < max(counts) else ''
-    over = '; ± is the standard deviation over trials, at 1 m' if max(counts) > 1 else ''
-    lines = [f'{len(best.queries)} queries, trials: {max(counts)}{alone}{over}.',
+    over = 'trials, of the time over searches' if max(counts) > 1 else 'searches'
+    lines = [f'{len(best.queries)} queries, trials: {max(counts)}{alone}; ± is the standard '
+             f'deviation over {over}.',
              'Confidences are fitted on simulated worlds.']
     lines += [f'{one.method} refused: {_kinds(one)}.' for one in summaries if one.refusals]
     lines += [f'{one.method} compared {one.crops_share:.0%} of the crops of a query with labels, '
@@ -241,7 +268,7 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
               for one in summaries if 0.0 < one.crops_share < 1.0]
     if any(one.has_keyframes for one in summaries):
         lines.append('Keyframes: number of poses from each source, median of the points that '
-                     'agree, and mean time besides the search; --no-keyframes leaves them out.')
+                     'agree, and mean time outside the search; --no-keyframes leaves them out.')
     if len(summaries) > 1:
         lines.append(f'{_WITHIN_NOISE}: the queries are too few to separate it from {best.method} '
                      '(at 1 m; paired bootstrap, 95 %).')
@@ -266,8 +293,40 @@ def as_markdown(rows: Sequence[Sequence[str]]) -> str:
     return '\n'.join([lines[0], '|' + '---|' * len(rows[0]), *lines[1:]])
 
 
-def as_csv(summaries: Sequence[Summary]) -> str:
-    """Return a line of figures for each method."""
+def as_latex(rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in LaTeX, for the package booktabs."""
+    head, *body = [' & '.join(map(_latex, row)) + r' \\' for row in rows]
+    columns = 'l' * len(rows[0])
+    return '\n'.join([rf'\begin{{tabular}}{{{columns}}}', r'\toprule', head, r'\midrule', *body,
+                      r'\bottomrule', r'\end{tabular}', ''])
+
+
+def _latex(text: str) -> str:
+    return ''.join(_OF_LATEX.get(char, char) for char in text)
+
+
+def relative_errors(results: Iterable[Result], truth: Mapping[int, NDArray[np.float64]]
+                    ) -> dict[str, tuple[float, float]]:
+    """Return the median relative pose error [m, deg] of each method (Sturm et al. 2012).
+
+    It is the error of the motion from each query to the next one in time, where both have a pose.
+    Methods without such a pair are left out. The true poses are given by the number of the query.
+    """
+    errors: dict[str, list[tuple[float, float]]] = {}
+    solved = [(one, np.array(one.map_from_camera)) for one in results
+              if one.map_from_camera is not None]
+    for (method, _), trial in groupby(solved, key=lambda one: (one[0].method, one[0].trial)):
+        ordered = sorted(trial, key=lambda one: one[0].timestamp)
+        for (one, pose), (following, next_pose) in pairwise(ordered):
+            true = invert_transform(truth[one.query]) @ truth[following.query]
+            errors.setdefault(method, []).append(
+                pose_error(invert_transform(pose) @ next_pose, true))
+    return {method: tuple(np.median(some, axis=0).tolist()) for method, some in errors.items()}
+
+
+def as_csv(summaries: Sequence[Summary],
+           relative: Mapping[str, tuple[float, float]] | None = None) -> str:
+    """Return a line of figures for each method, with its relative_errors."""
     best = find_best(summaries)
     rows: list[dict[str, Any]] = []
     for one in summaries:
@@ -277,7 +336,12 @@ def as_csv(summaries: Sequence[Summary]) -> str:
             **{f'success_{limit:g}m': one.success(limit) for limit in LIMITS_M},
             **{f'success_{limit:g}m_std': one.success_deviation(limit) for limit in LIMITS_M},
             'median_error_m': one.median_error_m, 'mean_error_m': one.mean_error_m,
-            'mean_search_ms': one.mean_search_ms, 'coverage': float(one.coverage.mean()),
+            **dict(zip(('median_error_m_std', 'mean_error_m_std'), one.error_deviations_m,
+                       strict=True)),
+            **dict(zip(('relative_error_m', 'relative_error_deg'),
+                       (relative or {}).get(one.method, ('', '')), strict=True)),
+            'mean_search_ms': one.mean_search_ms, 'search_ms_std': one.search_deviation_ms,
+            'coverage': float(one.coverage.mean()),
             'accepted': float(one.accepted.mean()), 'precision_1m': one.precision(),
             'precision_1m_low': low, 'precision_1m_high': high, 'recall_1m': one.recall(),
             'wrongly_accepted': one.false_accepts(), 'less_than_best_1m': difference.mean,
@@ -290,10 +354,17 @@ def as_csv(summaries: Sequence[Summary]) -> str:
                          for source in _SOURCES}
             rows[-1] |= {'keyframe_inliers': float(np.median(one.keyframe_inliers)),
                          'keyframes_ms': float(one.keyframes_ms.mean())}
+    return csv_text(rows)
+
+
+def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return rows with equal names of columns as CSV, numbers with six digits."""
     text = io.StringIO()
     writer = csv.DictWriter(text, rows[0], lineterminator='\n')
     writer.writeheader()
-    writer.writerows(rows)
+    for row in rows:
+        writer.writerow({name: f'{value:.6g}' if isinstance(value, float) else value
+                         for name, value in row.items()})
     return text.getvalue()
 
 

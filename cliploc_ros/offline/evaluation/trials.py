@@ -58,13 +58,13 @@ class Result:
     method: str
     trial: int  #: From 0; added to the seed of the run
     query: int  #: Number of the frame in its query file
-    timestamp: float  #: Of the image [s]
+    timestamp: float  #: Timestamp of the image [s]
     boxes: int  #: Number of detections
     #: Whether a pose was found, and whether it was accepted
     solved: bool
     accepted: bool
-    map_from_camera: list[list[float]] | None  #: The best pose; None where none was found
-    #: Error of the best pose; None where none was found
+    map_from_camera: list[list[float]] | None  #: The best pose; None if none was found
+    #: Error of the best pose; None if none was found
     error_m: float | None
     error_deg: float | None
     score: float  #: Sum of the IoUs of its inliers
@@ -75,13 +75,13 @@ class Result:
     best_iteration: int  #: Iteration that found the best pose, from 1
     coverage: float  #: Share of its samples that the search tried
     reason: str  #: Reason of the refusal; empty when accepted
-    search_ms: float  #: Of the objects. The times are the only fields that differ from run to run.
+    search_ms: float  #: Search of objects. Only times differ from run to run.
     crops_share: float = 1.0  #: Share of the crops of its frames that were compared with labels
-    #: Of several maps, the one of the pose, which is in the coordinates of the first map: on
+    #: With several maps, the map of the pose, which is in the coordinates of the first map: on
     #: another map, it is far away. Empty for a single map.
     map: str = ''
     refusal_kind: str = ''  #: See cliploc_ros.core.acceptance.verdict; empty when accepted
-    #: What the pose comes from: 'objects', 'keyframes' or 'both'; empty where none was found
+    #: What the pose comes from: 'objects', 'keyframes' or 'both'; empty if none was found
     source: str = ''
     #: Points of keyframes that agree on their pose, whatever the pose comes from
     keyframe_inliers: int = 0
@@ -120,10 +120,10 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
 
 def join_cameras(queries: Mapping[str, Sequence[PosedQuery]], tolerance_s: float
                  ) -> tuple[PosedQuery, ...]:
-    """Return the queries of the first camera, each with what the others saw at its instant.
+    """Return the queries of the first camera, each with the other cameras at its instant.
 
-    The true poses tell how the cameras are mounted. DatasetError: no other image is so near in
-    time to one of the first camera.
+    The mounts of the cameras follow from the true poses. DatasetError: no other image is so near
+    in time to one of the first camera.
     """
     (first, main), *others = queries.items()
     stamps = {name: np.array([one.observation.stamp_ns for one in its]) for name, its in others}
@@ -219,8 +219,8 @@ def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: PosedQuery
         keyframe_search=found.keyframe_search)
 
 
-# Of the boxes of a kitchen, a tenth have no depth. The share of those whose depth is of something
-# else, and between which values that is [m], are guesses.
+# In a kitchen, a tenth of the boxes have no depth. The share of boxes with the depth of something
+# else, and the range of that depth [m], are guesses.
 _NO_DEPTH, _SOMETHING_ELSE, _ANY_DEPTH_M = 0.1, 0.05, (0.5, 5.0)
 
 
@@ -300,7 +300,7 @@ def simulate_depths(centers: NDArray[np.float64], shapes: NDArray[np.float64],
     Parameters
     ----------
     centers, shapes : ndarray (m, 3), (m, 6)
-        Of the ellipsoid that each box shows, in the map; NaN where it shows something else.
+        Ellipsoid of the object in each box, in the map; NaN for other things.
     map_from_camera : ndarray (4, 4)
     scale : float
         Measured over true depth.

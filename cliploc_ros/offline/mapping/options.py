@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.offline.vocabulary.vocabulary import common_name
 
 #: Frames this near in time are of one instant [s], and the share of a pose's error that they have
 #: in common where errors have no time constant.
@@ -101,8 +102,9 @@ class MappingOptions:
     random_seed: int = 0  #: Equal seed and input give equal output
 
     def moves(self, name: str) -> bool:
-        """Return whether objects of a class move; detectors write some of them with capitals."""
-        return name.lower() in map(str.lower, self.moving_classes)
+        """Return whether objects of a class move, under whatever name a detector has for it."""
+        moving = set(map(str.lower, self.moving_classes))
+        return name.lower() in moving or common_name(name) in moving
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.views import NO_SIZE
+from cliploc_ros.offline.vocabulary.vocabulary import common_name
 
 # The scale of a map is told by as many classes as this. A whole map is off by more than this
 # factor before it is named: ellipsoids enclose objects loosely, or show parts of them. Guesses.
@@ -34,7 +35,7 @@ class Size(NamedTuple):
 
 def size_of_class(name: str) -> Size | None:
     """Return the size of objects of a class, which may have capitals; None: it has no size."""
-    return _sizes().get(name.lower())
+    return _sizes().get(common_name(name))
 
 
 def log_sizes(names: Iterable[str]) -> NDArray[np.float64]:

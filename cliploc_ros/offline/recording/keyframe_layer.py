@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes of a recording: which images, which of their features, and where these are."""
+"""Keyframes of a recording: choice of images, features, and their places in the map."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ _IMAGE_PX, _JPEG_QUALITY = 256, 60
 _LEAST_PARALLAX = np.radians(1.5)
 # A ray misses its point by no more than 2 px at f = 525 px.
 _MOST_ERROR = 2.0 / 525.0
-# Images that each one is compared with: the nearest ones that look the same way.
+# Images that each image is compared with: the nearest images with the same direction.
 _NEIGHBOURS = 8
 _LEAST_M, _MOST_M, _MOST_COS = 0.05, 2.0, np.cos(np.radians(40.0))
 #: The points of a room or hall are this far [m].
@@ -53,16 +53,16 @@ _BESIDE, _EDGE = np.ones((3, 3), dtype=np.uint8), 0.1
 
 @dataclass(frozen=True)
 class LayerOptions:
-    """Which images become keyframes, and how many points each keeps."""
+    """Choice of keyframes, and the number of their points."""
 
     #: An image becomes a keyframe unless one of them is nearer than both. 0: every image.
     distance_m: float = 0.1
     angle_deg: float = 5.0
-    #: Of a keyframe. A point takes 146 bytes, so 600 make 4.4 MB of 50 keyframes.
+    #: Points per keyframe. A point takes 146 bytes: 600 points of 50 keyframes take 4.4 MB.
     most_points: int = 600
     #: Whether to store small images of the keyframes, too, for people to look at
     images: bool = False
-    kind: FeatureKind = SIFT  #: Of the features
+    kind: FeatureKind = SIFT  #: Kind of the features
 
     def __post_init__(self) -> None:
         """Refuse values that make no layer."""
@@ -91,7 +91,7 @@ class _Keyframe(NamedTuple):
     posed: PosedFeatures
     depths: NDArray[np.float64]
     jpeg: bytes
-    camera: Camera  #: Of the undistorted image
+    camera: Camera  #: Camera of the undistorted image
 
 
 def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions = _DEFAULT
@@ -288,12 +288,12 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float64]
                      ) -> NDArray[np.float32]:
-    """Return the depth of what single pixels show.
+    """Return the depth at single pixels.
 
     Parameters
     ----------
     camera : Camera
-        Of the colour image.
+        Camera of the colour image.
     pixels : ndarray (n, 2)
         In the colour image, distorted [px].
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One frame through detector and CLIP: what becomes of it in an observation file."""
+"""Run detector and CLIP on one frame, for an observation file."""
 
 import io
 import time
@@ -31,7 +31,7 @@ MAX_DETECTIONS = 50
 
 @dataclass(frozen=True)
 class SeenFrame:
-    """What detector and CLIP said about a frame: n boxes."""
+    """Results of detector and CLIP for a frame: n boxes."""
 
     #: Number of the image in its source, name of its camera ('' for one), and its stamp [ns]
     place: int
@@ -80,7 +80,7 @@ class LoadNetworks:
 
     detector: DetectorOptions
     clip: ClipOptions | None  #: None: classes and boxes only
-    threads: int = 0  #: Of a network on a CPU; 0 leaves its own choice
+    threads: int = 0  #: Threads of a network on a CPU; 0 leaves its own choice
 
     def __call__(self) -> Callable[[RawFrame], SeenFrame | str]:
         """Return the function that looks at a frame.

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Record observations once: an observation file next to the recording.
 
-The file's name depends on all that its content depends on: source, networks and keyframes. A run
-that is stopped leaves its partial results beside it, and the next run goes on.
+The file's name depends on everything that determines its content: source, networks, keyframes. A
+run that is stopped leaves its partial results beside it, and the next run continues.
 """
 
 import base64
@@ -54,7 +54,7 @@ _UNKNOWN = np.full((4, 4), np.nan)
 
 @dataclass(frozen=True)
 class KeyframeOptions:
-    """How far apart keyframes are: either is enough."""
+    """Spacing of keyframes: either limit is enough."""
 
     #: [m] [deg]. 0 takes every frame with a pose.
     distance_m: float = 0.1
@@ -72,7 +72,7 @@ EVERY_FRAME = KeyframeOptions(0.0, 0.0)
 
 
 class KeyframeFilter:
-    """Asked once for each frame of a camera in order, tells whether it is a keyframe."""
+    """Chooses the keyframes among the frames of a camera, which come in order."""
 
     def __init__(self, options: KeyframeOptions) -> None:
         self._options = options
@@ -80,7 +80,7 @@ class KeyframeFilter:
         self.asked = self.without_pose = self.keyframes = 0
 
     def __call__(self, place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
-        """Tell whether the frame with this pose is a keyframe."""
+        """Return whether the frame with this pose is a keyframe."""
         self.asked += 1
         if pose is None:
             self.without_pose += 1
@@ -99,7 +99,7 @@ _DEFAULT_KEYFRAMES = KeyframeOptions()
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """How to look at a recording."""
+    """Options of reading a recording."""
 
     detector: DetectorOptions
     clip: ClipOptions | None  #: None: no embeddings
@@ -155,7 +155,7 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
                 odometry: Mapping[str, Poses] | None = None) -> Recorded:
     """Return the observations of a source: those of an earlier run, or record them.
 
-    Odometry is no part of what the networks depend on: an earlier run without it serves as well.
+    The networks do not depend on odometry: an earlier run without it can be used as well.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Questions that take long, answered in a thread while people use the page."""
+"""Long computations, in a thread while people use the page."""
 
 import threading
 from collections.abc import Callable, Hashable

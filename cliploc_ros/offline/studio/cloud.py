@@ -46,7 +46,7 @@ class Cloud(NamedTuple):
 
 def find_cloud(recording: Recording | None, layer: KeyframeLayer | None, extent: Bounds
                ) -> Cloud | None:
-    """Return the points of a map's surfaces; None where nothing is known of them.
+    """Return the points of a map's surfaces; None if nothing is known of them.
 
     CliplocError: an image or depth image cannot be read.
     """

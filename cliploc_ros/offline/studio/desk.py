@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 
 
 class Desk:
-    """What the people at the page do.
+    """The actions of the people at the page.
 
     Attributes
     ----------
@@ -168,7 +168,7 @@ class Desk:
         return f'wrote {path.name}; open it in a browser'
 
     def extent(self) -> Bounds:
-        """Return where the map is, by its landmarks and by the cameras that saw it."""
+        """Return the bounds of the landmarks and of the cameras that saw them."""
         studio = self.studio
         source = studio.layer if studio.recording is None else studio.recording.detections
         return extent_of([one.center for one in studio.document.landmarks.values()],

@@ -57,7 +57,7 @@ class Document:
         self.lock = RLock()
         self.changed = Event()
         self.notes: tuple[str, ...] = ()
-        #: The digest of a foreign content, of which a person has to decide
+        #: The digest of a content by another program, until a person decides about it
         self.foreign = ''
         self._accepted = ''
         self.selection: tuple[str, ...] = ()
@@ -97,7 +97,7 @@ class Document:
 
     @property
     def encoder_key(self) -> str:
-        """The encoder of the landmarks' looks; '' where the map has none."""
+        """The encoder of the landmarks' looks; '' if the map has none."""
         return self._look_file.encoder_key
 
     def take_encoder(self, encoder_key: str) -> None:
@@ -128,7 +128,7 @@ class Document:
 
     @property
     def is_saved(self) -> bool:
-        """Whether the file holds all edits."""
+        """Return whether the file holds all edits."""
         return fields_of(self._saved) == fields_of(self.landmarks)
 
     @property
@@ -143,7 +143,7 @@ class Document:
 
     @property
     def is_in_gesture(self) -> bool:
-        """Whether the last edit may go on, as a drag does."""
+        """Return whether the last edit may continue, such as a drag."""
         return self._gesture is not None
 
     def to_map(self) -> LandmarkMap:
@@ -154,7 +154,7 @@ class Document:
     # ---- edits ----------------------------------------------------------------------------------
 
     def apply(self, change: Change, gesture: object = None) -> None:
-        """Make a change; successive ones of one gesture, as of a drag, are undone together.
+        """Make a change; successive changes of one gesture, such as a drag, are undone together.
 
         CliplocError: the journal cannot be written.
         """

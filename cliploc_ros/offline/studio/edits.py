@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a person can do to a map. Each edit returns a change as a value and alters nothing.
+"""The edits of a map. Each edit returns a change as a value and alters nothing.
 
-A change holds landmarks as they are after it; the change that undoes it, as they were before.
+A change holds the landmarks after it; the change that undoes it holds the landmarks before it.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -28,7 +28,7 @@ from cliploc_ros.offline.studio.landmark import (
     shape_fields,
 )
 
-# What a recording said of a landmark is not known of an ellipsoid that a person placed.
+# Fields that a recording measured; they do not hold for an ellipsoid that a person placed.
 _NO_EVIDENCE = {'position_sigma': None, 'support': None, 'seen_ratio': None, 'baseline_deg': None}
 _MEASURED = (*_NO_EVIDENCE, 'last_seen')
 # What an edit of a field is called, and the field that is not true after it.
@@ -42,7 +42,7 @@ class EditError(CliplocError):
 
 
 class Change(NamedTuple):
-    """What an edit does."""
+    """The effect of an edit."""
 
     what: str  #: For the person who edits
     after: Mapping[str, Landmark | None]  #: Landmarks by id, None for one that goes
@@ -86,7 +86,7 @@ def change_from_json(tree: Mapping[str, Any], landmarks: Landmarks) -> Change:
 
 
 def _change_of(what: str, landmarks: Landmarks, after: Mapping[str, Landmark | None]) -> Change:
-    """Return the change to other landmarks; refuse locked and invalid ones."""
+    """Return the change to other landmarks; refuse locked and invalid landmarks."""
     changed = {key: one for key, one in after.items() if one != landmarks.get(key)}
     for landmark_id, landmark in changed.items():
         old = landmarks.get(landmark_id)
@@ -150,7 +150,7 @@ def delete(landmarks: Landmarks, landmark_ids: Iterable[str]) -> Change:
 
 
 def mark(landmarks: Landmarks, landmark_ids: Iterable[str], what: str, **marks: Any) -> Change:
-    """Set marks of landmarks, locked ones included."""
+    """Set marks of landmarks, also of locked landmarks."""
     chosen = {key: _get(landmarks, key) for key in landmark_ids}
     return _change_of(f'{what} {", ".join(chosen)}', landmarks, {
         key: replace(one, marks=replace(one.marks, **marks)) for key, one in chosen.items()})
@@ -215,7 +215,7 @@ def split(landmarks: Landmarks, landmark_id: str) -> Change:
 
 
 def take_fits(landmarks: Landmarks, landmark_ids: Iterable[str], fitted: LandmarkMap) -> Change:
-    """Give landmarks the ellipsoids, and what is known of them, of a fitted map."""
+    """Give landmarks the ellipsoids of a fitted map, with their optional fields."""
     rows = {key: row for row, key in enumerate(fitted.landmark_ids)}
     after = {}
     for key in landmark_ids:

@@ -5,7 +5,7 @@
 The relocalizer refuses a map with unknown fields, since a misspelled field would be silently
 without effect. The studio opens such a map, keeps these fields, and says that they are refused.
 
-A look is what an image encoder saw of a landmark. It is a part of the landmark, so it follows its
+A look holds the image embeddings of a landmark. It is a part of the landmark, so it follows its
 landmark through merge, split, delete, undo and redo.
 """
 
@@ -34,7 +34,7 @@ LEAST_SEMI_AXIS_M = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Encoded:
-    """What an image encoder saw of one landmark."""
+    """The image embeddings of one landmark."""
 
     mean: NDArray[np.float16]  #: (d,): the mean direction of its crops, of unit length
     #: (m, d): crops that stand for all of its crops, unit rows; at most five
@@ -56,7 +56,7 @@ class Encoded:
 
 
 def merge_looks(looks: Sequence[Encoded | None], weights: Sequence[float]) -> Encoded | None:
-    """Return the look of one landmark that several become; None where no look is known.
+    """Return the look of one landmark that several become; None if no look is known.
 
     The weights are, for example, the numbers of boxes. Looks of another encoder than the first
     one's do not count.
@@ -88,11 +88,11 @@ def looks_of(embeddings: LandmarkEmbeddings) -> dict[str, Encoded]:
 
 @dataclass(frozen=True)
 class Marks:
-    """What the studio keeps of a landmark; the map file does not hold it."""
+    """The state of a landmark in the studio, which the map file does not hold."""
 
     is_locked: bool = False  #: Edits are refused
     is_hidden: bool = False  #: The scene and the views leave it out
-    decision: str = ''  #: Of the review: accepted, fixed; '' for none
+    decision: str = ''  #: Decision of the review: accepted, fixed; '' for none
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Landmark:
 
     @property
     def label(self) -> str:
-        """The label; of several, the one with the greatest weight."""
+        """The label; of several, the label with the greatest weight."""
         if 'label' in self.fields:
             return str(self.fields['label'])
         return max(self.details.labels or (('', 0.0),), key=lambda pair: pair[1])[0]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The layers of the scene around the landmarks, each drawn when what it shows is another object.
+"""The layers of the scene around the landmarks, each drawn again when its content changes.
 
 Surfaces, cameras, keyframes, the relocalizer's answers, coverage and look-alike places, and the
 running relocalizer. No ROS here: its state comes as a value that ``live`` makes.

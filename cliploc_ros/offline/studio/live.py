@@ -53,14 +53,14 @@ class LivePose(NamedTuple):
     map_from_body: NDArray[np.float64]
     covariance: NDArray[np.float64]  #: (3, 3): of the position [m^2]
     frame_id: str  #: The coordinate frame of the pose
-    stamp_s: float  #: Of the image [s]
+    stamp_s: float  #: Stamp of the image [s]
 
 
 class LiveState(NamedTuple):
     """The last reports of the running relocalizer."""
 
     is_heard: bool  #: It reported within the last seconds
-    values: Mapping[str, str]  #: Of its last diagnostics
+    values: Mapping[str, str]  #: Values of its last diagnostics
     pose: LivePose | None  #: The last accepted one
 
     @property
@@ -80,7 +80,7 @@ class LiveState(NamedTuple):
 
     @property
     def is_current(self) -> bool:
-        """Whether the pose is the last answer, and its node still reports."""
+        """Return whether the pose is the last answer, and its node still reports."""
         return self.is_heard and self.verdict.startswith(('accepted', 'withheld'))
 
 
@@ -114,7 +114,7 @@ class LiveRelocalizer:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a request waits for its answer."""
+        """Return whether a request waits for its answer."""
         return self._turn.locked()
 
     def lines(self, document: Document) -> list[str]:

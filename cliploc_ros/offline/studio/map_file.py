@@ -57,7 +57,7 @@ NO_FILE = ''
 
 @dataclass(frozen=True)
 class MapFile:
-    """A map file: its text, '' where there is none, and the same as a tree.
+    """A map file: its text, '' if there is none, and the same as a tree.
 
     ``node`` is the key in the file whose parameters hold the map.
     """
@@ -74,7 +74,7 @@ class MapFile:
 
     @property
     def map_set(self) -> MapSet:
-        """What the files next to the map have to be of."""
+        """The identity that the files next to the map must have."""
         return set_of(self.text)
 
     @property
@@ -197,7 +197,7 @@ def patched(text: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
 
 def _patches(text: str, node: yaml.Node, old: Mapping[str, Any], new: Mapping[str, Any]
              ) -> Iterator[tuple[int, int, str]]:
-    """Yield start and end of what changes below a mapping, and the text that takes its place."""
+    """Yield start and end of each change below a mapping, and the text in its place."""
     entries = {key.value: (key, value) for key, value in node.value}
     newline = '\r\n' if '\r\n' in text else '\n'
     for name, value in old.items():
@@ -273,8 +273,8 @@ def _flow(name: str, value: Any) -> str:
 class LookFile(NamedTuple):
     """The file of image embeddings next to a map, with the looks by id of the landmark.
 
-    ``encoder_key`` is '' where the file is missing or cannot be used. ``state`` tells whether
-    another program changed the file since; None where there is none.
+    ``encoder_key`` is '' if the file is missing or cannot be used. ``state`` tells whether
+    another program changed the file since; None if there is none.
     """
 
     path: Path

@@ -32,7 +32,7 @@ _STRETCH = 2.0
 _DEPTHS_M = np.geomspace(0.4, 12.0, 24)
 # A drawn box that overlaps a detector's box by more than this has its class.
 _SAME_IOU = 0.5
-# A view of the next box is this far from those of the other ones, if there is one [deg].
+# Angle between the view of the next box and the views of the other boxes, if possible [deg].
 _GOOD_ANGLE_DEG = 45.0
 # Asking again means that the last view did not help: views this near to it are skipped [deg].
 _OTHER_ANGLE_DEG = 10.0
@@ -46,7 +46,7 @@ class NewLandmark:
     def __init__(self, document: Document, recording: Recording):
         self._document, self._recording = document, recording
         self.boxes: dict[int, list[float]] = {}
-        #: Of the detector's boxes that were taken or drawn over; '' for none
+        #: Class of the detector's boxes that were chosen or drawn over; '' for none
         self.class_id = ''
         #: The ellipsoid that fits the boxes, if there is one, and what is doubtful about it
         self.fit: Fit | None = None

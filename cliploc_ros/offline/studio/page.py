@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 _REDRAW_INTERVAL_S = 0.05
 _BLANK = 70
-# The selection is drawn around its landmarks, so much larger; a missing one shines through.
+# The selection is drawn around its landmarks, larger by this factor; a missing one shines through.
 _SELECTED_RGB: Rgb = (255, 220, 0)
 _AROUND = 1.03
 _MISSING_RGB: Rgb = (220, 0, 0)
@@ -195,7 +195,7 @@ class Page:
         return draw_image(scene, image, camera, self._studio.map_from_camera)
 
     def picture(self, path: str) -> Content | None:
-        """Return the picture of a path; None where there is none."""
+        """Return the picture of a path; None if there is none."""
         try:
             return picture_of(self._studio, path)
         except CliplocError as error:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the page shows, part by part, as JSON can hold it, and its pictures."""
+"""The content of the page, part by part, as JSON, and its pictures."""
 
 from typing import Any
 

@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 
 
 class FoundPhrases(NamedTuple):
-    """The best phrases, the best one first, and what a person should know; '' for nothing."""
+    """The best phrases, best first, and a note for the user; '' for none."""
 
     phrases: tuple[str, ...]
     note: str
@@ -84,7 +84,7 @@ class PhraseFinder:
         return FoundPhrases(tuple(text for text, _ in best[:_PHRASES]), '')
 
     def _mean(self, landmarks: Landmarks, landmark_id: str) -> NDArray[np.float32] | None:
-        """Return the mean embedding (d,) of a landmark's crops; None where nothing shows it."""
+        """Return the mean embedding (d,) of a landmark's crops; None if nothing shows it."""
         look, recording, key = landmarks[landmark_id].look, self._recording, self._weights.key
         if (look is None or look.encoder_key != key) and recording is not None:
             look = recording.look_of(recording.boxes_of(landmarks)[landmark_id], key)

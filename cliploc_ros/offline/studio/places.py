@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a robot would be accepted, refused or misled in the map, and places that look alike.
+"""Coverage: places where a robot would be accepted, refused or misled, and look-alike places.
 
-Both are check_map's. The positions are fewer, in an order that spreads them: where time runs out,
-those that were tried lie all over the map.
+Both are check_map's, with fewer positions. Their order spreads them over the map, so that the
+positions tried before time runs out cover all of it.
 """
 
 import time
@@ -42,12 +42,12 @@ _OPTIONS = CheckOptions(max_positions=100, headings=8)
 class Coverage(NamedTuple):
     """The coverage and the look-alikes of a map."""
 
-    landmarks: Landmarks  #: That were checked
-    grid: Grid  #: All positions, the tried ones first
-    check: GridCheck  #: Of the tried positions
+    landmarks: Landmarks  #: Checked landmarks
+    grid: Grid  #: All positions; tried positions come first
+    check: GridCheck  #: Check of the tried positions
     look_alikes: tuple[LookAlike, ...]
     detector: str  #: The source of the detector's errors, in words
-    keyframes: KeyframeCheck | None  #: Of the tried positions; None without keyframes
+    keyframes: KeyframeCheck | None  #: Check of the tried positions; None without keyframes
 
     @property
     def figures(self) -> dict[str, str]:

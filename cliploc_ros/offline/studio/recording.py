@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording says of landmarks: its boxes, where they lie in its views, relocalizations.
+"""The recording of a studio: boxes of landmarks, their places in its views, relocalizations.
 
 Relocalizations have the recording's boxes and poses. Similarities are simulated, as check_map does
 it. The views are not held out: a landmark that was fitted to them fits them better than new
@@ -43,7 +43,7 @@ from cliploc_ros.offline.studio.landmark import Encoded, Landmarks, looks_of, ma
 
 #: Fewer boxes leave an ellipsoid open.
 LEAST_BOXES = 3
-# What is looked at around a box, as a share of its size.
+# Margin around a box that is examined, as a share of its size.
 _MARGIN = 0.25
 # Between the pictures of the film [s].
 _PICTURE_S = 0.2
@@ -73,7 +73,7 @@ class Recording:
 
     @cached_property
     def film_step(self) -> int:
-        """How many views the film goes on with each picture."""
+        """Return the number of views between two pictures of the film."""
         gaps_s = np.diff(np.unique(self.detections.stamps_s))
         if not len(gaps_s):
             return 1
@@ -117,7 +117,7 @@ class Recording:
             None if self.images is None else self._sharpness)
 
     def _sharpness(self, one: Sighting) -> float:
-        """Return the share of fine detail in what the view shows around the landmark."""
+        """Return the share of fine detail in the view around the landmark."""
         crop = self.crop(one.view, one.bbox_xyxy)
         if crop is None:
             return 0.0
@@ -152,7 +152,7 @@ class Recording:
         return image[top:bottom, left:right]
 
     def look_of(self, rows: NDArray[np.int64], encoder_key: str) -> Encoded | None:
-        """Return the look that an encoder has of some boxes; None where it saw none of them."""
+        """Return the look that an encoder has of some boxes; None if it saw none of them."""
         detections = self.detections
         if detections.encoder_key != encoder_key or detections.embeddings is None or not len(rows):
             return None

@@ -38,7 +38,7 @@ class ReviewQueue:
 
     @property
     def has_boxes(self) -> bool:
-        """Whether a recording's boxes judge the landmarks; else the map's own figures do."""
+        """Return whether boxes of a recording judge the landmarks, not the map's own figures."""
         return self._recording is not None and len(self._recording.detections.classes) > 0
 
     def check_of(self, landmark_id: str) -> LandmarkCheck | None:
@@ -47,7 +47,7 @@ class ReviewQueue:
 
     @property
     def order(self) -> list[str]:
-        """The landmarks of the last check, the worst first, deleted ones included; newer ones."""
+        """The landmarks of the last check, worst first, also if deleted; then newer landmarks."""
         return list(dict.fromkeys([*self._order, *self._document.landmarks]))
 
     def decision(self, landmark_id: str) -> str:

@@ -311,7 +311,7 @@ class Studio:
 
     @property
     def is_stale(self) -> bool:
-        """Whether the map was edited since the last search of places."""
+        """Return whether the map was edited since the last search of places."""
         return self.places is not None and fields_of(self.places.landmarks) != fields_of(
             self.document.landmarks)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a person looks from: the whole map, from above, one landmark, a view of the recording."""
+"""Viewpoints: the whole map, from above, one landmark, a view of the recording."""
 
 import time
 from collections.abc import Sequence
@@ -22,24 +22,24 @@ _FLAT_RAD = 0.08
 _FLAT_NEAR, _NEAR_M = 0.3, 0.01
 # A vertical by hand-held cameras that is so near z confirms z [deg].
 _SAME_UP_DEG = 20.0
-# Of landmarks and cameras, so many lie within the extent.
+# Share of landmarks and cameras within the extent.
 _EXTENT_SHARE = 0.95
 # Steps of a flight, and seconds of one.
 _FLIGHT_STEPS, _STEP_S = 10, 0.03
 # A landmark that is looked at fills about a third of the page's height, unless it is small.
 _LEAST_RADIUS_M, _AROUND = 0.2, 2.5
 _LEAST_RISE = 0.35
-#: Of a page between its panels, before it tells.
+#: Aspect of the scene between the panels, until the page reports it.
 USUAL_ASPECT = 0.6
 # The latest flight of each browser: a flight ends when another one begins.
 _FLIGHTS: WeakKeyDictionary[Any, object] = WeakKeyDictionary()
 
 
 class Bounds(NamedTuple):
-    """Where the map is."""
+    """A sphere around the map."""
 
     middle: NDArray[np.float64]  #: (3,) [m]
-    radius_m: float  #: Of a sphere around almost all of it
+    radius_m: float  #: Radius of a sphere around almost all of it
     up: NDArray[np.float64]  #: (3,): the unit vector that points up
     floor_m: float  #: Height of the floor along ``up``
     top_m: float  #: Height of the highest landmark or camera

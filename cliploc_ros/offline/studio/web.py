@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Who may open the page, and what its port answers: our page, its images, and viser's scene.
+"""Access to the page, and the answers of its port: our page, its images, and viser's scene.
 
-viser 1.1 lets everyone in who reaches its port. On the loopback interface these include all users
+viser 1.1 lets in everyone who reaches its port. On the loopback interface these include all users
 of this machine, and every page that its browsers show, since a browser opens WebSockets to any
 host. So each request needs the token that the studio prints, a request to this machine needs a
 loopback name as its host, and a WebSocket needs the studio's own page as its origin.
@@ -40,7 +40,7 @@ _POLICY = ("default-src 'self'; img-src 'self' data:; style-src 'self' 'unsafe-i
 
 
 class Content(NamedTuple):
-    """What a path has: a file's content, and the ending of its name."""
+    """The content of a file, and the ending of its name."""
 
     content: bytes
     suffix: str
@@ -48,7 +48,7 @@ class Content(NamedTuple):
 
 
 class Board:
-    """What all open pages show: parts by name, as JSON. A page gets those that changed."""
+    """The content of all open pages: parts by name, as JSON. A page gets changed parts only."""
 
     def __init__(self) -> None:
         self._parts: dict[str, str] = {}
@@ -124,7 +124,7 @@ class Gate:
         return f'/{self.token}/'
 
     def admit(self, request: Request) -> str | None:
-        """Return the path below the token, '' for a ticket; None where the request is refused."""
+        """Return the path below the token, '' for a ticket; None if the request is refused."""
         try:
             host, origin = request.headers.get('Host', ''), request.headers.get('Origin')
             name, their_host = urlsplit(f'//{host}').hostname, urlsplit(origin or '').netloc

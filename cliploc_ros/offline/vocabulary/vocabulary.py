@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The phrases of each detector class: shipped ones for COCO, and those of a user's file."""
+"""The phrases of classes: those of COCO and Objects365 are shipped, a file adds more."""
 
 import os
 import re
@@ -96,7 +96,7 @@ def _alternatives(name: str, rules: Rules, chosen: dict[str, str]) -> Sequence[s
 class Vocabulary:
     """Phrases by class."""
 
-    added: Mapping[str, tuple[str, ...]]  #: Phrases of a user besides the shipped ones
+    added: Mapping[str, tuple[str, ...]]  #: Phrases of a user, in addition to the shipped phrases
 
     def phrases(self, class_name: str) -> tuple[str, ...]:
         """Return the phrases of a class, each once; the user's come first.
@@ -107,7 +107,7 @@ class Vocabulary:
 
 
 def load_vocabulary(path: str | os.PathLike[str] | None = None) -> Vocabulary:
-    """Return the shipped vocabulary, with the phrases of a file besides.
+    """Return the shipped vocabulary, and the phrases of a file if one is given.
 
     Parameters
     ----------
@@ -128,14 +128,27 @@ def load_vocabulary(path: str | os.PathLike[str] | None = None) -> Vocabulary:
                        for name, entry in entries.items()})
 
 
-def shipped_classes() -> tuple[str, ...]:
-    """Return the classes that the shipped vocabulary knows by name."""
+def coco_classes() -> tuple[str, ...]:
+    """Return the classes of COCO, by their numbers."""
     return tuple(_shipped('coco.yaml'))
+
+
+def shipped_classes() -> tuple[str, ...]:
+    """Return the names of classes that the shipped vocabulary knows, in lower case."""
+    return (*coco_classes(), *_shipped('objects365.yaml'), *_shipped('aliases.yaml'))
+
+
+def common_name(name: str) -> str:
+    """Return the name under which vocabulary and sizes have a detector's class."""
+    plain = ' '.join(name.lower().split())
+    return str(_shipped('aliases.yaml').get(plain, plain))
 
 
 def shipped_phrases(name: str) -> tuple[str, ...]:
     """Return the phrases of a class without those of a user."""
-    return _phrases_of(name, _shipped('coco.yaml').get(name, {}), f"class '{name}'")
+    common = common_name(name)
+    entry = _shipped('coco.yaml').get(common, _shipped('objects365.yaml').get(common, {}))
+    return _phrases_of(common if entry else name, entry, f"class '{name}'")
 
 
 @cache

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a node subscribes to."""
+"""The subscriptions of a node."""

@@ -35,7 +35,7 @@ _MAX_DEPTH_BYTES = 72 * 2**20
 _OF_DEPTH = ('depth', 'depth_camera_info')
 # A guess at the memory of one detection in Python.
 _DETECTION_BYTES = 2000
-# What to do about stamps.
+# Advice about stamps.
 _STAMPING = {'image': 'the driver of the camera must stamp each when it is taken',
              'detections': "the detector must copy the image's header"}
 # Bytes of an image that tell it from others.
@@ -56,9 +56,9 @@ class Frame:
     #: When the image arrived, and when its detections did (monotonic clock) [s].
     received_at: float
     detected_at: float
-    #: Depth of about the same time; None where there is none
+    #: Depth of about the same time; None if there is none
     depth: Image | CompressedImage | None = None
-    depth_camera_info: CameraInfo | None = None  #: Of a depth camera that is not registered
+    depth_camera_info: CameraInfo | None = None  #: For unregistered depth
     camera: str = ''  #: Name of its camera; empty for the only one
     beside: tuple['Frame', ...] = ()  #: Those of other cameras at this instant
     left_out: tuple[str, ...] = ()  #: Names of the cameras without a frame of this instant
@@ -109,7 +109,7 @@ class FrameSource:
                        'depth_camera_info': 'depth_camera_info'}
         #: The relative names of the topics
         self.topics = {name: of_camera(camera, topic) for name, topic in topics.items()}
-        #: Of each topic the newest message, and when it arrived (monotonic clock) [s]
+        #: The newest message of each topic and its arrival (monotonic clock) [s]
         self.heard: dict[str, tuple[Any, float]] = {}
         #: Delay of the newest image after its stamp, and the delay nearest to 0 so far [s]
         self.lag_s, self.nearest_lag_s = math.nan, math.inf
@@ -206,7 +206,7 @@ class FrameSource:
                 and not self._node.count_publishers(self._resolved(name))]
 
     def examine(self, health: Health, stale_after_s: float) -> None:
-        """Report missing inputs, rates, and what waits or was dropped."""
+        """Report missing inputs, rates, and waiting or dropped messages."""
         now = time.monotonic()
         with self._changed:
             for name in self.topics.keys() - {'depth_camera_info'}:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""From the messages of an instant to a query, and what contradicts itself in them."""
+"""Messages of an instant as a query, and the contradictions between them."""
 
 import logging
 import math
@@ -101,7 +101,7 @@ class Instants:
 
     def _observed(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
                   by_odometry: bool) -> tuple[NDArray[np.uint8], Observation]:
-        """Return the image of a frame, and what was detected in it, without crops."""
+        """Return the image of a frame and its detections, without crops."""
         with self._keeping(frame.camera):
             image, camera, given = read_frame(frame, parameters)
             faults = faults_of_frame(frame, camera, parameters, state)

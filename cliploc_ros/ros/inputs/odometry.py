@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The topic `odom`: how fast the robot moves, and where its camera took each image."""
+"""The topic `odom`: the speed of the robot, and the motion of its camera between images."""
 
 import math
 import threading
@@ -33,16 +33,16 @@ _UNIT_TOLERANCE = 0.01
 _FARTHEST_M = 1e7
 # Poses further apart are not interpolated: wheels send every 20 ms, visual odometry every 100.
 _MAX_GAP_NS = NS_PER_S // 2
-# A message is never this late, nor are more than this many in a row: time was set back.
+# A message this late, or this many late ones in a row, means that time was set back.
 _MAX_LATE_NS, _MOST_LATE = NS_PER_S, 5
 # For moves [m] and turns [rad]. Wheels that slip, poses that tremble and stamps are off by less.
 _SLACK = np.array([SAME_SPOT.distance_m, np.radians(SAME_SPOT.angle_deg)])
-# A robot is not faster than this [1/s] where nothing tells its speed. It changes its speed by less
+# A robot of unknown speed is not faster than this [1/s]. It changes its speed by less
 # than this [1/s^2], and between two twists by less than this; a change lasts no longer [s].
 # Guesses: no run of a Husky ends at 5 Hz or more, see python -m studies.sensors.
 _FASTEST, _CHANGE = np.array([3.0, 3.0]), np.array([3.0, 8.0])
 _TWIST_CHANGE, _CHANGE_S = np.array([3.0, 4.0]), 0.5
-# Twists fit that miss at most this share of a motion, at least so much; what happened long ago
+# Twists fit that miss at most this share of a motion, at least this much; what happened long ago
 # counts less.
 _MISSED_SHARE, _LEAST_MOTION, _MOST_MOTION = 0.25, np.array([0.3, 0.5]), np.array([4.0, 6.0])
 _NO_TWIST, _MOST_TWIST = np.zeros((2, 3)), 1e3
@@ -96,7 +96,7 @@ class OdometryWindow:
         self._way_m, self._step_end = 0.0, np.zeros(3)
         # Messages in a row that are older than the newest.
         self._late = 0
-        # Of this run: moves and turns by the poses, and how far the twists are off.
+        # Sums over this run: moves and turns by the poses, and errors of the twists.
         self._motion, self._missed = np.zeros(2), np.zeros(2)
         #: The number of the present run of odometry: poses of two runs are not related.
         self.run = 0
@@ -136,10 +136,10 @@ class OdometryWindow:
         Parameters
         ----------
         position : ndarray (3,)
-            Of the robot in odometry's coordinate frame [m].
+            Position of the robot in odometry's coordinate frame [m].
         quat_xyzw : ndarray (4,)
         twist : ndarray (2, 3)
-            Of the robot in its own coordinate frame [m/s], [rad/s]. Many drivers leave it at 0.
+            Twist in the robot's coordinate frame [m/s], [rad/s]. Many drivers leave it at 0.
         """
         values = np.concatenate([position, quat_xyzw])
         length = float(np.linalg.norm(quat_xyzw))
@@ -169,7 +169,7 @@ class OdometryWindow:
     def moved_since(self, stamp_ns: int) -> tuple[float, float] | None:
         """Return how far the newest pose is from the two about an instant, at most [m], [degrees].
 
-        None where the instant is outside of all poses, or in a gap of more than 3 s.
+        None if the instant is outside of all poses, or in a gap of more than 3 s.
         """
         if not self.spans(stamp_ns, 0):
             return None
@@ -182,9 +182,9 @@ class OdometryWindow:
         return float(max(way[0] for way in ways)), math.degrees(max(way[1] for way in ways))
 
     def way_at(self, stamp_ns: int) -> float:
-        """Return the way driven since this run began until an instant [m], to a few centimetres.
+        """Return the length of the way from the start of this run to an instant [m].
 
-        Its length, however near to its beginning it leads.
+        It is right to a few centimetres. Driving in a circle counts.
         """
         row = bisect_right(self._poses, stamp_ns, key=lambda one: one.stamp_ns)
         return self._poses[row - 1].way_m if row else 0.0
@@ -260,7 +260,7 @@ def _step(before: _Pose, after: _Pose) -> NDArray[np.float64]:
 
 def _driven(speed: NDArray[np.float64], seconds: float, since_s: float = 0.0
             ) -> NDArray[np.float64]:
-    """Return move and turn (2, 3) at a speed, which is the mean since some time before."""
+    """Return move and turn (2, 3) at a speed, the mean since `since_s` ago."""
     move, turn = seconds * speed
     heading = cv2.Rodrigues((since_s + seconds) / 2 * speed[1])[0]
     return np.array([heading @ move, turn])
@@ -335,10 +335,10 @@ def _is_silence(poses: Sequence[_Pose], gap_ns: int) -> bool:
 
 
 class OdometryPlace(NamedTuple):
-    """Where odometry had the robot, or its camera, at the stamp of an image."""
+    """Pose of the robot, or its camera, in odometry at the stamp of an image."""
 
     odom_from_frame: NDArray[np.float64]  #: (4, 4)
-    #: Places of one run share their odometry frame; those of different runs do not compare.
+    #: Places of one run share their odometry frame; places of different runs are not comparable.
     run: int
     way_m: float  #: Driven since the run began
     frame: str = ''  #: The coordinate frame whose pose this is
@@ -434,7 +434,7 @@ class OdometrySource(qos.Listener):
 
         Many sources of poses leave the twist empty. Where the last two poses are further apart,
         up to 3 s, it is the mean speed between them. Odometry that has just begun may take
-        `patience_s`, at most 2 s, to cover that time; None where it does not, or where the
+        `patience_s`, at most 2 s, to cover that time; None if it does not, or where the
         stamps stand still.
         """
         with self._heard:
@@ -450,7 +450,7 @@ class OdometrySource(qos.Listener):
     def _last_moment(self) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
         """Return the robot's poses a moment ago and now, and the time between them [s].
 
-        None where the poses are not known.
+        None if the poses are unknown.
         """
         if self._newest is None:
             return None
@@ -466,7 +466,7 @@ class OdometrySource(qos.Listener):
     def moved_since(self, stamp: Time, patience_s: float) -> tuple[float, float] | None:
         """Return how far the robot is from where it was at an image, at most [m], [degrees].
 
-        Waits for the message that follows the image. None where odometry does not cover that
+        Waits for the message that follows the image. None if odometry does not cover that
         time, or has a gap of more than 3 s there.
         """
         at_ns = stamp_ns(stamp)

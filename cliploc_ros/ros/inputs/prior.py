@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is known before an image: where the robot probably is.
+"""The prior: where the robot probably is, before an image.
 
-The topic `~/prior` tells where the robot is, until another message does. Without one it is where
+A message on `~/prior` says where the robot is, until the next message. Without one it is where
 it was last: the pose of the last accepted request, and what the localizer showed after it, are
 kept in a file. That holds until the first accepted pose; from then on the robot is awake.
 """
@@ -47,9 +47,9 @@ class PriorSource:
         self._node, self._transforms = node, transforms
         self._heard: PoseWithCovarianceStamped | None = None  # also an invalid one
         self._told: PoseWithCovarianceStamped | None = None
-        # Until a pose is accepted: the last one before, and the hash of its map.
+        # The last pose of the previous run and the hash of its map, until a pose is accepted.
         self._last: tuple[PoseWithCovarianceStamped, str] | None = None
-        # From then on: what was written last, when, and the hash of the map.
+        # After that: the pose that was written last, its time, and the hash of the map.
         self._written: NDArray[np.float64] | None = None
         self._written_at, self._map_hash = 0.0, ''
         self._subscriptions: list[Subscription] = []
@@ -102,7 +102,7 @@ class PriorSource:
 
     def keep(self, accepted: PoseWithCovarianceStamped, parameters: RelocalizerParameters,
              map_hash: str) -> None:
-        """Keep an accepted pose for the next start; the one of the last start is used up."""
+        """Keep an accepted pose for the next start; the pose of the last start is used up."""
         self._last, self._map_hash = None, map_hash
         self._store(accepted, parameters)
 

@@ -80,7 +80,7 @@ class CameraRig:
         self._changed = threading.Condition()
         self._tolerance_s = parameters.sync_tolerance_s
         self._on_frame = on_frame
-        #: Of each camera, by its name; that of the only one is empty
+        #: Source of each camera, by name; the name of a single camera is empty
         self.sources = {name: FrameSource(node, parameters, linger_s, self._take, name,
                                           self._changed)
                         for name in parameters.camera_names or ('',)}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the robot knows besides its image: mount, vertical, odometry, and where it was."""
+"""Mount, vertical, odometry and last pose of the robot: everything but its image."""
 
 import math
 import threading
@@ -48,7 +48,7 @@ _MIN_MEAN_LENGTH = 0.95
 _MAX_CONTRADICTION_DEG = 5.0
 #: Samples so near an image are averaged [ns]: vibration is faster, and robots turn slowly.
 WINDOW_NS = 100_000_000
-# A second of the fastest usual IMU.
+# Messages of the fastest usual IMU in a second.
 _MAX_SAMPLES = 1000
 # sensor_msgs/Imu: the first element of the covariance of a field that is not measured.
 _NOT_MEASURED = -1.0
@@ -63,7 +63,7 @@ class NoVerticalError(CliplocError):
 
 
 class Sample(NamedTuple):
-    """What an IMU measured at one instant, in its own coordinate frame; at least one of both."""
+    """Measurements of an IMU at one instant, in its own coordinate frame; at least one of two."""
 
     stamp_ns: int
     #: A unit vector (3,), by the orientation.
@@ -241,16 +241,16 @@ class RobotState:
 
     #: The mount (4, 4); identity where the camera's own pose is wanted.
     camera_from_base: NDArray[np.float64]
-    #: The vertical, a unit vector (3,) in the camera's optical frame; None where it is not known.
+    #: The vertical, a unit vector (3,) in the camera's optical frame; None if it is not known.
     up_in_camera: NDArray[np.float64] | None = None
-    #: Of the camera; None where odometry does not cover the image.
+    #: Place of the camera; None if odometry does not cover the image.
     place: OdometryPlace | None = None
-    #: (4, 4): the pose of a depth camera that is not registered; None where tf2 lacks it
+    #: (4, 4): the pose of a depth camera that is not registered; None if tf2 lacks it
     camera_from_depth: NDArray[np.float64] | None = None
 
 
 class KnownBefore(NamedTuple):
-    """What is known at an instant besides its messages."""
+    """Knowledge about an instant that its messages do not hold."""
 
     state: RobotState  #: At the stamp of the frame to localize
     #: The frames of other cameras whose mounts are known, with the robot's state at each
@@ -270,7 +270,7 @@ class RobotStateSource:
         self._unknown = set[str]()  # coordinate frames that tf2 did not know the last time
 
     def open(self) -> None:
-        """Subscribe to what the parameters ask for."""
+        """Subscribe to the inputs that the parameters select."""
         parameters = self._node.settings.values
         self.vertical.open(parameters.gravity)
         self.prior.open(parameters)

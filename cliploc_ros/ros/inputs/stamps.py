@@ -23,15 +23,15 @@ _MAX_AHEAD_NS = NS_PER_S // 5
 _MAX_DISORDER_NS = NS_PER_S
 # Images that are expected at a time: two for each of the last two detections.
 _EXPECTED = 4
-# Detections may come this much later than the last ones.
+# Detections may come this much later than the previous detections.
 _SPARE = 1.5
-# So many messages in a row with a stamp of their own show that each has one: stamps in whole
-# seconds differ at times, too. The same message comes again twice, as relays send it, or more.
+# This many messages in a row with a stamp of their own show that each has its own: stamps in whole
+# seconds differ at times, too. A message that a relay repeats comes at least this often.
 _SHOWN, _REPEATED = 3, 2
-# Ten seconds of a camera at 30 Hz.
+# Images of a camera at 30 Hz in ten seconds.
 _REMEMBERED = 300
-# Messages come so evenly after their stamps, also where a simulation or a bag runs at another
-# rate; what comes otherwise is of another clock (a guess).
+# Spread of the delay of messages after their stamps, also of a simulation or a bag at another
+# rate; a greater spread shows another clock (a guess).
 _UNEVEN_S = 5.0
 
 
@@ -104,7 +104,7 @@ def stamp_problem(stamp: Time) -> str:
 
 
 class StampOrder:
-    """Finds jumps in the stamps of several streams, each of which is in order otherwise."""
+    """Finds jumps in the stamps of several streams that are in order otherwise."""
 
     def __init__(self) -> None:
         self._newest_ns: dict[str, int] = {}
@@ -129,7 +129,7 @@ class ExactPairing:
 
     Stamps are compared for equality, not for order: frames may arrive out of order.
 
-    Images wait for their detections, and large ones may fill the memory before these come. Then
+    Images wait for their detections. Large images may fill the memory before that. Then
     each n-th stays, and the two that are the newest when detections arrive: a detector that is
     done with an image mostly takes the newest one next.
 
@@ -140,7 +140,7 @@ class ExactPairing:
     max_count : int
         How many messages of each topic are kept.
     early, late : str
-        The topics of the images and of what is made of them; without them, the oldest messages
+        The topics of the images and of the detections in them; without them, the oldest messages
         give way.
     """
 
@@ -152,7 +152,7 @@ class ExactPairing:
             topic: OrderedDict() for topic in max_bytes}
         self._early, self._late = early, late
         self.last_stamp_ns: dict[str, int] = {}
-        # Of the images, the number of each by its stamp, and those that stay whatever comes.
+        # Number of each image by its stamp, and the numbers of images that stay in any case.
         self._numbers: dict[int, int] = {}
         self._expected: deque[int] = deque(maxlen=_EXPECTED)
         self.clear()
@@ -198,7 +198,7 @@ class ExactPairing:
         return complete
 
     def waits_near(self, topic: str, stamp_ns: int, tolerance_ns: float) -> bool:
-        """Return whether an item of a topic waits whose stamp is near another one."""
+        """Return whether a waiting item of a topic has a stamp near a given one."""
         return any(abs(one - stamp_ns) <= tolerance_ns for one in self._waiting[topic])
 
     def oldest(self, topic: str) -> Any:
@@ -218,7 +218,7 @@ class ExactPairing:
         self.dropped = dict.fromkeys(self.received, 0)
         self.last_stamp_ns.clear()
         self._numbers.clear()
-        self._expected.extend([1, 2, 1, 2])  # a detector that begins takes one of the first
+        self._expected.extend([1, 2, 1, 2])  # a detector that starts takes one of the first images
         self.every, self.outrun = 1, 0
 
     def _stays(self, stamp_ns: int) -> bool:
@@ -227,7 +227,7 @@ class ExactPairing:
         return number % self.every == 0 or number in self._expected
 
     def _learn(self, stamp_ns: int) -> None:
-        """Take in how many images later detections come, and expect those of the newest ones."""
+        """Learn the delay of detections, in images, and expect those of the newest images."""
         newest, waiting = self.received[self._early], self._waiting[self._early]
         self._expected.extend([newest, newest + 1])
         if stamp_ns not in self._numbers or not waiting:
@@ -245,7 +245,7 @@ class ExactPairing:
 
 
 class MessageStamps:
-    """Tells whether the stamps of a topic name its messages, for which each needs its own.
+    """Finds out whether each message of a topic has a stamp of its own, which then names it.
 
     Detections with a stamp that several images have may be of any of them. The same message may
     come again.
@@ -258,7 +258,7 @@ class MessageStamps:
         """Forget all stamps."""
         #: Why the stamps name no messages, as in "the stamp is 0"; empty if they may.
         self.problem = ''
-        # Of each stamp the last message, and how often that came.
+        # The last message of each stamp, and how often it came.
         self._known: dict[int, tuple[int, int]] = {}
         self._own, self._lag_s = 0, math.nan
 
@@ -272,9 +272,9 @@ class MessageStamps:
         return self._known.get(at_ns, (0, 0))[1] >= _REPEATED
 
     def add(self, stamp: Time, content: Hashable, received_at: float) -> bool:
-        """Take in a stamp and what tells its message from others; return whether it names it.
+        """Take in a stamp and the content of its message; return whether the stamp names it.
 
-        After a stamp that does not, so does none until some in a row are right. The message
+        After a stamp that does not, no stamp does until some in a row are right. The message
         arrived at `received_at` (monotonic clock) [s].
         """
         at_ns, message, why, times = stamp_ns(stamp), hash(content), stamp_problem(stamp), 0

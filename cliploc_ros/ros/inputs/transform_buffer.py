@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The part that needs tf2_ros to be imported: tf2's buffer, made safe against time jumps."""
+"""tf2's buffer, made safe against time jumps. Importing this module needs tf2_ros."""
 
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
@@ -15,8 +15,8 @@ class TransformBuffer(Buffer):
 
     tf2 itself refuses transforms that are ten seconds older than the newest one, and interpolates
     between those from before and after a shorter jump. Jazzy's Buffer clears itself only where it
-    is given a node, and its first releases raise TypeError there. Besides, transforms from before
-    the jump may arrive after the clock's. clear() keeps static transforms.
+    is given a node, and its first releases raise TypeError there. Transforms from before the
+    jump may also arrive after the clock's jump. clear() keeps static transforms.
     """
 
     def __init__(self, node: Node) -> None:

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What every node is made of: lifecycle, executor, parameters, worker, diagnostics."""
+"""The parts of every node: lifecycle, executor, parameters, worker, diagnostics."""

@@ -76,7 +76,7 @@ class Health:
 
 
 class StageTimes:
-    """How long each stage of one result took; written in one thread, read in another.
+    """Times of the stages of one result; written in one thread, read in another.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def in_words(stages_ms: Mapping[str, float]) -> str:
 
 
 class Stages:
-    """How long recent stages took; written in one thread, read in another."""
+    """Times of recent stages; written in one thread, read in another."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -190,7 +190,7 @@ class Diagnostics:
 
 
 def _gpu_memory() -> dict[str, object]:
-    """Return the GPU memory that PyTorch holds; nothing where it uses none."""
+    """Return the GPU memory that PyTorch holds; nothing if it uses none."""
     torch = sys.modules.get('torch')
     cuda = getattr(torch, 'cuda', None)  # while it is being imported it has none
     if cuda is None or not cuda.is_initialized():

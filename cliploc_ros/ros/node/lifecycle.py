@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A managed node: what it loads, when it works, who brings it up; and its process.
+"""A managed node with its lifecycle, and the process that it runs in.
 
 run_node is the main function of that process, and the only caller of rclpy.init.
 """
@@ -148,7 +148,7 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         self.worker = Worker(self.report)
         self.settings = NodeParameters(self, parameters, others)
         self.active = False
-        #: What the diagnostics tell in every state
+        #: Values that the diagnostics report in every state
         self.facts: dict[str, object] = {}
         self._transition = threading.Lock()
         self._failure = ''

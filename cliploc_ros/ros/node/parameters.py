@@ -23,7 +23,7 @@ from cliploc_ros.errors import OptionsError, did_you_mean
 
 Value = str | int | float | bool | list[float] | list[str]
 
-# What rclpy declares by itself, or what holds a map.
+# Parameters that rclpy declares itself, and the parameters of a map.
 _FOREIGN_PREFIXES = ('map.', 'qos_overrides.')
 _FOREIGN_NAMES = ('use_sim_time', 'start_type_description_service')
 
@@ -128,7 +128,7 @@ class Parameters:
 
     @classmethod
     def rows(cls) -> tuple[ParameterRow, ...]:
-        """Return the declarations, those of the class first, then the inherited ones."""
+        """Return the declarations, own ones before inherited ones."""
         own_first = sorted(fields(cls), key=lambda one: one.name not in cls.__annotations__)
         return tuple(replace(one.metadata['row'], name=one.name) for one in own_first)
 
@@ -147,7 +147,7 @@ class NodeParameters[P: Parameters]:
     node : Node
         Made with automatically_declare_parameters_from_overrides=True.
     others : type, optional
-        Parameters of the nodes that may be given the same file.
+        Parameters of other nodes, which the same parameter file may hold.
     """
 
     def __init__(self, node: Node, kind: type[P], others: type[Parameters] = Parameters) -> None:

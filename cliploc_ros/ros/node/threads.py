@@ -20,7 +20,7 @@ from rclpy.timer import Timer
 
 from cliploc_ros.errors import CliplocError, InternalError, StoppedError, TimeUpError
 
-# Requests that may wait at a time, a thread each; further ones wait in the middleware.
+# Requests that may wait at a time, a thread each; further requests wait in the middleware.
 MAX_REQUESTS = 16
 # For requests that wait, transitions, parameters and timers. The pool creates threads on demand.
 _THREADS = MAX_REQUESTS + 8

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a reader of a layout takes and returns: images in the order of time, with their poses."""
+"""Input and result of a reader of a layout: images in the order of time, with their poses."""
 
 import re
 from collections import Counter
@@ -30,21 +30,21 @@ _AS_USUAL = DepthFormat()
 
 @dataclass(frozen=True)
 class FolderOptions:
-    """What a folder does not say itself."""
+    """Settings that a folder does not hold itself."""
 
     intrinsics: str | None = None  #: Name of a preset, or a camera.json; None: the folder's own
     trajectory: TimedPoses | None = None  #: Poses instead of the folder's own
     max_gap_ns: int = 0  #: Greatest gap between two poses to interpolate over [ns]
-    #: (4, 4): how the camera is mounted on what the poses are of
+    #: (4, 4): mount of the camera on the body of the poses
     body_from_camera: NDArray[np.float64] | None = None
-    depth: DepthFormat = _AS_USUAL  #: What differs from the folder's usual format
-    layout: str = ''  #: Key of one of LAYOUTS; '': the one whose files are there
+    depth: DepthFormat = _AS_USUAL  #: Differences from the folder's usual format
+    layout: str = ''  #: Key of one of LAYOUTS; '': recognized by its files
     images: Path | None = None  #: Folder of the images of colmap and nerf
-    axes: str | None = None  #: What the stored poses are, one of AXES; None: by the layout
+    axes: str | None = None  #: Convention of the stored poses, one of AXES; None: by the layout
     scale: float | None = None  #: Metres of a stored unit
-    #: Two images, and the distance between their cameras [m]: another way to say the scale
+    #: Two images, and the distance between their cameras [m]: another way to give the scale
     known_distance: tuple[str, str, float] | None = None
-    any_unit: bool = False  #: Take an unknown unit for the metre
+    any_unit: bool = False  #: Accept an unknown unit as the metre
     level: bool = False  #: Turn the map so that z is up, by the tilt of the cameras
     #: A pose or depth image of TUM RGB-D belongs to an image at most this far away [ns]
     tolerance_ns: int = STAMP_TOLERANCE_NS
@@ -55,10 +55,10 @@ class Capture:
     """Images in the order of time, with the poses that are stored for them."""
 
     files: tuple[ImageFile, ...]
-    axes: str = 'opencv'  #: What a stored pose is: one of placing.AXES
+    axes: str = 'opencv'  #: Convention of the stored poses: one of placing.AXES
     depth: DepthFormat = _AS_USUAL
     #: Axis of the poses' coordinate frame that points up by the definition of the layout: 'y' or
-    #: 'z'; '' where it defines none
+    #: 'z'; '' if it defines none
     up: str = ''
     is_metric: bool = True  #: Whether the unit is the metre by the definition of the layout
     notes: tuple[str, ...] = ()
@@ -143,18 +143,18 @@ def _sound(pose: NDArray[np.float64] | None, where: str) -> NDArray[np.float64] 
 
 
 def first_image(folder: Path, stem: str) -> Path | None:
-    """Return the image of a name without its ending; None where there is none."""
+    """Return the image of a name without its ending; None if there is none."""
     return next((found for end in IMAGES if (found := beside(folder / f'{stem}{end}'))), None)
 
 
 def size_of_image(path: Path) -> tuple[int, int] | None:
-    """Return width and height of an image [px]; None where it cannot be read."""
+    """Return width and height of an image [px]; None if it cannot be read."""
     image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return None if image is None else (image.shape[1], image.shape[0])
 
 
 def beside(path: Path) -> Path | None:
-    """Return a file; None where it is missing, or no name of a file."""
+    """Return a file; None if it is missing, or no name of a file."""
     try:
         return path if path.is_file() else None
     except OSError:  # too long

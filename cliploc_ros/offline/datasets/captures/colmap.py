@@ -32,7 +32,7 @@ class _Model(NamedTuple):
     name: str
     focals: int
     distortion: str = ''
-    #: Of each value of the file, the coefficient in OpenCV's order
+    #: Index in OpenCV's order of the coefficient that each value of the file stands for
     places: tuple[int, ...] = ()
 
     @property

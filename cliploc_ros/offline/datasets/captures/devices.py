@@ -35,7 +35,7 @@ _MAX_GAP_NS = 200_000_000
 
 
 def read_polycam(folder: Path, options: capture.FolderOptions) -> capture.Capture:
-    """Return the keyframes of Polycam's raw data, the optimized ones where there are any."""
+    """Return the keyframes of Polycam's raw data, with optimized poses if there are any."""
     root, kind = folder / 'keyframes', 'corrected_'
     if not ((root / 'corrected_images').is_dir() and (root / 'corrected_cameras').is_dir()):
         kind = ''
@@ -211,12 +211,12 @@ def read_hololens(folder: Path, options: capture.FolderOptions) -> capture.Captu
 
 
 def _stamp_ns(time_s: float) -> int:
-    """Return a time [s] in nanoseconds; NO_STAMP where it is none."""
+    """Return a time [s] in nanoseconds; NO_STAMP if it is none."""
     return round(time_s * NS_PER_S) if abs(time_s) < 1e15 else NO_STAMP
 
 
 TRANSFORMS = 'transforms.json'
-_SAME_FOCAL = 1.02  # two fields that say it are rounded
+_SAME_FOCAL = 1.02  # the focal length is in two fields, rounded
 _PERSPECTIVE = ('PINHOLE', 'SIMPLE_PINHOLE', 'SIMPLE_RADIAL', 'RADIAL', 'OPENCV', 'PERSPECTIVE')
 _FISHEYE = ('OPENCV_FISHEYE', 'FISHEYE')
 _INTRINSICS = ('w', 'h', 'fl_x', 'fl_y', 'cx', 'cy', 'camera_angle_x', 'k1', 'k2', 'k3', 'k4',
@@ -268,10 +268,10 @@ def read_nerf(folder: Path, options: capture.FolderOptions) -> capture.Capture:
 
 
 def _file_of(folder: Path, name: str, images: Path | None) -> Path:
-    """Return the file of a name in a transforms.json, as the systems of others write them, too.
+    """Return the image file that a name in a transforms.json stands for, also of Windows.
 
-    It is in a folder of images by its name alone where one is given, or where the whole path leads
-    nowhere.
+    If a folder of images is given, or the whole path does not exist, only the last part of the
+    name counts.
     """
     alone = PureWindowsPath(name).name  # of / and \\ alike
     within = name.replace('\\', '/')

@@ -35,7 +35,7 @@ _TRIED = 3
 
 def place_images(files: Sequence[ImageFile], axes: str, scale: float = 1.0,
                  map_from_stored: _Pose = UP['z']) -> tuple[ImageFile, ...]:
-    """Return images with poses map_from_camera instead of stored ones.
+    """Return images with poses map_from_camera in place of the stored poses.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def find_scale(files: Sequence[ImageFile], first: str, second: str, metres: floa
 
 
 def check_axes(files: Sequence[ImageFile], axes: str, where: object) -> str:
-    """Return a note where images and stored poses do not fit; '' where they do, or do not tell.
+    """Return a note where images and stored poses do not fit; '' if they do, or do not tell.
 
     DatasetError: they fit well if read in another way; says which.
     """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a reader of a map format returns, how it becomes a map of ours, and readers of texts."""
+"""The result of a reader of a map format, its conversion to our map, and readers of texts."""
 
 import codecs
 import csv
@@ -22,14 +22,14 @@ from cliploc_ros.files.storage import read_file
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.parsing import FieldError, Fields, naming, unit_quaternion
 from cliploc_ros.offline.mapping.refit import refit_map
-from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
+from cliploc_ros.offline.vocabulary.vocabulary import coco_classes
 
 # A thinner semi-axis is a fit that collapsed; a larger one does not belong to an object. Guesses.
 _SEMI_AXIS_RANGE_M = (1e-3, 100.0)
 _MAX_COORDINATE_M = 1e6
 _MAX_NORM_ERROR = 0.01
 MAX_FILE_BYTES = 512 * 1024 * 1024
-COCO = shipped_classes()
+COCO = coco_classes()
 _MAX_LENGTH = 1000
 # A map file holds four decimals of a weight. A class with less means nothing.
 _LEAST_SHARE = 0.001
@@ -55,7 +55,7 @@ class Skipped(NamedTuple):
 
 
 class GivenMap(NamedTuple):
-    """The content of a file: landmarks, what could not be read as one, and notes on the file."""
+    """The content of a file: landmarks, objects that could not be read, and notes on the file."""
 
     landmarks: list[GivenLandmark]
     left_out: list[Skipped]
@@ -63,7 +63,7 @@ class GivenMap(NamedTuple):
 
 
 class ImportedMap(NamedTuple):
-    """A map of ours, what was left out and why, and what to say about it."""
+    """A map of ours, the objects left out with their reasons, and notes for the user."""
 
     landmark_map: LandmarkMap
     left_out: tuple[Skipped, ...]
@@ -116,7 +116,7 @@ def place(given: GivenMap, source: str, frame_id: str, scale: float,
 
 def _with_errors(details: LandmarkDetails, scale: float, errors: tuple[float, float] | None
                  ) -> LandmarkDetails:
-    """Return details with the deviation of the file in metres, or with given ones."""
+    """Return details with the deviation of the file in metres, or with given deviations."""
     if details.position_sigma is not None:
         return replace(details, position_sigma=scale * details.position_sigma)
     if errors is None:
@@ -250,7 +250,7 @@ def read_msgloc(path: Path, class_names: Sequence[str]) -> GivenMap:
     path : Path
         A JSON file.
     class_names : sequence of str
-        Of the class indices; a file may also name classes.
+        Names of the class indices; a file may also name classes.
     """
     given = GivenMap([], [], [])
     negative = 0

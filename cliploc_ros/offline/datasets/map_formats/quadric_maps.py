@@ -42,7 +42,7 @@ class QuadricError(Exception):
 
 
 class WireError(Exception):
-    """What is wrong with a protocol buffer; the caller adds the file's name."""
+    """A fault of a protocol buffer; the caller adds the file's name."""
 
 
 def read_goreloc(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
@@ -81,7 +81,7 @@ def read_oaslam(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
     path : Path
         map_objects_NAME.txt, or map_NAME.mapobjects next to map_NAME.objecttracks.
     class_names : sequence of str
-        Of the category indices.
+        Names of the category indices.
     """
     if path.suffix == '.mapobjects':
         return _read_saved_map(path, class_names)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The files of a check: figures as JSON; a page whose first screen says all, the rest folded.
+"""The files of a check: figures as JSON, and a page with the main results first.
 
 Beside an advice are the room's own images: a landmark in its best view, or the nearest view.
 """
@@ -33,7 +33,7 @@ GRADE_COLORS = {'faulty': html.MISLED, 'minor': html.REFUSED, 'sound': '#009E73'
 GRADE_NAMES = {'faulty': 'serious fault', 'minor': 'minor fault', 'sound': 'sound'}
 _MOST_LANDMARKS = 300
 _MOST_MATCHED = 12
-# Of the first screen.
+# Numbers and advice on the first screen.
 _NUMBERS, FIRST_ADVICE = 3, 3
 # How the names of figures for large type begin, the most telling first.
 _TELLING = ('recorded frames accepted by', 'positions with a heading accepted',

@@ -38,9 +38,9 @@ def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
                   ) -> Iterator[tuple[str, str, bytes]]:
     """Yield the name, the caption and the PNG of each picture."""
     canvas = _Canvas(landmark_map, report)
-    yield ('grid', 'Expected relocalization from above. A cell is a camera position: the darker, '
-           'the more of the headings with at least three detectable landmarks give an accepted, '
-           'right pose. Ticks point where the camera looked when a wrong pose was accepted. '
+    yield ('grid', 'Expected relocalization from above. A cell is a camera position: its shade '
+           'is the share of headings with three or more detectable landmarks that give a right, '
+           'accepted pose. Ticks point where the camera looked when a wrong pose was accepted. '
            'Positions inside of a landmark, and beyond all objects, are left out. Numbers '
            'are those of the advice.', png_of(_grid_figure(canvas), _DPI))
     if report.recording is not None and report.recording.trials:

@@ -46,7 +46,7 @@ class ViewPainter:
         self._map, self._detections, self._read = landmark_map, detections, read
 
     def of(self, advice: Advice) -> Picture | None:
-        """Return the view that shows best what an advice is about; None where there is none."""
+        """Return the view that shows best what an advice is about; None if there is none."""
         if advice.landmarks:
             rows = [self._map.landmark_ids.index(one) for one in advice.landmarks]
             words = 'outlined: ' + ' and '.join(advice.landmarks)

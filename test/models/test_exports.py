@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""OpenVINO gives what PyTorch gives, from a cache that may be damaged, full or read-only."""
+"""Exports to ONNX give what PyTorch gives, from a cache that may be damaged."""
 
 import gc
 import logging
@@ -17,13 +17,12 @@ import pytest
 import torch
 from clip_reference import Reference
 
-from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.errors import ModelError
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.images import crop_bounds
-from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.models.yolo_detector import YoloDetector
-from cliploc_ros.models.yolo_weights import load_yolo
+from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 
 pytestmark = pytest.mark.full
 
@@ -79,7 +78,7 @@ def test_embeddings_equal_those_of_open_clip(name, precision, request, cache, im
     assert encoder.encode_crops(image_rgb, BBOXES[:0]).shape == (0, encoder.embed_dim)
 
 
-def test_a_second_start_neither_converts_nor_builds_the_tower_in_pytorch(
+def test_a_second_start_neither_exports_nor_builds_the_tower_in_pytorch(
         demo_clip, cache, caplog):
     load(demo_clip, cache)
     caplog.clear()
@@ -99,30 +98,32 @@ def small_cache(small_clip, tmp_path_factory) -> Path:
     return folder
 
 
-def change_weights(folder):
-    with (folder / 'network.bin').open('r+b') as file:
-        file.seek(50_000)
-        file.write(bytes(5_000))
+def change(file: Path) -> None:
+    with file.open('r+b') as opened:
+        opened.seek(50_000)
+        opened.write(bytes(5_000))
 
 
-@pytest.mark.parametrize('damage', [
-    lambda folder: os.truncate(folder / 'network.bin', 1000), change_weights,
-    lambda folder: (folder / 'about.json').write_text(''),
-    lambda folder: (folder / 'about.json').write_text('{"identity": ["another"]}')])
+@pytest.mark.parametrize(('damage', 'warns'), [
+    (lambda cache: os.truncate(next(cache.glob('onnx/*/visual/model.onnx')), 1000), 'exporting'),
+    (lambda cache: next(cache.glob('onnx/*/export.json')).write_text('{}'), 'exporting'),
+    (lambda cache: change(next(cache.glob('openvino/*/network.blob'))), 'compiling'),
+    (lambda cache: os.truncate(next(cache.glob('openvino/*/network.blob')), 1000), 'compiling'),
+    (lambda cache: next(cache.glob('openvino/*/about.json')).write_text(''), 'compiling')])
 def test_a_damaged_cache_is_made_anew(small_clip, small_cache, tmp_path, image_rgb, caplog,
-                                      damage):
+                                      damage, warns):
     shutil.copytree(small_cache, tmp_path, dirs_exist_ok=True)
     before = load(small_clip, small_cache).encode_crops(image_rgb, BBOXES)
-    folder, = (tmp_path / 'openvino').iterdir()
-    damage(folder)
+    damage(tmp_path)
     caplog.clear()
     assert np.array_equal(load(small_clip, tmp_path).encode_crops(image_rgb, BBOXES), before)
     warning, = (one for one in caplog.records if one.levelno >= logging.WARNING)
-    assert 'cannot be used' in warning.getMessage() and str(folder) in warning.getMessage()
+    assert warns in warning.getMessage() and str(tmp_path) in warning.getMessage()
     caplog.clear()
     assert np.array_equal(load(small_clip, tmp_path).encode_crops(image_rgb, BBOXES), before)
     assert not any(one.levelno >= logging.WARNING for one in caplog.records)
-    assert [*(tmp_path / 'openvino').iterdir()] == [folder]
+    for kind in ('onnx', 'openvino'):
+        assert not any(one.name.startswith('.') for one in (tmp_path / kind).iterdir())
 
 
 MISSING = """
@@ -130,12 +131,13 @@ import logging, sys
 sys.modules['openvino'] = None  # as where it is not installed
 logging.basicConfig(level=logging.INFO, format='%(levelname)s %(message)s')
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.models.yolo_detector import YoloDetector
-from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 for _ in range(2):
-    assert YoloDetector(DetectorOptions(sys.argv[1], device='cpu')).inference == 'pytorch'
+    assert load_detector(DetectorOptions(sys.argv[1], device='cpu')).inference == 'pytorch'
 try:
-    YoloDetector(DetectorOptions(sys.argv[1], device='cpu', inference='openvino'))
+    load_detector(DetectorOptions(sys.argv[1], device='cpu', inference='openvino'))
 except OptionsError as error:
     print(error)
 """
@@ -150,7 +152,7 @@ def test_without_openvino_pytorch_runs_and_one_line_says_so():
     assert 'is not installed' in done.stdout
 
 
-def test_a_network_that_openvino_runs_otherwise_is_run_by_pytorch(small_clip, tmp_path, caplog):
+def test_pytorch_runs_a_network_whose_export_gives_other_results(small_clip, tmp_path, caplog):
     state = {name: torch.full_like(tensor, float('nan'))
              for name, tensor in small_clip.model.state_dict().items()}
     torch.save(state, tmp_path / 'weights.pt')
@@ -160,10 +162,10 @@ def test_a_network_that_openvino_runs_otherwise_is_run_by_pytorch(small_clip, tm
     with pytest.raises(ModelError, match='not finite'):  # says PyTorch
         load(small_clip, tmp_path, inference='auto', **changes)
     assert 'PyTorch runs it' in caplog.text
-    assert not any((tmp_path / 'openvino').iterdir())
+    assert not (tmp_path / 'onnx').exists()
 
 
-def compare(first: YoloDetector, second: YoloDetector, images: list[np.ndarray]) -> float:
+def compare(first: ObjectDetector, second: ObjectDetector, images: list[np.ndarray]) -> float:
     """Return the largest difference of two detectors' boxes [px]."""
     differences = [0.0]
     for image in images:
@@ -175,8 +177,9 @@ def compare(first: YoloDetector, second: YoloDetector, images: list[np.ndarray])
     return max(differences)
 
 
-def detector(model: object, cache: Path, **changes) -> YoloDetector:
-    return YoloDetector(DetectorOptions(str(model), device='cpu', cache_dir=str(cache), **changes))
+def detector(model: object, cache: Path, **changes) -> ObjectDetector:
+    return load_detector(DetectorOptions(str(model), device='cpu', cache_dir=str(cache),
+                                         **changes))
 
 
 def test_boxes_in_real_images_equal_those_of_pytorch(shared_data, cache):
@@ -187,23 +190,3 @@ def test_boxes_in_real_images_equal_those_of_pytorch(shared_data, cache):
                       images)
     print(f'\nlargest difference of a box: {largest:.5f} px')
     assert largest < 0.5
-
-
-@pytest.fixture(scope='module')
-def export(tmp_path_factory) -> Path:
-    """Return what ``yolo export format=openvino dynamic=True`` makes."""
-    folder = tmp_path_factory.mktemp('export')
-    (folder / 'yolo.pt').symlink_to(ASSETS / 'yolo.pt')
-    load_yolo(ASSETS / 'yolo.pt')
-    from ultralytics import YOLO
-
-    return Path(YOLO(folder / 'yolo.pt').export(format='openvino', dynamic=True, verbose=False))
-
-
-def test_an_export_of_ultralytics(export, cache, demo_rgb):
-    assert export.name == 'yolo_openvino_model'
-    exported = detector(export, cache)
-    assert compare(exported, detector(ASSETS / 'yolo.pt', cache, inference='pytorch'),
-                   demo_rgb) < 0.5
-    with pytest.raises(OptionsError, match='needs OpenVINO'):
-        detector(export, cache, inference='pytorch')

@@ -1,0 +1,106 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable ``export_network``: write ONNX files of weights that exist for PyTorch only."""
+
+import argparse
+import shutil
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from cliploc_ros.cli.options import add_weights_options
+from cliploc_ros.command import option, run_main
+from cliploc_ros.errors import OptionsError
+
+EPILOG = """\
+It needs PyTorch (script/setup models). A robot runs the files without it: name them as its
+parameters model and clip_pretrained.
+
+examples:
+  export_network --model yolov8n.pt --out yolov8n.onnx
+  export_network --model yolov8s-worldv2.pt --detector-vocabulary office.yaml --out office.onnx
+  export_network --clip-model ViT-L-14 --clip-pretrained openai --out vit_l14
+"""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Export a network; return the exit code."""
+    return run_main(make_parser(), export_network, args)
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='export_network', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
+        description='Write a detector of ultralytics or a CLIP of open_clip as ONNX, and compare '
+        'the results of both.')
+    add_weights_options(parser)
+    option(parser, '--half', 'store weights in half precision: half the size; the network still '
+           'runs in fp32')
+    option(parser, '--out PATH', 'the file of a detector, or the new folder of a CLIP', Path,
+           required=True)
+    parser.set_defaults(device='cpu', inference='pytorch', profile='auto')
+    return parser
+
+
+def export_network(options: argparse.Namespace) -> int:
+    """Write the ONNX files of the network that the command line names; return the exit code.
+
+    CliplocError: the message names the option or file to mend.
+    """
+    is_clip = bool(options.clip_model or options.clip_pretrained)
+    if is_clip == bool(options.model):
+        raise OptionsError('name either a detector (--model) or a CLIP (--clip-model and '
+                           '--clip-pretrained)')
+    if is_clip and (options.detector_vocabulary or options.text_model):
+        raise OptionsError('--detector-vocabulary and --text-model are for --model')
+    if options.out.exists() and (is_clip or options.out.is_dir()):
+        raise OptionsError(f'{options.out} exists: name a new {"folder" if is_clip else "file"}')
+    if not is_clip and options.out.suffix != '.onnx':
+        raise OptionsError(f'--out {options.out}: the name of a detector ends on .onnx')
+    if not options.out.absolute().parent.is_dir():
+        raise OptionsError(f'{options.out.absolute().parent} is no folder: make it first')
+    with tempfile.TemporaryDirectory(prefix='cliploc_ros_export_') as desk:
+        found = (_export_clip if is_clip else _export_detector)(options, Path(desk))
+        shutil.move(found, options.out)
+    files = [options.out] if options.out.is_file() else options.out.rglob('*')
+    print(f'{options.out}: {sum(file.stat().st_size for file in files) / 1e6:.1f} MB, results '
+          'equal to those of PyTorch')
+    return 0
+
+
+def _export_detector(options: argparse.Namespace, desk: Path) -> Path:
+    from cliploc_ros.cli.sources import detector_options
+    from cliploc_ros.models.devices import needs_pytorch
+    from cliploc_ros.models.exports import DETECTOR
+    from cliploc_ros.models.yolo_weights import resolve_published
+
+    detector = detector_options(options)
+    file = resolve_published(detector.model, '', 'model')
+    with needs_pytorch('an export'):
+        from cliploc_ros.models.yolo_detector import export_detector
+
+        export_detector(file, detector, desk, options.half)
+    return desk / DETECTOR
+
+
+def _export_clip(options: argparse.Namespace, desk: Path) -> Path:
+    from cliploc_ros.cli.sources import clip_options
+    from cliploc_ros.models.clip_weights import resolve_clip_weights
+    from cliploc_ros.models.devices import needs_pytorch
+
+    weights = resolve_clip_weights(clip_options(options))
+    if weights.is_onnx:
+        raise OptionsError(f'{weights.file} has ONNX files already')
+    with needs_pytorch('an export'):
+        from cliploc_ros.models.export import export_clip
+
+        folder = desk / 'clip'
+        folder.mkdir()
+        export_clip(weights, folder, options.half)
+    return folder
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Folders of networks that were exported to ONNX: written once, and checked before their use."""
+
+import contextlib
+import hashlib
+import json
+import logging
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from cliploc_ros.errors import CliplocError, ModelError
+from cliploc_ros.files.storage import parse_json, read_file, resolve_cache_dir, warn_not_kept
+from cliploc_ros.models.devices import free_memory
+from cliploc_ros.models.files import fingerprint_file, first_line, keep_folder
+from cliploc_ros.models.protocols import DetectorOptions
+
+# Of such a folder, and of how networks are exported.
+_FORMAT = 1
+_MOST_EXPORTS = 8
+_ABOUT = 'export.json'
+#: The file of an exported detector in its folder.
+DETECTOR = 'model.onnx'
+
+logger = logging.getLogger(__name__)
+# Exports that no disk takes, removed when the process ends.
+_unkept: dict[Path, tempfile.TemporaryDirectory[str]] = {}
+
+
+class ExportError(ModelError):
+    """A network cannot be exported, or gives other results than in PyTorch."""
+
+
+def detector_identity(file: Path, options: DetectorOptions) -> list[str]:
+    """Return what an exported detector depends on: its weights, and the texts it looks for."""
+    identity = [fingerprint_file(file)]
+    if options.prompts:
+        tower = Path(options.text_model).expanduser()
+        identity += [fingerprint_file(tower) if tower.is_file() else options.text_model,
+                     json.dumps(options.prompts)]
+    return identity
+
+
+def describe_export(folder: Path, key: str) -> None:
+    """Complete a folder: write the fingerprints of its files, and what the weights are called."""
+    files = sorted(file for file in folder.rglob('*') if file.is_file())
+    (folder / _ABOUT).write_text(json.dumps({'key': key, 'files': {
+        str(file.relative_to(folder)): fingerprint_file(file) for file in files}}))
+
+
+def export_key(folder: Path) -> str:
+    """Return the key of the weights in a folder of ours; '' for others and changed ones."""
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
+        about: dict[str, Any] = parse_json(read_file(folder / _ABOUT))
+        if all(fingerprint_file(folder / name) == fingerprint
+               for name, fingerprint in about['files'].items()):
+            return str(about['key'])
+    return ''
+
+
+def find_export(cache_dir: str, name: str, identity: Sequence[str]) -> Path | None:
+    """Return the folder of an export in the cache, if it is there and sound."""
+    folder = _folder(cache_dir, name, identity)
+    if folder in _unkept:
+        return Path(_unkept[folder].name)
+    if not folder.exists():
+        return None
+    if not export_key(folder):
+        logger.warning('%s is damaged: exporting %s again', folder, name)
+        return None
+    with contextlib.suppress(OSError):  # a read-only cache works too
+        os.utime(folder)
+    return folder
+
+
+def keep_export(cache_dir: str, name: str, identity: Sequence[str],
+                export: Callable[[Path], None]) -> Path:
+    """Return the folder of an export; export the network where the cache does not have it.
+
+    The name of the folder is the hash of all that the network depends on. It is written under
+    another name and renamed: any number of processes may share the cache. The export is to write
+    into the folder that it gets, and end with `describe_export`.
+
+    ExportError: it failed. ModelError, ModuleNotFoundError: from ``export``.
+    """
+    folder, started = _folder(cache_dir, name, identity), time.monotonic()
+    if folder in _unkept:
+        return Path(_unkept[folder].name)
+    if export_key(folder):
+        return folder
+    logger.info('exporting %s to ONNX: once, into %s', name, folder)
+    # A library that meets a full disk raises the errors of a network that it cannot export, so it
+    # writes elsewhere.
+    desk = tempfile.TemporaryDirectory(prefix='cliploc_ros_export_')
+    try:
+        export(Path(desk.name))
+    except ExportError as error:
+        raise ExportError(f'{name}: {error}') from error
+    except (CliplocError, ModuleNotFoundError):
+        raise
+    except Exception as error:  # tracing and exporting raise exceptions of all kinds
+        raise ExportError(f'{name} cannot be exported to ONNX: {first_line(error)}') from error
+    try:
+        keep_folder(folder, _MOST_EXPORTS, partial(shutil.copytree, desk.name))
+    except OSError as error:
+        warn_not_kept('the exported network is not cached and the next start is slow again: '
+                      f'cannot write {folder} ({first_line(error)}); make room, or choose a '
+                      'writable cache_dir')
+        _unkept[folder], folder = desk, Path(desk.name)
+    free_memory()
+    logger.info('%s is exported after %.0f s', name, time.monotonic() - started)
+    return folder
+
+
+def _folder(cache_dir: str, name: str, identity: Sequence[str]) -> Path:
+    digest = hashlib.sha256(json.dumps([_FORMAT, *identity]).encode()).hexdigest()
+    return resolve_cache_dir(cache_dir) / 'onnx' / f'{Path(name).name}-{digest[:32]}'

@@ -1,0 +1,126 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Networks that are named as OWNER/NAME of the Hugging Face hub, downloaded once."""
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Sequence
+from fnmatch import fnmatch
+from pathlib import Path
+
+from cliploc_ros.errors import ModelError
+from cliploc_ros.files.storage import read_file, replace_file, resolve_cache_dir
+from cliploc_ros.models.files import download
+
+# OWNER/NAME, @REVISION (a branch, tag or commit) and :FILE, the last two as wanted.
+_NAME = re.compile(r'([\w-][\w.-]*/[\w-][\w.-]*)(?:@([\w][\w.-]*))?(?::([\w][\w./-]*\.onnx))?')
+# Where packets are dropped, this gives up [s].
+_PATIENCE_S = 10.0
+
+
+def is_hub_name(name: str) -> bool:
+    """Return whether a name is OWNER/NAME[@REVISION][:FILE], and no file or folder here."""
+    return (not Path(name).expanduser().exists() and _NAME.fullmatch(name) is not None
+            and Path(name).suffix not in ('.pt', '.ts', '.safetensors', '.bin', '.json'))
+
+
+def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequence[str],
+                   cache_dir: str) -> Path:
+    """Return a folder with networks and the files beside them; download it if necessary.
+
+    A download is made once: with a marker of it, no request is sent. Content is compared with the
+    digest that the hub names, and what was interrupted goes on. Proxy, mirror and offline mode are
+    those of huggingface_hub: HTTPS_PROXY, HF_ENDPOINT, HF_HUB_OFFLINE.
+
+    ModelError: the name is no folder and none of the hub, or the download fails.
+
+    Parameters
+    ----------
+    name : str
+        A folder, or OWNER/NAME[@REVISION][:FILE].
+    networks : sequence of sequences of str
+        For each network the patterns of its ONNX file; the first that exists is taken, with its
+        file of weights. A FILE in the name takes the place of the first network.
+    beside : sequence of str
+        Patterns of all other files.
+    """
+    folder = Path(name).expanduser().absolute()
+    if folder.is_dir():
+        return folder
+    match = _NAME.fullmatch(name)
+    if match is None:
+        raise ModelError(f'{folder} does not exist: check the path of the network')
+    repository, revision, file = match.groups()
+    wanted = [[file], *networks[1:]] if file else list(networks)
+    own = resolve_cache_dir(cache_dir) / 'weights'
+    request = json.dumps([repository, revision, [*map(list, wanted)], list(beside)])
+    marker = own / f'{repository.replace("/", "--")}-{_digest(request.encode())[:16]}.json'
+    try:
+        found = own / str(json.loads(read_file(marker)))
+    except (OSError, ValueError):
+        found = own / 'missing'
+    if found.is_dir():
+        return found
+
+    def fetch() -> Path:
+        os.environ.setdefault('HF_HUB_DISABLE_TELEMETRY', '1')
+        import huggingface_hub
+
+        told = huggingface_hub.HfApi().model_info(repository, revision=revision,
+                                                  timeout=_PATIENCE_S)
+        files = [each.rfilename for each in told.siblings or ()]
+        chosen = [each for each in files if any(fnmatch(each, pattern) for pattern in beside)]
+        for patterns in wanted:
+            main = next((each for pattern in patterns for each in files
+                         if fnmatch(each, pattern)), None)
+            if main is None:
+                raise ModelError(f'{name} has none of {", ".join(patterns)}: it has '
+                                 f'{", ".join(files)}')
+            chosen += [each for each in files if each.startswith(main)]
+        for each in chosen:
+            path = Path(huggingface_hub.hf_hub_download(
+                repository, each, revision=told.sha, cache_dir=own))
+            _check_content(path)
+        snapshot = Path(str(path)[:-len(each)])
+        with replace_file(marker) as partial:
+            partial.write_text(json.dumps(str(snapshot.relative_to(own))))
+        return snapshot
+
+    listed = ', '.join([*(patterns[0] for patterns in wanted), *beside])
+    return download(f"the network '{name}'", own, (
+        f'Without a network: download {listed} from https://huggingface.co/{repository} on '
+        'another machine into a folder, and name the path of that folder'), fetch)
+
+
+def find_network(folder: Path, name: str, networks: Sequence[str]) -> Path:
+    """Return the ONNX file in a folder of `resolve_folder`; ModelError: there is none."""
+    match = _NAME.fullmatch(name)
+    if match is not None and match[3] and (folder / match[3]).is_file():
+        return folder / match[3]
+    for pattern in networks:
+        for file in sorted(folder.glob(pattern)):
+            return file
+    raise ModelError(f'{folder} has none of {", ".join(networks)}: put an ONNX file there')
+
+
+def _check_content(file: Path) -> None:
+    """Remove a file whose content is not what the hub named; raise ValueError.
+
+    The hub's cache names each file after its digest: SHA-256 of large ones, else git's SHA-1.
+    """
+    blob = file.resolve()
+    content = hashlib.sha256 if len(blob.name) == 64 else hashlib.sha1
+    head = b'' if len(blob.name) == 64 else b'blob %d\0' % blob.stat().st_size
+    digest = content(head, usedforsecurity=False)
+    with blob.open('rb') as opened:
+        while block := opened.read(2**20):
+            digest.update(block)
+    if len(blob.name) in (40, 64) and digest.hexdigest() != blob.name:
+        blob.unlink()
+        raise ValueError(f'{file.name} is not the file that the hub named, by its digest')
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

@@ -1,0 +1,216 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The towers of a CLIP in ONNX files, with the tokenizer and the preparation of crops.
+
+What inputs and outputs mean is read from the files and from the configurations beside them.
+"""
+
+import contextlib
+import html
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.errors import ModelError
+from cliploc_ros.files.storage import parse_json, read_file
+from cliploc_ros.models.clip_weights import (
+    CONFIG,
+    IMAGE_TOWERS,
+    PREPROCESS,
+    PREPROCESSOR,
+    TEXT_TOWERS,
+    TOKENIZER,
+    ClipOptions,
+    ClipWeights,
+)
+from cliploc_ros.models.crops import CropPreparation
+from cliploc_ros.models.files import first_line
+from cliploc_ros.models.hub import find_network
+from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, read_config
+
+# Pillow's numbers of filters, which transformers writes.
+_FILTERS = {2: 'bilinear', 3: 'bicubic'}
+# Of a CLIP.
+_DEFAULTS = {'max_position_embeddings': 77, 'vocab_size': 49_408}
+# A tokenizer uses nearly all of the tokens that its text tower knows.
+_LEAST_SHARE = 0.9
+_EMBEDDINGS = ('image_embeds', 'text_embeds', 'embedding')
+
+
+class OnnxTower:
+    """An image tower in OpenVINO on a CPU, for batches of any size.
+
+    ModelError: the files hold no image tower of these weights.
+    """
+
+    inference = 'openvino'
+
+    def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
+        network = OnnxNetwork(find_network(weights.file, '', IMAGE_TOWERS), options.cache_dir,
+                              'f32' if options.precision == 'fp32' else None)
+        self._network, self._input = network, network.image_input()
+        self.prepare = CropPreparation(read_preparation(weights.file, self._input.shape[2:]))
+        self._output = ''
+        probe = self.prepare(np.zeros((32, 32, 3), dtype=np.uint8))[None]
+        self._output = _embedding(network, self._run(probe), weights)
+
+    def __call__(self, batch: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the features (n, d) of prepared crops (n, 3, s, s)."""
+        at_once = len(batch) if self._input.shape[0] == ANY else 1
+        return np.concatenate([self._run(batch[start:start + at_once])[self._output]
+                               for start in range(0, len(batch), at_once)])
+
+    def _run(self, batch: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+        return self._network(**{self._input.name: batch.astype(self._input.type, copy=False)})
+
+
+def read_preparation(folder: Path, fixed: Sequence[int]) -> dict[str, Any]:
+    """Return how crops are prepared, as `CropPreparation` takes it.
+
+    ``fixed`` has height and width of the network's input, ANY where they vary. ModelError: the
+    configuration is missing, incomplete, or of another network.
+    """
+    file = folder / PREPROCESSOR
+    if (folder / PREPROCESS).exists():  # open_clip's own
+        file = folder / PREPROCESS
+    about = read_config(file, 'nothing else says how images are prepared')
+    size = about.get('size')
+    squashes = not about.get('do_center_crop', isinstance(size, dict) and 'shortest_edge' in size)
+    found = {'size': about.get('crop_size') if not squashes else size,
+             'resize_mode': 'squash' if squashes else 'shortest',
+             'interpolation': _FILTERS.get(about.get('resample', 3), 'bicubic'),
+             'mean': about.get('image_mean'), 'std': about.get('image_std')}
+    if file.name != PREPROCESSOR:
+        found = about
+    elif not about.get('do_normalize', True):
+        found |= {'mean': [0.0] * 3, 'std': [1.0] * 3}
+    size = found.get('size')
+    if isinstance(size, dict):
+        size = size.get('shortest_edge', (size.get('height'), size.get('width')))
+    try:
+        height, width = map(int, (size, size) if isinstance(size, int) else tuple(size))  # type: ignore[arg-type]
+        mean, std = (np.array(found[name], np.float32).reshape(3).tolist()
+                     for name in ('mean', 'std'))
+    except (LookupError, ValueError, TypeError) as error:
+        raise ModelError(f'{file} does not say how images are prepared: it needs their size, and '
+                         'a mean and a standard deviation of three numbers') from error
+    if (height, width) != tuple(want if want != ANY else has for want, has in
+                                zip(fixed, (height, width), strict=True)) or min(mean + std) < 0:
+        raise ModelError(f'{file} says that images have {height} x {width} pixels, the network '
+                         f'takes {fixed[0]} x {fixed[1]}: they are not of the same CLIP')
+    return found | {'size': (height, width), 'mean': mean, 'std': std}
+
+
+class OnnxTextTower:
+    """A text tower with its tokenizer, in OpenVINO on a CPU.
+
+    ModelError: the files hold no text tower of these weights.
+    """
+
+    def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
+        network = OnnxNetwork(find_network(weights.file, '', TEXT_TOWERS), options.cache_dir)
+        self._network, self._weights = network, weights
+        masks = [each for each in network.inputs if 'mask' in each.name]
+        texts = [each for each in network.inputs if 'mask' not in each.name]
+        if len(texts) != 1 or len(masks) > 1 or any(
+                len(each.shape) != 2 or each.type not in (np.int32, np.int64)
+                for each in network.inputs):
+            raise ModelError(f'{network.file} takes no tokens: its inputs are '
+                             f'{network.described_inputs()}, expected (texts, tokens)')
+        self._text, self._masks = texts[0], masks
+        #: The most tokens of a label
+        self.context = (self._text.shape[1] if self._text.shape[1] != ANY
+                        else _of_text(weights.file, 'max_position_embeddings', 'context_length'))
+        self._tokenizer, self._padding = _read_tokenizer(weights.file)
+
+    def count(self, label: str) -> int:
+        """Return the number of tokens of a label, with start and end."""
+        self._tokenizer.no_truncation()
+        return len(self._tokenizer.encode(clean(label)).ids)
+
+    def tokens(self, labels: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the tokens (L, context) of labels, and a mask that is 0 behind their ends."""
+        self._tokenizer.enable_truncation(self.context)
+        found = np.full((len(labels), self.context), self._padding, dtype=np.int64)
+        mask = np.zeros_like(found)
+        for row, encoded in enumerate(self._tokenizer.encode_batch([*map(clean, labels)])):
+            found[row, :len(encoded.ids)], mask[row, :len(encoded.ids)] = encoded.ids, 1
+        return found, mask
+
+    def __call__(self, labels: Sequence[str], batch: int) -> NDArray[np.float32]:
+        """Return the features (L, d) of labels, some of them at once."""
+        at_once = batch if self._text.shape[0] == ANY else 1
+        tokens, mask = self.tokens(labels)
+        found = []
+        for start in range(0, len(tokens), at_once):
+            rows = slice(start, start + at_once)
+            outputs = self._network(
+                **{self._text.name: tokens[rows].astype(self._text.type)},
+                **{each.name: mask[rows].astype(each.type) for each in self._masks})
+            found.append(outputs[_embedding(self._network, outputs, self._weights)])
+        return np.concatenate(found)
+
+
+def clean(label: str) -> str:
+    """Return a label as CLIP was trained with it: HTML, wide letters and the like are mended."""
+    import ftfy
+
+    return ' '.join(html.unescape(html.unescape(ftfy.fix_text(label))).split())
+
+
+def _embedding(network: OnnxNetwork, outputs: dict[str, NDArray[np.float32]],
+               weights: ClipWeights) -> str:
+    """Return the name of the output that has one embedding a row."""
+    flat = [name for name, output in outputs.items() if output.ndim == 2]
+    names = [name for name in flat if name in _EMBEDDINGS] or flat
+    if len(names) != 1 or outputs[names[0]].shape[1] != weights.embed_dim:
+        shapes = {name: output.shape for name, output in outputs.items()}
+        raise ModelError(f'{network.file} gives {shapes}, expected one output (n, '
+                         f'{weights.embed_dim}), as {CONFIG} says: export a tower with its '
+                         'projection')
+    return names[0]
+
+
+def _of_text(folder: Path, *names: str) -> int:
+    """Return a size of the text tower, by the names that transformers and open_clip have for it.
+
+    ModelError: the configuration does not say it.
+    """
+    config = read_config(folder / CONFIG, 'it has the sizes of the text tower')
+    text: dict[str, Any] = next((config[name] for name in ('text_config', 'text_cfg')
+                                 if isinstance(config.get(name), dict)), {})
+    size = next((text[name] for name in names if name in text), None)
+    if size is None and (config.get('model_type') == 'clip' or 'text_cfg' in config):
+        size = _DEFAULTS[names[0]]  # what equals the default is not written
+    if not isinstance(size, int) or not 2 < size < 2**24:
+        raise ModelError(f"{folder / CONFIG} does not say '{names[0]}' of its text tower: add it")
+    return size
+
+
+def _read_tokenizer(folder: Path) -> tuple[Any, int]:
+    """Return the tokenizer of a folder, and the token that fills the end of a text."""
+    import tokenizers
+
+    files = [file for file in (folder / TOKENIZER, folder / 'textual' / TOKENIZER)
+             if file.exists()]
+    if not files:
+        raise ModelError(f'{folder / TOKENIZER} is missing, and it splits labels into tokens: put '
+                         'the one of the published network there')
+    try:
+        tokenizer = tokenizers.Tokenizer.from_str(read_file(files[0]).decode())
+        if len(tokenizer.encode('a cup').ids) < 3:
+            raise ValueError('it marks no end of a text')
+        known, size = _of_text(folder, 'vocab_size'), tokenizer.get_vocab_size()
+        if not _LEAST_SHARE * known <= size <= known:
+            raise ValueError(f'it has {size} tokens, the text tower {known}')
+    except Exception as error:  # the library has no exceptions of its own
+        raise ModelError(f'{files[0]} is no tokenizer of a CLIP: {first_line(error)}') from error
+    padding = 0
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
+        stored = parse_json(read_file(files[0]))['padding']
+        padding = int(stored['pad_id'])
+    tokenizer.no_padding()
+    return tokenizer, padding

@@ -1,0 +1,301 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A detector in an ONNX file: exports of YOLO, and of D-FINE, RT-DETR, DETR and their kin.
+
+What the outputs mean is read from the file's metadata and from the configuration beside it.
+"""
+
+import ast
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from cliploc_ros.core.observation import Detections
+from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.models.devices import resolve_device
+from cliploc_ros.models.files import first_line
+from cliploc_ros.models.hub import find_network, resolve_folder
+from cliploc_ros.models.images import check_image_rgb
+from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, read_config
+from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.yolo_boxes import Letterbox, select_boxes, without_doubles
+
+_CONFIG, _PREPROCESSOR = 'config.json', 'preprocessor_config.json'
+#: The files of a published detector, the ONNX file by preference.
+NETWORKS = ('model.onnx', 'onnx/model.onnx')
+BESIDE = (_CONFIG, _PREPROCESSOR)
+_LOGITS, _BOXES = 'logits', 'pred_boxes'
+# Of YOLO, where neither the file nor the options say.
+_STRIDE = 32
+
+
+class _Head(Protocol):
+    """What stands before and after a network."""
+
+    names: dict[int, str]  #: Class number to name
+    has_doubles: bool  #: Whether several boxes of a class may be of one object
+
+    def find(self, image_rgb: NDArray[np.uint8], options: DetectorOptions) -> NDArray[np.float32]:
+        """Return the boxes (n, 6) in an image: left, top, right, bottom, score, class.
+
+        The most confident is the first.
+        """
+
+
+class OnnxDetector:
+    """An `ObjectDetector` of an ONNX file, in OpenVINO on a CPU.
+
+    ModelError: files are missing, damaged, or hold no detector; the message names what is missing.
+    OptionsError: the options ask for a GPU, for PyTorch or for prompts.
+    """
+
+    device, inference = 'cpu', 'openvino'
+
+    def __init__(self, options: DetectorOptions) -> None:
+        if options.prompts:
+            raise OptionsError(f'{options.model}: its classes are fixed: a vocabulary needs the '
+                               '.pt file of a YOLO-World or YOLOE')
+        if (options.inference == 'pytorch' or options.precision == 'fp16'
+                or (options.device != 'auto' and resolve_device(options.device) != 'cpu')):
+            raise OptionsError(f"{options.model} runs in OpenVINO: set device to 'cpu', precision "
+                               "and inference to 'auto', or name a .pt file for a GPU")
+        file = _resolve(options)
+        network = OnnxNetwork(file, options.cache_dir)
+        self._head: _Head = (DetrHead if {_LOGITS, _BOXES} <= set(network.outputs)
+                             else YoloHead)(network)
+        #: All classes that the network knows
+        self.class_names = tuple(dict.fromkeys(self._head.names.values()))
+        self.configure(options)
+        # It sets up kernels before the first image, and shows whether the outputs are as expected.
+        try:
+            self.detect(np.zeros((64, 64, 3), dtype=np.uint8))
+        except RuntimeError as error:  # OpenVINO has no exceptions of its own
+            raise ModelError(f'OpenVINO does not run {file}: {first_line(error)}; export the '
+                             'network again') from error
+
+    def configure(self, options: DetectorOptions) -> None:
+        """Change the options, except for model, device and inference."""
+        self._options = options
+
+    def detect(self, image_rgb: NDArray[np.uint8]) -> Detections:
+        """Return the objects in an image (h, w, 3) uint8, the most confident first.
+
+        Several boxes of a class on one object, as weak queries or two texts of a class give them,
+        are one: see ``iou``.
+
+        ImageError: for an image of another shape or type, or without pixels.
+        """
+        check_image_rgb(image_rgb)
+        names = self._head.names
+        rows = self._head.find(np.ascontiguousarray(image_rgb), self._options)
+        numbers = np.array([self.class_names.index(names[int(one)]) for one in rows[:, 5]],
+                           dtype=np.int64)
+        if self._head.has_doubles:
+            rows = rows[without_doubles(rows[:, :4], numbers, self._options.iou,
+                                        self._options.max_det)]
+        return Detections(bboxes_xyxy=rows[:, :4].astype(np.float64),
+                          class_ids=tuple(names[int(one)] for one in rows[:, 5]),
+                          scores=rows[:, 4].astype(np.float64))
+
+
+def _resolve(options: DetectorOptions) -> Path:
+    """Return the ONNX file that the options name; download it if it is not here yet."""
+    path = Path(options.model).expanduser().absolute()
+    if path.suffix == '.onnx' or path.is_file():
+        return path
+    return find_network(resolve_folder(options.model, [NETWORKS], BESIDE, options.cache_dir),
+                        options.model, NETWORKS)
+
+
+class YoloHead:
+    """An export of ultralytics: a letterbox before it, and doubles dropped after it.
+
+    Its metadata have the class names; files of others have them in ``config.json``.
+    """
+
+    def __init__(self, network: OnnxNetwork) -> None:
+        self._network, self._input = network, network.image_input()
+        about = network.metadata
+        task = about.get('task', 'detect')
+        if task not in ('detect', 'segment'):  # YOLOE is published with a head for masks
+            raise ModelError(f"{network.file} is a YOLO model for the task '{task}': one for "
+                             "'detect' is needed")
+        self.names = _names(network)
+        # two texts of a class
+        self.has_doubles = len(set(self.names.values())) < len(self.names)
+        self._stride = int(about['stride']) if about.get('stride', '').isdecimal() else _STRIDE
+        height, width = self._input.shape[2:]
+        self._size = None if ANY in (height, width) else (height, width)
+        self._layout = self._layout_of(self._run(np.zeros((1, 3, *(
+            self._size or (2 * self._stride,) * 2)))))
+
+    def _run(self, pixels: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return the output, boxes with scores, for an input with values 0 to 1."""
+        outputs = self._network(**{self._input.name: pixels.astype(self._input.type)})
+        boxes = [one for one in outputs.values() if one.ndim == 3 and len(one) == 1]
+        if len(boxes) != 1:
+            raise ModelError(
+                f'{self._network.file} is no detector: its outputs are '
+                f'{ {name: one.shape for name, one in outputs.items()} }, expected one of shape '
+                f"(1, boxes, classes) or '{_LOGITS}' and '{_BOXES}'")
+        return boxes[0][0]
+
+    def _layout_of(self, output: NDArray[np.float32]) -> str:
+        """Return what an output holds, by its shape: see ``find``."""
+        count, file = len(self.names), self._network.file
+        # YOLOv5's own program writes no task, and a column for the confidence in any object
+        if 'task' not in self._network.metadata and output.shape[1] == 5 + count:
+            return 'objectness'
+        if output.shape[1] == 6 and output.shape[0] != 4 + count:
+            return 'selected'
+        if output.shape[0] == 4 + count:
+            return 'classes'
+        # YOLOE's masks follow the classes
+        if self._network.metadata.get('task') == 'segment':
+            if self._network.metadata.get('end2end') == 'True' and output.shape[1] > 6:
+                return 'selected'
+            if output.shape[0] > 4 + count:
+                return 'classes'
+        raise ModelError(f'{file} is no detector of {count} classes: its output has the shape '
+                         f'{output.shape}, expected ({4 + count}, boxes) or (boxes, 6)')
+
+    def find(self, image_rgb: NDArray[np.uint8], options: DetectorOptions) -> NDArray[np.float32]:
+        """Return the boxes (n, 6) in an image, see _Head.find."""
+        side = -(-options.imgsz // self._stride) * self._stride
+        letterbox = Letterbox.of(image_rgb.shape[1::-1], *(self._size or (side, side)),
+                                 None if self._size else self._stride)
+        pixels = letterbox.fill(image_rgb).transpose(2, 0, 1)[None]
+        output = self._run(np.ascontiguousarray(pixels, dtype=np.float32) / np.float32(255))
+        if self._layout == 'objectness':
+            output = np.hstack([output[:, :4], output[:, 4:5] * output[:, 5:]]).T
+        elif self._layout == 'classes':
+            output = output[:4 + len(self.names)]
+        rows = select_boxes(output, options.conf, options.iou, options.max_det,
+                            self._layout == 'selected')
+        return np.hstack([letterbox.in_image(rows[:, :4]), rows[:, 4:]])
+
+
+class DetrHead:
+    """A network of DETR's kind: queries with logits and boxes, as transformers exports them.
+
+    ``config.json`` has the class names, ``preprocessor_config.json`` how images are prepared.
+    """
+
+    has_doubles = True  # of weak queries
+
+    def __init__(self, network: OnnxNetwork) -> None:
+        self._network, self._input = network, network.image_input()
+        self.names = _names(network)
+        file = _beside(network.file, _PREPROCESSOR)
+        about = read_config(file, 'nothing else says how images are prepared')
+        size = about.get('size')
+        fixed = self._input.shape[2:]
+        if not isinstance(size, dict) or not ({'height', 'width'} <= size.keys()
+                                              or 'shortest_edge' in size):
+            raise ModelError(f"{file}: the field 'size' names neither height and width nor "
+                             f'shortest_edge: {size}')
+        if ANY not in fixed:
+            if 'height' in size and (size['height'], size['width']) != fixed:
+                raise ModelError(f'{file} says that images are {size["height"]} x '
+                                 f'{size["width"]}, {network.file} takes {fixed[0]} x {fixed[1]}: '
+                                 'they are not of the same network')
+            size = {'height': fixed[0], 'width': fixed[1]}
+        self._size: dict[str, int] = size
+        self._scale = np.float32(about.get('rescale_factor', 1 / 255)
+                                 if about.get('do_rescale', True) else 1.0)
+        self._mean, self._deviation = np.zeros(3, np.float32), np.ones(3, np.float32)
+        if about.get('do_normalize', True):
+            try:
+                self._mean = np.array(about['image_mean'], np.float32).reshape(3)
+                self._deviation = np.array(about['image_std'], np.float32).reshape(3)
+            except (LookupError, ValueError, TypeError) as error:
+                raise ModelError(f"{file}: the fields 'image_mean' and 'image_std' must have "
+                                 'three numbers each') from error
+        self._resample = Image.Resampling(about.get('resample', Image.Resampling.BILINEAR))
+        probe = self._run(np.zeros((64, 64, 3), dtype=np.uint8))[_LOGITS]
+        #: Whether the last logit of a query means 'no object'
+        self._has_nothing = probe.shape[-1] == len(self.names) + 1
+        if probe.shape[-1] not in (len(self.names), len(self.names) + 1):
+            raise ModelError(f'{network.file} has {probe.shape[-1]} classes, {_CONFIG} names '
+                             f'{len(self.names)}: they are not of the same network')
+
+    def _run(self, image_rgb: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
+        """Return logits (q, c) and boxes (q, 4) for an image (h, w, 3)."""
+        height, width = image_rgb.shape[:2]
+        if 'height' in self._size:
+            size = self._size['width'], self._size['height']
+        else:
+            scale = min(self._size['shortest_edge'] / min(height, width),
+                        self._size.get('longest_edge', np.inf) / max(height, width))
+            size = max(1, round(width * scale)), max(1, round(height * scale))
+        # OpenCV's bilinear filter skips pixels where an image shrinks, Pillow's does not
+        scaled = np.asarray(Image.fromarray(image_rgb).resize(size, self._resample))
+        pixels = (scaled * self._scale - self._mean) / self._deviation
+        given: dict[str, NDArray[Any]] = {self._input.name: np.ascontiguousarray(
+            pixels.transpose(2, 0, 1)[None], dtype=self._input.type)}
+        for one in self._network.inputs:
+            if one.name == 'pixel_mask':  # which pixels are no padding
+                shape = [size[1] if side == ANY else side for side in one.shape[1:]]
+                if one.shape[1:] == (ANY, ANY):
+                    shape = [size[1], size[0]]
+                given[one.name] = np.ones((1, *shape), dtype=one.type or np.int64)
+            elif one.name != self._input.name:
+                raise ModelError(f"{self._network.file} has the input '{one.name}', which is "
+                                 'unknown: export it with images as its only input')
+        outputs = self._network(**given)
+        return {name: outputs[name][0] for name in (_LOGITS, _BOXES)}
+
+    def find(self, image_rgb: NDArray[np.uint8], options: DetectorOptions) -> NDArray[np.float32]:
+        """Return the boxes (n, 6) in an image, see _Head.find."""
+        found = self._run(image_rgb)
+        logits = found[_LOGITS].astype(np.float64)
+        scores: NDArray[Any]
+        if self._has_nothing:
+            shares: NDArray[np.float64] = np.exp(logits - logits.max(axis=1, keepdims=True))
+            scores = (
+                shares / shares.sum(axis=1, keepdims=True))[:, :-1]
+            queries, classes = np.arange(len(scores)), scores.argmax(axis=1)
+        else:
+            # as the library: the best pairs of query and class, as many as there are queries
+            scores = 1.0 / (1.0 + np.exp(-logits))
+            best = np.argsort(-scores, axis=None, kind='stable')[:len(scores)]
+            queries, classes = np.unravel_index(best, scores.shape)
+        chosen = scores[queries, classes]
+        order = np.argsort(-chosen, kind='stable')
+        order = order[chosen[order] > options.conf]
+        middle, size = np.split(found[_BOXES][queries[order]], [2], axis=1)
+        half = size / 2
+        sides = np.array(image_rgb.shape[1::-1] * 2, dtype=np.float32)
+        boxes = np.clip(np.hstack([middle - half, middle + half]) * sides, 0, sides)
+        return np.hstack([boxes, chosen[order, None], classes[order, None]]).astype(np.float32)
+
+
+def _beside(file: Path, name: str) -> Path:
+    """Return a file beside a network, or above the folder ``onnx`` that it is published in."""
+    above = file.parent.parent / name
+    is_above = file.parent.name == 'onnx' and not (file.parent / name).exists() and above.exists()
+    return above if is_above else file.parent / name
+
+
+def _names(network: OnnxNetwork) -> dict[int, str]:
+    """Return the names of the classes by their number: of the metadata, or of config.json."""
+    where, found = f'{network.file}', None
+    if text := network.metadata.get('names'):
+        try:
+            found = ast.literal_eval(text)
+        except (ValueError, SyntaxError, MemoryError, RecursionError) as error:
+            raise ModelError(f'{where}: the class names in its metadata cannot be read; export '
+                             'the network again') from error
+    else:
+        file = _beside(network.file, _CONFIG)
+        where = f"{file}: the field 'id2label'"
+        found = read_config(file, f'{network.file} holds no class names').get('id2label')
+    if isinstance(found, list):
+        found = dict(enumerate(found))
+    if not isinstance(found, dict) or sorted(map(str, found)) != sorted(
+            map(str, range(len(found)))) or not found:
+        raise ModelError(f'{where} must have the class names with the keys 0, 1 ...')
+    return {int(number): str(name) for number, name in found.items()}

@@ -1,0 +1,262 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Networks in ONNX files, run by OpenVINO on a CPU; compiled once and kept on disk."""
+
+import contextlib
+import ctypes
+import glob
+import hashlib
+import json
+import logging
+import os
+import threading
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.errors import ModelError
+from cliploc_ros.files.storage import parse_json, read_file, resolve_cache_dir, warn_not_kept
+from cliploc_ros.models.devices import count_threads, free_memory, import_openvino
+from cliploc_ros.models.files import (
+    check_weights_file,
+    damaged,
+    fingerprint_file,
+    first_line,
+    keep_folder,
+)
+
+# A compiled network is as large as its file: ViT-L-14 takes 1.2 GB, YOLOv8x .3 GB.
+_MOST_NETWORKS = 8
+# Of the folder that holds a compiled network.
+_FORMAT = 1
+_BLOB, _ABOUT = 'network.blob', 'about.json'
+_FLOATS: dict[str, type[np.number[Any]]] = {'f32': np.float32, 'f16': np.float16}
+_INTEGERS: dict[str, type[np.number[Any]]] = {'i64': np.int64, 'i32': np.int32}
+#: A size of an input that varies.
+ANY = -1
+_MADV_DONTNEED = 4
+
+logger = logging.getLogger(__name__)
+
+
+class Input(NamedTuple):
+    """An input of a network."""
+
+    name: str
+    shape: tuple[int, ...]  #: ANY where a size varies
+    type: type[np.number[Any]] | None  #: None for one that no image or text can be fed as
+
+
+class CompiledNetwork:
+    """A network that OpenVINO compiled; it runs one input at a time."""
+
+    def __init__(self, compiled: Any) -> None:
+        self._compiled = compiled
+        self._lock = threading.Lock()
+
+    @staticmethod
+    def of(network: Any, precision: str | None = 'f32') -> 'CompiledNetwork':
+        """Compile an ``openvino.Model``; the precision is as in OnnxNetwork."""
+        return CompiledNetwork(import_openvino().Core().compile_model(
+            network, 'CPU', _settings(precision)))
+
+    def __call__(self, inputs: Any) -> list[NDArray[np.float32]]:
+        """Return the outputs for some inputs, an array or a dictionary by names."""
+        with self._lock:
+            return [np.array(output, dtype=np.float32)
+                    for output in self._compiled(inputs).values()]
+
+
+class OnnxNetwork:
+    """A network of an ONNX file: inputs by their names in, outputs by their names out.
+
+    Compiling takes seconds, so the compiled network is kept in the folder ``openvino`` of the
+    cache, by the content of the file, the processor and OpenVINO's version. OpenVINO runs a
+    damaged one without an error (measured: boxes off by 20 px), so its SHA-256 is kept, too.
+
+    ModelError: the file is missing, damaged, or holds operations that OpenVINO does not know.
+
+    Parameters
+    ----------
+    precision : str or None
+        'f32', or None for the processor's own choice: bf16 where it multiplies matrices in it.
+    """
+
+    def __init__(self, file: Path, cache_dir: str, precision: str | None = 'f32') -> None:
+        check_weights_file(file)
+        if import_openvino() is None:
+            raise ModelError(f'{file} needs OpenVINO, which is not installed: pip install '
+                             'openvino')
+        self.file = file
+        folder = _folder(file, cache_dir, precision)
+        try:
+            compiled, self.metadata = _stored(folder, precision)
+        except FileNotFoundError:
+            compiled, self.metadata = _compile(file, folder, precision)
+        except Exception as error:  # OpenVINO has no exceptions of its own
+            logger.warning('%s cannot be used (%s): compiling %s again', folder,
+                           first_line(error), file.name)
+            compiled, self.metadata = _compile(file, folder, precision)
+        self._network = CompiledNetwork(compiled)
+        self.inputs = tuple(_described(port) for port in compiled.inputs)
+        self.outputs = tuple(_name_of(port) for port in compiled.outputs)
+
+    def __call__(self, **inputs: NDArray[Any]) -> dict[str, NDArray[np.float32]]:
+        """Return the outputs for some inputs; both by name."""
+        return dict(zip(self.outputs, self._network(inputs), strict=True))
+
+    def image_input(self) -> Input:
+        """Return the input that takes images (n, 3, h, w); ModelError: there is none."""
+        images = [each for each in self.inputs if len(each.shape) == 4]
+        if len(images) != 1 or images[0].shape[0] not in (1, ANY) or (
+                images[0].shape[1] not in (3, ANY)):
+            raise ModelError(f'{self.file} takes no single colour image: its inputs are '
+                             f'{self.described_inputs()}, expected (1, 3, height, width)')
+        if images[0].type not in _FLOATS.values():
+            raise ModelError(f'{self.file} takes images that are no floating-point numbers '
+                             f'({self.described_inputs()}), and nothing says how they are scaled: '
+                             'export it with inputs in fp32')
+        return images[0]
+
+    def described_inputs(self) -> str:
+        """Return names and shapes of the inputs for a message."""
+        return ', '.join(f"'{each.name}' {each.shape}" for each in self.inputs)
+
+
+def read_config(file: Path, purpose: str) -> dict[str, Any]:
+    """Return the JSON object of a file beside a network; ModelError: it is missing or damaged.
+
+    The error says what it is needed for.
+    """
+    try:
+        found = parse_json(read_file(file))
+    except FileNotFoundError:
+        raise ModelError(f'{file} is missing, and {purpose}: put the one of the published '
+                         'network there') from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise ModelError(f'{file} cannot be read: {first_line(error)}') from error
+    if not isinstance(found, dict):
+        raise ModelError(f'{file} is no JSON object: download it again')
+    return found
+
+
+def _settings(precision: str | None) -> dict[str, Any]:
+    # A pinned thread waits for other processes on its core. The number of threads is that of
+    # PyTorch, whose limits apply here, too.
+    settings: dict[str, Any] = {
+        'PERFORMANCE_HINT': 'LATENCY', 'NUM_STREAMS': 1, 'ENABLE_CPU_PINNING': False,
+        'INFERENCE_NUM_THREADS': count_threads()}
+    return settings if precision is None else settings | {'INFERENCE_PRECISION_HINT': precision}
+
+
+# ---- compiled networks on disk ------------------------------------------------------------------
+
+def _folder(file: Path, cache_dir: str, precision: str | None) -> Path:
+    """Return the folder of a compiled network, by all that it depends on."""
+    openvino = import_openvino()
+    # with the file of weights that a large network has beside it
+    files = sorted(file.parent.glob(f'{glob.escape(file.name)}*'))
+    depends = [_FORMAT, *map(fingerprint_file, files), precision, openvino.get_version(),
+               openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME')]
+    digest = hashlib.sha256(json.dumps(depends).encode()).hexdigest()
+    return resolve_cache_dir(cache_dir) / 'openvino' / f'{file.stem}-{digest[:32]}'
+
+
+def _stored(folder: Path, precision: str | None) -> tuple[Any, dict[str, str]]:
+    """Return a compiled network and its metadata.
+
+    FileNotFoundError: there is none. ValueError and others: it is damaged.
+    """
+    about = parse_json(read_file(folder / _ABOUT))
+    openvino = import_openvino()
+    # Mapped, the file takes no memory beside the weights of the compiled network.
+    blob = np.memmap(folder / _BLOB, dtype=np.uint8, mode='r')
+    if hashlib.sha256(blob).hexdigest() != about['sha256']:
+        raise ValueError(f'{_BLOB} is damaged')
+    compiled = openvino.Core().import_model(openvino.Tensor(blob), 'CPU', _settings(precision))
+    _release_pages(folder / _BLOB)
+    with contextlib.suppress(OSError):  # a read-only cache works too
+        os.utime(folder)
+    return compiled, dict(about['metadata'])
+
+
+def _compile(file: Path, folder: Path, precision: str | None) -> tuple[Any, dict[str, str]]:
+    """Compile a network and keep it; return it with the metadata of its file."""
+    core = import_openvino().Core()
+    try:
+        network = core.read_model(file)
+    except Exception as error:  # OpenVINO has no exceptions of its own
+        raise _unreadable(file, str(error)) from error
+    about = network.get_rt_info()
+    metadata: dict[str, str] = {
+        name: str(value.value) for name, value in about['framework'].items()
+    } if 'framework' in about else {}
+    try:
+        compiled = core.compile_model(network, 'CPU', _settings(precision))
+    except Exception as error:
+        raise ModelError(f'OpenVINO does not run {file}: {first_line(error)}; export the network '
+                         'again, without quantization') from error
+    del network
+    try:
+        keep_folder(folder, _MOST_NETWORKS, partial(_write, compiled, metadata))
+    except Exception as error:  # OpenVINO reports a full disk as it reports a bad network
+        warn_not_kept('the compiled network is not cached and the next start is slow again: '
+                      f'cannot write {folder} ({first_line(error)}); make room, or choose a '
+                      'writable cache_dir')
+    free_memory()
+    return compiled, metadata
+
+
+def _write(compiled: Any, metadata: dict[str, str], folder: Path) -> None:
+    folder.mkdir()
+    content = compiled.export_model()
+    blob = content if isinstance(content, bytes) else content.getbuffer()
+    about = {'sha256': hashlib.sha256(blob).hexdigest(), 'metadata': metadata}
+    for name, written in ((_BLOB, blob), (_ABOUT, json.dumps(about).encode())):
+        with (folder / name).open('wb') as file:
+            file.write(written)
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def _release_pages(file: Path) -> None:
+    """Release the memory of a mapped file; the system reads again what is used again.
+
+    The CPU's kernels have copies of the weights in layouts of their own, and read the file only
+    while they are compiled.
+    """
+    madvise = getattr(ctypes.CDLL(None), 'madvise', None)
+    if madvise is None:
+        return
+    inode = str(file.stat().st_ino)
+    with contextlib.suppress(OSError):  # only Linux has it
+        for line in Path('/proc/self/maps').read_text().splitlines():
+            fields = line.split(maxsplit=5)
+            if fields[4] == inode and fields[-1].endswith(file.name):
+                start, end = (int(bound, 16) for bound in fields[0].split('-'))
+                madvise(ctypes.c_void_p(start), ctypes.c_size_t(end - start), _MADV_DONTNEED)
+
+
+def _unreadable(file: Path, reason: str) -> ModelError:
+    if "can't be parsed" in reason:
+        return damaged(file, 'its graph ends too early')
+    if 'externally stored data' in reason:
+        name = reason.partition('(')[2].partition(',')[0]
+        return ModelError(f'the weights of {file} are in a file of their own, {name}, which is '
+                          'missing: put it beside the network')
+    lines = [line.strip() for line in reason.splitlines() if line.strip()]
+    return ModelError(f'OpenVINO does not read {file}: {" ".join(lines[-2:])[:300]}; update '
+                      'OpenVINO, or export the network with an opset of 11 to 21')
+
+
+def _described(port: Any) -> Input:
+    shape = tuple(ANY if size.is_dynamic else size.get_length() for size in port.partial_shape)
+    return Input(_name_of(port), shape,
+                 (_FLOATS | _INTEGERS).get(port.element_type.get_type_name()))
+
+
+def _name_of(port: Any) -> str:
+    return min(port.names, default='')

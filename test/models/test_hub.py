@@ -1,0 +1,159 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Networks by OWNER/NAME from a model hub on this machine: once, whole, and without a network."""
+
+import hashlib
+import http.server
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.full
+
+PROJECT = Path(__file__).resolve().parents[2]
+COMMIT = '1' * 40
+RESOLVE = """
+import json, sys
+from cliploc_ros.errors import ModelError
+from cliploc_ros.models.hub import find_network, resolve_folder
+networks = ['model.onnx', 'onnx/model.onnx']
+try:
+    folder = resolve_folder(sys.argv[2], [networks], ['config.json'], sys.argv[1])
+except ModelError as error:
+    print(json.dumps({'error': str(error)}))
+else:
+    print(json.dumps({'network': str(find_network(folder, sys.argv[2], networks))}))
+"""
+
+
+class Hub(http.server.BaseHTTPRequestHandler):
+    """The part of a model hub that a download needs."""
+
+    files: dict[str, bytes]
+    #: What is sent in place of a file
+    sent: dict[str, bytes]
+    requests: list[str]
+    #: A file that is sent in part, and how much of it
+    broken: tuple[str, int] | None
+
+    def do_HEAD(self):
+        self._answer(False)
+
+    def do_GET(self):
+        self._answer(True)
+
+    def _answer(self, has_body):
+        self.requests.append(f'{self.command} {self.path}')
+        if '/api/models/' in self.path:
+            body, extra = json.dumps({
+                'id': 'someone/net', 'sha': COMMIT,
+                'siblings': [{'rfilename': name} for name in self.files]}).encode(), {}
+        else:
+            name = self.path.partition(f'/resolve/{COMMIT}/')[2]
+            if name not in self.files:
+                self.send_error(404)
+                return
+            body = self.sent.get(name, self.files[name])
+            extra = {'ETag': f'"{hashlib.sha256(self.files[name]).hexdigest()}"',
+                     'X-Repo-Commit': COMMIT, 'Accept-Ranges': 'bytes'}
+        start = int(self.headers.get('Range', 'bytes=0-')[6:].partition('-')[0])
+        self.send_response(206 if start else 200)
+        for key, value in extra.items():
+            self.send_header(key, value)
+        if start:
+            self.send_header('Content-Range', f'bytes {start}-{len(body) - 1}/{len(body)}')
+        self.send_header('Content-Length', str(len(body) - start))
+        self.end_headers()
+        if has_body:
+            if self.broken and self.path.endswith(self.broken[0]):
+                body = body[:self.broken[1]]
+            self.wfile.write(body[start:])
+
+    def log_message(self, *arguments):
+        pass
+
+
+@pytest.fixture
+def hub(monkeypatch, tmp_path):
+    Hub.files = {'config.json': b'{}', 'onnx/model.onnx': os.urandom(100_000),
+                 'onnx/model.onnx_data': os.urandom(3_000_000),
+                 'onnx/model_fp16.onnx': b'\x08half',
+                 'model.safetensors': b'large', 'README.md': b'text'}
+    Hub.sent, Hub.requests, Hub.broken = {}, [], None
+    monkeypatch.setenv('HF_HOME', str(tmp_path / 'hub'))
+    monkeypatch.setenv('HF_HUB_DISABLE_XET', '1')
+    with http.server.ThreadingHTTPServer(('127.0.0.1', 0), Hub) as server:
+        monkeypatch.setenv('HF_ENDPOINT', f'http://127.0.0.1:{server.server_port}')
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield Hub
+        server.shutdown()
+
+
+def resolve(cache: Path, name: str = 'someone/net', **environment: str) -> dict[str, str]:
+    done = subprocess.run(
+        [sys.executable, '-c', RESOLVE, str(cache), name], cwd=PROJECT, text=True,
+        env={**os.environ, 'NO_PROXY': '127.0.0.1', **environment}, capture_output=True,
+        timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_a_download_is_made_once_and_of_what_is_needed(hub, tmp_path):
+    found = Path(resolve(tmp_path / 'cache')['network'])
+    assert found.read_bytes() == hub.files['onnx/model.onnx']
+    names = {str(file.relative_to(found.parents[1])) for file in found.parents[1].rglob('*')}
+    assert names == {'onnx', 'config.json', 'onnx/model.onnx', 'onnx/model.onnx_data'}
+    assert tmp_path / 'cache/weights' in found.parents
+    hub.requests.clear()
+    assert Path(resolve(tmp_path / 'cache')['network']) == found
+    assert hub.requests == [], 'a robot without a network does not wait for one'
+    copied = tmp_path / 'cache'
+    copied.rename(tmp_path / 'carried')
+    assert 'carried' in resolve(tmp_path / 'carried', HF_HUB_OFFLINE='1')['network']
+
+
+def test_a_revision_and_a_file(hub, tmp_path):
+    found = Path(resolve(tmp_path, f'someone/net@{COMMIT}:onnx/model_fp16.onnx')['network'])
+    assert found.read_bytes() == b'\x08half'
+    assert any(COMMIT in request for request in hub.requests if '/api/' in request)
+
+
+def test_another_file_under_the_same_name(hub, tmp_path):
+    hub.sent['onnx/model.onnx'] = os.urandom(100_000)
+    text = resolve(tmp_path)['error']
+    assert 'model.onnx is not the file that the hub named' in text
+    hub.sent.clear()
+    assert 'network' in resolve(tmp_path)
+
+
+def test_an_interrupted_download_goes_on(hub, tmp_path):
+    hub.broken = ('onnx/model.onnx_data', 2_000_000)
+    assert 'cannot download' in resolve(tmp_path)['error']
+    hub.broken = None
+    hub.requests.clear()
+    found = Path(resolve(tmp_path)['network'])
+    assert found.with_name('model.onnx_data').read_bytes() == hub.files['onnx/model.onnx_data']
+    assert not any('GET' in one and one.endswith('/config.json') for one in hub.requests)
+
+
+def test_a_repository_without_onnx(hub, tmp_path):
+    hub.files = {'model.safetensors': b'large'}
+    assert 'has none of model.onnx, onnx/model.onnx' in resolve(tmp_path)['error']
+
+
+def test_without_a_network_the_message_names_files_and_remedy(tmp_path):
+    with socket.socket() as free:
+        free.bind(('127.0.0.1', 0))
+        port = free.getsockname()[1]
+    for environment in ({'HF_ENDPOINT': f'http://127.0.0.1:{port}'}, {'HF_HUB_OFFLINE': '1'}):
+        text = resolve(tmp_path, **environment)['error']
+        assert "cannot download the network 'someone/net'" in text
+        assert 'model.onnx, config.json from https://huggingface.co/someone/net' in text
+    text = resolve(tmp_path, 'not/a/name')['error']
+    assert 'does not exist' in text

@@ -1,0 +1,375 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The paper with one command, from a server of this machine, on the demo's room and networks."""
+
+import csv
+import fcntl
+import io
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tarfile
+import threading
+import time
+import zipfile
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from urllib.parse import urlparse
+
+import numpy as np
+import pytest
+import yaml
+from disks import small_disk
+
+from cliploc_ros.cli import build_map, evaluate
+from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
+from cliploc_ros.offline.datasets.bag_poses import GROUND_TRUTH, find_poses
+from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
+from demo import ASSETS
+from studies import reproduce
+
+pytestmark = pytest.mark.full
+
+PROJECT = Path(__file__).resolve().parents[2]
+SHIPPED = yaml.safe_load((PROJECT / 'studies/reproduce.yaml').read_text())
+ARCHIVE = 'rgbd_dataset_freiburg3_demo.tgz'
+# huggingface_hub writes 10 MiB at once: the archive is longer, and held back after more.
+FILLER_BYTES, HELD_BYTES = 12 * 2**20, 11 * 2**20
+PATIENCE_S = 120
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Sends files, or the rest of them; holds one back after its first bytes."""
+
+    def do_GET(self):
+        server, name = self.server, self.path.strip('/')
+        server.asked.append((name, self.headers.get('Range')))
+        content = server.files.get(name)
+        if content is None:
+            self.send_error(404)
+            return
+        start = int(re.fullmatch(r'bytes=(\d+)-', self.headers.get('Range', 'bytes=0-'))[1])
+        if start >= len(content):
+            self.send_error(416)
+            return
+        self.send_response(206 if start else 200)
+        self.send_header('Content-Length', str(len(content) - start))
+        if start:
+            self.send_header('Content-Range', f'bytes {start}-{len(content) - 1}/{len(content)}')
+        self.end_headers()
+        if name == server.held:
+            self.wfile.write(content[start:HELD_BYTES])
+            server.released.wait(PATIENCE_S)
+        else:
+            self.wfile.write(content[start:])
+
+    def log_message(self, *_):
+        """Say nothing."""
+
+
+@pytest.fixture
+def server():
+    """Serves the demo's networks, and one of its walks as a sequence of TUM RGB-D."""
+    with ThreadingHTTPServer(('127.0.0.1', 0), Handler) as serving:
+        serving.files = {name: (ASSETS / name).read_bytes()
+                         for name in ('yolo.onnx', 'clip.json', 'clip.safetensors')}
+        serving.files[ARCHIVE] = archive_of_walk()
+        serving.asked, serving.held, serving.released = [], '', threading.Event()
+        thread = threading.Thread(target=serving.serve_forever, args=(0.05,))
+        thread.start()
+        yield serving
+        serving.released.set()
+        serving.shutdown()
+        thread.join()
+
+
+def archive_of_walk():
+    """Return a walk as an archive of TUM RGB-D."""
+    content = io.BytesIO()
+    with tarfile.open(fileobj=content, mode='w:gz', compresslevel=1) as archive:
+        archive.add(ASSETS / 'mapping', 'rgbd_dataset_freiburg3_demo')
+        filler = tarfile.TarInfo('rgbd_dataset_freiburg3_demo/depth')
+        filler.size = FILLER_BYTES
+        archive.addfile(filler, io.BytesIO(np.random.default_rng(0).bytes(FILLER_BYTES)))
+    return content.getvalue()
+
+
+def sources_of(address, **changes):
+    """Return sources on a server; few classes are mapped, for the test to be short."""
+    sequence = {'name': 'the demo', 'url': f'{address}/{ARCHIVE}', 'megabytes': 4.3,
+                'licence': 'Apache-2.0', 'unpacked': 9, 'queries': 4,
+                'paper': SHIPPED['sequences']['fr3']['paper']}
+    return {
+        'networks': [{'name': name, 'url': f'{address}/{name}', 'megabytes': 2, 'option': option,
+                      'licence': 'Apache-2.0'} for name, option in (
+            ('yolo.onnx', '--model'), ('clip.json', '--clip-model'),
+            ('clip.safetensors', '--clip-pretrained'))],
+        'options': [], 'remarks': ['No frame of this is real.'], 'asking': [
+            '--sweep', '50', '--workers', '1'],
+        'mapping': ['--no-joint', '--moving', 'book, bowl, mug, bottle, can, clock'],
+        'sequences': {'fr3': sequence | changes}}
+
+
+@pytest.fixture
+def write_sources(server, tmp_path):
+    """Write sources for the server with changes of the sequence; return their file."""
+    def write(**changes):
+        file = tmp_path / 'sources.yaml'
+        file.write_text(yaml.safe_dump(sources_of(
+            f'http://127.0.0.1:{server.server_port}', **changes), allow_unicode=True))
+        return file
+    return write
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """An empty cache of the user, but for the demo's converted networks."""
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+
+
+@pytest.fixture
+def refused(run_here):
+    """Run in this process, and return the one line of the error."""
+    def run(*arguments):
+        done = run_here(reproduce.main, 'fr3', *arguments)
+        assert done.returncode == 1
+        line, = (line for line in done.stderr.splitlines() if line.startswith('error: '))
+        return line
+    return run
+
+
+def kill_once(sources, out, condition):
+    """Kill a run as soon as a condition holds."""
+    log = out.with_suffix('.log')
+    with log.open('w') as file, subprocess.Popen(
+            [sys.executable, '-m', 'studies.reproduce', 'fr3', '--yes', '--trials', '2', '--out',
+             out, '--sources', sources], cwd=PROJECT, stdout=file, stderr=file) as process:
+        deadline = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert process.poll() is None and time.monotonic() < deadline, log.read_text()
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+
+
+def results_of(out):
+    """Return all that does not depend on how fast the machine is."""
+    def lasting(row):
+        return {name: value for name, value in row.items() if '_ms' not in name}
+
+    with (out / 'table.csv').open() as file:
+        table = [lasting(row) for row in csv.DictReader(file)]
+    return table, [lasting(row) for row in json.loads(
+        (out / 'fr3/evaluation/results.json').read_text())]
+
+
+def test_a_run_that_is_killed_twice_goes_on(server, write_sources, cache, run_here, tmp_path):
+    sources, out = write_sources(), tmp_path / 'out'
+    part, whole = (out / 'downloads' / f'{ARCHIVE}{end}' for end in ('.partial', ''))
+    server.held = ARCHIVE
+    kill_once(sources, out, lambda: part.exists() and part.stat().st_size)
+    size = part.stat().st_size
+    assert 0 < size <= HELD_BYTES and not whole.exists()
+    server.held = ''
+    kill_once(sources, out, lambda: any(
+        file.stat().st_size for file in out.glob('fr3/.mapped.cliploc-*.unfinished')))
+    assert (ARCHIVE, f'bytes={size}-') in server.asked
+    assert whole.read_bytes() == server.files[ARCHIVE]
+    assert not (out / 'fr3/map.yaml').exists()
+    asked = len(server.asked)
+    arguments = ('fr3', '--yes', '--trials', 2, '--sources', sources, '--out')
+    done = run_here(reproduce.main, *arguments, out)
+    assert done.returncode == 0, done.stderr
+    assert len(server.asked) == asked, 'all was there'
+    check_results(out, done.stdout)
+    once = run_here(reproduce.main, *arguments, tmp_path / 'once')
+    assert once.returncode == 0, once.stderr
+    assert results_of(out) == results_of(tmp_path / 'once')
+    before = (out / 'fr3/map.yaml').stat().st_mtime_ns
+    again = run_here(reproduce.main, *arguments, out)
+    assert again.returncode == 0 and (out / 'fr3/map.yaml').stat().st_mtime_ns == before
+    other = run_here(reproduce.main, *arguments, out, '--trials', 3)
+    assert other.returncode == 1 and 'was begun with other --sources or --trials' in other.stderr
+
+
+def check_results(out, printed):
+    text = (out / 'table.txt').read_text()
+    assert text in printed
+    row = next(line for line in text.splitlines() if re.match('hybrid +b-prosac', line))
+    assert row.endswith('0.72±0.0283     0.983±0.0638      0.926±0.226')
+    assert re.search(r'\.\d\d±\.\d\d / \.\d\d±\.\d\d / \.\d\d±\.\d\d', row)
+    assert re.search('^auto  ', text, re.MULTILINE)
+    assert 'No frame of this is real.' in text
+    with (out / 'table.csv').open() as file:
+        rows = {row['method']: row for row in csv.DictReader(file)}
+    assert (*rows,) == (*PAPER_METHODS, 'auto')
+    assert (rows['clip_bf']['paper_success'], rows['clip_bf']['paper_success_std'],
+            rows['auto']['paper_success']) == ('0.68', '0.0', '')
+    latex = (out / 'table.tex').read_text()
+    assert latex.count(r' \\') == 1 + len(rows) and '±' not in latex
+    page = (out / 'page.html').read_text()
+    assert page.count('src="data:image/png;base64,') == 3 and '0.72±0.0283' in page
+    with tarfile.open(out / 'results.tar') as archive:
+        names = archive.getnames()
+        about = json.load(archive.extractfile('reproduction/about.json'))
+    assert names == [f'reproduction/{name}' for name in (
+        'table.txt', 'table.csv', 'table.tex', 'page.html', 'about.json', 'fr3/map.yaml',
+        'fr3/evaluation/results.json', 'fr3/evaluation/summary.csv')]
+    assert (out / 'results.tar').stat().st_size < 3e6
+    assert set(about['digests']) == {ARCHIVE, 'yolo.onnx', 'clip.json', 'clip.safetensors'}
+
+
+def test_it_says_what_it_downloads_and_asks(server, write_sources, run_here, tmp_path,
+                                            monkeypatch):
+    given = ('fr3', '--sources', write_sources(), '--out', tmp_path / 'out')
+    monkeypatch.setattr(sys, 'stdin', io.StringIO('n\n'))
+    done = run_here(reproduce.main, *given)
+    assert done.returncode == 1 and 'nothing was downloaded' in done.stdout
+    for said in (f'/{ARCHIVE}', 'Apache-2.0', '10 MB to download', 'a guess',
+                 'No frame of this is real.'):
+        assert said in done.stdout
+    done = run_here(reproduce.main, *given)  # the input has ended
+    assert done.returncode == 1 and 'give --yes' in done.stderr
+    assert run_here(reproduce.main, *given, '--yes', '--plan').returncode == 0
+    assert not server.asked
+
+
+def test_what_cannot_be_downloaded(server, write_sources, refused, tmp_path):
+    given = ('--yes', '--sources', write_sources(), '--out', tmp_path / 'out')
+    weights = server.files.pop('yolo.onnx')
+    said = refused(*given)
+    assert 'cannot download' in said and '404' in said and 'Check network and address' in said
+    server.files['yolo.onnx'] = weights
+    # of another file, longer than the one that is there now
+    part = tmp_path / 'out/downloads/yolo.onnx.partial'
+    part.write_bytes(bytes(len(weights) + 1))
+    assert '416' in refused(*given)
+    assert not part.exists()
+
+
+def test_a_server_that_is_off(server, write_sources, refused, tmp_path):
+    sources = write_sources()
+    sources.write_text(sources.read_text().replace(str(server.server_port), '9'))
+    said = refused('--yes', '--sources', sources, '--out', tmp_path / 'out')
+    assert 'cannot download' in said and 'refused' in said
+    assert f'put the file there yourself, as {tmp_path}/out/downloads/yolo.onnx' in said
+
+
+def test_another_file_at_an_address(server, write_sources, refused, tmp_path):
+    given = ('--yes', '--sources', write_sources(sha256='0' * 64), '--out', tmp_path / 'out')
+    said = refused(*given)
+    assert f'expected {"0" * 64}' in said and f'kept as {ARCHIVE}.refused' in said
+    # a digest that nobody knew is compared later, too
+    (tmp_path / 'out/downloads/yolo.onnx').write_bytes(b'something else')
+    assert 'yolo.onnx has SHA-256' in refused(*given)
+    assert not (tmp_path / 'out/downloads/yolo.onnx').exists()
+
+
+def test_an_archive_that_is_cut_short(server, write_sources, refused, tmp_path):
+    server.files[ARCHIVE] = server.files[ARCHIVE][:-1000]
+    said = refused('--yes', '--sources', write_sources(), '--out', tmp_path / 'out')
+    assert 'cannot be unpacked' in said and 'run again to download it' in said
+    assert not [one for one in (tmp_path / 'out/downloads').iterdir() if ARCHIVE in one.name]
+
+
+def test_a_full_disk(write_sources, refused, tmp_path):
+    (tmp_path / 'out').mkdir()
+    sources = write_sources(megabytes=1e9)
+    said = refused('--yes', '--sources', sources, '--out', tmp_path / 'out')
+    assert 'GB are needed: make room, or set --out to another disk' in said
+    sources.write_text(re.sub('(megabytes|unpacked): .*', r'\1: 0', sources.read_text()))
+    done = subprocess.run(
+        [*small_disk(tmp_path / 'out'), sys.executable, '-m', 'studies.reproduce', 'fr3', '--yes',
+         '--out', tmp_path / 'out', '--sources', sources], cwd=PROJECT, capture_output=True,
+        text=True, env=os.environ)
+    assert done.returncode == 1
+    assert 'is full: make room, or set --out to another disk' in done.stderr
+    assert 'Traceback' not in done.stderr
+
+
+def test_another_run_in_the_folder(write_sources, refused, tmp_path):
+    (tmp_path / 'out').mkdir()
+    with (tmp_path / 'out/.lock').open('w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert 'another run is at work' in refused(
+            '--yes', '--sources', write_sources(), '--out', tmp_path / 'out')
+
+
+def test_an_output_that_cannot_be_written(write_sources, refused):
+    said = refused('--yes', '--sources', write_sources(), '--out', '/proc/nowhere')
+    assert '/proc/nowhere: cannot be written to' in said
+
+
+def test_sources_that_lack_something(refused, tmp_path):
+    file = tmp_path / 'sources.yaml'
+    for text in ('networks: []\n', 'networks: []\nsequences: {fr2: {name: a}}\n'):
+        file.write_text(text)
+        assert 'is not like reproduce.yaml' in refused('--sources', file)
+    content = sources_of('http://127.0.0.1:9')
+    content['sequences'] = {}
+    file.write_text(yaml.safe_dump(content))
+    assert 'has no sequence fr3' in refused('--sources', file)
+
+
+def test_seven_scenes_is_an_archive_in_an_archive(shared_data, tmp_path):
+    frames = sorted((shared_data / 'seven_scenes_kitchen').glob('frame-*'))[:30]
+    inner = io.BytesIO()
+    with zipfile.ZipFile(inner, 'w') as archive:
+        for file in frames:
+            archive.write(file, f'seq-01/{file.name}')
+    (tmp_path / 'downloads').mkdir()
+    with zipfile.ZipFile(tmp_path / 'downloads/kitchen.zip', 'w') as archive:
+        archive.writestr('kitchen/seq-01.zip', inner.getvalue())
+    one = reproduce.Recording(
+        name='', url='http://127.0.0.1:9/kitchen.zip', megabytes=1, licence='', unpacked=1,
+        queries=3, inner='kitchen/seq-01.zip')
+    folder = reproduce.unpacked(one, tmp_path, tmp_path)
+    assert folder == tmp_path / 'frames/seq-01'
+    reproduce.write_bags(one, folder, tmp_path)
+    stamps = [[raw.stamp_ns for raw in bag_frames(
+        tmp_path / name, BagTopics('/image/compressed', '/camera_info'),
+        find_poses(0, GROUND_TRUTH, None, 0, 0, None)).read_raw(lambda *_: True)]
+        for name in ('mapped', 'asked')]
+    assert [len(some) for some in stamps] == [5, 3]
+    assert not set(stamps[0]) & set(stamps[1])
+    shutil.rmtree(tmp_path / 'frames')
+    with pytest.raises(DatasetError, match='no item named'):
+        reproduce.unpacked(reproduce.Recording(
+            name='', url=one.url, megabytes=1, licence='', unpacked=1, queries=3,
+            inner='other.zip'), tmp_path, tmp_path)
+
+
+def test_the_form_of_the_shipped_sources():
+    """The addresses cannot be opened here."""
+    sources = reproduce.Sources.of_file(PROJECT / 'studies/reproduce.yaml')
+    assert (*sources.recordings,) == ('fr2', 'fr3', 'kitchen')
+    for one in (*sources.networks, *sources.recordings.values()):
+        address = urlparse(one.url)
+        assert address.scheme == 'https' and address.hostname in {
+            'cvg.cit.tum.de', 'download.microsoft.com', 'github.com',
+            'openaipublic.azureedge.net'}
+        assert Path(address.path).suffix in ('.tgz', '.zip', '.pt')
+        assert re.fullmatch('([0-9a-f]{64})?', one.sha256)
+        assert one.licence and one.megabytes > 0
+    encoder = sources.networks[1]
+    assert encoder.sha256 in encoder.url
+    paper = (PROJECT.parent / 'shared/paper/clip-loc.tex')
+    numbers = set(re.findall(r'[\d.]+\\pm[\d.]+', paper.read_text())) if paper.exists() else None
+    for name in ('fr2', 'fr3'):
+        table = sources.recordings[name].paper
+        assert (*table,) == PAPER_METHODS
+        printed = {cell.replace('±', r'\pm') for row in table.values() for cell in row}
+        assert numbers is None or printed <= numbers
+    networks = [*sources.options, *(word for one in sources.networks
+                                    for word in (one.option, one.file))]
+    build_map.make_parser().parse_args(
+        ['--bag', 'a', '--out', 'b', *networks, *sources.mapping])
+    for one in sources.recordings.values():
+        evaluate.make_parser().parse_args(
+            ['--bag', 'a', '--map', 'b', *networks, *sources.asking, *one.asking])
+    assert subprocess.run(['bash', '-n', PROJECT / 'script/reproduce'], check=False
+                          ).returncode == 0
