@@ -88,8 +88,8 @@ class OnnxNetwork:
     def __init__(self, file: Path, cache_dir: str, precision: str | None = 'f32') -> None:
         check_weights_file(file)
         if import_openvino() is None:
-            raise ModelError(f'{file} needs OpenVINO, which is not installed: pip install '
-                             'openvino')
+            raise ModelError(f"{file} needs OpenVINO, which is not installed: pip install "
+                             "openvino, or the extra 'runtime'")
         self.file = file
         folder = _folder(file, cache_dir, precision)
         try:
