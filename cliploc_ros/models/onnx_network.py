@@ -202,6 +202,8 @@ def _compile(file: Path, folder: Path, precision: str | None) -> tuple[Any, dict
     del network
     try:
         keep_folder(folder, _MOST_NETWORKS, partial(_write, compiled, metadata))
+        # Read again: then the weights are in memory once, and the file is known to be sound.
+        compiled, _ = _stored(folder, precision)
     except Exception as error:  # OpenVINO reports a full disk as it reports a bad network
         warn_not_kept('the compiled network is not cached and the next start is slow again: '
                       f'cannot write {folder} ({first_line(error)}); make room, or choose a '
