@@ -115,7 +115,7 @@ def quiet_export() -> Iterator[None]:
     """Export without the warnings of constants in a trace: a probe tests them."""
     import torch
 
-    fast = torch.backends.mha.get_fastpath_enabled()
+    fast, threads = torch.backends.mha.get_fastpath_enabled(), torch.get_num_threads()
     torch.backends.mha.set_fastpath_enabled(False)  # ONNX has no such operation
     try:
         with warnings.catch_warnings(), torch.no_grad():
@@ -123,6 +123,7 @@ def quiet_export() -> Iterator[None]:
             yield
     finally:
         torch.backends.mha.set_fastpath_enabled(fast)
+        torch.set_num_threads(threads)  # ultralytics takes one for an export
 
 
 def halve(file: Path) -> None:

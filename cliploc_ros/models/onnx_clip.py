@@ -192,8 +192,12 @@ def _of_text(folder: Path, *names: str) -> int:
 
 def _read_tokenizer(folder: Path) -> tuple[Any, int]:
     """Return the tokenizer of a folder, and the token that fills the end of a text."""
-    import tokenizers
-
+    try:
+        import ftfy  # noqa: F401
+        import tokenizers
+    except ModuleNotFoundError as error:
+        raise ModelError(f"{error.name} is not installed, and labels need it: pip install "
+                         f"{error.name}, or the extra 'runtime'") from error
     files = [file for file in (folder / TOKENIZER, folder / 'textual' / TOKENIZER)
              if file.exists()]
     if not files:

@@ -88,8 +88,8 @@ class OnnxNetwork:
     def __init__(self, file: Path, cache_dir: str, precision: str | None = 'f32') -> None:
         check_weights_file(file)
         if import_openvino() is None:
-            raise ModelError(f'{file} needs OpenVINO, which is not installed: pip install '
-                             'openvino')
+            raise ModelError(f"{file} needs OpenVINO, which is not installed: pip install "
+                             "openvino, or the extra 'runtime'")
         self.file = file
         folder = _folder(file, cache_dir, precision)
         try:
@@ -202,6 +202,8 @@ def _compile(file: Path, folder: Path, precision: str | None) -> tuple[Any, dict
     del network
     try:
         keep_folder(folder, _MOST_NETWORKS, partial(_write, compiled, metadata))
+        # Read again: then the weights are in memory once, and the file is known to be sound.
+        compiled, _ = _stored(folder, precision)
     except Exception as error:  # OpenVINO reports a full disk as it reports a bad network
         warn_not_kept('the compiled network is not cached and the next start is slow again: '
                       f'cannot write {folder} ({first_line(error)}); make room, or choose a '
