@@ -51,7 +51,7 @@ def test_refits_to_a_recording(import_map, office, table, observations, tmp_path
     print(f'{len(found)} landmarks, median error {np.median(errors_m) * 100:.1f} cm')
     assert len(found) >= 30 and np.median(errors_m) < 0.03
     assert {one.source for one in found.details} == {'import_map csv theirs.csv'}
-    assert all(one.support >= 3 and one.position_sigma < 0.05 and one.shared_sigma is None
+    assert all(one.support >= 3 and one.position_sigma < 0.1 and one.shared_sigma is None
                for one in found.details)
     left_out = {one['landmark_id']: one['reason'] for one in json.loads(report.read_text())[
         'left_out']}

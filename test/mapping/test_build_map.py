@@ -60,6 +60,13 @@ def test_noise_and_missed_boxes_cost_little():
         assert details.position_sigma < 0.02
 
 
+def test_many_views_leave_an_uncertainty_that_all_share():
+    few, many = (build_map(see(make_table(), walk_around(frames), noise_px=3.0)).landmark_map
+                 for frames in (20, 180))
+    # errors that are independent in each view would make it a third
+    assert 0.6 < np.median(many.position_sigmas) / np.median(few.position_sigmas) < 1.0
+
+
 def test_equal_seed_and_input_give_an_equal_map():
     detections = see(make_table(), walk_around(), noise_px=3.0)
     first, second = build_map(detections), build_map(detections)

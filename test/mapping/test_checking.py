@@ -72,6 +72,7 @@ def rooms_report():
 
 def test_a_true_map_has_no_fault_and_its_frames_are_accepted(report):
     assert all(one.faults == () for one in report.landmarks)
+    assert any('set `height_range_m` to [' in note for note in report.notes)
     recording, grid = report.recording, report.grid
     assert recording.held_out.explained == 1.0
     assert 0.9 < recording.held_out.median_iou < 1.0
@@ -151,6 +152,9 @@ def test_a_shifted_landmark_is_told_its_offset(detections):
     assert worst.landmark_id == 'thing_4'
     assert worst.offset_m == pytest.approx(0.12, abs=0.01)
     assert any('is 12 cm away' in fault for fault in worst.faults)
+    # how uncertain a map is, it says itself
+    sure = replace(shifted, details=(LandmarkDetails(position_sigma=0.07),) * len(TABLE))
+    assert {one.position_sigma_m for one in check_landmarks(sure, witness, [])} == {0.07}
 
 
 @pytest.mark.parametrize('turn_deg', [0.0, 35.0, -120.0])

@@ -129,7 +129,7 @@ def views_of(stamps_s, frames):
                  np.zeros(count, int), np.zeros((count, 3)), np.arange(count), np.ones(count),
                  np.searchsorted(frames, np.arange(count + 1)), frames, np.zeros(boxes, int),
                  nothing, nothing, nothing > 0, np.zeros((count, 4)), np.zeros(boxes),
-                 np.zeros(boxes))
+                 np.zeros(boxes), np.tile([np.inf, 1.0], (boxes, 1)))
 
 
 @pytest.mark.parametrize('correlation_s', [0.0, 3.0, 200.0])

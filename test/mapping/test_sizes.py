@@ -6,12 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from walk import make_table, see, walk_around
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.report import BY_OBJECTS, Measure
-from cliploc_ros.offline.mapping.check.sizes import scale_by_sizes, size_of_class
+from cliploc_ros.offline.mapping.fitting import fit_ellipsoid
 from cliploc_ros.offline.mapping.options import CheckOptions
+from cliploc_ros.offline.mapping.sizes import log_sizes, scale_by_sizes, size_of_class
+from cliploc_ros.offline.mapping.views import make_views
 
 QUICK = CheckOptions(max_positions=4, headings=4)
 
@@ -72,3 +75,34 @@ def test_a_map_whose_objects_carry_nothing_is_keyframes_only(office):
 
 def replace_value(measure, value):
     return measure._replace(value=value)
+
+
+def bottle(semi_axes):
+    """A table with one bottle, upright."""
+    table = make_table(2).select([1])
+    assert table.class_ids == ('bottle',)
+    return replace(table, semi_axes=np.array([semi_axes]))
+
+
+def with_sizes(detections):
+    """Return views that know sizes, as they do with depth, and no depth."""
+    return make_views(detections)._replace(
+        sizes=log_sizes(detections.class_names)[detections.classes])
+
+
+def longest(views, center, basis):
+    """Return the longest extent of the fit from a start [m]."""
+    fit = fit_ellipsoid(views, np.arange(len(views.frames)), center, basis)
+    return 2.0 * np.linalg.norm(fit.basis, axis=0).max()
+
+
+def test_the_size_of_a_class_decides_only_where_boxes_of_one_side_do_not():
+    # errors of boxes that differ by 6 degrees look like a bottle that is long along the rays
+    table, size = bottle([0.8, 0.04, 0.13]), size_of_class('bottle')
+    table = replace(table, quats_xyzw=np.array([[0.0, 0.0, 0.0, 1.0]]))
+    start = table.centers[0], 0.1 * np.eye(3)
+    one_side, all_sides = (see(table, walk, noise_px=1.0) for walk in (
+        walk_around(40, turn_deg=6.0), walk_around(30)))
+    unknown = make_views(one_side)  # as without depth
+    assert longest(unknown, *start) > size.most_m > longest(with_sizes(one_side), *start)
+    assert longest(with_sizes(all_sides), *start) == pytest.approx(1.6, rel=0.03)

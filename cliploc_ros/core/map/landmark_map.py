@@ -46,7 +46,7 @@ from cliploc_ros.files.storage import finish_set
 _UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation')
 #: Standard deviation of a centre on each axis [m] where the map has no position_sigma: a guess for
-#: maps made by hand. Landmarks of build_map have .006 (median, TUM fr3), simulated ones .005 to
+#: maps made by hand. Landmarks of build_map have .012 (median, TUM fr3), simulated ones .005 to
 #: .04. On the TUM map, which has none, 0 to .03 localize equally well.
 DEFAULT_SIGMA_M = 0.02
 _MAX_TEXT_LENGTH = 1000

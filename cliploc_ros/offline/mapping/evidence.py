@@ -18,13 +18,8 @@ from cliploc_ros.core.map import visibility
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.visibility import HIDDEN_SHARE, SHOWN_SHARE
 from cliploc_ros.offline.mapping.association import find_overlaps, ious_with
-from cliploc_ros.offline.mapping.fitting import accumulate
-from cliploc_ros.offline.mapping.landmarks import (
-    LANDMARK_SIZE,
-    Landmarks,
-    group_boxes,
-    project_box,
-)
+from cliploc_ros.offline.mapping.fitting import centre_covariance
+from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes, project_box
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.views import Views
 
@@ -34,7 +29,7 @@ REACH = 1.2
 #: Of the boxes of a landmark in a map.
 MIN_MEDIAN_IOU = 0.5
 #: The centre of a large landmark may deviate by this share of its size.
-MAX_SIGMA_SHARE = 0.1
+MAX_SIGMA_SHARE = 0.2
 # IoU from which a landmark explains a box of its class.
 _EXPLAINED_IOU = 0.3
 # A class with fewer boxes is taken to be seen at the sizes of its boxes and of all classes only.
@@ -92,18 +87,11 @@ def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
         frames = views.frames[rows]
         offsets = center - cameras[frames]
         distances = np.linalg.norm(offsets, axis=1)
-        information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
-        accumulate(views, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
-        try:
-            variance = np.linalg.eigvalsh(np.linalg.inv(information)[:3, :3])[-1]
-        except np.linalg.LinAlgError:  # boxes that the image cuts on all sides leave it open
-            variance = np.inf
         columns.append((
             len(rows), len(np.unique(views.viewpoints[frames])),
             is_expected(views, cameras, center, basis, REACH * distances.max()).sum(),
             widest_angle_deg(offsets / distances[:, None]),
-            # rounding makes what no box restrains negative
-            np.sqrt(variance) if variance > 0.0 else np.inf,
+            np.sqrt(np.linalg.eigvalsh(centre_covariance(views, rows, center, basis))[-1]),
             np.median(ious_with(views, rows, center, basis)), views.stamps_s[frames].max()))
     values = np.array(columns, dtype=np.float64).reshape(-1, 7).T
     return Evidence(*values[:3].astype(np.int64), *values[3:])
@@ -143,8 +131,10 @@ def is_expected(views, cameras, center, basis, reach):
 def reasons_against(landmarks: Landmarks, evidence: Evidence, options: MappingOptions
                     ) -> list[str | None]:
     """Return for each landmark why it stays out of the map; None where it belongs into it."""
-    return [_reason(evidence, number, float(np.linalg.norm(basis)), options)
-            for number, basis in enumerate(landmarks.bases)]
+    # by its volume: what is drawn out along the rays is uncertain, not large
+    sizes_m = np.sqrt(3.0) * np.cbrt(np.abs(np.linalg.det(landmarks.bases)))
+    return [_reason(evidence, number, size_m, options)
+            for number, size_m in enumerate(sizes_m.tolist())]
 
 
 def _reason(evidence: Evidence, number: int, size_m: float, options: MappingOptions) -> str | None:

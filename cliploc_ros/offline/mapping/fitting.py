@@ -6,7 +6,9 @@ Each edge that does not lie at the image border gives a residual: projected edge
 edge, in standard deviations. An edge at the border only bounds the object: it counts where the
 projection ends inside of it. A measured depth gives one more residual. Residuals r pass through
 the Cauchy loss c^2/2 log(1 + r^2/c^2). A weak prior draws the logarithms of the semi-axes to
-their mean, since boxes from similar directions leave the thickness open.
+their mean, since boxes from similar directions leave the thickness open. Where depth lets boxes of
+one side suffice, each semi-axis that is longer than objects of the class are gives a residual of
+its logarithm, with the same loss, for the same reason.
 """
 
 from math import log, sqrt
@@ -33,6 +35,11 @@ _AXIS_SPREAD = 0.7
 # An ellipsoid that is not wholly in front of a camera costs what four edges this far off cost.
 _BEHIND_RESIDUAL = 20.0
 _BEHIND_COST = 4.0 * 20.0
+# Objects are no ellipsoids, and detectors have habits: the boxes of one landmark err alike. A mean
+# of any number of viewpoints keeps this share of the variance. Chosen on TUM fr3 and the demo: .59
+# and .84 of all errors are within a deviation, .93 and 1.00 within three.
+_ALIKE = 0.15
+_UNKNOWN_M = 1e6
 _MAX_DAMPING = 1e7
 _LEAST_IMPROVEMENT = 1e-4
 # Greatest change of a logarithm, and of the centre in greatest semi-axes, in one step.
@@ -72,6 +79,25 @@ def fit_ellipsoid(views: Views, rows: NDArray[np.int64], center: NDArray[np.floa
     cost = descend(views, np.ascontiguousarray(rows, dtype=np.int64), center, basis, iterations,
                    information)
     return Fit(center, basis, cost, information)
+
+
+def centre_covariance(views: Views, rows: NDArray[np.int64], center: NDArray[np.float64],
+                      basis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the covariance (3, 3) [m^2] of a centre that was fitted to the boxes of some rows.
+
+    All who ask how uncertain a landmark is get this answer. Where its boxes do not restrain a
+    landmark, it is a large multiple of the identity. The size of its class does not count.
+    """
+    information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
+    accumulate(views.without_sizes, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
+    alike = 1.0 + _ALIKE * len(np.unique(views.viewpoints[views.frames[rows]]))
+    try:
+        covariance = alike * np.linalg.inv(information)[:3, :3]
+    except np.linalg.LinAlgError:  # boxes that the image cuts on all sides leave it open
+        covariance = np.full((3, 3), np.nan)
+    # rounding makes what no box restrains negative
+    is_known = np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0.0
+    return covariance if is_known else _UNKNOWN_M ** 2 * np.eye(3)
 
 
 @compiled
@@ -146,7 +172,8 @@ def accumulate(views, rows, center, basis, information, gradient):
                 for j in range(i + 1):
                     information[i, j] += scaled * stiffness * by_landmark[edge, j]
         cost += share * add_depth(views, row, center, share, information, gradient)
-    cost += add_axis_prior(basis, information, gradient)
+    size = _largest(views.sizes[rows], np.zeros_like(rows), 1)[0]
+    cost += add_axis_prior(basis, size, information, gradient)
     for i in range(LANDMARK_SIZE):
         for j in range(i):
             information[j, i] = information[i, j]
@@ -198,10 +225,21 @@ def robust_weight(residual):
 
 
 @compiled
-def add_axis_prior(basis, information, gradient):
+def _largest(sizes, numbers, count):
+    """Return the largest of the sizes (m, 2) of boxes of each of a number of landmarks."""
+    largest = np.full((count, 2), -np.inf)
+    for place in range(len(sizes)):
+        if sizes[place, 0] > largest[numbers[place], 0]:
+            largest[numbers[place]] = sizes[place]
+    return largest
+
+
+@compiled
+def add_axis_prior(basis, size, information, gradient):
     """Add the prior on the semi-axes to the normal equations; return its cost.
 
-    The logarithm of a semi-axis changes by half of its diagonal element of D.
+    The logarithm of a semi-axis changes by half of its diagonal element of D. The size (2,) is
+    that of Views.sizes, of the largest class among the landmark's boxes.
     """
     logs = np.empty(3)
     for k in range(3):
@@ -212,6 +250,12 @@ def add_axis_prior(basis, information, gradient):
     for k in range(3):
         residual = (logs[k] - mean) / _AXIS_SPREAD
         cost += 0.5 * residual * residual
+        excess = (logs[k] - size[0]) * size[1]
+        if excess > 0.0:
+            cost += robust_cost(excess)
+            weight = robust_weight(excess)
+            gradient[diagonal[k]] += 0.5 * weight * size[1] * excess
+            information[diagonal[k], diagonal[k]] += 0.25 * weight * size[1] * size[1]
         for i in range(3):
             slope = ((0.5 if i == k else 0.0) - 1.0 / 6.0) / _AXIS_SPREAD
             gradient[diagonal[i]] += slope * residual
@@ -280,6 +324,7 @@ def accumulate_all(views, rows, landmarks, centers, bases, of_landmarks, of_pose
                    landmark_gradient, pose_gradient):
     """Add up the normal equations of all boxes; return their cost, the axis prior included."""
     cost, box = 0.0, np.empty(4)
+    sizes = _largest(views.sizes[rows], landmarks, len(centers))
     by_landmark, by_motion = np.empty((4, LANDMARK_SIZE)), np.empty((4, POSE_SIZE))
     for place in range(len(rows)):
         row, landmark = rows[place], landmarks[place]
@@ -320,7 +365,8 @@ def accumulate_all(views, rows, landmarks, centers, bases, of_landmarks, of_pose
                     of_boxes[place, i, j] += weight * by_pose[edge, i] * by_landmark[edge, j]
     for landmark in range(len(centers)):
         lower = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
-        cost += add_axis_prior(bases[landmark], lower, landmark_gradient[landmark])
+        cost += add_axis_prior(bases[landmark], sizes[landmark], lower,
+                               landmark_gradient[landmark])
         for i in range(LANDMARK_SIZE):
             for j in range(i + 1):
                 of_landmarks[landmark, i, j] += lower[i, j]

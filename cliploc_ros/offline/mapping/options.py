@@ -88,7 +88,7 @@ class MappingOptions:
     min_seen_ratio: float = 0.03
     min_baseline_deg: float = 20.0  #: Least angle between two of its directions [deg]
     #: Greatest deviation of a centre [m]; of a large landmark, see evidence.MAX_SIGMA_SHARE
-    max_position_sigma_m: float = 0.05
+    max_position_sigma_m: float = 0.08
     #: Refine the poses with the landmarks, as far as they may be off; None: poses are exact
     pose_errors: PoseErrors | None = None
     #: Without pose_errors, estimate them, and refine the poses where they are significant

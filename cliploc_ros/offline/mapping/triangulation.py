@@ -27,6 +27,7 @@ from cliploc_ros.offline.mapping.landmarks import (
 )
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.sizes import log_sizes
 from cliploc_ros.offline.mapping.views import Views
 
 # How far the centre lies behind the surface, in radii that the box suggests, and the standard
@@ -43,8 +44,8 @@ _UNIT_FACTOR = 1.6
 _LEAST_CORRECTION = 0.02
 
 # With depth a landmark may deviate this much [m]: along the rays, which its boxes hardly show.
-# Chosen on the kitchen's frames, where .05 m leaves out a sixth of the explained boxes.
-_MAX_POSITION_SIGMA_M = 0.1
+# Chosen on the kitchen's frames, where half of it leaves out a sixth of the explained boxes.
+_MAX_POSITION_SIGMA_M = 0.15
 # Angles between the rays of a pair: less leaves the depth open, more shows other sides.
 _PARALLAX_DEG = (5.0, 75.0)
 _GREATEST_COSINE, _LEAST_COSINE = (float(value) for value in np.cos(np.radians(_PARALLAX_DEG)))
@@ -68,8 +69,9 @@ def options_with_depth(options: MappingOptions) -> MappingOptions:
 
 def add_depths(views: Views, detections: PosedDetections,
                scales: NDArray[np.float64] | None = None) -> Views:
-    """Return views that know how deep the centre of each box's object lies.
+    """Return views that know how deep the centre of each box's object lies, and class sizes.
 
+    With depth, boxes of one side place a landmark, but leave open how long it is along the rays.
     The scales are true depth divided by measured depth, of each camera; None: all are 1.
     """
     assert detections.depths is not None
@@ -84,7 +86,8 @@ def add_depths(views: Views, detections: PosedDetections,
                      + np.square(_CENTER_SIGMA * radii * centers))
     known = np.isfinite(centers) & np.isfinite(sigmas)
     return views._replace(depths=np.where(known, centers, 0.0), depth_stiffness=np.where(
-        known, 1.0 / np.where(known, sigmas, 1.0), 0.0))
+        known, 1.0 / np.where(known, sigmas, 1.0), 0.0),
+        sizes=log_sizes(detections.class_names)[detections.classes])
 
 
 def box_radii(views: Views, rows: NDArray[np.int64]) -> NDArray[np.float64]:

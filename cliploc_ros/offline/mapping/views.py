@@ -12,6 +12,8 @@ from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.simulation import EDGE_SIGMA_PX, EDGE_SIGMA_SHARE
 
+#: In Views.sizes.
+NO_SIZE = (np.inf, 1.0)
 # An edge this near to the image border is open: the object may extend beyond it.
 _BORDER_PX = 3.0
 # Two frames less than this apart in both show a landmark from one viewpoint.
@@ -55,6 +57,9 @@ class Views(NamedTuple):
     #: unknown
     depths: NDArray[np.float64]
     depth_stiffness: NDArray[np.float64]
+    #: (n, 2): logarithm of half the longest extent [m] of objects of the box's class and its
+    #: inverse standard deviation, see cliploc_ros.offline.mapping.sizes; of recordings with depth
+    sizes: NDArray[np.float64]
 
     @property
     def centers(self) -> NDArray[np.float64]:
@@ -68,6 +73,11 @@ class Views(NamedTuple):
         poses[:, :3, :3] = self.rotations.transpose(0, 2, 1)
         poses[:, :3, 3] = self.centers
         return poses
+
+    @property
+    def without_sizes(self) -> 'Views':
+        """Return the same views with classes of no known size."""
+        return self._replace(sizes=np.tile(NO_SIZE, (len(self.frames), 1)))
 
     def with_poses(self, map_from_camera: NDArray[np.float64]) -> 'Views':
         """Return the same views with other poses (F, 4, 4)."""
@@ -84,7 +94,8 @@ class Views(NamedTuple):
             self.weights[frames],
             self.offsets[first:last + 1] - boxes.start, self.frames[boxes] - first,
             self.classes[boxes], self.edges[boxes], self.stiffness[boxes], self.is_open[boxes],
-            self.bounds[frames], self.depths[boxes], self.depth_stiffness[boxes])
+            self.bounds[frames], self.depths[boxes], self.depth_stiffness[boxes],
+            self.sizes[boxes])
 
 
 def make_views(detections: PosedDetections) -> Views:
@@ -114,7 +125,7 @@ def make_views(detections: PosedDetections) -> Views:
         detections.frame_offsets, detections.frames, detections.classes,
         (boxes_px - principals[of_boxes]) / focals[of_boxes], focals[of_boxes] / deviations_px,
         is_open, ((bounds_px - principals) / focals)[detections.frame_cameras],
-        np.zeros(len(boxes_px)), np.zeros(len(boxes_px)))
+        np.zeros(len(boxes_px)), np.zeros(len(boxes_px)), np.tile(NO_SIZE, (len(boxes_px), 1)))
 
 
 def at_border(boxes_px: NDArray[np.float64], sizes: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -41,10 +42,10 @@ from cliploc_ros.offline.mapping.check.report import (
     check_keyframes,
     find_measures,
 )
-from cliploc_ros.offline.mapping.check.sizes import scale_by_sizes
 from cliploc_ros.offline.mapping.evidence import BoxQuality, best_ious, explained_boxes
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.sizes import scale_by_sizes
 from cliploc_ros.offline.mapping.systematic import find_corrections
 from cliploc_ros.offline.mapping.tilt import tilt_note
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views
@@ -58,6 +59,8 @@ _NOTES = (
 _NO_RECORDING = (
     'no recording: the detector is a guess that finds 60 % of the objects in view within 5 m, in '
     'images of 640 x 480 px with a focal length of 525 px')
+# A robot's camera is this much above or below those of the recording at most [m], a guess.
+_HEIGHT_MARGIN_M = 0.3
 
 
 def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = None,
@@ -111,6 +114,7 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         notes += _notes_on(recording)
         if note := tilt_note(detections.map_from_camera):
             notes.append(note)
+    notes.append(_where_cameras_can_be(recorded))
     overlaps = find_map_overlaps(landmark_map, witness, views)
     places = make_grid(landmark_map, None if detections is None else detections.of_first_camera,
                        options)
@@ -186,6 +190,17 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
         trials=tuple(trials), simulated=tuple(simulated),
         corrections=tuple(find_corrections(detections, views, witness.fitted, witness.shown)),
         edge_scale=models[0].edge_scale)
+
+
+def _where_cameras_can_be(recorded: NDArray[np.float64] | None) -> str:
+    """Return what is known of where the cameras (F, 4, 4) of accepted poses can be."""
+    known = 'accepted poses may lie anywhere: the map does not know where cameras can be'
+    if recorded is None:
+        return f'{known}, and no recording tells their heights: set `height_range_m`'
+    low, high = recorded[:, 2, 3].min(), recorded[:, 2, 3].max()
+    return (f'{known}; those of the recording were {low:.2f} to {high:.2f} m high. For a camera '
+            f'of such a height, set `height_range_m` to [{low - _HEIGHT_MARGIN_M:.1f}, '
+            f'{high + _HEIGHT_MARGIN_M:.1f}]')
 
 
 def _notes_on(recording: RecordingCheck) -> list[str]:

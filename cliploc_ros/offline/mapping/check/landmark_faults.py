@@ -14,7 +14,6 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import misspelt_classes
 from cliploc_ros.offline.mapping.association import associate
-from cliploc_ros.offline.mapping.check.sizes import size_of_class
 from cliploc_ros.offline.mapping.doubles import close_pairs, find_doubles
 from cliploc_ros.offline.mapping.evidence import (
     MAX_SIGMA_SHARE,
@@ -26,6 +25,7 @@ from cliploc_ros.offline.mapping.evidence import (
 from cliploc_ros.offline.mapping.fitting import fit_landmarks
 from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of, landmarks_of_map
 from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.sizes import size_of_class
 from cliploc_ros.offline.mapping.views import Views
 from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
 
@@ -201,8 +201,8 @@ def _class_of_label(label: str, class_id: str, by_words: Mapping[tuple[str, ...]
 
 def _support(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> dict[str, Any]:
     """Return the numbers of a landmark's support: from a recording, or from the map itself."""
+    given = landmark_map.details[row] if landmark_map.details else LandmarkDetails()
     if witness is None:
-        given = landmark_map.details[row] if landmark_map.details else LandmarkDetails()
         return {'support': given.support, 'seen_ratio': given.seen_ratio,
                 'baseline_deg': given.baseline_deg, 'position_sigma_m': given.position_sigma}
     evidence, expected = witness.evidence, int(witness.expected[row])
@@ -213,7 +213,9 @@ def _support(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> di
     return {'support': int(evidence.support[row]), 'expected': expected,
             'seen_ratio': float(evidence.seen_ratio[row]),
             'baseline_deg': float(evidence.baseline_deg[row]),
-            'position_sigma_m': float(evidence.position_sigma[row]),
+            # what the map says of itself is what localization reckons with
+            'position_sigma_m': float(evidence.position_sigma[row])
+            if given.position_sigma is None else given.position_sigma,
             'offset_m': offset if is_told else None,
             'median_iou': float(evidence.median_iou[row])}
 

@@ -19,7 +19,7 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU, associate
 from cliploc_ros.offline.mapping.building import REFINEMENTS
-from cliploc_ros.offline.mapping.fitting import fit_ellipsoid
+from cliploc_ros.offline.mapping.fitting import centre_covariance, fit_ellipsoid
 from cliploc_ros.offline.mapping.joint import Anchors, pose_changes, pose_errors, refine_jointly
 from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
@@ -106,8 +106,8 @@ def refit(views: Views, landmarks: Landmarks, shown: NDArray[np.int64], min_view
         if len(np.unique(views.viewpoints[views.frames[rows]])) >= min_viewpoints:
             fit = fit_ellipsoid(views, rows, centers[number], bases[number])
             centers[number], bases[number] = fit.center, fit.basis
-            covariances[number] = (np.linalg.inv(fit.information)[:3, :3]
-                                   + _LEAST_SIGMA_M ** 2 * np.eye(3))
+            covariances[number] = centre_covariance(views, rows, fit.center, fit.basis)
+            covariances[number] += _LEAST_SIGMA_M ** 2 * np.eye(3)
     return Refits(landmarks._replace(centers=centers, bases=bases), covariances)
 
 

@@ -2,15 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """How large objects of a class are: evidence on landmarks, and on the scale of a map."""
 
+from collections.abc import Iterable
 from functools import cache
 from importlib.resources import files
 from typing import NamedTuple
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.views import NO_SIZE
 from cliploc_ros.offline.vocabulary.vocabulary import common_name
 
 # The scale of a map is told by as many classes as this. A whole map is off by more than this
@@ -33,6 +36,16 @@ class Size(NamedTuple):
 def size_of_class(name: str) -> Size | None:
     """Return the size of objects of a class, which may have capitals; None: it has no size."""
     return _sizes().get(common_name(name))
+
+
+def log_sizes(names: Iterable[str]) -> NDArray[np.float64]:
+    """Return how large objects of classes are (C, 2), as Views.sizes has it.
+
+    The factor within which nearly all objects lie counts as two standard deviations.
+    """
+    sizes = [size_of_class(name) for name in names]
+    return np.array([NO_SIZE if one is None else
+                     (np.log(0.5 * one.extent_m), 2.0 / np.log(one.factor)) for one in sizes])
 
 
 @cache
