@@ -109,7 +109,7 @@ def write_page(folder: Path, reviews: Sequence[Review], method: str, section: st
         section,
         fold(f'All figures; method {method}', table([name for name, _ in _COLUMNS], rows)),
         # several cameras have pictures without a list of matches
-        fold('How to read the pictures', how, '' if any(one.beside for one in reviews)
+        fold('How to read the pictures', how, '' if any(review.beside for review in reviews)
              else _LIST), *pictures))
     return page_file
 

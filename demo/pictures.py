@@ -54,10 +54,10 @@ def draw_wake_up(review: Review, landmark_map: LandmarkMap, path: Path) -> None:
     numbers = _numbers(review)
     if review.beside:
         views = {review.camera_name: review, **review.beside}
-        for place, (name, one) in enumerate(views.items()):
+        for place, (name, view) in enumerate(views.items()):
             axes = figure.add_axes((0.008 + 0.496 * (place % 2), 0.48 - 0.45 * (place // 2),
                                     0.488, 0.425))
-            _draw_image(axes, one, landmark_map, _numbers(one), is_numbered=False)
+            _draw_image(axes, view, landmark_map, _numbers(view), is_numbered=False)
             axes.set_title(name, loc='left', fontsize=10, pad=3)
     else:
         _draw_image(figure.add_axes((0.008, 0.075, 0.552, 0.84)), review, landmark_map, numbers)
@@ -273,11 +273,11 @@ def draw_kidnapped(file: Path, camera: Camera, detections: Detections, landmark_
     for axes in figure.axes[2:]:
         axes.remove()
     timeline = figure.add_subplot(grid[1, :])
-    lost = next(row for row, one in enumerate(moments) if one.state == 'lost')
+    lost = next(row for row, moment in enumerate(moments) if moment.state == 'lost')
     _draw_expected(view, file, camera, detections, landmark_map, moments[lost].localized)
     _draw_ways(top, landmark_map, moments)
-    times = np.array([one.time_s for one in moments])
-    errors = [pose_error(one.localized, one.truth)[0] for one in moments]
+    times = np.array([moment.time_s for moment in moments])
+    errors = [pose_error(moment.localized, moment.truth)[0] for moment in moments]
     for one, end in zip(moments, times[1:], strict=False):
         timeline.axvspan(one.time_s, end, color=_STATES.get(one.state, '#FFFFFF'), linewidth=0)
     timeline.plot(times, errors, color=_TRUTH, linewidth=2.0)
@@ -307,7 +307,7 @@ def _draw_ways(axes: Axes, landmark_map: LandmarkMap, moments: Sequence[Moment])
     """Draw the way of the robot, and that of its localizer's poses."""
     draw_map(axes, landmark_map)
     for name, color, style in (('truth', _TRUTH, '-'), ('localized', BAD, '--')):
-        way = np.array([getattr(one, name)[:2, 3] for one in moments])
+        way = np.array([getattr(moment, name)[:2, 3] for moment in moments])
         jumps = np.nonzero(np.linalg.norm(np.diff(way, axis=0), axis=1) > 1.0)[0] + 1
         for number, part in enumerate(np.split(way, jumps)):
             axes.plot(*part.T, color=color, linestyle=style, linewidth=2.0,

@@ -86,7 +86,7 @@ def true_ids(bboxes_xyxy: npt.NDArray[np.float64], true_boxes: Sequence[TrueBox]
              ) -> tuple[str, ...]:
     """Return the object whose visible part fills each box (n, 4), or ''."""
     ids = []
-    of_objects = np.array([one.bbox_xyxy for one in true_boxes]).reshape(-1, 4)
+    of_objects = np.array([box.bbox_xyxy for box in true_boxes]).reshape(-1, 4)
     for ious in box_ious(bboxes_xyxy, of_objects):
         ids.append(true_boxes[int(np.argmax(ious))].object_id
                    if ious.max(initial=0.0) > SAME_OBJECT_IOU else '')

@@ -67,8 +67,8 @@ def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: PosedQuery
     """
     frames = [relocalizer.search(one) for one in (*query.neighbours, query.observation)]
     found = relocalizer.locate(frames)
-    errors = [pose_error(one.map_from_camera, query.map_from_camera)[0]
-              for one in found.hypotheses]
+    errors = [pose_error(hypothesis.map_from_camera, query.map_from_camera)[0]
+              for hypothesis in found.hypotheses]
     joined = join_frames(landmark_map, relocalizer.options, frames)
     true, = contenders_of(joined, [refined(joined, unrefined(query.map_from_camera))], [True])
     candidates = [{one.landmark for one in its
@@ -108,7 +108,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument('--limit', type=float, default=0.5, metavar='M',
                         help='error of a right pose (%(default)s)')
     options = parser.parse_args(arguments)
-    places = [one.load() for one in chosen_places(options)]
+    places = [chosen_place.load() for chosen_place in chosen_places(options)]
     rows = []
     for matching, mode in product(options.matching, MODES):
         found = []
@@ -116,8 +116,8 @@ def run(arguments: list[str]) -> int:
             relocalizer = Relocalizer(place.landmark_map, place.options(
                 mode, RelocalizerOptions(matching=matching)))
             queries = place.ask(mode) if mode in place.modes else []
-            found += [blame(place.landmark_map, relocalizer, one, options.limit)
-                      for one in queries]
+            found += [blame(place.landmark_map, relocalizer, query, options.limit)
+                      for query in queries]
         counts = Counter(one.cause for one in found)
         rows.append([_MATCHINGS[matching], mode, len(found), *(
             counts[cause] for cause in ('', *CAUSES)), sum(

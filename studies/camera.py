@@ -101,7 +101,7 @@ def _called_wrong(looks: Sequence[Look]) -> str:
 
 
 def _after(looks: Sequence[Look]) -> str:
-    alarms = [one for one in _alarms(looks) if one]
+    alarms = [alarm for alarm in _alarms(looks) if alarm]
     return f'{np.median(alarms):.0f}, {max(alarms)}' if alarms else ''
 
 

@@ -185,8 +185,8 @@ def judged_by(answers: Iterable[Answer], field: str) -> dict[str, Judged]:
 
 def judged_of(answers: Sequence[Answer]) -> Judged:
     """Return the confidences of answers, and if they are right."""
-    return (np.array([one.confidence for one in answers]),
-            np.array([one.right for one in answers], dtype=np.bool_))
+    return (np.array([answer.confidence for answer in answers]),
+            np.array([answer.right for answer in answers], dtype=np.bool_))
 
 
 def fit_logistic(predictors: NDArray[np.float64], right: NDArray[np.bool_],

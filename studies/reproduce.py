@@ -150,8 +150,8 @@ def run(options: argparse.Namespace) -> int:
         return 0
     with _alone_in(out):
         networks = list(sources.options)
-        for one in sources.networks:
-            networks += [one.option, str(_downloaded(one, out))]
+        for network in sources.networks:
+            networks += [network.option, str(_downloaded(network, out))]
         for name in names:
             _reproduce(name, sources, networks, options)
         _write_results(names, sources, out)
@@ -321,7 +321,7 @@ def write_bags(one: Recording, frames: Path, folder: Path) -> None:
 def _table(folder: Path, paper: Mapping[str, Sequence[str]]) -> list[tuple[str, ...]]:
     """Return the table of `evaluate`, its header first, with the paper's figures beside it."""
     results = json.loads((folder / 'results.json').read_text())
-    summaries = summary.summarize(Result(**one) for one in results)
+    summaries = summary.summarize(Result(**result) for result in results)
     rows = [tuple(row[column] for column in _COLUMNS) for row in summary.table_rows(summaries)]
     if not paper:
         return rows
@@ -386,7 +386,7 @@ def _about(out: Path, names: Sequence[str], sources: Sources) -> dict[str, Any]:
         with suppress(metadata.PackageNotFoundError):
             versions[package] = metadata.version(package)
     return {'machine': platform.platform(), 'cores': os.cpu_count(), 'python': sys.version,
-            'packages': versions, 'networks': [asdict(one) for one in sources.networks],
+            'packages': versions, 'networks': [asdict(network) for network in sources.networks],
             'sequences': {name: asdict(sources.recordings[name]) for name in names},
             'digests': {file.stem: file.read_text().strip()
                         for file in sorted((out / 'downloads').glob('*.sha256'))}}

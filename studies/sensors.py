@@ -149,7 +149,7 @@ def angle_table(robot: Robot) -> str:
 
 def vertical_rows(robot: Robot) -> list[list[Any]]:
     """Return rows of the vertical of an IMU: by orientation, and by acceleration alone."""
-    stamps = np.array([one.stamp_ns for one in robot.samples])
+    stamps = np.array([sample.stamp_ns for sample in robot.samples])
     instants_s = np.arange(robot.poses[0, 0] + 2.0, robot.poses[-1, 0] - 2.0, _EVERY_S)
     off_slow, off_alone = [], []
     for at_ns in np.round(instants_s * NS_PER_S).astype(np.int64):
@@ -158,8 +158,8 @@ def vertical_rows(robot: Robot) -> list[list[Any]]:
                                        for side in (-1, 1))
         near = robot.samples[begin:end]
         up = _up(near, robot.samples[max(0, end - _KEPT):end])
-        slow = np.mean([one.acceleration for one in robot.samples[first:last]
-                        if one.acceleration is not None], axis=0)
+        slow = np.mean([sample.acceleration for sample in robot.samples[first:last]
+                        if sample.acceleration is not None], axis=0)
         off_slow.append(_angle_deg(up, slow))
         off_alone.append(_angle_deg(up, _up([one._replace(up=None) for one in near])))
     stands = np.interp(instants_s, robot.poses[:, 0], robot.speeds) < _STANDS_M_S
@@ -175,7 +175,7 @@ def accelerometer_rows(folder: Path) -> list[list[Any]]:
     fields = [line.split() for line in lines if not line.startswith('#')]
     samples = [Sample(parse_stamp_ns(stamp, str(folder)), None, np.array(xyz, dtype=np.float64))
                for stamp, *xyz in fields]
-    stamps = np.array([one.stamp_ns for one in samples])
+    stamps = np.array([sample.stamp_ns for sample in samples])
     truth, found = [], []
     poses = read_tum_trajectory(folder / 'groundtruth.txt')
     for at_ns in read_image_list(folder / 'rgb.txt')[0]:
@@ -212,7 +212,7 @@ def _gyro_yaw(robot: Robot) -> tuple[float, NDArray[np.float64]]:
 
     The lag is the one with which the two fit best. The mean rate of a robot that stands is 0.
     """
-    at_s = np.array([one.stamp_ns for one in robot.samples]) / NS_PER_S
+    at_s = np.array([sample.stamp_ns for sample in robot.samples]) / NS_PER_S
     ups = np.array([np.full(3, np.nan) if one.up is None else one.up for one in robot.samples])
     rates = (robot.turn_rates * ups).sum(axis=1)
     stands = np.interp(at_s, robot.poses[:, 0], robot.speeds) < _STANDS_M_S

@@ -115,7 +115,8 @@ def _splits(path: Path) -> dict[str, tuple[Rows, Rows]]:
     rows = np.arange(len(load_observations(path)))
     maps = {'even': rows[::2], 'half0': rows[:len(rows) // 2], 'half1': rows[len(rows) // 2:]}
     if (file := path.with_name('splits.json')).exists():
-        maps = {name: np.array(one['map']) for name, one in json.loads(file.read_text()).items()}
+        maps = {name: np.array(entry['map']) for name, entry in json.loads(
+            file.read_text()).items()}
     other = str.maketrans('01', '10')
     return {name: (own, maps.get(name.translate(other), own) if name[-1] in '01'
                    else np.setdiff1d(rows, own)) for name, own in maps.items()}

@@ -33,7 +33,7 @@ def _of_frames(change: Callable[[Observation, float, np.random.Generator], Obser
 
         return tuple(replace(
             query, observation=of_frame(query.observation, query.number),
-            neighbours=tuple(of_frame(one, query.number) for one in query.neighbours))
+            neighbours=tuple(of_frame(neighbour, query.number) for neighbour in query.neighbours))
             for query in queries)
 
     return changed
@@ -131,8 +131,8 @@ def scaled_odometry(queries: Sequence[PosedQuery], factor: float) -> tuple[Posed
             step = invert_transform(before.odom_from_camera) @ after.odom_from_camera
             turn = Rotation.from_rotvec(factor * Rotation.from_matrix(step[:3, :3]).as_rotvec())
             poses.append(poses[-1] @ make_transform(turn.as_matrix(), factor * step[:3, 3]))
-        scaled = {one.stamp_ns: replace(one, odom_from_camera=pose)
-                  for one, pose in zip(frames, poses, strict=True)}
+        scaled = {frame.stamp_ns: replace(frame, odom_from_camera=pose)
+                  for frame, pose in zip(frames, poses, strict=True)}
         found.append(replace(query, observation=scaled[query.observation.stamp_ns],
                              neighbours=tuple(scaled[one.stamp_ns] for one in query.neighbours)))
     return tuple(found)

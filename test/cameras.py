@@ -26,7 +26,7 @@ def make_surroundings():
         turn = Rotation.from_matrix(turned(row)[:3, :3])
         centers.append(turn.apply(room.centers + rng.normal(0.0, 0.6, room.centers.shape)))
         quats.append((turn * Rotation.from_quat(room.quats_xyzw)).as_quat())
-    ids = tuple(f'{name}_{one}' for name in NAMES for one in room.landmark_ids)
+    ids = tuple(f'{name}_{landmark_id}' for name in NAMES for landmark_id in room.landmark_ids)
     return LandmarkMap('map', ids, ids, 4 * room.class_ids, np.concatenate(centers),
                        np.tile(room.semi_axes, (4, 1)), np.concatenate(quats))
 

@@ -202,7 +202,7 @@ def _changes(node: ast.AST, parent: ast.AST, field: str) -> Iterator[tuple[str, 
         case ast.Constant(value=float() as value):
             yield f'{value} is {1.3 * value or 1.0:g}', ast.Constant(1.3 * value or 1.0)
         case ast.Call(args=[first, second, *others], func=function) if not any(
-                isinstance(one, ast.Starred) for one in node.args) and not _ALIKE.search(
+                isinstance(argument, ast.Starred) for argument in node.args) and not _ALIKE.search(
                 ast.unparse(function)):
             yield 'arguments exchanged', _with(node, args=[second, first, *others])
 
@@ -415,7 +415,7 @@ class Judge:
             self.outcomes += _finish(*one)
 
     def _outcomes(self, mutants: Sequence[Mutant]) -> list[Outcome]:
-        return [self._outcome(one) for one in mutants]
+        return [self._outcome(mutant) for mutant in mutants]
 
     def _outcome(self, mutant: Mutant) -> Outcome:
         names = [name for name in self._tests.of(mutant)
@@ -515,22 +515,22 @@ def _plant_at_import(mutant: Mutant) -> None:
 
 def _codes_of(code: CodeType) -> Iterator[CodeType]:
     yield code
-    for one in code.co_consts:
-        if isinstance(one, CodeType):
-            yield from _codes_of(one)
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _codes_of(constant)
 
 
 def judge(mutants: Sequence[Mutant], workers: int) -> list[Outcome]:
     """Return the outcome of each fault. Kernels are judged in a process of their own."""
-    kernels = [one for one in mutants if one.is_compiled]
+    kernels = [mutant for mutant in mutants if mutant.is_compiled]
     outcomes = list(_finish(*_start(lambda: _judge_kernels(kernels, workers))))
     import hypothesis, numba, scipy.optimize, scipy.spatial, scipy.stats, yaml  # noqa: E401,F401,I001
 
-    tests, others = Tests('compiled'), [one for one in mutants if not one.is_compiled]
-    at_import = Judge([one for one in others if one.function is None], tests, workers)
+    tests, others = Tests('compiled'), [mutant for mutant in mutants if not mutant.is_compiled]
+    at_import = Judge([other for other in others if other.function is None], tests, workers)
     at_import.run()
     return outcomes + at_import.outcomes + _judge_functions(
-        [one for one in others if one.function is not None], tests, workers)
+        [other for other in others if other.function is not None], tests, workers)
 
 
 def _judge_kernels(mutants: Sequence[Mutant], workers: int) -> list[Outcome]:
@@ -540,10 +540,10 @@ def _judge_kernels(mutants: Sequence[Mutant], workers: int) -> list[Outcome]:
 
 def _judge_functions(mutants: Sequence[Mutant], tests: Tests, workers: int) -> list[Outcome]:
     judge, files = Judge(mutants, tests, workers), {
-        name.split('::')[0] for one in mutants for name in tests.of(one)}
+        name.split('::')[0] for mutant in mutants for name in tests.of(mutant)}
     if files:
         pytest.main([*_QUIET, '-s', *sorted(files)], [judge])
-    return judge.outcomes + [Outcome(one, 0) for one in mutants if not files]
+    return judge.outcomes + [Outcome(mutant, 0) for mutant in mutants if not files]
 
 
 # ---- the report ---------------------------------------------------------------------------------
@@ -561,8 +561,8 @@ def report(outcomes: Sequence[Outcome]) -> str:
         text += (f'{row:28}{its["killed"]:8}{its["survived"]:10}{its["not run"]:9}'
                  f'{its["killed"] / its.total():7.2f}\n')
     return text + '\nno test noticed (tests that run the line):\n' + ''.join(
-        f'{one.mutant.file}:{one.mutant.line}: {one.mutant.what} ({one.tests}): '
-        f'{planted(one.mutant)[1]}\n' for one in sorted(outcomes) if not one.killer)
+        f'{outcome.mutant.file}:{outcome.mutant.line}: {outcome.mutant.what} ({outcome.tests}): '
+        f'{planted(outcome.mutant)[1]}\n' for outcome in sorted(outcomes) if not outcome.killer)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -18,10 +18,10 @@ def write_open_yolo(file: Path, config: str, task: str = 'detect') -> Path:
     kind = tasks.WorldModel if 'world' in config else {
         'detect': tasks.YOLOEModel, 'segment': tasks.YOLOESegModel}[task]
     model = kind(config, verbose=False)
-    for one in model.modules():  # else all boxes have nearly the same score
-        if isinstance(one, torch.nn.BatchNorm2d):
-            one.running_var.uniform_(0.1, 0.3)
-            one.running_mean.normal_(0.0, 0.1)
+    for module in model.modules():  # else all boxes have nearly the same score
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.running_var.uniform_(0.1, 0.3)
+            module.running_mean.normal_(0.0, 0.1)
     model.names, model.task = {i: f'class {i}' for i in range(model.model[-1].nc)}, task
     torch.save({'model': model.half(), 'version': ultralytics.__version__,
                 'train_args': {'imgsz': 640, 'task': task}}, file)

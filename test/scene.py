@@ -47,7 +47,7 @@ def make_room() -> LandmarkMap:
 def doubled_room(offset) -> LandmarkMap:
     """The room twice; the second one is an offset (3,) away [m]."""
     room = make_room()
-    return replace(room, landmark_ids=(*room.landmark_ids, *(f'{one}_2' for one in
+    return replace(room, landmark_ids=(*room.landmark_ids, *(f'{landmark_id}_2' for landmark_id in
                                                             room.landmark_ids)),
                    labels=room.labels * 2, class_ids=room.class_ids * 2,
                    centers=np.concatenate([room.centers, room.centers + offset]),

@@ -93,8 +93,8 @@ def test_the_tests_of_the_capabilities_exist():
 def texts(node):
     """Return the strings of a syntax tree; what they insert is an ellipsis."""
     if isinstance(node, ast.JoinedStr):
-        yield ''.join(one.value if isinstance(one, ast.Constant) else '...'
-                      for one in node.values)
+        yield ''.join(value.value if isinstance(value, ast.Constant) else '...'
+                      for value in node.values)
     elif isinstance(node, ast.Constant) and isinstance(node.value, str):
         yield node.value
     else:

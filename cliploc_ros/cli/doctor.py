@@ -52,11 +52,11 @@ def run(options: argparse.Namespace) -> int:
         f'{one.what:<12} {one.state:<12} {printable(one.text)}', flush=True))
     with running_ros(options.ros_args):
         doctor(options.params_file, options.relocalizer, options.timeout, report)
-    failed = [one.what for one in report.findings if one.state is State.FAIL]
+    failed = [finding.what for finding in report.findings if finding.state is State.FAIL]
     print(f'{len(failed)} of {len(report.findings)} failed: {", ".join(failed)}' if failed else
           f'nothing failed in {len(report.findings)} checks' + (
               ', but no pose is found here' if any(
-                  one.state is State.REFUSED for one in report.findings) else ''))
+                  finding.state is State.REFUSED for finding in report.findings) else ''))
     return int(bool(failed))
 
 

@@ -234,7 +234,7 @@ def _needs_clip(options: argparse.Namespace, methods: 'Sequence[Method]') -> boo
 
     A file of queries is for other methods, too.
     """
-    comparing = [one.name for one in methods if one.options.needs_similarities]
+    comparing = [method.name for method in methods if method.options.needs_similarities]
     if options.clip or options.queries is not None:
         return bool(comparing or options.save_queries)
     if comparing or options.save_queries:
@@ -253,7 +253,7 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
     from cliploc_ros.core.keyframes.layer import layer_path
 
     wanted, problem = options.keyframes, ''
-    if not any(one.keyframes for one in methods):
+    if not any(method.keyframes for method in methods):
         problem = f"none of the methods uses them: add '{AUTO}'"
     elif len(options.map) > 1:
         problem = 'several maps are searched by objects only'

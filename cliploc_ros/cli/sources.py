@@ -165,8 +165,8 @@ def read_cameras_of_map(options: argparse.Namespace, map_file: Path) -> dict[str
     frames = read_cameras(options, gap_s=0.0, any_unit=is_scaled)
     if not built_from.is_moved:
         return frames
-    return {name: move_frames(one, built_from.scale, np.array(built_from.rotation))
-            for name, one in frames.items()}
+    return {name: move_frames(frame, built_from.scale, np.array(built_from.rotation))
+            for name, frame in frames.items()}
 
 
 def source_of(options: argparse.Namespace) -> Path:

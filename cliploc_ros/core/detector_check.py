@@ -66,7 +66,7 @@ class DetectorCheck:
             unused = f'{right - left:.3g} x {bottom - top:.3g} px at ({left:.3g}, {top:.3g})'
         self._frames.append(_Tally(
             len(given), int(scored.sum()), len(usable),
-            sum(one in self._known for one in usable.class_ids),
+            sum(class_id in self._known for class_id in usable.class_ids),
             float(odd[0]) if len(odd) else None, unused, Counter(usable.class_ids)))
 
     @property
@@ -99,11 +99,11 @@ class DetectorCheck:
         """Return the numbers of all frames."""
         frames = self._frames
         return _Tally(
-            sum(one.given for one in frames), sum(one.scored for one in frames),
-            sum(one.usable for one in frames), sum(one.of_map for one in frames),
-            next((one.odd_score for one in frames if one.odd_score is not None), None),
-            next((one.bad_box for one in frames if one.bad_box), ''),
-            sum((one.classes for one in frames), Counter()))
+            sum(frame.given for frame in frames), sum(frame.scored for frame in frames),
+            sum(frame.usable for frame in frames), sum(frame.of_map for frame in frames),
+            next((frame.odd_score for frame in frames if frame.odd_score is not None), None),
+            next((frame.bad_box for frame in frames if frame.bad_box), ''),
+            sum((frame.classes for frame in frames), Counter()))
 
     def _certain(self, tally: _Tally) -> list[Fault]:
         """Return why no detection of some frames is of use; nothing if one is."""

@@ -247,15 +247,15 @@ class Localizer:
             See Relocalizer.relocalize. The localizer drops this instant.
         """
         if self.depth_scale.is_wrong:
-            query = replace(query, frames=tuple(replace(one, depths=None)
-                                                for one in query.frames))
+            query = replace(query, frames=tuple(replace(frame, depths=None)
+                                                for frame in query.frames))
         if query.cameras is not None:
             self.cameras = query.cameras.copied()
         query = replace(query, cameras=self.cameras.copied(), by_keyframes=query.by_keyframes
                         and deadline - time.monotonic() >= LEAST_S)
         others = [self.with_free_crops(query, row, crops) for row in range(len(query.frames) - 1)]
-        for one in query.frames:
-            self.cameras.see(one)
+        for frame in query.frames:
+            self.cameras.see(frame)
         found = self._localize(query, others, *self._crops(query, crops, deadline, begin_stage),
                                self.recognizer(query, deadline, begin_stage))
         self.cameras.add(found.cameras)
@@ -265,8 +265,8 @@ class Localizer:
             # where nothing is accepted, the map may be out of date
             index = self._relocalizer.landmark_map.classes
             self.cameras.add_instant(query.frames, [int(index.are_own(index.classes_of(
-                one.detections.class_ids)).sum()) for one in query.frames], [
-                    len(one) for one in found.frame_matches[-len(query.frames):]])
+                frame.detections.class_ids)).sum()) for frame in query.frames], [
+                    len(frame_match) for frame_match in found.frame_matches[-len(query.frames):]])
         return found
 
     def recognizer(self, query: Query, deadline: float = math.inf,
@@ -357,8 +357,8 @@ class Localizer:
                   crops: Crops | None, recognizer: ImageRecognizer | None) -> Relocalization:
         """Search the newest frame beside the others, and keep what the answer depended on."""
         budget = self._relocalizer.begin(len(others) + 1, len(others) + 1) if others else None
-        beside = [self._relocalizer.search(one, budget.search_end(number, len(others) + 1))
-                  for number, one in enumerate(others, start=1)] if budget else []
+        beside = [self._relocalizer.search(other, budget.search_end(number, len(others) + 1))
+                  for number, other in enumerate(others, start=1)] if budget else []
         rooms: list[int] = []
         if crops is not None:
             rooms, room = [len(crops.known)], crops.room

@@ -105,7 +105,7 @@ class RelocalizerOptions:
             raise OptionsError(f'height_range_m: {list(heights)} must be a lower and a greater '
                                'height')
         mounts = self.mount_deviation
-        if len(mounts) != 2 or not all(0.0 <= one < math.inf for one in mounts):
+        if len(mounts) != 2 or not all(0.0 <= mount < math.inf for mount in mounts):
             raise OptionsError(f'mount_deviation: {list(mounts)} must be two numbers, 0 or more')
 
     @property

@@ -141,10 +141,10 @@ def _fields_of(query: Query) -> dict[str, Any]:
            ('run', 'limit', 'length_s', 'by_keyframes', 'is_thorough', 'rooms')},
         'cameras': None if query.cameras is None else query.cameras.fields(),
         'has_images': bool(query.images),
-        'frames': [asdict(replace(one, similarities=None)) | {'crops': (
-            '' if one.similarities is None else 'embeddings' if isinstance(
-                one.similarities, CropSimilarities) else 'similarities')}
-            for one in query.frames]}
+        'frames': [asdict(replace(frame, similarities=None)) | {'crops': (
+            '' if frame.similarities is None else 'embeddings' if isinstance(
+                frame.similarities, CropSimilarities) else 'similarities')}
+            for frame in query.frames]}
 
 
 def _query_of(about: Mapping[str, Any], images: Iterator[NDArray[np.uint8]],

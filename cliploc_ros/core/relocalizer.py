@@ -143,8 +143,8 @@ def in_its_map(found: Relocalization, landmark_map: LandmarkMap
     reason = found.reason and f'in {name}: {found.reason}'
     return replace(
         found, reason=reason,
-        hypotheses=tuple(replace(one, map_from_camera=place.map_from_camera)
-                         for one, place in zip(found.hypotheses, places, strict=True)
+        hypotheses=tuple(replace(hypothesis, map_from_camera=place.map_from_camera)
+                         for hypothesis, place in zip(found.hypotheses, places, strict=True)
                          if place.name == name),
         frame_matches=tuple(tuple(replace(one, landmark=one.landmark - part.first)
                                   for one in of_frame if one.landmark in rows)
@@ -219,8 +219,8 @@ class Relocalizer:
             are no frames or too many.
         """
         budget = self.begin(len(observations))
-        frames = [self.search(one, budget.search_end(number, len(observations)))
-                  for number, one in enumerate(observations, start=1)]
+        frames = [self.search(observation, budget.search_end(number, len(observations)))
+                  for number, observation in enumerate(observations, start=1)]
         return self.look_again(self.locate(frames, budget, recognizer=recognizer), frames,
                                recognizer=recognizer)
 
@@ -253,7 +253,7 @@ class Relocalizer:
             met = self._meet(joined, budget)
         compared = Comparison(joined, met, looks, recognizer)
         result = Relocalization(
-            False, '', tried=sum(one.progress.tried for one in frames),
+            False, '', tried=sum(frame.progress.tried for frame in frames),
             coverage=coverage_of(frames), stamp_ns=frames[-1].observation.stamp_ns,
             recognition=compared.recognition)
         if not compared.contenders:
@@ -311,10 +311,10 @@ def _nothing_found(landmark_map: LandmarkMap, frames: Sequence[SearchedFrame]
     if not len(landmark_map):
         return RefusalKind.TOO_FEW_OBJECTS, ('the map has keyframes alone, and none fits the '
                                              'image; turn the camera to a recorded view')
-    if any(one.has_samples for one in frames):
+    if any(frame.has_samples for frame in frames):
         kind, reason = RefusalKind.UNEXPLAINED, 'no pose explains the detections'
     else:
-        detections = sum(len(one.observation.detections) for one in frames)
+        detections = sum(len(frame.observation.detections) for frame in frames)
         kind = RefusalKind.TOO_FEW_OBJECTS
         reason = (f'{detections} detections give fewer than {frames[-1].sample_size} distinct '
                   'correspondence candidates')

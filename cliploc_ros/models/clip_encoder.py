@@ -73,7 +73,7 @@ def load_encoder(options: ClipOptions, labels: Sequence[Label]) -> LoadedEncoder
 def embed_labels(weights: ClipWeights, options: ClipOptions, labels: Sequence[Label]
                  ) -> LabelEmbeddings:
     """Return the embeddings of labels, see `load_encoder`; they need no encoder of crops."""
-    described = [((one, 1.0),) if isinstance(one, str) else one for one in labels]
+    described = [((label, 1.0),) if isinstance(label, str) else label for label in labels]
     # Once each and sorted: moving or reordering landmarks needs no new embeddings.
     unique = sorted(set(described))
     embeddings = mixed_rows(unique, partial(_encoded_once, weights, options), weights.embed_dim)

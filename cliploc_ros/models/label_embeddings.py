@@ -108,7 +108,7 @@ def mixed_rows(descriptions: Sequence[WeightedLabels],
     keeps its embedding. ``encode`` returns the embeddings (m, embed_dim) of m labels, unit rows.
     It is called with sorted labels, at most PART at once.
     """
-    labels = sorted({label for one in descriptions for label, _ in one})
+    labels = sorted({label for description in descriptions for label, _ in description})
     # the share of each label in each description, a sparse matrix (R, U)
     columns = {label: column for column, label in enumerate(labels)}
     ends = np.cumsum([0, *map(len, descriptions)])

@@ -91,13 +91,13 @@ class OnnxDetector:
         check_image_rgb(image_rgb)
         names = self._head.names
         rows = self._head.find(np.ascontiguousarray(image_rgb), self._options)
-        numbers = np.array([self.class_names.index(names[int(one)]) for one in rows[:, 5]],
+        numbers = np.array([self.class_names.index(names[int(row)]) for row in rows[:, 5]],
                            dtype=np.int64)
         if self._head.has_doubles:
             rows = rows[without_doubles(rows[:, :4], numbers, self._options.iou,
                                         self._options.max_det)]
         return Detections(bboxes_xyxy=rows[:, :4].astype(np.float64),
-                          class_ids=tuple(names[int(one)] for one in rows[:, 5]),
+                          class_ids=tuple(names[int(row)] for row in rows[:, 5]),
                           scores=rows[:, 4].astype(np.float64))
 
 
@@ -135,7 +135,7 @@ class YoloHead:
     def _run(self, pixels: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the output, boxes with scores, for an input with values 0 to 1."""
         outputs = self._network(**{self._input.name: pixels.astype(self._input.type)})
-        boxes = [one for one in outputs.values() if one.ndim == 3 and len(one) == 1]
+        boxes = [output for output in outputs.values() if output.ndim == 3 and len(output) == 1]
         if len(boxes) != 1:
             raise ModelError(
                 f'{self._network.file} is no detector: its outputs are '

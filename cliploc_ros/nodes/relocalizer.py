@@ -69,7 +69,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
             self.settings.snapshot()
             self.facts['topics'] = ' '.join(
                 f'{name}:={self.resolve_topic_name(name)}' for name in (
-                    *(topic for one in sources for topic in one.topics.values()),
+                    *(topic for source in sources for topic in source.topics.values()),
                     *_OTHER_TOPICS, parameters.localizer_pose) if name)
         self._handoff = HandOff(self, self._robot.odometry)
         self._handoff.on_shown(self._robot.prior.follow)
@@ -141,7 +141,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
     def examine(self, health: Health) -> None:
         """Report the inputs, the last verdict and the device."""
         parameters = self.settings.values
-        missing = [line for one in self._frames.sources.values() for line in one.missing()]
+        missing = [line for source in self._frames.sources.values() for line in source.missing()]
         if parameters.require_localizer and (no_localizer := self._handoff.missing()):
             missing.append(no_localizer)
         self._frames.examine(health, parameters.stale_after_s)

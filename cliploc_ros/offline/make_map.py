@@ -193,7 +193,7 @@ def scale_of_objects(detections: PosedDetections, options: MappingOptions, class
     scale = 1.0
     for _ in range(_TRIALS):
         built = build_map(detections.moved(scale, np.eye(3)), options).landmark_map
-        own = [row for row, one in enumerate(built.class_ids) if one == class_name]
+        own = [row for row, class_id in enumerate(built.class_ids) if class_id == class_name]
         if not own:
             raise MappingError(
                 f"`object_size`: no object of class '{class_name}' is mapped; there are "

@@ -96,11 +96,11 @@ def tiles(numbers: Iterable[tuple[str, str, bool]]) -> str:
 def bars(rows: Iterable[Bar]) -> str:
     """Return bars with a mark at each threshold."""
     return '<div class="bars">' + ''.join(
-        f'<span>{escape(one.name)}</span><span class="bar">'
-        f'<i{"" if one.is_good else " class=over"} style="width:{_percent(one.value)}"></i>'
-        f'<u style="left:{_percent(one.limit)}"></u></span>'
-        f'<span>{"✓" if one.is_good else "✗"} {escape(one.shown)}</span>'
-        for one in rows) + '</div>'
+        f'<span>{escape(row.name)}</span><span class="bar">'
+        f'<i{"" if row.is_good else " class=over"} style="width:{_percent(row.value)}"></i>'
+        f'<u style="left:{_percent(row.limit)}"></u></span>'
+        f'<span>{"✓" if row.is_good else "✗"} {escape(row.shown)}</span>'
+        for row in rows) + '</div>'
 
 
 def _percent(share: float) -> str:

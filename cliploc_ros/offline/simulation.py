@@ -125,9 +125,9 @@ def guess_detector(landmark_map: LandmarkMap) -> DetectorModel:
     """Return a detector without any measurement."""
     count = len(landmark_map)
     ratios = np.full(count, _GUESSED_RATIO)
-    for row, one in enumerate(landmark_map.details):
-        if one.seen_ratio is not None:
-            ratios[row] = one.seen_ratio
+    for row, detail in enumerate(landmark_map.details):
+        if detail.seen_ratio is not None:
+            ratios[row] = detail.seen_ratio
     return DetectorModel(landmark_map, _GUESSED_CAMERA, (), ratios,
                          np.full(count, _GUESSED_REACH_M), 1.0, GUESSED_MIN_SIDE_PX, ())
 

@@ -202,7 +202,7 @@ class CaseRecorder:
             'reason': found.detail, 'map_hash': found.map_hash,
             'parameters': asdict(parameters), 'options': asdict(parameters.options()),
             'versions': versions}))
-        size, limit_mb, used = sum(one.nbytes for one in arrays.values()), \
+        size, limit_mb, used = sum(array.nbytes for array in arrays.values()), \
             parameters.record_limit_mb, 0
         for parent, _, names in folder.walk():
             for name in names:

@@ -315,7 +315,7 @@ def _check_detections(parameters: RelocalizerParameters, localizer: FrameLocaliz
         return report.skip('detector', 'it sees no object: turn the camera to some')
     text = f'{len(found)} boxes, {frame.detected_at - frame.received_at:.2f} s after their image'
     if localizer is not None:
-        own = sum(one in localizer.landmark_map.class_ids for one in found.class_ids)
+        own = sum(class_id in localizer.landmark_map.class_ids for class_id in found.class_ids)
         text += f', {own} of them of the classes of the map'
         check = DetectorCheck(localizer.landmark_map, parameters.matching != 'clip')
         with report.failing('detector'):

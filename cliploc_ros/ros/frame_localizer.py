@@ -141,9 +141,9 @@ class FrameLocalizer:
         found, own = in_its_map(self.instants.explained(found), self.landmark_map)
         parts = parts_of(self.landmark_map)
         if seen.similarities is not None and len(parts) > 1:
-            pieces = split_similarities(seen.similarities, [len(one.landmark_map)
-                                                            for one in parts])
-            which = [one.first for one in parts].index(own.first)
+            pieces = split_similarities(seen.similarities, [len(part.landmark_map)
+                                                            for part in parts])
+            which = [part.first for part in parts].index(own.first)
             seen = replace(seen, similarities=pieces[which])
         names = [one.camera_name for one in query.frames]
         layer = None if self.keyframes is None else self.keyframes.localizer.layer

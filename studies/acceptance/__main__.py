@@ -131,8 +131,8 @@ def _priors(options: argparse.Namespace) -> None:
 
 def _retries(options: argparse.Namespace) -> None:
     rows = []
-    for one in chosen_places(options):
-        place = one.load()
+    for chosen_place in chosen_places(options):
+        place = chosen_place.load()
         queries = place.ask(ONE)
         elsewhere, _ = exchange_landmarks(place.landmark_map, queries, 1.0,
                                           np.random.default_rng(options.seed))
@@ -143,7 +143,7 @@ def _retries(options: argparse.Namespace) -> None:
                                        k=min(RelocalizerOptions.k, len(its_map)))
             robots = list(tqdm(searches.retry(its_map, queries, plain, options.seed), name,
                                len(queries), disable=None))
-            rows.append(searches.retries_row(f'{one.name}, {name}', least, robots))
+            rows.append(searches.retries_row(f'{chosen_place.name}, {name}', least, robots))
     print(table(['map', 'min_confidence', 'accepted at the first look',
                  f'within {searches.LOOKS} looks, each alone',
                  f'within {searches.LOOKS} looks that agree', 'more than 1 m off'], rows))

@@ -77,11 +77,11 @@ class Case:
 def judge(found: Relocalization, map_from_camera: NDArray[np.float64], setting: Setting,
           is_elsewhere: bool = False) -> Case:
     """Return the hypotheses of a search, compared with the true pose (4, 4)."""
-    poses = np.array([one.map_from_camera for one in found.hypotheses])
+    poses = np.array([hypothesis.map_from_camera for hypothesis in found.hypotheses])
     errors = np.array([pose_error(pose, map_from_camera)[0] for pose in poses])
-    return Case(tuple(one.support for one in found.hypotheses), poses,
+    return Case(tuple(hypothesis.support for hypothesis in found.hypotheses), poses,
                 (errors < RIGHT_M) & (not is_elsewhere),
-                np.array([one.handicap for one in found.hypotheses]), setting,
+                np.array([hypothesis.handicap for hypothesis in found.hypotheses]), setting,
                 is_elsewhere, 1.0 if found.evidence is None
                 else found.evidence.certainty * found.evidence.found)
 
@@ -192,8 +192,8 @@ def _arrays(cases: Sequence[Case]) -> _Arrays:
     given, right = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
     for row, case in enumerate(cases):
         count = len(case.supports)
-        supports[row, :count] = [[getattr(one, name) for name in _FIELDS]
-                                 for one in case.supports]
+        supports[row, :count] = [[getattr(support, name) for name in _FIELDS]
+                                 for support in case.supports]
         given[row, :count], right[row, :count] = True, case.right
         handicaps[row, :count] = case.handicaps
     return _Arrays(supports, given, right, handicaps, np.array(
@@ -243,7 +243,7 @@ def _levelled(cases: Sequence[Case], raw: Calibration) -> Calibration:
 
     solutions = [minimize(surprise, [0.0, 0.5], (knee,), method='Nelder-Mead')
                  for knee in _KNEES]
-    best = int(np.argmin([one.fun for one in solutions]))
+    best = int(np.argmin([solution.fun for solution in solutions]))
     shift, slope = solutions[best].x
     return raw._replace(objects=raw.objects._replace(
         none_right=raw.objects.none_right + float(shift), knee=_KNEES[best],

@@ -66,13 +66,13 @@ class Place(NamedTuple):
         """Return the queries with what is known in a mode."""
         is_fused = mode in (FIVE, ALL)
         queries: Sequence[PosedQuery] = self.frames
-        if is_fused and any(one.neighbours for one in queries):
+        if is_fused and any(query.neighbours for query in queries):
             return []  # of several cameras, one instant
         if mode in (VERTICAL, LEVEL, ALL):
             queries = with_vertical(queries, vertical_deg, seed)
         if is_fused:
             queries = with_neighbours(queries, self.groups, STEP_M, STEP_DEG, seed)
-        return [one for one, is_main in zip(queries, self.is_main, strict=True)
+        return [query for query, is_main in zip(queries, self.is_main, strict=True)
                 if is_main or (self.every_frame and not is_fused)]
 
     def options(self, mode: str, options: RelocalizerOptions) -> RelocalizerOptions:
@@ -80,7 +80,7 @@ class Place(NamedTuple):
         options = replace(options, k=min(options.k, len(self.landmark_map)))
         if mode not in (LEVEL, ALL):
             return options
-        heights = [one.map_from_camera[2, 3] for one in self.frames]
+        heights = [frame.map_from_camera[2, 3] for frame in self.frames]
         return replace(options, height_range_m=(min(heights) - _HEIGHT_M,
                                                 max(heights) + _HEIGHT_M))
 
@@ -106,7 +106,7 @@ class Recording(NamedTuple):
         queries: Sequence[PosedQuery] = make_queries(found, landmark_map, every_frame=True)
         if not self.has_depth:
             queries = _without_depth(queries)
-        elif all(one.depths is None for one in found.frames):
+        elif all(frame.depths is None for frame in found.frames):
             queries = _with_simulated_depth(queries, found, landmark_map)
         return Place(landmark_map, queries,
                      [one.group for one in found.frames], [one.is_main for one in found.frames],
@@ -130,7 +130,7 @@ class Simulated(NamedTuple):
         """Return the place."""
         world = make_world(self.kind, self.seed, has_depth=self.has_depth, cameras=self.cameras)
         return Place(world.landmark_map, world.queries, world.groups,
-                     [one.number % GROUP_SIZE == GROUP_SIZE - 1 for one in world.queries])
+                     [query.number % GROUP_SIZE == GROUP_SIZE - 1 for query in world.queries])
 
 
 class Halved(NamedTuple):

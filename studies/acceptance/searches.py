@@ -165,10 +165,10 @@ def _flickering(observation: Observation, rng: np.random.Generator) -> Observati
 
 def retries_row(name: str, min_confidence: float, robots: Sequence[Retries]) -> list[str]:
     """Return a row of the table of retries."""
-    counts = [sum(bool(one.accepted[0]) for one in robots),
-              sum(bool(one.alone.any()) for one in robots),
-              sum(bool(one.accepted.any()) for one in robots)]
-    wrong = sum(one.first_error_m > RIGHT_M for one in robots)
+    counts = [sum(bool(robot.accepted[0]) for robot in robots),
+              sum(bool(robot.alone.any()) for robot in robots),
+              sum(bool(robot.accepted.any()) for robot in robots)]
+    wrong = sum(robot.first_error_m > RIGHT_M for robot in robots)
     return [name, f'{min_confidence:g}',
-            *(f'{one} of {len(robots)} ({interval(one, len(robots))})' for one in counts),
+            *(f'{count} of {len(robots)} ({interval(count, len(robots))})' for count in counts),
             f'{wrong}']

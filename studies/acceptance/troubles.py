@@ -97,7 +97,7 @@ def age_half(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: fl
     aged = landmark_map.centers.copy()
     aged[changed[::2]] = move_objects(landmark_map, (), 1.0, rng)[0].centers[changed[::2]]
     return (replace(landmark_map, centers=aged).select(kept.tolist()), _with_columns(
-        [one for one in queries if (one.map_from_camera[0, 3] > middle) == is_right], kept))
+        [query for query in queries if (query.map_from_camera[0, 3] > middle) == is_right], kept))
 
 
 def add_aged_twin(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
@@ -202,8 +202,8 @@ def random_detections(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], 
 
 def _each_frame(queries: Sequence[PosedQuery], change: Callable[[Observation], Observation]
                 ) -> list[PosedQuery]:
-    return [replace(one, observation=change(one.observation),
-                    neighbours=tuple(map(change, one.neighbours))) for one in queries]
+    return [replace(query, observation=change(query.observation),
+                    neighbours=tuple(map(change, query.neighbours))) for query in queries]
 
 
 def of_rows(observation: Observation, rows: NDArray[np.int64]) -> Observation:
@@ -274,8 +274,8 @@ def tell_twin(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], wrong: f
     for query in queries:
         alike = find_alike(landmark_map, query.map_from_camera[:3, 3])
         twins = [move @ query.map_from_camera for move in alike.moves]
-        twins = [one for one in twins if np.linalg.norm(
-            one[:2, 3] - query.map_from_camera[:2, 3]) > RIGHT_M]
+        twins = [twin for twin in twins if np.linalg.norm(
+            twin[:2, 3] - query.map_from_camera[:2, 3]) > RIGHT_M]
         if twins and len(deviations):
             found.append(_told(landmark_map, query, _spot_of(twins[0]), deviations, rng))
         elif twins:

@@ -31,11 +31,11 @@ _FAMILIES = list(dict.fromkeys(name.partition(':')[0] for name in cases()))
 
 
 def _collect(options: argparse.Namespace) -> int:
-    places = tuple(one for site in options.sites
-                   for one in read_places(site, options.model))
-    if len({one.site for one in places}) < 2:
+    places = tuple(place for site in options.sites
+                   for place in read_places(site, options.model))
+    if len({place.site for place in places}) < 2:
         raise OptionsError('--sites: images of other sites are needed: give two or more')
-    chosen = [one for one in places if any(text in one.name for text in options.places)]
+    chosen = [place for place in places if any(text in place.name for text in options.places)]
     names = [name for name in cases() if name.partition(':')[0] in options.families]
     work = partial(make_collect, options.out, places, options.queries)
     for tasks in (product(chosen, ['']),  # built once, before several workers need it
@@ -60,7 +60,7 @@ def _fit(options: argparse.Namespace) -> int:
     found: list[tuple[list[verdicts.Row], list[verdicts.Row]]] = run_all(
         verdicts.make_rows, _stored(options), 'cases', options.workers)
     places, signs = ([row for rows in found for row in rows[part]] for part in range(2))
-    if len({one.site for one in places}) < 2:
+    if len({place.site for place in places}) < 2:
         raise OptionsError(f'{options.out}: records of two rooms are needed; collect them first')
     for rows in (places, signs):
         print(answer_table(verdicts.left_out(rows), ['case']), end='\n\n')
@@ -81,7 +81,7 @@ def _judge(options: argparse.Namespace) -> int:
 
 
 def _refused(outcomes: Sequence[verdicts.Outcome]) -> str:
-    kinds = Counter(one.refusal for one in outcomes if one.refusal).most_common()
+    kinds = Counter(outcome.refusal for outcome in outcomes if outcome.refusal).most_common()
     return ', '.join(f'{count} {kind}' for kind, count in kinds)
 
 

@@ -203,7 +203,7 @@ def _ask(number: int, case: Case, query: Query, landmark_map: LandmarkMap,
             camera, boxes, stamp_ns=second * 1_000_000_000, up_in_camera=query.up_in_camera,
             odom_from_camera=odom))
         recognizer = ImageRecognizer(localizer, _Features(image, camera, looker, case.features))
-        frames, seen = [*(one.searched for one in looks), searched], list[Recognition]()
+        frames, seen = [*(look.searched for look in looks), searched], list[Recognition]()
         for _ in range(2):
             found = relocalizer.locate(frames, recognizer=recognizer)
             seen.append(found.recognition or Recognition())

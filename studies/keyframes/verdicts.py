@@ -66,14 +66,14 @@ class Outcome(Answer):
 
 def decide(case: StoredCase, record: Record, way: str) -> Relocalization:
     """Return the package's answer to a record by objects, by keyframes, or by both."""
-    searched, keyframes = [one.searched for one in record.looks], _keyframes(case)
+    searched, keyframes = [look.searched for look in record.looks], _keyframes(case)
     if way == 'keyframes':
         relocalizer = Relocalizer(case.landmark_map, record.options)
         searched = [relocalizer.search(without_boxes(one.observation)) for one in searched]
     return localize(case.landmark_map, record.options, searched, [
         None if way == 'objects' else StoredRecognizer(
-            one.seen, keyframes, one.searched.observation.camera, may_be_thorough=way != 'fast')
-        for one in record.looks])
+            look.seen, keyframes, look.searched.observation.camera, may_be_thorough=way != 'fast')
+        for look in record.looks])
 
 
 @lru_cache(maxsize=1)
@@ -85,8 +85,8 @@ def make_judge(ways: Sequence[str] = WAYS) -> Callable[[Path], list[Outcome]]:
     """Return what judges the records of a file in some ways."""
     def judge(path: Path) -> list[Outcome]:
         case: StoredCase = pickle.loads(path.read_bytes())
-        return [one for record in case.records for way in ways
-                for one in _outcomes(case, record, way)]
+        return [outcome for record in case.records for way in ways
+                for outcome in _outcomes(case, record, way)]
     return judge
 
 
@@ -97,7 +97,7 @@ def _outcomes(case: StoredCase, record: Record, way: str) -> list[Outcome]:
         case=case.name, number=record.number, way=way, truth=number,
         refusal='' if found.accepted else str(found.refusal_kind or way), **judged(found, truth))
         for number, truth in enumerate(record.truths or (None,))]
-    return [first, *(replace(one, nees=inf) for one in others)]
+    return [first, *(replace(other, nees=inf) for other in others)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,21 +158,21 @@ def make_rows() -> Callable[[Path], list[tuple[list[Row], list[Row]]]]:
 
 def fit(rows: Sequence[Row]) -> Floats:
     """Return the coefficients of a logistic model whose chance counts below each row's ceiling."""
-    predictors = np.array([one.predictors for one in rows])
+    predictors = np.array([row.predictors for row in rows])
     return fit_logistic(
-        predictors, np.array([one.right for one in rows]),
+        predictors, np.array([row.right for row in rows]),
         np.append(0.0, np.full(predictors.shape[1] - 1, _PRIOR ** -2)),
-        weights=np.array([_WEIGHT if one.family in _UNTROUBLED else 1.0 for one in rows]),
-        ceilings=np.array([one.ceiling for one in rows]))
+        weights=np.array([_WEIGHT if row.family in _UNTROUBLED else 1.0 for row in rows]),
+        ceilings=np.array([row.ceiling for row in rows]))
 
 
 def left_out(rows: Sequence[Row]) -> list[Row]:
     """Return rows, accepted by the coefficients that the other sites fit."""
-    others = {site: fit([one for one in rows if one.site != site])
-              for site in {one.site for one in rows}}
-    chances = [float(one.ceiling * chance(one.predictors, others[one.site])) for one in rows]
-    return [replace(one, confidence=its, accepted=its >= RelocalizerOptions().min_confidence)
-            for one, its in zip(rows, chances, strict=True)]
+    others = {site: fit([row for row in rows if row.site != site])
+              for site in {row.site for row in rows}}
+    chances = [float(row.ceiling * chance(row.predictors, others[row.site])) for row in rows]
+    return [replace(row, confidence=its, accepted=its >= RelocalizerOptions().min_confidence)
+            for row, its in zip(rows, chances, strict=True)]
 
 
 def paste(section: str, names: Sequence[str], coefficients: Floats) -> Iterator[str]:

@@ -66,7 +66,7 @@ def run() -> int:
     options = parser.parse_args()
     if options.elsewhere < 0:
         raise OptionsError('--elsewhere must not be below 0')
-    names = [Path(one.partition('@')[0]).name for one in options.folders]
+    names = [Path(folder.partition('@')[0]).name for folder in options.folders]
     if len(set(names)) < len(names):
         raise OptionsError('two folders have one name: rename one')
     make_folder(options.out)
@@ -74,7 +74,7 @@ def run() -> int:
     if unknown := sorted(set(scales) - set(names)):
         raise OptionsError(f'--scale {unknown[0]}: is none of the folders')
     reading = RoomOptions(options.model, options.out, options.conf, scales)
-    rooms = [read_room(one, reading) for one in options.folders]
+    rooms = [read_room(folder, reading) for folder in options.folders]
     if ROBOT in options.kinds:  # recorded once, before several workers need it
         for room in rooms:
             if room.has_poses:
@@ -99,7 +99,7 @@ def _tables(answers: Sequence[asking.Answers], rooms: Sequence[Room]) -> Iterato
     outcomes = sorted((one for answer in answers for one in answer.outcomes), key=lambda one: (
         [room.name for room in rooms].index(one.room), asking.WAYS.index(one.way),
         asking.KNOWN.index(one.known)))
-    here = [one for one in outcomes if one.is_here]
+    here = [outcome for outcome in outcomes if outcome.is_here]
     objects = [one for one in here if one.way == asking.OBJECTS]
     yield 'Rooms', _room_table(answers, rooms)
     yield 'Success and acceptance', answer_table(here, ['room', 'kind', 'way', 'known'])
@@ -109,7 +109,7 @@ def _tables(answers: Sequence[asking.Answers], rooms: Sequence[Room]) -> Iterato
         yield f'Poses by {" and ".join(by)}; of each confidence those that are right', \
             answer_table(posed, by, **{f'from_{low:g}_on': _share_right(low, high)
                                        for low, high in pairwise(_BINS)})
-    elsewhere = [one for one in outcomes if not one.is_here]
+    elsewhere = [outcome for outcome in outcomes if not outcome.is_here]
     yield 'Images of other rooms: all accepted are false', '\n\n'.join(
         answer_table(elsewhere, by) for by in (['room', 'way'], ['way']))
     yield 'Why objects fail by more than .5 m', answer_table(
@@ -122,20 +122,20 @@ def _tables(answers: Sequence[asking.Answers], rooms: Sequence[Room]) -> Iterato
 def _share_right(low: float, high: float) -> Callable[[Sequence[asking.Outcome]], str]:
     """Return the column of the share that is right, of poses of some confidence."""
     def share(outcomes: Sequence[asking.Outcome]) -> str:
-        own = [one.right for one in outcomes if low <= one.confidence < high]
+        own = [outcome.right for outcome in outcomes if low <= outcome.confidence < high]
         return f'{np.mean(own):.2f} of {len(own)}' if own else ''
 
     return share
 
 
 def _count(cause: str) -> Callable[[Sequence[asking.Outcome]], int]:
-    return lambda outcomes: sum(one.cause == cause for one in outcomes)
+    return lambda outcomes: sum(outcome.cause == cause for outcome in outcomes)
 
 
 def _room_table(answers: Sequence[asking.Answers], rooms: Sequence[Room]) -> str:
     rows = []
     for room in rooms:
-        maps = [one for one in answers if one.task.room == room.name and one.landmarks]
+        maps = [answer for answer in answers if answer.task.room == room.name and answer.landmarks]
         boxes = np.diff(room.detections.frame_offsets)
         size = np.ptp(room.detections.map_from_camera[:, :3, 3], axis=0)
         rows.append((room.name, len(room), f'{boxes.mean():.1f}', f'{np.mean(boxes >= 3):.2f}',

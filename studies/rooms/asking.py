@@ -107,7 +107,7 @@ def make_ask(folders: Sequence[str], reading: RoomOptions, options: AskOptions
 
     @lru_cache
     def rooms() -> dict[str, Room]:
-        return {room.name: room for room in (read_room(one, reading) for one in folders)}
+        return {room.name: room for room in (read_room(folder, reading) for folder in folders)}
 
     def ask(task: Task) -> list[Answers]:
         room = rooms()[task.room]

@@ -87,7 +87,7 @@ def _features(image_rgb: NDArray[np.uint8], camera: Camera) -> tuple[Floats, NDA
         cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY), None)
     if descriptors is None:
         return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32)
-    bearings = camera.normalize_points(np.array([one.pt for one in points], dtype=np.float64))
+    bearings = camera.normalize_points(np.array([point.pt for point in points], dtype=np.float64))
     known = np.isfinite(bearings).all(axis=1)
     roots = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
     return bearings[known], roots[known]

@@ -256,7 +256,7 @@ def _robot_view(color: Callable[[], tuple[Image, Camera]]
 
 def _without_poses(folder: Path) -> Frames:
     """Return images whose poses nobody knows, by a usual camera."""
-    paths = sorted(one for one in folder.iterdir() if one.suffix.lower() in ('.jpg', '.png'))
+    paths = sorted(entry for entry in folder.iterdir() if entry.suffix.lower() in ('.jpg', '.png'))
     if not paths:
         raise DatasetError(f'{folder}: has no images')
     first = cv2.imread(str(paths[0]))

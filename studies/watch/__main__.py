@@ -38,7 +38,7 @@ def _fit(options: argparse.Namespace) -> None:
     looks = [look for seed in tqdm(range(options.first_seed, options.first_seed + options.worlds),
                                    disable=None)
              for kind in KINDS for look in fit.looks_of(kind, seed)]
-    fitted = fit.fit([one for one in looks if one.kind in FITTED_KINDS])
+    fitted = fit.fit([look for look in looks if look.kind in FITTED_KINDS])
     print(fit.report(looks, fitted))
     print('\nfor calibration.yaml, watch:\n' + ', '.join(
         f'{name}: {value:.3g}' for name, value in fitted.watch.items()

@@ -71,7 +71,7 @@ def _wrong(right: NDArray[np.float64], poses: NDArray[np.float64], bounds: NDArr
 
 def fit(looks: Sequence[Look]) -> Calibration:
     """Return the coefficients of maximum likelihood."""
-    seen = [one for one in looks if one.evidence.known]
+    seen = [look for look in looks if look.evidence.known]
     terms = np.array([[*one.evidence.terms.values()] for one in seen])
     found = fit_logistic(terms, np.array([one.is_right for one in seen]),
                          np.full(terms.shape[1], 2.0 * _RIDGE * len(seen)))
@@ -82,8 +82,8 @@ def fit(looks: Sequence[Look]) -> Calibration:
 def report(looks: Sequence[Look], calibration: Calibration) -> str:
     """Return a table of how well single looks at three objects or more tell right from wrong."""
     rows = []
-    for kind in (*dict.fromkeys(one.kind for one in looks), 'all'):
-        its = [one for one in looks if kind in (one.kind, 'all') and one.evidence.known >= 3]
+    for kind in (*dict.fromkeys(look.kind for look in looks), 'all'):
+        its = [look for look in looks if kind in (look.kind, 'all') and look.evidence.known >= 3]
         odds = np.array([log_odds(one.evidence, True, calibration) for one in its])
         right = np.array([one.is_right for one in its])
         rows.append([kind, len(its), f'{odds[right].mean():.1f}', f'{odds[~right].mean():.1f}',

@@ -70,9 +70,9 @@ def simulated_drive(kind: str, seed: int, images: int, changed: float = 0.0,
                     labels: bool = False) -> Drive:
     """Return a drive through a world; without labels, objects are matched by class."""
     found = make_drive(kind, seed, images, changed)
-    poses = np.array([one.map_from_camera for one in found.world.queries])
-    seen = [one.observation if labels else replace(one.observation, similarities=None)
-            for one in found.world.queries]
+    poses = np.array([query.map_from_camera for query in found.world.queries])
+    seen = [query.observation if labels else replace(query.observation, similarities=None)
+            for query in found.world.queries]
     stamped = [replace(one, stamp_ns=round(row * LOOK_S * NS_PER_S))
                for row, one in enumerate(seen)]
     return Drive(kind, found.world.landmark_map, with_odometry(stamped, poses, seed), poses,
@@ -84,7 +84,7 @@ def with_odometry(observations: Sequence[Observation], poses: NDArray[np.float64
     """Return observations with odometry along true poses (k, 4, 4), with errors of each step."""
     rng = np.random.default_rng([seed, 11])
     odom, way_m, found = poses[0], 0.0, []
-    for row, one in enumerate(observations):
+    for row, observation in enumerate(observations):
         if row:
             step = invert_transform(poses[row - 1]) @ poses[row]
             length = float(np.linalg.norm(step[:3, 3]))
@@ -93,7 +93,7 @@ def with_odometry(observations: Sequence[Observation], poses: NDArray[np.float64
                 Rotation.from_rotvec(np.radians(_STEP_DEG) * rng.normal(size=3)).as_matrix(),
                 _STEP_M * rng.normal(size=3)) if moved else np.eye(4)
             odom, way_m = odom @ step @ error, way_m + length
-        found.append(replace(one, odom_from_camera=odom, odom_way_m=way_m))
+        found.append(replace(observation, odom_from_camera=odom, odom_way_m=way_m))
     return found
 
 
@@ -198,7 +198,7 @@ def judge(drive: Drive, seed: int, wrong_poses: bool) -> tuple[Right, list[Alarm
         expected[expect(drive.landmark_map, observation.camera, pose,
                         np.empty(0, dtype=np.int64)).landmarks] += 1
     named = [ids.index(one) for one in reports[-1].missing]
-    return Right(drive.name, tuple(one.state for one in reports), len(named),
+    return Right(drive.name, tuple(report.state for report in reports), len(named),
                  int(is_wrong[named].sum()),
                  int((is_wrong & (expected >= _EXPECTED)).sum())), alarms
 
@@ -215,7 +215,7 @@ def _wrong_ways(drive: Drive, poses: NDArray[np.float64], row: int, rng: np.rand
     if twin is not None:
         yield TWIN, drive.observations[ahead], twin @ poses[ahead]
     others = np.nonzero(~_FAR.agreeing(poses[row][None], poses[:-LOOKS])[0])[0]
-    odom = np.array([one.odom_from_camera for one in drive.observations])
+    odom = np.array([observation.odom_from_camera for observation in drive.observations])
     for there in rng.choice(others, min(_KIDNAPS, len(others)), replace=False):
         # neither odometry nor the localizer notice that the robot is carried away
         ahead = slice(there, there + _MOST_LOOKS)

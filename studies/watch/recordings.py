@@ -79,8 +79,8 @@ def watch_recording(recorded: Recorded, watch: Watch, truth: Poses | None, perio
 
 def alarms_of(looks: Sequence[WatchedLook]) -> list[WatchedLook]:
     """Return the looks at which an alarm begins."""
-    states = [WatchState.UNCERTAIN, *(one.state for one in looks)]
-    return [one for one, (before, now) in zip(looks, pairwise(states), strict=True)
+    states = [WatchState.UNCERTAIN, *(look.state for look in looks)]
+    return [look for look, (before, now) in zip(looks, pairwise(states), strict=True)
             if now == WatchState.LOST != before]
 
 
@@ -90,7 +90,7 @@ def times_to_alarm(looks: Sequence[WatchedLook]) -> list[dict[str, Any]]:
     seconds, metres and looks are None where it did not.
     """
     found: list[dict[str, Any]] = []
-    begins = [row for row, one in enumerate(looks) if one.is_right is False
+    begins = [row for row, look in enumerate(looks) if look.is_right is False
               and (row == 0 or looks[row - 1].is_right is not False)]
     for first in begins:
         last = next((row for row in range(first, len(looks))
@@ -110,8 +110,8 @@ def summarize_watch(looks: Sequence[WatchedLook]) -> dict[str, Any]:
     """Return the figures of a watched recording; None where the truth does not tell."""
     hours = (looks[-1].stamp_s - looks[0].stamp_s) / 3600.0 if len(looks) > 1 else 0.0
     alarms = alarms_of(looks)
-    false = sum(one.is_right is True for one in alarms)
-    knows = any(one.is_right is not None for one in looks)
+    false = sum(alarm.is_right is True for alarm in alarms)
+    knows = any(look.is_right is not None for look in looks)
     return {
         'looks': len(looks), 'hours': hours, 'way_m': looks[-1].way_m if looks else 0.0,
         'states': {str(one): sum(look.state == one for look in looks) for one in WatchState},
@@ -125,7 +125,7 @@ def write_watch(folder: Path, looks: Sequence[WatchedLook]) -> str:
     summary = summarize_watch(looks)
     make_folder(folder)
     write_text(folder / 'watch.json', json.dumps(
-        {**summary, 'every_look': [asdict(one) for one in looks]}, indent=1))
+        {**summary, 'every_look': [asdict(look) for look in looks]}, indent=1))
     states = ', '.join(f'{name} {count}' for name, count in summary['states'].items())
     lines = [f'{len(looks)} looks in {60.0 * summary["hours"]:.1f} min and '
              f'{summary["way_m"]:.0f} m: {states}; {summary["alarms"]} alarms']

@@ -94,14 +94,14 @@ def rows_of(class_ids: Sequence[str]) -> list[int]:
 
 def make_objects(things: Sequence[Thing], rng: np.random.Generator) -> Objects:
     """Return things as objects; those of one class and model have the same size."""
-    models = np.array([one.model for one in things])
+    models = np.array([thing.model for thing in things])
     sizes = np.array([TYPICAL[CLASS_NAMES[row]][:3] for row in rows_of([
-        one.name for one in things])])
+        thing.name for thing in things])])
     growth = {kind: rng.uniform(*_GROWTH, 3)
-              for kind in dict.fromkeys((one.name, one.model) for one in things)}
-    sizes *= [growth[one.name, one.model] for one in things]
-    return Objects(tuple(one.name for one in things), models,
-                   np.array([[one.x, one.y, one.z] for one in things]), sizes,
+              for kind in dict.fromkeys((thing.name, thing.model) for thing in things)}
+    sizes *= [growth[thing.name, thing.model] for thing in things]
+    return Objects(tuple(thing.name for thing in things), models,
+                   np.array([[thing.x, thing.y, thing.z] for thing in things]), sizes,
                    np.array([one.yaw for one in things]), np.array([one.whole for one in things]))
 
 

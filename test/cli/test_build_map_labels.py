@@ -89,7 +89,7 @@ def test_labels_from_the_shipped_vocabulary(observations):
 def test_phrases_of_a_user(observations, tmp_path, capsys):
     """A pattern that the shipped vocabulary lacks."""
     words = tmp_path / 'words.yaml'
-    classes = {one.split('_')[0] for one in LandmarkMap.from_file(
+    classes = {class_id.split('_')[0] for class_id in LandmarkMap.from_file(
         observations.with_name('shipped.yaml')).class_ids}
     words.write_text(''.join(
         f"{name}:\n  phrases: ['a {{colour}} {name} {{pattern}}', 'a {{colour}} {name}']\n"

@@ -55,7 +55,7 @@ def test_a_doubled_map_fails(check_map, tmp_path):
     (('{room}', '--images', '{folder}', '--out', '{folder}/out'), '--observations'),
     (('{room}', '--queries', '{folder}/gone.npz', '--out', '{folder}/out'), 'gone.npz')])
 def test_what_to_correct_is_named(check_map, room_file, tmp_path, args, named):
-    done = check_map(*(one.format(folder=tmp_path, room=room_file) for one in args))
+    done = check_map(*(argument.format(folder=tmp_path, room=room_file) for argument in args))
     assert done.returncode == 1
     assert done.stderr.startswith('error: ')
     assert named in done.stderr

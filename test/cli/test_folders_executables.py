@@ -59,8 +59,8 @@ def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys)
     assert run(evaluate, '--folder', walk, '--map', built, *NETWORKS, *CLIP, '--methods', 'auto',
                '--trials', 1, '--sweep', '--no-figures', '--out', tmp_path / 'out') == 0
     assert '12 of 12 images' in capsys.readouterr().out
-    accepted = [one for one in json.loads((tmp_path / 'out/results.json').read_text())
-                if one['accepted']]
+    accepted = [trial for trial in json.loads((tmp_path / 'out/results.json').read_text())
+                if trial['accepted']]
     assert len(accepted) > 4 and max(one['error_m'] for one in accepted) < 0.5
 
     studio = open_studio(make_parser().parse_args([str(built), '--images', str(walk)]))
@@ -76,8 +76,8 @@ def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys)
 
 
 def errors_of(folder):
-    return [one['error_m'] for one in json.loads((folder / 'results.json').read_text())
-            if one['accepted']]
+    return [trial['error_m'] for trial in json.loads((folder / 'results.json').read_text())
+            if trial['accepted']]
 
 
 @pytest.mark.parametrize('how', [('--scale', '0.4'), ('--object-size', 'clock', '0.3')])
@@ -113,7 +113,7 @@ def test_a_scaled_and_levelled_map_is_evaluated_on_its_own_recording(tmp_path, c
     caplog.clear()
     assert run(build_map, '--colmap', folder, *NETWORKS, *CLIP, '--level', '--scale', 0.8,
                '--out', tmp_path / 'twice.yaml') == 0
-    assert any('other poses or keyframes' in one for one in caplog.messages)
+    assert any('other poses or keyframes' in message for message in caplog.messages)
     twice, once = (load_recording(path).load() for path in (tmp_path / 'twice.yaml', built))
     again = np.isin(once.stamps_s, twice.stamps_s)
     assert len(twice) == again.sum()
@@ -127,7 +127,7 @@ def test_a_scaled_and_levelled_map_is_evaluated_on_its_own_recording(tmp_path, c
     caplog.clear()
     assert run(build_map, '--colmap', folder, *NETWORKS, *CLIP, '--level', '--scale', 0.8,
                '--out', tmp_path / 'longer.yaml') < 2
-    assert not any('other poses or keyframes' in one for one in caplog.messages)
+    assert not any('other poses or keyframes' in message for message in caplog.messages)
 
 
 def test_a_levelled_map_is_evaluated_on_the_bag_that_made_it(tmp_path, capsys):

@@ -50,10 +50,10 @@ def test_refits_to_a_recording(import_map, office, table, observations, tmp_path
                 for name, center in zip(found.landmark_ids, found.centers, strict=True)]
     print(f'{len(found)} landmarks, median error {np.median(errors_m) * 100:.1f} cm')
     assert len(found) >= 30 and np.median(errors_m) < 0.03
-    assert {one.source for one in found.details} == {'import_map csv theirs.csv'}
-    assert all(one.support >= 3 and one.position_sigma < 0.1 and one.shared_sigma is None
-               for one in found.details)
-    left_out = {one['landmark_id']: one['reason'] for one in json.loads(report.read_text())[
+    assert {detail.source for detail in found.details} == {'import_map csv theirs.csv'}
+    assert all(detail.support >= 3 and detail.position_sigma < 0.1 and detail.shared_sigma is None
+               for detail in found.details)
+    left_out = {trial['landmark_id']: trial['reason'] for trial in json.loads(report.read_text())[
         'left_out']}
     assert len(left_out) == 42 - len(found)
     assert 'semi-axes' in left_out['thin'] and 'ghost' in left_out

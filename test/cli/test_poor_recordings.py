@@ -80,7 +80,7 @@ def test_what_moves_is_no_landmark(office, tmp_path, capsys):
     assert 'person' not in built.landmark_map.class_ids
     assert any('person are not landmarks' in note for note in built.report.notes)
     report = check(plain, crowded)
-    faults = {one.landmark_id: one for one in report.landmarks}
+    faults = {landmark.landmark_id: landmark for landmark in report.landmarks}
     assert all(faults[name].severity >= 1.0 for name, kind in zip(
         plain.landmark_ids, plain.class_ids, strict=True) if kind == 'person')
     save_observations(tmp_path / 'office.npz', office)

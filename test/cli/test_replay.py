@@ -286,14 +286,14 @@ def test_small_sequence_round_trip(make_sequence, tmp_path, run_here, storage, f
     stamps = [round(float(stamp) * 10) * 100_000_000 for stamp in sequence.stamps]
     for name in list(topics)[:3]:
         assert [bag_messages.stamp_ns(message) for message in topics[name]] == stamps
-        assert {one.header.frame_id for one in topics[name]} == {'camera_optical_frame'}
+        assert {topic.header.frame_id for topic in topics[name]} == {'camera_optical_frame'}
     for message, expected_bgr in zip(topics[images], sequence.images_bgr, strict=True):
         np.testing.assert_array_equal(decode_rgb(message), expected_bgr[:, :, ::-1])
     if form == 'compressed':
         assert {message.format for message in topics[images]} == {'rgb8; png compressed bgr8'}
         first = (sequence.folder / 'rgb' / f'{sequence.stamps[0]}.png').read_bytes()
         assert topics[images][0].data.tobytes() == first
-    assert [len(one.detections) for one in topics['/front/camera/detections']] == [0, 1, 2, 0]
+    assert [len(topic.detections) for topic in topics['/front/camera/detections']] == [0, 1, 2, 0]
     (pose, *_) = topics['/front/camera/ground_truth']
     assert pose.header.frame_id == 'world'
     assert (bag_messages.stamp_ns(pose), pose.pose.position.x) == (stamps[1], 0)

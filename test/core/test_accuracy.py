@@ -74,7 +74,7 @@ def test_five_frames_joined_by_odometry(case, office_map, queries, judge, thresh
         if case != 'nothing':
             frames = with_vertical(frames, 1.0, seed)
         frames = with_neighbours(frames, [frame.group for frame in queries], 0.01, 0.5, seed)
-        asked.append([one for one in frames if queries[one.number].is_main])
+        asked.append([frame for frame in frames if queries[frame.number].is_main])
     found, within = judge(OPTIONS if case == 'nothing' else HEIGHTS, *asked)
     assert all(found.success(limit) >= one
                for limit, one in zip(LIMITS_M, least['success'], strict=True))

@@ -77,7 +77,7 @@ def test_landmarks_of_several_classes_agree_with_their_mask(landmarks, others, d
     index = ClassIndex.of(landmarks, others)
     mask = same_class(tuple(detections), tuple(landmarks))
     for row, name in others:
-        mask[[one == name for one in detections], row] = True
+        mask[[detection == name for detection in detections], row] = True
     classes = index.classes_of(detections)
     assert (class_candidates(index, classes).pairs == np.argwhere(mask)).all()
     rarest = class_candidates(index, classes, 100).pairs

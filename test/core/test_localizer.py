@@ -114,8 +114,8 @@ def fused(session, observation, run=0):
 
 def test_a_session_finds_what_the_relocalizer_finds(session):
     observations = [frame(number, 4.0 * number) for number in range(3)]
-    for one in observations:
-        found = session.answer(Query((one,), limit=5, length_s=5.0))
+    for observation in observations:
+        found = session.answer(Query((observation,), limit=5, length_s=5.0))
     at_once = RELOCALIZER.relocalize(observations)
     np.testing.assert_array_equal(found.map_from_camera, at_once.map_from_camera)
     assert found.covariance == pytest.approx(at_once.covariance)

@@ -357,7 +357,7 @@ def test_the_right_one_of_different_floors_is_accepted(place):
     assert max(pose_error(found.map_from_camera, MAP_FROM_CAMERA)) < 1.0
     assert np.allclose(found.map_from_camera, alone.map_from_camera, atol=1e-6)
     assert np.diag(found.covariance) == pytest.approx(np.diag(alone.covariance), rel=0.02)
-    assert {one.landmark for one in found.matches} == set(range(12))
+    assert {match.landmark for match in found.matches} == set(range(12))
 
 
 @pytest.mark.parametrize('turned', [False, True])

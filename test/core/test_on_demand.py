@@ -54,7 +54,7 @@ def searches(crops, observation=VIEW):
 
 
 def poses_of(found):
-    return [one.map_from_camera for one in found.hypotheses]
+    return [hypothesis.map_from_camera for hypothesis in found.hypotheses]
 
 
 def test_the_crops_that_say_most_come_first():
@@ -67,14 +67,14 @@ def test_the_crops_that_say_most_come_first():
 
 def test_each_stage_has_more_crops_and_the_last_one_all():
     stages = searches(Crops(lambda rows: SURE[rows], np.array([5])))
-    assert [len(one.compared) for one in stages] == [1, 1 + BATCH, 1 + 2 * BATCH, len(SEEN)]
+    assert [len(stage.compared) for stage in stages] == [1, 1 + BATCH, 1 + 2 * BATCH, len(SEEN)]
     assert stages[0].compared.tolist() == [5], 'what is known costs nothing'
     assert sorted(stages[-1].compared) == list(range(len(SEEN)))
-    for one in stages:
-        assert np.array_equal(one.similarities, SURE[one.compared])
-        rows = one.similarity_rows
-        assert np.array_equal(np.nonzero(rows >= 0)[0], np.sort(one.compared))
-        assert np.array_equal(one.compared[rows[rows >= 0]], np.nonzero(rows >= 0)[0])
+    for stage in stages:
+        assert np.array_equal(stage.similarities, SURE[stage.compared])
+        rows = stage.similarity_rows
+        assert np.array_equal(np.nonzero(rows >= 0)[0], np.sort(stage.compared))
+        assert np.array_equal(stage.compared[rows[rows >= 0]], np.nonzero(rows >= 0)[0])
 
 
 def test_crops_end_when_there_is_no_room():

@@ -41,7 +41,7 @@ def test_cameras_of_one_instant_have_no_odometry_between_them(rng):
     """Whatever their names say, equal names are frames of one camera that moved."""
     relocalizer = Relocalizer(MAP, replace(OPTIONS, mount_deviation=(0.0, 0.0)))
     frames = look(rng, objects=5)
-    rigid, moving = (relocalizer.relocalize([replace(one, camera_name=name) for one, name in
+    rigid, moving = (relocalizer.relocalize([replace(frame, camera_name=name) for frame, name in
                                              zip(frames, names, strict=True)])
                      for names in (NAMES, 4 * ('',)))
     assert np.trace(rigid.covariance) < 0.9 * np.trace(moving.covariance)
@@ -73,7 +73,7 @@ def test_instants_are_kept_and_replaced_as_a_whole(rng):
     def localize(number, pose):
         *others, last = look(rng, pose, stamp_ns=number)
         found = localizer.answer(Query((*others, last), limit=5, length_s=60.0))
-        return found, [len(one.searched) for one in localizer._instants]
+        return found, [len(instant.searched) for instant in localizer._instants]
     assert localize(0, np.eye(4))[1] == [4]
     assert localize(1, np.eye(4))[1] == [4], 'a robot that stands replaces its instant'
     assert localize(2, STEP)[1] == [4, 4]

@@ -127,8 +127,8 @@ def pose_at(x, y, yaw_deg):
 def drive(count):
     """A robot on a circle about the middle that looks outwards, 20 degrees on each time."""
     angles = np.radians(20.0 * np.arange(count))
-    return [pose_at(3.0 + np.cos(one), 3.0 + np.sin(one), np.degrees(one) + 15.0)
-            for one in angles]
+    return [pose_at(3.0 + np.cos(angle), 3.0 + np.sin(angle), np.degrees(angle) + 15.0)
+            for angle in angles]
 
 
 def see(landmark_map, pose, number=0, odom=True, rng=None, rows=None):
@@ -205,7 +205,7 @@ def test_a_robot_that_is_carried_away_is_noticed(watch, room):
 def test_minutes_without_objects_end_in_uncertain(watch, room):
     follow(watch, room, drive(10))
     reports = follow(watch, room, drive(18) * 20, first=10, rows=[])
-    assert {one.state for one in reports} == {WatchState.LOCALIZED, WatchState.UNCERTAIN}
+    assert {report.state for report in reports} == {WatchState.LOCALIZED, WatchState.UNCERTAIN}
     assert reports[-1].state == WatchState.UNCERTAIN
     assert 0.5 <= reports[-1].probability < 0.9
 
@@ -290,7 +290,7 @@ def test_missing_landmarks_are_named(watch, room):
     gone = [2, 9, 17, 25]
     there = np.setdiff1d(np.arange(COUNT), gone)
     reports = follow(watch, room, drive(90), rows=there, rng=np.random.default_rng(1))
-    assert WatchState.LOST not in {one.state for one in reports}
+    assert WatchState.LOST not in {report.state for report in reports}
     assert not reports[3].missing  # one look does not name any
     expected = {row for pose in drive(18)
                 for row in expect(room, CAMERA, pose, np.arange(COUNT)).landmarks}

@@ -48,8 +48,8 @@ def write_bag(path, storage, parts, compression='NONE'):
             topics = {name: writer.add_connection(name, STRING, typestore=typestore(),
                                                   offered_qos_profiles=[qos])
                       for name, qos in QOS.items()}
-            for one in messages:
-                writer.write(topics[one.topic], one.stamp_ns, one.data)
+            for message in messages:
+                writer.write(topics[message.topic], message.stamp_ns, message.data)
     path.mkdir()
     every = []
     for index, _ in enumerate(parts):
@@ -88,7 +88,7 @@ def test_reads_what_jazzy_records(tmp_path, storage, compression):
         assert reader.deserialize(messages[0]).data == 'message 0'
         chosen = reader.messages(['/chatter', '/robot_description'], messages[3].stamp_ns,
                                  messages[9].stamp_ns)
-        assert list(chosen) == [one for one in messages[3:9] if one.topic != '/status']
+        assert list(chosen) == [message for message in messages[3:9] if message.topic != '/status']
 
 
 def truncate(path, size):
@@ -186,8 +186,8 @@ def test_metadata_is_as_jazzy_reads_it(tmp_path, plugin):
     }
     latched = offered | {'depth': 1, 'durability': 'transient_local'}
     topics = [one['topic_metadata'] for one in info['topics_with_message_count']]
-    assert [one['offered_qos_profiles'] for one in topics] == [[offered], [latched]]
-    assert [one['serialization_format'] for one in topics] == ['cdr', 'cdr']
+    assert [topic['offered_qos_profiles'] for topic in topics] == [[offered], [latched]]
+    assert [topic['serialization_format'] for topic in topics] == ['cdr', 'cdr']
     assert topics[1]['type_description_hash'].startswith('RIHS01_2142741200')
 
 

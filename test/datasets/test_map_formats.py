@@ -68,7 +68,7 @@ def check_equal(imported, true_map):
     assert found.class_ids == true_map.class_ids
     np.testing.assert_allclose(found.centers, true_map.centers, atol=1e-5)
     np.testing.assert_allclose(shapes(found), shapes(true_map), atol=1e-5)
-    assert {one.source for one in found.details} == {'a test'}
+    assert {detail.source for detail in found.details} == {'a test'}
 
 
 def test_goreloc(true_map, tmp_path):
@@ -87,8 +87,8 @@ def test_what_the_file_does_not_know_of_its_errors_is_given(true_map, tmp_path):
     known, *others = place(given, 'a test', 'map', scale, np.eye(4),
                            (0.05, 1.0)).landmark_map.details
     assert (known.position_sigma, known.shared_sigma) == (0.1, None)
-    assert {(one.position_sigma, one.shared_sigma, one.shared_sigma_deg)
-            for one in others} == {(0.05, 0.05, 1.0)}
+    assert {(other.position_sigma, other.shared_sigma, other.shared_sigma_deg)
+            for other in others} == {(0.05, 0.05, 1.0)}
 
 
 def test_oaslam_text(true_map, tmp_path):
@@ -105,7 +105,7 @@ def test_oaslam_saved_map(true_map, tmp_path):
     write(tmp_path / 'map_m.objecttracks', tracks)
     imported = import_all(read_oaslam(path, COCO))
     check_equal(imported, true_map)
-    assert [one.support for one in imported.landmark_map.details] == [4] * 4
+    assert [detail.support for detail in imported.landmark_map.details] == [4] * 4
 
 
 def test_msgloc(true_map, tmp_path):
@@ -132,7 +132,7 @@ def test_table_of_a_spreadsheet(tmp_path, encoding):
     assert found.centers[0].tolist() == [3.0, -2.0, 1.5]
     assert found.semi_axes[0].tolist() == [0.3, 0.2, 0.1]
     assert found.quats_xyzw[0].tolist() == [0.0, 0.0, 0.0, 1.0]
-    assert [one.support for one in found.details] == [7, None]
+    assert [detail.support for detail in found.details] == [7, None]
     assert [note.endswith(' colour') for note in given.notes] == [True]
 
 

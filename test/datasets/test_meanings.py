@@ -114,9 +114,9 @@ def test_depth_of_transforms_json_is_in_the_unit_of_its_poses(shots, tmp_path):
     for shot in shots:
         cv2.imwrite(str(folder / f'depth/{shot.path.stem}.png'),
                     np.full((48, 64), 1000, dtype=np.uint16))
-    edited(folder, lambda values: [one.update(
+    edited(folder, lambda values: [value.update(
         depth_file_path=f'depth/{shot.path.stem}.png')
-        for one, shot in zip(values['frames'], shots, strict=True)])
+        for value, shot in zip(values['frames'], shots, strict=True)])
     with pytest.raises(DatasetError, match='`scale`'):
         read_folder(folder)
     for fields, options, expected_m in (

@@ -150,8 +150,8 @@ def test_queries_are_read(tmp_path):
 def assert_same(queries, others):
     assert queries.landmark_ids == others.landmark_ids
     assert queries.intrinsics_fx_fy_cx_cy == others.intrinsics_fx_fy_cx_cy
-    for one, other in zip(queries, others, strict=True):
-        for name, value in vars(one).items():
+    for query, other in zip(queries, others, strict=True):
+        for name, value in vars(query).items():
             np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
 
 

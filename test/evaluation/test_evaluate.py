@@ -168,10 +168,10 @@ def test_a_bag_a_folder_and_the_saved_queries_say_the_same(walk, evaluated_bag, 
     results = results_of(walk / 'from_bag')
     assert results == results_of(walk / 'from_saved')
     # a bag's quaternions are rounded once more
-    for one, other in zip(results, results_of(walk / 'from_tum'), strict=True):
+    for result, other in zip(results, results_of(walk / 'from_tum'), strict=True):
         for name in ('error_m', 'error_deg', 'nees', 'confidence'):
-            assert one.pop(name) == pytest.approx(other.pop(name), abs=1e-6)
-        assert one == other
+            assert result.pop(name) == pytest.approx(other.pop(name), abs=1e-6)
+        assert result == other
     results = results_of(walk / 'from_bag')
     queries = len(load_queries(walk / 'saved.npz'))
     assert queries == IMAGES - 1

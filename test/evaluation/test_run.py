@@ -71,7 +71,7 @@ def test_every_method_trial_and_query_is_there(results, methods, questions):
     assert sum(count_trials(method, 3) for method in methods) == 7
     keys = [(result.method, result.trial, result.query) for result in results]
     assert len(set(keys)) == len(keys)
-    assert [one.method for one in summarize(results)] == [one.name for one in methods]
+    assert [one.method for one in summarize(results)] == [method.name for method in methods]
     solved = [result for result in results if result.solved]
     assert solved
     assert len(solved) < len(results)
@@ -80,7 +80,7 @@ def test_every_method_trial_and_query_is_there(results, methods, questions):
 
 
 def test_trials_differ_and_repeat(results, room, questions, methods):
-    sampled = [one for one in results if one.method == 'class_ransac']
+    sampled = [result for result in results if result.method == 'class_ransac']
     count = len(questions)
     assert ([one.score for one in sampled[:count]]
             != [one.score for one in sampled[count:2 * count]])
@@ -125,8 +125,8 @@ def test_what_is_done_is_not_run_again(results, room, questions, methods):
 def test_similarities_follow_the_maps_order(room, recording, questions):
     turned = Queries(recording.landmark_ids[::-1], recording.intrinsics_fx_fy_cx_cy, tuple(
         replace(frame, similarities=frame.similarities[:, ::-1]) for frame in recording.frames))
-    for one, other in zip(make_queries(turned, room), questions, strict=True):
-        np.testing.assert_array_equal(one.observation.similarities,
+    for query, other in zip(make_queries(turned, room), questions, strict=True):
+        np.testing.assert_array_equal(query.observation.similarities,
                                       other.observation.similarities)
 
 
@@ -205,7 +205,7 @@ def test_keyframes_are_for_auto_and_what_is_based_on_it(tmp_path):
     path.write_text('strict: {min_confidence: 0.9}\nobjects: {keyframes: false}\n'
                     'wide: {base: hybrid_b-prosac}\n')
     methods = parse_methods(['auto', 'clip_bf', str(path)], FIVE, 40)
-    assert [one.name for one in methods if one.keyframes] == ['auto', 'strict']
+    assert [method.name for method in methods if method.keyframes] == ['auto', 'strict']
 
 
 @pytest.mark.parametrize(('text', 'named'), [
@@ -355,12 +355,12 @@ def test_names_do_not_cover_each_other(inches):
     draw_map(axes, room)
     axes.autoscale_view()
     spread_names(figure)
-    names = [one for one in axes.texts if one.get_visible()]
-    boxes = [one.get_window_extent() for one in names]
+    names = [text for text in axes.texts if text.get_visible()]
+    boxes = [name.get_window_extent() for name in names]
     assert not any(first.overlaps(second) for first, second in combinations(boxes, 2))
     assert all(axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1 for box in boxes)
     assert (len(names) == len(room)) == (inches > 2.0), 'a small map has no room for all'
     highest = room.landmark_ids[int(np.argmax(room.centers[:, 2]))]
-    assert highest in [one.get_text() for one in names]
+    assert highest in [name.get_text() for name in names]
     image = cv2.imdecode(np.frombuffer(png_of(figure, 50), np.uint8), cv2.IMREAD_COLOR)
     assert image.shape[0] == pytest.approx(50 * inches, abs=1)

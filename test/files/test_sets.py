@@ -98,7 +98,7 @@ def test_files_of_another_set_are_refused(path):
     document = Document(path)
     document.close()
     assert 'is of the set' in document.notes[0]
-    assert all(one.look is None for one in document.landmarks.values())
+    assert all(landmark.look is None for landmark in document.landmarks.values())
 
 
 def test_the_studio_finishes_what_a_killed_writer_left(path):
@@ -135,7 +135,7 @@ def test_a_set_that_cannot_be_written_changes_nothing(path):
         write_map(path, made_map(3).landmark_map, besides={blocker: lambda place, digest:
                                                           place.write_text(digest)})
     assert read(path) == (0, {True})
-    assert not [one for one in path.parent.iterdir() if one.name.startswith('.')]
+    assert not [entry for entry in path.parent.iterdir() if entry.name.startswith('.')]
 
 
 def test_two_writers_at_once_leave_one_whole_set(path):
@@ -145,13 +145,13 @@ def test_two_writers_at_once_leave_one_whole_set(path):
         writers = [fork.Process(target=lambda numbers: [write_set(path, one) for one in numbers],
                                 args=(range(100 * turn + 10 * one, 100 * turn + 10 * one + 10),))
                    for one in range(2)]
-        for one in writers:
-            one.start()
-        for one in writers:
-            one.join()
-        assert [one.exitcode for one in writers] == [0, 0]
+        for writer in writers:
+            writer.start()
+        for writer in writers:
+            writer.join()
+        assert [writer.exitcode for writer in writers] == [0, 0]
         assert read(path)[1] == {True}
-    assert not [one for one in path.parent.iterdir() if one.name.startswith('.')]
+    assert not [entry for entry in path.parent.iterdir() if entry.name.startswith('.')]
 
 
 def test_what_a_killed_writer_left_comes_not_into_a_later_set_without_it(path):
@@ -162,7 +162,7 @@ def test_what_a_killed_writer_left_comes_not_into_a_later_set_without_it(path):
                    MapRecording(path.with_name('seen.npz')))
     LandmarkMap.from_file(path)
     assert not layer_path(path).exists()
-    assert not [one for one in path.parent.iterdir() if one.name.startswith('.')]
+    assert not [entry for entry in path.parent.iterdir() if entry.name.startswith('.')]
 
 
 def test_files_of_a_set_stay_private_and_links_stay_links(path, tmp_path):
@@ -225,16 +225,16 @@ def test_two_processes_of_one_number_share_a_folder(tmp_path):
     writers = [subprocess.Popen([*own_numbers(), sys.executable, '-c', code,
                                  str(path), str(number)], stdout=subprocess.PIPE, text=True)
                for number in range(2)]
-    assert len({one.stdout.readline() for one in writers}) == 1, 'they have one number'
+    assert len({writer.stdout.readline() for writer in writers}) == 1, 'they have one number'
     reads = 0
-    while any(one.poll() is None for one in writers):
+    while any(writer.poll() is None for writer in writers):
         if path.exists():
             found = load_landmark_embeddings(path)
             assert found.means[0, int(found.encoder_key)] == 1.0
             reads += 1
     assert reads > 50
-    assert [one.wait() for one in writers] == [0, 0]
-    assert [one.name for one in tmp_path.iterdir()] == [path.name]
+    assert [writer.wait() for writer in writers] == [0, 0]
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 
 def test_a_file_whose_names_have_no_ending_misses_its_arrays(path):

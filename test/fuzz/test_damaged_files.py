@@ -97,7 +97,7 @@ def damaged(content, draw):
 def plain(value):
     """What a reader returns, as values that can be compared."""
     if is_dataclass(value):
-        return {name: plain(one) for name, one in vars(value).items() if not name.startswith('_')}
+        return {name: plain(var) for name, var in vars(value).items() if not name.startswith('_')}
     if isinstance(value, np.ndarray):
         return value.tobytes(), value.shape
     return [plain(one) for one in value] if isinstance(value, tuple | list) else repr(value)

@@ -71,19 +71,19 @@ def rooms_report():
 
 
 def test_a_true_map_has_no_fault_and_its_frames_are_accepted(report):
-    assert all(one.faults == () for one in report.landmarks)
+    assert all(landmark.faults == () for landmark in report.landmarks)
     assert any('set `height_range_m` to [' in note for note in report.notes)
     recording, grid = report.recording, report.grid
     assert recording.held_out.explained == 1.0
     assert 0.9 < recording.held_out.median_iou < 1.0
-    assert not any(one.is_significant for one in recording.corrections)
+    assert not any(correction.is_significant for correction in recording.corrections)
     assert report.overlaps == report.look_alikes == ()
-    verdicts = Counter(one.verdict for one in recording.trials)
+    verdicts = Counter(trial.verdict for trial in recording.trials)
     assert len(recording.trials) == 12 and verdicts['accepted'] >= 9 and not verdicts['misled']
-    assert all(one.error_m < 0.1 for one in recording.trials if one.verdict == 'accepted')
+    assert all(trial.error_m < 0.1 for trial in recording.trials if trial.verdict == 'accepted')
     assert len(grid.trials) == 4 * len(grid.positions)
     assert (grid.accepted <= grid.headings).all()
-    blind = [one for one in grid.trials if one.landmarks == 0]
+    blind = [trial for trial in grid.trials if trial.landmarks == 0]
     assert {one.verdict for one in blind} == {'refused'}
 
 
@@ -117,7 +117,7 @@ def test_a_misspelt_class_is_named_with_the_right_one(detections, is_recorded):
     (fault,) = worst.faults
     assert f"'{right}k'" in fault and f"mean '{right}'?" in fault
     assert ('misspelt' in fault) != is_recorded
-    assert all(one.severity == 0.0 for one in others)
+    assert all(other.severity == 0.0 for other in others)
 
 
 @pytest.mark.parametrize(('label', 'class_id', 'other'), [
@@ -139,8 +139,8 @@ def test_boxes_that_leave_a_place_open_do_not_say_that_a_landmark_moved(detectio
     boxes = detections.bboxes_xyxy.copy()
     boxes[own, 0], boxes[own, 1], boxes[own, 2] = 0.0, 0.0, 640.0
     _, witness = witness_of(TABLE, replace(detections, bboxes_xyxy=boxes))
-    (one,) = [one for one in check_landmarks(TABLE, witness, [])
-              if one.landmark_id == 'thing_4']
+    (one,) = [checked for checked in check_landmarks(TABLE, witness, [])
+              if checked.landmark_id == 'thing_4']
     assert not any(' cm away' in fault for fault in one.faults)
 
 
@@ -181,7 +181,7 @@ def test_identical_rooms_fail_the_check(rooms_report):
     assert 'nothing tells them apart' in rooms_report.advice[0]
     # more objects would not help
     assert not any('map more objects' in text for text in rooms_report.advice)
-    assert sum(one.verdict == 'accepted' for one in rooms_report.grid.trials) == 0
+    assert sum(trial.verdict == 'accepted' for trial in rooms_report.grid.trials) == 0
 
 
 def test_a_symmetric_place_is_one_place(report):
@@ -255,12 +255,12 @@ def test_frames_for_which_no_landmark_is_left_count_as_refused(detections):
                            lambda share: None)
     assert len(trials) == 12
     bare_stamps = detections.stamps_s[bare.frames]
-    of_bare = [one for one in trials if one.stamp_s in bare_stamps]
+    of_bare = [trial for trial in trials if trial.stamp_s in bare_stamps]
     assert of_bare
     assert {one.verdict for one in of_bare} == {'refused'}
     # the other parts tell nothing of the map there
-    assert all(one.is_judged == (one.stamp_s not in bare_stamps) for one in trials)
-    assert any(one.verdict == 'accepted' for one in trials)
+    assert all(trial.is_judged == (trial.stamp_s not in bare_stamps) for trial in trials)
+    assert any(trial.verdict == 'accepted' for trial in trials)
 
 
 def test_a_walk_that_passes_each_object_once_is_judged_by_what_it_can_tell():

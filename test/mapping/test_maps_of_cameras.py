@@ -127,7 +127,7 @@ def test_cameras_share_the_errors_of_the_robot(odometry):
     print(f'\nposes off by: one camera {1e3 * one:.0f} mm, four {1e3 * four:.0f} mm')
     assert four < (1.0 if odometry else 0.6) * one
     if odometry:
-        assert any(' 239 of 239 ' in one for one in built.report.notes)
+        assert any(' 239 of 239 ' in note for note in built.report.notes)
 
 
 def test_a_rig_stays_rigid():
@@ -201,9 +201,9 @@ def test_the_check_names_the_camera_that_is_off():
     options = CheckOptions(relocalizer=RelocalizerOptions(iterations=300), frames=16,
                            max_positions=4, headings=4, spacing_m=2.0)
     right = check_map(ROOM, detections, options=options)
-    assert any('front' in one for one in right.notes)
+    assert any('front' in note for note in right.notes)
     assert len(right.recording.trials) == len(right.recording.simulated) == 16
-    assert not any(one.is_significant for one in right.recording.corrections)
+    assert not any(correction.is_significant for correction in right.recording.corrections)
     wrong = check_map(ROOM, replace(detections, cameras=tuple(cameras)), options=options)
     advice, = (line for line in wrong.advice if line.startswith('calibrate the camera'))
     assert re.search('fx of left by -[45]', advice)

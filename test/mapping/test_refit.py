@@ -79,7 +79,7 @@ def test_only_chosen_landmarks_move(table, boxes):
     found = refit_map(boxes, given, chosen).landmark_map
     assert (found.centers[~chosen] == given.centers[~chosen]).all()
     assert (found.quats_xyzw[~chosen] == given.quats_xyzw[~chosen]).all()
-    assert [one.support is None for one in found.details] == (~chosen).tolist()
+    assert [detail.support is None for detail in found.details] == (~chosen).tolist()
     assert errors_m(found, table)[4] < 0.01
 
 
@@ -157,13 +157,13 @@ def make_map(*things):
 
 def watch(*things, noise_px=1.0):
     """Return what a detector sees of some things: class, centre, axes, frames with a box."""
-    parts = [see(make_map(one[:3]), POSES, noise_px, seed=row)
-             for row, one in enumerate(things)]
-    parts = [one.select_boxes(frames[one.frames])
-             for one, (*_, frames) in zip(parts, things, strict=True)]
-    frames = np.concatenate([one.frames for one in parts])
+    parts = [see(make_map(thing[:3]), POSES, noise_px, seed=row)
+             for row, thing in enumerate(things)]
+    parts = [part.select_boxes(frames[part.frames])
+             for part, (*_, frames) in zip(parts, things, strict=True)]
+    frames = np.concatenate([part.frames for part in parts])
     order = np.argsort(frames, kind='stable')
-    columns = {name: np.concatenate([getattr(one, name) for one in parts])[order]
+    columns = {name: np.concatenate([getattr(part, name) for part in parts])[order]
                for name in ('bboxes_xyxy', 'classes', 'scores')}
     return replace(parts[0], frame_offsets=np.searchsorted(frames[order], np.arange(
         len(POSES) + 1)), **columns)

@@ -44,7 +44,7 @@ def test_few_classes_and_views_of_one_side_tell_no_scale(office):
     cups = [row for row, name in enumerate(office.class_ids) if name == 'cup']
     assert scale_by_sizes(scaled(office.select(cups), 3.0)) is None
     one_sided = replace(office, details=tuple(
-        replace(one, baseline_deg=5.0) for one in office.details))
+        replace(detail, baseline_deg=5.0) for detail in office.details))
     assert not office.details or scale_by_sizes(scaled(one_sided, 3.0)) is None
 
 

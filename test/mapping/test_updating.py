@@ -43,7 +43,7 @@ def make_things(count=20, seed=5) -> LandmarkMap:
 
 
 def ids(landmarks):
-    return {one.landmark_id for one in landmarks}
+    return {landmark.landmark_id for landmark in landmarks}
 
 
 def test_nothing_changed():
@@ -127,15 +127,15 @@ def test_the_better_position_wins():
     wrong = things.centers + rng.normal(scale=0.03, size=things.centers.shape)
     sigmas = [0.05] * 10 + [0.002] * 10
     old = replace(things, centers=wrong, details=tuple(
-        replace(one, position_sigma=sigma)
-        for one, sigma in zip(things.details, sigmas, strict=True)))
+        replace(detail, position_sigma=sigma)
+        for detail, sigma in zip(things.details, sigmas, strict=True)))
     updated = update_map(old, see(things, POSES, noise_px=2.0))
     assert len(updated.report.confirmed) == len(things)
     found = updated.landmark_map
     errors = np.linalg.norm(found.centers - things.centers, axis=1)
     before = np.linalg.norm(wrong - things.centers, axis=1)
     assert errors[:10].mean() < 0.4 * before[:10].mean()
-    assert all(one.position_sigma < 0.02 for one in found.details[:10])
+    assert all(detail.position_sigma < 0.02 for detail in found.details[:10])
     kept = (found.centers[10:] == wrong[10:]).all(axis=1)
     assert kept.sum() >= 5  # the others differ by so much that they were nudged
 
@@ -199,7 +199,7 @@ def test_an_offset_of_the_coordinate_frame_is_corrected_and_noted():
     assert updated.report.missing == updated.report.new == ()
     assert updated.report.offset_m == pytest.approx(0.073, abs=0.02)
     assert updated.report.offset_deg == pytest.approx(2.0, abs=0.3)
-    assert any('off the map' in one for one in updated.report.notes)
+    assert any('off the map' in note for note in updated.report.notes)
     assert np.linalg.norm(updated.landmark_map.centers[12] - (1.6, 0.1, 0.8)) < 0.03
     assert np.abs(updated.map_from_camera[:, :3, 3] - POSES[:, :3, 3]).max() < 0.03
 
@@ -370,7 +370,7 @@ def test_a_lost_landmark_beside_a_like_one_comes_back():
 def test_a_displaced_landmark_that_is_hard_to_see_comes_back_and_leaves_no_ghost():
     """Its low seen_ratio alone does not prove that it has gone from where the map has it."""
     things = make_things(12)
-    details = tuple(replace(one, seen_ratio=ratio) for one, ratio in zip(
+    details = tuple(replace(detail, seen_ratio=ratio) for detail, ratio in zip(
         things.details, np.linspace(0.1, 0.9, 12), strict=True))
     things = replace(things, details=details)
     wrong = moved(things, {0: things.centers[0] + (0.27, 0.25, 0.0)})
@@ -422,8 +422,8 @@ def test_an_object_that_comes_back_gets_its_id_back():
                                                 (0.05, (0.05, 1.0))])
 def test_an_exact_map_hardly_moves_and_errors_of_poses_are_estimated(sigma_m, noise):
     things, rng = make_things(), np.random.default_rng(0)
-    old = replace(things, details=tuple(replace(one, position_sigma=sigma_m)
-                                        for one in things.details))
+    old = replace(things, details=tuple(replace(detail, position_sigma=sigma_m)
+                                        for detail in things.details))
     poses = POSES.copy()
     poses[:, :3, 3] += rng.normal(scale=noise[0], size=(len(POSES), 3))
     poses[:, :3, :3] = Rotation.from_rotvec(rng.normal(
@@ -433,7 +433,7 @@ def test_an_exact_map_hardly_moves_and_errors_of_poses_are_estimated(sigma_m, no
     ways = np.linalg.norm(updated.landmark_map.centers - things.centers, axis=1)
     assert np.median(ways) < 0.01
     assert (updated.report.pose_change_m > 0.04) == (noise[0] > 0.0)
-    assert any('estimated from' in one for one in updated.report.notes) == (
+    assert any('estimated from' in note for note in updated.report.notes) == (
         noise[0] > 0.0)
 
 

@@ -96,6 +96,6 @@ def nearest_errors(built: LandmarkMap, table: LandmarkMap):
     """Return the distance [m] from each true landmark to the nearest built one of its class."""
     errors = []
     for center, name in zip(table.centers, table.class_ids, strict=True):
-        same = np.array([one == name for one in built.class_ids])
+        same = np.array([class_id == name for class_id in built.class_ids])
         errors.append(np.linalg.norm(built.centers[same] - center, axis=1).min(initial=np.inf))
     return np.array(errors)

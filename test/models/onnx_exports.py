@@ -49,10 +49,10 @@ def make_d_fine(folder: Path) -> torch.nn.Module:
     network = transformers.DFineForObjectDetection(transformers.DFineConfig(
         backbone_config=backbone, encoder_in_channels=[24, 32, 40], decoder_in_channels=[32] * 3,
         **_SMALL)).eval()
-    for one in network.modules():  # else all places of an image have nearly the same features
-        if hasattr(one, 'running_var'):
-            one.running_var.uniform_(0.1, 0.3)
-            one.running_mean.normal_(0.0, 0.1)
+    for module in network.modules():  # else all places of an image have nearly the same features
+        if hasattr(module, 'running_var'):
+            module.running_var.uniform_(0.1, 0.3)
+            module.running_mean.normal_(0.0, 0.1)
     torch.nn.init.normal_(network.model.enc_score_head.weight, 0.0, 1.0)
     network.config.save_pretrained(folder)
     transformers.RTDetrImageProcessor(size={'height': SIDE, 'width': SIDE}).save_pretrained(folder)

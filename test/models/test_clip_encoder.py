@@ -209,7 +209,7 @@ def test_images_of_several_maps_are_compared_together_or_not_at_all(clip, tmp_pa
     plain = np.asarray(embed_map(clip, ROOM, [], 'text'))
     rows = embed_map(clip, both, files, 'image')
     assert np.array_equal(np.asarray(rows), plain[[*range(len(ROOM)), 2, 0, 1]])
-    warning, = (one for one in caplog.records if one.levelname == 'WARNING')
+    warning, = (record for record in caplog.records if record.levelname == 'WARNING')
     assert f'{files[1]} has no images' in warning.getMessage()
 
 

@@ -117,13 +117,13 @@ def test_a_damaged_cache_is_made_anew(small_clip, small_cache, tmp_path, image_r
     damage(tmp_path)
     caplog.clear()
     assert np.array_equal(load(small_clip, tmp_path).encode_crops(image_rgb, BBOXES), before)
-    warning, = (one for one in caplog.records if one.levelno >= logging.WARNING)
+    warning, = (record for record in caplog.records if record.levelno >= logging.WARNING)
     assert warns in warning.getMessage() and str(tmp_path) in warning.getMessage()
     caplog.clear()
     assert np.array_equal(load(small_clip, tmp_path).encode_crops(image_rgb, BBOXES), before)
-    assert not any(one.levelno >= logging.WARNING for one in caplog.records)
+    assert not any(record.levelno >= logging.WARNING for record in caplog.records)
     for kind in ('onnx', 'openvino'):
-        assert not any(one.name.startswith('.') for one in (tmp_path / kind).iterdir())
+        assert not any(entry.name.startswith('.') for entry in (tmp_path / kind).iterdir())
 
 
 MISSING = """

@@ -127,7 +127,7 @@ def test_boxes_of_d_fine_equal_those_of_the_library(d_fine, load):
         outputs = network(torch.from_numpy(pixels(image)))
     theirs = transformers.RTDetrImageProcessor().post_process_object_detection(
         outputs, threshold=0.0, target_sizes=[(SIDE, SIDE)])[0]
-    assert found.class_ids == tuple(NAMES[int(one)] for one in theirs['labels'])
+    assert found.class_ids == tuple(NAMES[int(number)] for number in theirs['labels'])
     px = np.abs(found.bboxes_xyxy - np.clip(theirs['boxes'].numpy(), 0, SIDE)).max()
     score = np.abs(found.scores - theirs['scores'].numpy()).max()
     print(f'\nboxes at most {px:.5f} px apart, scores {score:.6f}')
@@ -284,7 +284,7 @@ def test_a_damaged_compiled_network_is_compiled_again(plain, images, tmp_path, c
     content[len(content) // 2:len(content) // 2 + 3000] = bytes(3000)
     blob.write_bytes(content)
     assert np.array_equal(boxes(), before)
-    warning, = (one for one in caplog.records if one.levelname == 'WARNING')
+    warning, = (record for record in caplog.records if record.levelname == 'WARNING')
     assert 'is damaged' in warning.getMessage() and str(blob.parent) in warning.getMessage()
     caplog.clear()
     assert np.array_equal(boxes(), before) and not caplog.records

@@ -151,8 +151,8 @@ def test_one_detector_serves_all_cameras_in_turn(start, tester):
     try:
         wait_for(lambda: min(map(len, heard.values())) >= 4, 'detections of all', work=work)
     finally:
-        for one in subscriptions:
-            tester.destroy_subscription(one)
+        for subscription in subscriptions:
+            tester.destroy_subscription(subscription)
         for one in publishers.values():
             tester.destroy_publisher(one)
     stamps = [{msg.header.stamp.sec for msg in messages} for messages in heard.values()]

@@ -100,8 +100,8 @@ def of_another_frame(image, info, detections):
 
 
 def of_another_detector(image, info, detections):
-    for one in detections.detections:
-        one.results[0].hypothesis.class_id = 'sofa'
+    for detection in detections.detections:
+        detection.results[0].hypothesis.class_id = 'sofa'
     return image, info, detections
 
 

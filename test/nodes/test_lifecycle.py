@@ -188,7 +188,7 @@ def test_a_detector_looks_for_what_its_map_names_when_it_is_configured(manage, t
     process.wait_for_output('map.yaml: ')
     image = make_frame()[0]
     for names in (('a', 'b', 'c'), ('mug', 'chair', 'plant')):
-        classes = tuple(names['abc'.index(one)] for one in make_room().class_ids)
+        classes = tuple(names['abc'.index(class_id)] for class_id in make_room().class_ids)
         write_map(replace(make_room(), class_ids=classes), tmp_path / 'map.yaml')
         manager.do('configure', 'activate')
         with tester.hearing_detections() as detected:

@@ -80,7 +80,7 @@ def test_map_to_odom_is_broadcast_where_it_is_asked_for(own_relocalizer, tester)
     odom_from_base = transform_from_pose(np.array([5.0, 0.0, 0.0]), np.array([0, 0, 0.6, 0.8]))
     publisher, heard = tester.create_publisher(TFMessage, '/tf', 100), []
     subscription = tester.create_subscription(TFMessage, '/tf', lambda msg: heard.extend(
-        one for one in msg.transforms if one.header.frame_id == 'map'), 100)
+        transform for transform in msg.transforms if transform.header.frame_id == 'map'), 100)
     frame = make_frame(stamp_s=100.0)
     moving = transform_msg(Header(frame_id='odom', stamp=frame[0].header.stamp), 'base_link',
                            odom_from_base)

@@ -51,7 +51,7 @@ def core_answers(office, detections):
     localizer = Localizer(Relocalizer(LandmarkMap.from_file(office / 'map.yaml'),
                                       RelocalizerOptions(matching='class')))
     return [localizer.answer(Query((Observation(
-        PRESETS['fr3'], one.usable(640, 480, 50)),), run=None)) for one in detections]
+        PRESETS['fr3'], detection.usable(640, 480, 50)),), run=None)) for detection in detections]
 
 
 def test_recorded_detections(shared_data, start, tester, tmp_path):

@@ -47,7 +47,7 @@ def test_an_answer_has_its_pose_and_evidence_in_fields(relocalizer, tester):
                                               LATCHED)
     tester.wait(lambda: heard, 'the last answer')
     (status,), header = heard[-1].status, heard[-1].header
-    fields = {one.key: one.value for one in status.values}
+    fields = {value.key: value.value for value in status.values}
     assert (header.frame_id, header.stamp.sec, fields['stamp [s]']) == (
         'map', 12, '12.500000000')
     pose = tester.poses[-1].pose
@@ -65,10 +65,10 @@ def test_an_answer_has_its_pose_and_evidence_in_fields(relocalizer, tester):
     assert abs(float(fields['heading [deg]']) - np.degrees(np.arctan2(*ahead[::-1]))) < 15.0
     documented = set(re.findall('`([a-z ]+(?: \\[\\w+\\])?|orientation xyzw)`',
                                 page.split('### Answers in fields')[1].split('### What')[0]))
-    assert {one for one in fields if not one.endswith('[ms]')} <= documented
+    assert {field for field in fields if not field.endswith('[ms]')} <= documented
     refused = tester.call_while(SelfTest, 'relocalizer/relocalize_fields', make_frame(
         see_room(make_room()).select(np.array([0, 1]))))
-    fields = {one.key: one.value for one in refused.status[0].values}
+    fields = {value.key: value.value for value in refused.status[0].values}
     assert (refused.passed, fields['verdict'], fields['kind']) == (
         b'\x00', 'refused', 'too_few_objects')
     assert 'x [m]' not in fields

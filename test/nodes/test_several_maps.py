@@ -57,7 +57,7 @@ def test_maps_change_while_the_node_runs(own_relocalizer, tester, floors):
 
     def reloaded(**parameters):
         """Set parameters; return whether the maps could be read again."""
-        assert all(tester.set_parameter(*one).successful for one in parameters.items())
+        assert all(tester.set_parameter(*parameter).successful for parameter in parameters.items())
         return tester.trigger('reload_map').success
     assert not tester.relocalize(frame).success
     assert not reloaded(map_files=[first, second])

@@ -115,7 +115,7 @@ def test_a_recording_is_localized_in_the_map_of_the_room(folder):
         ASSETS / 'clip', '--methods', 'auto', '--trials', 1, '--workers', 1, '--no-figures',
         '--out', folder / 'out')) == 0
     results = json.loads((folder / 'out/results.json').read_text())
-    right = [one['solved'] and one['error_m'] < 0.5 for one in results]
-    accepted = [one['accepted'] for one in results]
+    right = [result['solved'] and result['error_m'] < 0.5 for result in results]
+    accepted = [result['accepted'] for result in results]
     assert np.mean(right) > 0.9 and np.mean(accepted) > 0.85
-    assert all(one['error_m'] < 1.0 for one in results if one['accepted'])
+    assert all(result['error_m'] < 1.0 for result in results if result['accepted'])

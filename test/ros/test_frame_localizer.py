@@ -117,7 +117,7 @@ def test_a_camera_of_another_run_of_odometry_is_left_out_and_named(localizer, va
     first = replace(frames[0], left_out=('right',))
     found = localizer.localize(first, values, KnownBefore(places[0], list(zip(
         frames[1:], places[1:], strict=True))), timer())
-    assert [one.camera_name for one in found.query.frames] == ['left', 'front']
+    assert [frame.camera_name for frame in found.query.frames] == ['left', 'front']
     assert found.left_out == ('right', 'back')
 
 

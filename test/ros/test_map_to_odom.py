@@ -54,7 +54,7 @@ class Robot:
         self.static_broadcaster = StaticTransformBroadcaster(self.world)
         self.heard = []
         self.world.create_subscription(TFMessage, '/tf', lambda msg: self.heard.extend(
-            one for one in msg.transforms if one.header.frame_id == 'map'), 10)
+            transform for transform in msg.transforms if transform.header.frame_id == 'map'), 10)
         self._spin_until = spin_until
         self.transforms.open()
 

@@ -147,7 +147,7 @@ def in_turn(cameras, heard, order, gap_s=0.0, skew_s=0.0):
         time.sleep(0.05)
     time.sleep(0.7)  # all patience is over
     stamps = [one.image.header.stamp for one in heard]
-    assert len({(one.sec, one.nanosec) for one in stamps}) == len(stamps), 'each once'
+    assert len({(stamp.sec, stamp.nanosec) for stamp in stamps}) == len(stamps), 'each once'
     return [one for one, at in zip(heard, stamps, strict=True)
             if at.sec + 1e-9 * at.nanosec >= begun_s - 1e-6]
 
@@ -201,7 +201,7 @@ def test_a_request_stays_subscribed_until_the_last_cameras_detections(rig, camer
     def images():
         cameras(now_s(), ALL, (CameraInfo, Image))
         time.sleep(0.05)
-    wait(lambda: all(one._pairing.received['image'] >= 5 for one in rig.sources.values()),
+    wait(lambda: all(source._pairing.received['image'] >= 5 for source in rig.sources.values()),
          'images', images)
     at_s = now_s()
     cameras(at_s, ALL, (CameraInfo, Image))

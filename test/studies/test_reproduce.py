@@ -273,7 +273,7 @@ def test_an_archive_that_is_cut_short(server, write_sources, refused, tmp_path):
     server.files[ARCHIVE] = server.files[ARCHIVE][:-1000]
     said = refused('--yes', '--sources', write_sources(), '--out', tmp_path / 'out')
     assert 'cannot be unpacked' in said and 'run again to download it' in said
-    assert not [one for one in (tmp_path / 'out/downloads').iterdir() if ARCHIVE in one.name]
+    assert not [entry for entry in (tmp_path / 'out/downloads').iterdir() if ARCHIVE in entry.name]
 
 
 def test_a_full_disk(write_sources, refused, tmp_path):
@@ -364,12 +364,12 @@ def test_the_form_of_the_shipped_sources():
         assert (*table,) == PAPER_METHODS
         printed = {cell.replace('±', r'\pm') for row in table.values() for cell in row}
         assert numbers is None or printed <= numbers
-    networks = [*sources.options, *(word for one in sources.networks
-                                    for word in (one.option, one.file))]
+    networks = [*sources.options, *(word for network in sources.networks
+                                    for word in (network.option, network.file))]
     build_map.make_parser().parse_args(
         ['--bag', 'a', '--out', 'b', *networks, *sources.mapping])
-    for one in sources.recordings.values():
+    for recording in sources.recordings.values():
         evaluate.make_parser().parse_args(
-            ['--bag', 'a', '--map', 'b', *networks, *sources.asking, *one.asking])
+            ['--bag', 'a', '--map', 'b', *networks, *sources.asking, *recording.asking])
     assert subprocess.run(['bash', '-n', PROJECT / 'script/reproduce'], check=False
                           ).returncode == 0

@@ -42,13 +42,13 @@ def test_images_between_the_mapped_ones_are_found(asked):
                   and one['kind'] == 'in turn' and one['asked'] == 'demo']
         assert len(errors) == 6
         assert np.mean(np.array(errors) < 0.25) >= least
-    robot = [one['error_m'] for one in outcomes
-             if one['kind'] == 'phone to robot' and one['way'] == 'both']
+    robot = [outcome['error_m'] for outcome in outcomes
+             if outcome['kind'] == 'phone to robot' and outcome['way'] == 'both']
     assert np.mean(np.array(robot) < 0.5) > 0.5
 
 
 def test_nothing_is_accepted_elsewhere(asked):
     outcomes = json.loads((asked[0] / 'outcomes.json').read_text())
-    elsewhere = [one for one in outcomes if one['asked'] == 'elsewhere']
+    elsewhere = [outcome for outcome in outcomes if outcome['asked'] == 'elsewhere']
     assert len(elsewhere) == 4 * 2 * 3  # parts, images, ways
     assert not any(one['accepted'] for one in elsewhere)

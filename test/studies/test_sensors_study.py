@@ -24,7 +24,7 @@ def numbers(row):
 def test_the_deviations_of_odometry_cover_a_real_husky(shared_data):
     robot = read_robot(shared_data / 'rooms/real_odometry_bags/test1.bag')
     rows = [numbers(row) for row in angle_table(robot).splitlines() if re.match(r'\| [0-9]', row)]
-    ways, of_map, of_looks = np.array([(one[0], one[-2], one[-1]) for one in rows]).T
+    ways, of_map, of_looks = np.array([(row[0], row[-2], row[-1]) for row in rows]).T
     assert list(ways) == [0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0]
     assert (of_map < 1.0).all() and (of_looks < 1.0).all()
     medians = {row[0]: float(row[3]) for row in vertical_rows(robot)}

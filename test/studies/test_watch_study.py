@@ -34,8 +34,8 @@ pytestmark = pytest.mark.full
 def test_wrong_poses_are_noticed_and_right_ones_are_not_lost():
     right, alarms = judge(simulated_drive('room', 1000, 80), 0, wrong_poses=True)
     assert 'lost' not in right.states
-    assert {'2 m', '30 deg', KIDNAPPED} <= {one.case for one in alarms}
-    jumps = [one.lost for one in alarms if one.case not in ('1 m', KIDNAPPED)]
+    assert {'2 m', '30 deg', KIDNAPPED} <= {alarm.case for alarm in alarms}
+    jumps = [alarm.lost for alarm in alarms if alarm.case not in ('1 m', KIDNAPPED)]
     assert np.mean(jumps) > 0.9
     assert '| room |' in right_table([right])
     assert '| all |' in alarm_table(alarms)

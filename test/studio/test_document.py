@@ -59,7 +59,7 @@ def test_all_kinds_of_lines(document, path):
     assert found.labels[:3] == ('a red cup', 'yes: "no" # <b>', 'yes: "no" # <b>')
     assert found.class_ids == ('cup', 'off', 'plant', 'floor lamp')
     assert found.centers[1].tolist() == [0.0, 0.0, 1e-6]
-    assert [one.source for one in found.details] == [None, None, None, 'studio']
+    assert [detail.source for detail in found.details] == [None, None, None, 'studio']
     text = path.read_text()
     assert "map_file: ''  # the relocalizer's own" in text
     assert '# the red one' in text and "# Ann's" in text and '# Hz' in text
@@ -233,5 +233,5 @@ def test_any_session_ends_as_its_file_says(tmp_path_factory, session):
     if document.landmarks:
         document.save()
         tree = read_parameter_file(path)['/**']['ros__parameters']['map']['landmarks']
-        assert tree == {key: dict(one.fields) for key, one in document.landmarks.items()}
+        assert tree == {key: dict(landmark.fields) for key, landmark in document.landmarks.items()}
     document.close()

@@ -39,7 +39,7 @@ def test_an_edit_changes_the_figures_and_the_positions_stay(studio):
     before = find_places(document.landmarks, None, None, silent)
     assert len(before.look_alikes) == 1 and len(before.look_alikes[0].matched) == 5
     assert before.figures['pairs of places that look alike'] == '1'
-    second_room = [key for key, one in document.landmarks.items() if one.center[0] > 3.5]
+    second_room = [key for key, landmark in document.landmarks.items() if landmark.center[0] > 3.5]
     document.edit(edits.set_fields, [second_room[1]], center=[8.6, 1.3, 0.2])
     document.edit(edits.set_fields, [second_room[2]], center=[6.6, -0.3, 0.9])
     after = find_places(document.landmarks, None, before, silent)

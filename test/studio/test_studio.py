@@ -45,8 +45,8 @@ def test_outlines_lie_in_the_image(studio):
     outlines = recording.outlines(studio.document.landmarks, 3)
     assert recording.image(3).shape == (480, 640, 3) and recording.image(-1) is None
     assert [one.distance_m for one in outlines] == sorted(one.distance_m for one in outlines)
-    assert all((one.bbox_xyxy[:2] < (640, 480)).all() and (one.bbox_xyxy[2:] > 0).all()
-               for one in outlines)
+    assert all((outline.bbox_xyxy[:2] < (640, 480)).all() and (outline.bbox_xyxy[2:] > 0).all()
+               for outline in outlines)
 
 
 def test_sightings_are_sharp_whole_and_from_several_sides(studio):

@@ -74,5 +74,5 @@ def test_hostile_messages_are_refused(page, caplog, action, hostile):
     desk.do('person', {'do': 'save'})
     assert not [line for line in desk.lines if line[0] == 'error']
     assert all(len(text) <= 600 for _, text in desk.lines)
-    assert not [one for one in caplog.records if one.levelno >= logging.ERROR]
+    assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
     assert page._redrawer.is_alive()

@@ -77,7 +77,7 @@ def observed(tmp_path, object_id):
     file = tmp_path / 'walk.npz'
     save_observations(file, PosedDetections(
         views.cameras, views.map_from_camera, views.stamps_s,
-        np.cumsum([0, *map(len, boxes)]), np.concatenate([one for one in boxes if one]),
+        np.cumsum([0, *map(len, boxes)]), np.concatenate([box for box in boxes if box]),
         ('bowl',), np.zeros(count, dtype=np.int64), np.ones(count), embeddings=embeddings,
         encoder_key=encoder.key))
     return file, embeddings

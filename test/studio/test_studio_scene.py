@@ -65,7 +65,7 @@ def test_depth_becomes_a_cloud_below_the_ceiling():
 def test_points_of_keyframes_have_the_colours_of_the_recording_or_of_their_height(studio):
     recording, landmarks = studio.recording, studio.document.landmarks
     poses, camera = recording.detections.map_from_camera, recording.detections.cameras[0]
-    extent = viewpoint.extent_of([one.center for one in landmarks.values()], poses)
+    extent = viewpoint.extent_of([landmark.center for landmark in landmarks.values()], poses)
     rays = camera.normalize_points(np.array([(200.0, 400.0), (400.0, 400.0)]))
     layer = replace(
         make_layer(map_of(landmarks), 1, points=2), map_from_camera=poses[3:4], camera=camera,

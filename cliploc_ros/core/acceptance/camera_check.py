@@ -360,7 +360,7 @@ class CameraCheck:
     def of_fields(cls, fields: Mapping[str, Any]) -> 'CameraCheck':
         """Return the state of `fields`; KeyError, TypeError or ValueError: it is broken."""
         check = cls()
-        check._records = {name: _Record.of_fields(name, one) for name, one in fields.items()}
+        check._records = {name: _Record.of_fields(name, field) for name, field in fields.items()}
         return check
 
     def see(self, observation: Observation) -> None:

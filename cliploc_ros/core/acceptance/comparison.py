@@ -96,7 +96,7 @@ class Comparison:
         contenders, seen = list(met), None
         if recognizer is not None:
             guesses = contenders[:int(CALIBRATION.keyframes.guesses)]
-            seen = recognizer.recognize([one.pose for one in guesses],
+            seen = recognizer.recognize([guess.pose for guess in guesses],
                                         constraint_of(self._last, joined.options))
             if seen.is_complete:  # what keyframes near a pose do not recognize
                 places = np.array([one.map_from_camera for one in seen.places]).reshape(-1, 4, 4)
@@ -111,7 +111,7 @@ class Comparison:
         self.poses = np.array([one.pose for one in contenders]).reshape(-1, 4, 4)  #: (m, 4, 4)
         rows = np.arange(len(contenders))
         #: (m,): probability of each, shared by those that agree
-        self.likely = self._confidences(rows, [one.odds for one in contenders])
+        self.likely = self._confidences(rows, [contender.odds for contender in contenders])
         self.recognition = seen  #: Result of the keyframes
         #: (m,): which contenders agree with the leading one
         self.leading = SAME_ANSWER.agreeing(self.poses[:1], self.poses).ravel()
@@ -177,8 +177,8 @@ class Comparison:
             if best.finalist.information is not None:
                 others = [one for one in self.contenders if one.recognized is None]
                 others.sort(key=lambda one: one is not best)
-                covariance = covariance + spread(np.array([one.pose for one in others]),
-                                                 np.array([one.odds for one in others]))
+                covariance = covariance + spread(np.array([other.pose for other in others]),
+                                                 np.array([other.odds for other in others]))
             found = best.pose, covariance
         if self._by_keyframes is None or self.place is None:
             assert found is not None
@@ -203,7 +203,7 @@ class Comparison:
             near=1.0 if self.place is None and best.finalist.information is None
             else share_within(RIGHT_M, CALIBRATION.covariance.caution * covariance),
             deviation_m=math.sqrt(np.trace(covariance[:3, :3])), coverage=coverage,
-            tried=sum(one.known_tried for one in frames),
+            tried=sum(frame.known_tried for frame in frames),
             meetings=math.inf if self.by_objects is None or is_exhaustive(
                 coverage, self._joined.options)
             else meetings_of(frames, best.finalist, best.matches),
@@ -221,7 +221,7 @@ class Comparison:
         """
         if self.place is None:
             return None
-        boxes = self._last.detections.bboxes_xyxy[[one.detection for one in best.matches[-1]]]
+        boxes = self._last.detections.bboxes_xyxy[[match.detection for match in best.matches[-1]]]
         return signs_of(self.place, best.support, boxes, self._last.camera)
 
     def _motion(self) -> Motion | None:
@@ -270,8 +270,8 @@ class Comparison:
         """Return the probability of the leading place without what objects say for it."""
         if self.place is None:
             return 0.0
-        rows = np.array([row for row, one in enumerate(self.contenders)
-                         if one.recognized is not None or not self.leading[row]])
+        rows = np.array([row for row, contender in enumerate(self.contenders)
+                         if contender.recognized is not None or not self.leading[row]])
         near = self.leading[rows]
         found = self._confidences(rows, [
             self.contenders[row].by_points if is_near else self.contenders[row].odds
@@ -293,7 +293,7 @@ class Comparison:
         rooms = np.append(alike.are_rooms, np.zeros(len(turned), dtype=np.bool_))
         inside = np.nonzero((low <= found[:, 2, 3]) & (found[:, 2, 3] <= high))[0]
         places = [refined(joined, unrefined(found[row])) for row in inside]
-        poses = np.array([best.pose, *(one.map_from_camera for one in places)])
+        poses = np.array([best.pose, *(place.map_from_camera for place in places)])
         # a place that refinement moved back to the leading pose is no other one
         elsewhere = ~SAME_ANSWER.agreeing(poses)[0]
         # of each place, the first
@@ -327,8 +327,8 @@ class Comparison:
         covered = np.array([self._recognizer.coverage(pose) for pose in [leading.pose, *twins]])
         known = np.where(are_rooms, np.minimum(1.0, covered[1:] / max(covered[0], 1e-9)), 1.0)
         theirs = np.array([max([0.0] + [
-            points_utility(one.recognized) for one in self.contenders
-            if one.recognized is not None and SAME_ANSWER.agree(one.pose, pose)])
+            points_utility(contender.recognized) for contender in self.contenders
+            if contender.recognized is not None and SAME_ANSWER.agree(contender.pose, pose)])
             for pose in twins])
         return np.maximum(0.0, known * max(0.0, points_utility(self.place)) - theirs)
 
@@ -372,7 +372,7 @@ def _chance_not_mirrored(joined: JoinedFrames, best: Contender) -> float:
         sorted({one.landmark for found in matches for one in found})]
     starts = [unrefined(pose) for pose in _reflections(centers) @ best.pose @ _FLIP]
     starts.sort(key=lambda one: -verify_rig(mirrored.rig, one.rotation, one.translation).score)
-    found = [refined(mirrored, one) for one in starts[:int(terms.refined)]]
+    found = [refined(mirrored, start) for start in starts[:int(terms.refined)]]
     supports = supports_of(mirrored, np.array([one.map_from_camera for one in found]),
                            [matches_of(mirrored.rig, one) for one in found])
     own, = utilities([best.support] if len(joined.frames) == len(best.matches)
@@ -387,8 +387,8 @@ def _mirrored(joined: JoinedFrames) -> JoinedFrames:
     They are mirrored on the plane z = 1, where a lens distorts nothing.
     """
     frames = []
-    for one in joined.frames:
-        seen = one.observation
+    for frame in joined.frames:
+        seen = frame.observation
         odom, camera = seen.odom_from_camera, seen.camera
         boxes = camera.normalize_bboxes(seen.detections.bboxes_xyxy)
         observation = replace(
@@ -396,8 +396,8 @@ def _mirrored(joined: JoinedFrames) -> JoinedFrames:
             camera=Camera(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0),
             detections=replace(seen.detections,
                                bboxes_xyxy=boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1)))
-        frames.append(one._replace(
-            observation=observation, vertical=one.vertical * (-1, 1, 1, 1, 1, 1, 1),
+        frames.append(frame._replace(
+            observation=observation, vertical=frame.vertical * (-1, 1, 1, 1, 1, 1, 1),
             scene=match_frame(joined.landmark_map, observation, joined.options)[0]))
     return join_frames(joined.landmark_map, joined.options, frames)
 

@@ -327,7 +327,7 @@ def region_odds(landmark_map: LandmarkMap, region: Region, poses: NDArray[np.flo
     A region of a map that is not there says nothing.
     """
     parts = parts_of(landmark_map)
-    shift = next((one.shift for one in parts if one.landmark_map.frame_id == region.frame_id),
+    shift = next((part.shift for part in parts if part.landmark_map.frame_id == region.frame_id),
                  None)
     if shift is None:
         return np.zeros(len(poses))
@@ -342,8 +342,8 @@ def region_odds(landmark_map: LandmarkMap, region: Region, poses: NDArray[np.flo
     spot, yaw = covariance[:2, :2], covariance[2, 2]
     squares = (np.einsum('ni,ij,nj->n', steps[:, :2], np.linalg.inv(spot), steps[:, :2])
                + steps[:, 2] ** 2 / yaw)
-    area = sum(float(np.prod(np.ptp(one.landmark_map.centers[:, :2], axis=0)
-                             + 2.0 * terms.margin_m)) for one in parts)
+    area = sum(float(np.prod(np.ptp(part.landmark_map.centers[:, :2], axis=0)
+                             + 2.0 * terms.margin_m)) for part in parts)
     # a region wider than the map is as good as the map
     peak = (max(0.0, math.log(area / (2.0 * math.pi)) - 0.5 * np.linalg.slogdet(spot)[1])
             + max(0.0, 0.5 * math.log(2.0 * math.pi / yaw)))

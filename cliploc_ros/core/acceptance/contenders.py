@@ -60,18 +60,18 @@ def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
     OptionsError: odom_from_camera is missing or no rigid transform; there are no frames or too
     many.
     """
-    cameras = cameras_from_last([one.observation for one in frames])
-    rig = make_rig([one.scene for one in frames], cameras,
-                   np.stack([one.vertical for one in frames]), landmark_map.position_sigmas)
+    cameras = cameras_from_last([frame.observation for frame in frames])
+    rig = make_rig([frame.scene for frame in frames], cameras,
+                   np.stack([frame.vertical for frame in frames]), landmark_map.position_sigmas)
     return JoinedFrames(landmark_map, options, frames, rig, cameras)
 
 
 def without_depth(joined: JoinedFrames) -> JoinedFrames:
     """Return frames as of cameras without depth."""
-    return join_frames(joined.landmark_map, joined.options, [one._replace(
-        observation=replace(one.observation, depths=None),
-        scene=one.scene._replace(depths=np.zeros_like(one.scene.depths)))
-        for one in joined.frames])
+    return join_frames(joined.landmark_map, joined.options, [frame._replace(
+        observation=replace(frame.observation, depths=None),
+        scene=frame.scene._replace(depths=np.zeros_like(frame.scene.depths)))
+        for frame in joined.frames])
 
 
 class Contender(NamedTuple):
@@ -108,8 +108,8 @@ class Contender(NamedTuple):
 def contenders_of(joined: JoinedFrames, finalists: Sequence[Finalist], upright: Sequence[bool]
                 ) -> list[Contender]:
     """Return poses as contenders, with their odds by objects."""
-    poses = np.array([one.map_from_camera for one in finalists]).reshape(-1, 4, 4)
-    matches = [matches_of(joined.rig, one) for one in finalists]
+    poses = np.array([finalist.map_from_camera for finalist in finalists]).reshape(-1, 4, 4)
+    matches = [matches_of(joined.rig, finalist) for finalist in finalists]
     supports = supports_of(joined, poses, matches)
     handicaps = np.where(upright, 0.0, CALIBRATION.attitude.wrong_mount) \
         if joined.knows_vertical else tilt_handicaps(poses, joined.options.tilt_deviation_deg)

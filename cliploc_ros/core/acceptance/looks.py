@@ -96,4 +96,4 @@ class Looks:
 
 
 def _before(looks: tuple[Look, ...], observation: Observation) -> tuple[Look, ...]:
-    return tuple(one for one in looks if one.observation.stamp_ns < observation.stamp_ns)
+    return tuple(look for look in looks if look.observation.stamp_ns < observation.stamp_ns)

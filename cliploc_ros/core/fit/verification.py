@@ -68,13 +68,13 @@ def cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64
     if len(observations) == 1:
         return cameras
     linked = []
-    for number, one in enumerate(observations, start=1):
+    for number, observation in enumerate(observations, start=1):
         where = f'odom_from_camera of frame {number} of {len(observations)}'
-        if one.odom_from_camera is None:
+        if observation.odom_from_camera is None:
             raise OptionsError(f'{where} is missing: several frames need it')
-        if not is_rigid(one.odom_from_camera):
+        if not is_rigid(observation.odom_from_camera):
             raise OptionsError(f'{where} is not a rigid transform')
-        linked.append(one.odom_from_camera)
+        linked.append(observation.odom_from_camera)
     for row, odom_from_camera in enumerate(linked[:-1]):
         cameras[row] = invert_transform(odom_from_camera) @ linked[-1]
     return cameras
@@ -88,13 +88,13 @@ def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64]
     """
     first = scenes[0]
     joined = first._replace(
-        box_ellipses=np.concatenate([one.box_ellipses for one in scenes]),
-        bearings=np.concatenate([one.bearings for one in scenes]),
-        depths=np.concatenate([one.depths for one in scenes]),
-        potential=Potential(*map(np.concatenate, zip(*(one.potential for one in scenes),
+        box_ellipses=np.concatenate([scene.box_ellipses for scene in scenes]),
+        bearings=np.concatenate([scene.bearings for scene in scenes]),
+        depths=np.concatenate([scene.depths for scene in scenes]),
+        potential=Potential(*map(np.concatenate, zip(*(scene.potential for scene in scenes),
                                                      strict=True))),
         pairs=first.pairs[:0],
-        groups=Groups(*map(np.concatenate, zip(*(one.groups for one in scenes), strict=True))))
+        groups=Groups(*map(np.concatenate, zip(*(scene.groups for scene in scenes), strict=True))))
     # how many rows each frame has in each array, in the order of FrameStarts
     sizes = [[0] * len(FrameStarts._fields), *(
         [len(one.box_ellipses), len(one.potential.landmarks), len(one.potential.detections),

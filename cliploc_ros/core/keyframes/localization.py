@@ -208,10 +208,10 @@ class KeyframeLocalizer:
             places = _places(*self._search_thoroughly(
                 descriptors, look, guesses, [one.map_from_camera for one in fast.places], deadline
             ), look)
-            places[:1] = [self._guided(one, look, descriptors) for one in places[:1]]
+            places[:1] = [self._guided(place, look, descriptors) for place in places[:1]]
         if time.monotonic() > deadline:
             return Recognition(is_complete=False, is_thorough=is_thorough)
-        return Recognition(tuple(self._recognized(one, look, is_thorough) for one in places),
+        return Recognition(tuple(self._recognized(place, look, is_thorough) for place in places),
                            is_thorough=is_thorough)
 
     def _search_fast(self, descriptors: NDArray[np.float32], look: _Look,
@@ -226,8 +226,8 @@ class KeyframeLocalizer:
             # More keyframes: those near the pose so far, and the next in similarity.
             near = keyframes_near(self.layer.map_from_camera, first.map_from_camera
                                    )[:_MORE].tolist() if first else []
-            more = [one for one in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
-                    if one not in chosen]
+            more = [rank for rank in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
+                    if rank not in chosen]
             matched = matched.join(self._match(descriptors, more, deadline))
             first = _place(matched, look)
         if first is None or first.agreed < LEAST_INLIERS:
@@ -245,8 +245,8 @@ class KeyframeLocalizer:
         The poses (4, 4) that were found before compete, too.
         """
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable')[:_CANDIDATES]
-        votes = [len(self._match(descriptors[:_VOTERS], [one], deadline).features)
-                 for one in ranks.tolist()]
+        votes = [len(self._match(descriptors[:_VOTERS], [rank], deadline).features)
+                 for rank in ranks.tolist()]
         chosen = ranks[np.argsort(-np.array(votes), kind='stable')][:_VOTED].tolist()
         for guess in (*guesses, *found):
             chosen += keyframes_near(self.layer.map_from_camera, guess)[:PROPOSED].tolist()
@@ -388,8 +388,8 @@ class KeyframeLocalizer:
     def _expects(self, keyframes: NDArray[np.int64], pose: NDArray[np.float64], camera: Camera
                  ) -> NDArray[np.bool_]:
         """Return in which cells of an image the first of some keyframes expect points."""
-        counts = [_count(_project(self.layer.points_in_map(one), pose, camera), camera)
-                  for one in keyframes[:_SIMILAR].tolist()]
+        counts = [_count(_project(self.layer.points_in_map(keyframe), pose, camera), camera)
+                  for keyframe in keyframes[:_SIMILAR].tolist()]
         return np.max(counts, axis=0, initial=0) >= _LEAST_EXPECTED
 
     def _shared(self, pose: NDArray[np.float64], counts: NDArray[np.int64]) -> NDArray[np.float64]:

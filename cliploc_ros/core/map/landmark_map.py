@@ -255,7 +255,7 @@ class LandmarkMap:
     @cached_property
     def position_sigmas(self) -> NDArray[np.float64]:
         """Return the standard deviation of each centre on each axis (L,) [m]."""
-        given = [one.position_sigma for one in self.details] or [None] * len(self)
+        given = [detail.position_sigma for detail in self.details] or [None] * len(self)
         return np.array([DEFAULT_SIGMA_M if one is None else one for one in given])
 
     @cached_property
@@ -274,16 +274,16 @@ class LandmarkMap:
         """Return all labels that describe each landmark, with their weights."""
         if not self.details:
             return tuple(((label, 1.0),) for label in self.labels)
-        return tuple(one.labels_with(label)
-                     for one, label in zip(self.details, self.labels, strict=True))
+        return tuple(detail.labels_with(label)
+                     for detail, label in zip(self.details, self.labels, strict=True))
 
     @cached_property
     def classes(self) -> ClassIndex:
         """Return the landmarks by class: their own, and classes that they are mistaken for."""
-        others = [(row, name) for row, one in enumerate(self.details)
-                  for name in one.likely_classes() if name != self.class_ids[row]]
-        weights = {(row, name): share for row, one in enumerate(self.details)
-                   for name, share in one.class_shares()}
+        others = [(row, name) for row, detail in enumerate(self.details)
+                  for name in detail.likely_classes() if name != self.class_ids[row]]
+        weights = {(row, name): share for row, detail in enumerate(self.details)
+                   for name, share in detail.class_shares()}
         return ClassIndex.of(self.class_ids, others, weights)
 
     @cached_property
@@ -420,7 +420,7 @@ def _is_valid(written: WrittenMap) -> bool:
         ((written.semi_axes >= low) & (written.semi_axes <= high)).all()
         and np.abs(written.centers).max() <= _MAX_COORDINATE_M
         and np.abs(norms - 1.0).max() <= _MAX_QUATERNION_NORM_ERROR
-        and not any('.' in one for one in written.landmark_ids)
+        and not any('.' in landmark_id for landmark_id in written.landmark_ids)
         and all(len(one) <= _MAX_TEXT_LENGTH and not one.isspace() and one
                 for column in texts for one in set(column)))
 

@@ -253,20 +253,20 @@ def _details(columns: list[tuple[Any, ...]], count: int) -> tuple[LandmarkDetail
         return ()
     texts, weights, classes, *numbers, sources = columns
     phrases, heavy = _values(_lists(texts)), _values(_lists(weights))
-    shares = _values('null' if one is None else f'{{{one[:-1]}}}'.replace('\n', ',')
-                     for one in classes)
-    names = _values(one or 'null' for one in sources)
-    if (any(one and len(one) != len(its) for one, its in zip(phrases, heavy, strict=True))
+    shares = _values('null' if kind is None else f'{{{kind[:-1]}}}'.replace('\n', ',')
+                     for kind in classes)
+    names = _values(source or 'null' for source in sources)
+    if (any(phrase and len(phrase) != len(its) for phrase, its in zip(phrases, heavy, strict=True))
             # a class that is repeated
-            or any(one and len(its) < one.count('\n')
-                   for one, its in zip(classes, shares, strict=True))):
+            or any(kind and len(its) < kind.count('\n')
+                   for kind, its in zip(classes, shares, strict=True))):
         return None
     labels, likely = ([pairs and tuple(pairs) for pairs in column] for column in (
         [one and zip(one, its, strict=True) for one, its in zip(phrases, heavy, strict=True)],
-        [one and one.items() for one in shares]))
+        [share and share.items() for share in shares]))
     if not (all(text.strip() and weight > 0.0 for column in (labels, likely)
                 for pairs in column if pairs for text, weight in pairs)
-            and all(one is None or one.strip() for one in names)):
+            and all(name is None or name.strip() for name in names)):
         return None
     support, *others = ([None if one is None else kind(one) for one in column]
                         for kind, column in zip((int, *[float] * 6), numbers, strict=True))
@@ -274,4 +274,4 @@ def _details(columns: list[tuple[Any, ...]], count: int) -> tuple[LandmarkDetail
 
 
 def _lists(texts: Iterable[str | None]) -> Iterable[str]:
-    return ('null' if one is None else f'[{one}]' for one in texts)
+    return ('null' if text is None else f'[{text}]' for text in texts)

@@ -218,7 +218,7 @@ class Missing:
     def _gone(self, landmarks: Iterable[int]) -> dict[int, float]:
         """Return the probability that each of some landmarks is gone."""
         # of those that were seen, without the sighting that makes them so
-        seen = [one for one in self._records.values() if one.found > 0.0]
+        seen = [record for record in self._records.values() if record.found > 0.0]
         found = sum(max(0.0, one.found - 1.0) for one in seen)
         missed = sum(one.missed for one in seen)
         overall = (_OF_FOUND * _FOUND + found) / (_OF_FOUND + found + missed)

@@ -359,7 +359,7 @@ def constraint_of(observation: Observation, options: RelocalizerOptions) -> Cons
 
 def coverage_of(frames: Sequence[SearchedFrame]) -> float:
     """Return the share of its samples that the search of the least searched frame tried."""
-    return min(one.progress.coverage for one in frames)
+    return min(frame.progress.coverage for frame in frames)
 
 
 def vertical_of(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64]:

@@ -168,8 +168,8 @@ def _turn_of(pose: NDArray[np.float64], information: NDArray[np.float64],
 
 def _robust_mean(turns: deque[_Turn]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the mean of some turns (3,) and its covariance (3, 3), by their scatter."""
-    vectors = np.array([one.rotvec for one in turns])
-    informations = np.array([one.information for one in turns])
+    vectors = np.array([turn.rotvec for turn in turns])
+    informations = np.array([turn.information for turn in turns])
     mean = np.median(vectors, axis=0)
     for _ in range(_ROUNDS):
         off = vectors - mean

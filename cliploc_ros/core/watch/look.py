@@ -145,14 +145,14 @@ def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
     index, (matches,) = landmark_map.classes, fit.matches
     classes = index.classes_of(observation.detections.class_ids)
     own = index.are_own(classes)
-    taken = {one.detection for one in matches}
+    taken = {match.detection for match in matches}
     unexplained = sum(row not in taken for row in np.nonzero(own)[0].tolist())
     found = expect(landmark_map, observation.camera, fit.pose,
-                   np.array([one.landmark for one in matches], dtype=np.int64))
+                   np.array([match.landmark for match in matches], dtype=np.int64))
     # detections that nothing explains are a term of their own
     utility, = utilities([fit.support]) - CALIBRATION.objects.unexplained * fit.support.unexplained
     in_view = index.of_landmarks[found.landmarks]
-    pairs = sum(int((in_view == one).sum()) for one in classes[own])
+    pairs = sum(int((in_view == kind).sum()) for kind in classes[own])
     return LookEvidence(int(own.sum()), round(fit.support.inliers), unexplained, float(utility),
                         len(found.landmarks), int((~found.was_seen).sum()), alignment.away_m,
                         alignment.away_deg, math.log1p(pairs)), found
@@ -179,8 +179,8 @@ def by_keyframes(recognizer: ImageRecognizer, alignment: Alignment,
     constraint = constraint_of(joined.frames[0].observation, joined.options)
     seen = recognizer.recognize([given], constraint)
     here, elsewhere = (max([0.0] + [
-        points_utility(one) for one in seen.places
-        if SAME_ANSWER.agree(one.map_from_camera, given) == near]) for near in (True, False))
+        points_utility(place) for place in seen.places
+        if SAME_ANSWER.agree(place.map_from_camera, given) == near]) for near in (True, False))
     missed = 0.0 if here or not seen.is_complete else terms.missed * recognizer.coverage(given)
     return here - elsewhere + missed
 

@@ -93,7 +93,7 @@ def check_agreement(views: Sequence[View], readings: Mapping[str, Reading], wher
     """
     given, first = next(iter(readings.items()))
     found: dict[str, list[float]] = {name: [] for name in readings}
-    for pair in _pairs([one for one in views if one.pose is not None], first):
+    for pair in _pairs([view for view in views if view.pose is not None], first):
         for name, error_px in _epipolar_errors(pair, readings).items():
             found[name].append(error_px)
         if len(found[given]) == _PAIRS:
@@ -117,7 +117,7 @@ def check_agreement(views: Sequence[View], readings: Mapping[str, Reading], wher
 
 def _pairs(views: Sequence[View], given: Reading) -> Iterator[tuple[View, View]]:
     """Yield pairs of views that are near each other in order, and turned."""
-    turns = [given.pose(one.pose)[:3, :3] for one in views if one.pose is not None]
+    turns = [given.pose(view.pose)[:3, :3] for view in views if view.pose is not None]
     last = len(views) - 1
     for start in np.unique(np.linspace(0, max(0, last - 1), _TRIED).astype(int)).tolist():
         angles = [rotation_angle_deg(turns[start].T @ turn)
@@ -156,10 +156,10 @@ def _match(pair: tuple[View, View], upright: bool
     """Return the cameras of two images, and the pixels (n, 2) of their matches."""
     looks = [one.look(upright) for one in pair]
     features = [extract(image, _FEATURES, _LONGEST_PX) for image, _ in looks]
-    ours, theirs = (unit_rows(one.descriptors) for one in features)
+    ours, theirs = (unit_rows(feature.descriptors) for feature in features)
     rows, _ = match(ours, theirs)
     return ([camera for _, camera in looks],
-            [one.pixels[rows[:, side]] for side, one in enumerate(features)])
+            [feature.pixels[rows[:, side]] for side, feature in enumerate(features)])
 
 
 def _overlapping(cameras: Sequence[Camera], pixels: Sequence[NDArray[np.float64]],
@@ -169,8 +169,8 @@ def _overlapping(cameras: Sequence[Camera], pixels: Sequence[NDArray[np.float64]
     They are those that an epipolar geometry explains, whatever the poses are; none where these are
     too few.
     """
-    points = np.array([change(camera).normalize_points(one)
-                       for camera, one in zip(cameras, pixels, strict=True)])
+    points = np.array([change(camera).normalize_points(pixel)
+                       for camera, pixel in zip(cameras, pixels, strict=True)])
     points, camera = points[:, np.isfinite(points).all(axis=(0, 2))], cameras[0]
     focal_px = camera.fx * _LONGEST_PX / max(camera.width, camera.height)
     if points.shape[1] < _LEAST_MATCHES:

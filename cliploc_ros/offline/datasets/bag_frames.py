@@ -92,8 +92,8 @@ def find_topics(bag: Path, image: str | None, camera_info: str | None) -> tuple[
     """
     with BagReader(bag) as reader:
         def named(types: Sequence[str]) -> list[str]:
-            return [one.name for one in reader.topics.values()
-                    if one.msgtype in types and one.message_count]
+            return [topic.name for topic in reader.topics.values()
+                    if topic.msgtype in types and topic.message_count]
 
         def only(candidates: Sequence[str], what: str, parameter: str) -> str:
             if len(candidates) == 1:
@@ -168,11 +168,11 @@ class _Cameras(NamedTuple):
                        find_camera(topics.intrinsics, reader.path)[0])
         infos: dict[bytes, bytes] = {}
         found = []
-        for one in reader.messages([topics.camera_info]):
-            stamp_ns = _peek_stamp_ns(one)
-            content = one.data[:4] + one.data[12:]  # all but the stamp
-            infos.setdefault(content, one.data)
-            found.append((stamp_ns, one.stamp_ns, content))
+        for message in reader.messages([topics.camera_info]):
+            stamp_ns = _peek_stamp_ns(message)
+            content = message.data[:4] + message.data[12:]  # all but the stamp
+            infos.setdefault(content, message.data)
+            found.append((stamp_ns, message.stamp_ns, content))
         sound = {content: data for content, data in infos.items()
                  if _says_calibration(data, topics.rectified)} or dict([*infos.items()][:1])
         _check_one_camera(map(_frame_of, sound.values()), f'{reader.path}: {topics.camera_info}')
@@ -257,7 +257,7 @@ def _sampled(reader: BagReader, topics: BagTopics, poses: Poses, cameras: _Camer
     views, last = [], np.iinfo(np.int64).min
     for begin in np.linspace(reader.start_ns, reader.end_ns, _COMPARED_PARTS, endpoint=False):
         begin_ns = max(int(begin), last)
-        found = [(_peek_stamp_ns(one), one.stamp_ns) for one in reader.messages(
+        found = [(_peek_stamp_ns(message), message.stamp_ns) for message in reader.messages(
             [topics.image], begin_ns, int(begin) + round(_PART_S * NS_PER_S))]
         last = max([last, *(recorded_ns + 1 for _, recorded_ns in found)])
         step = max(1, len(found) // _COMPARED_OF_PART)
@@ -353,9 +353,9 @@ class BagImages:
         """
         taken_ns, recorded_ns = self.times_ns[place].tolist()
         with BagReader(self.bag) as reader:
-            for one in reader.messages([self.topic], recorded_ns, recorded_ns + 1):
-                if _peek_stamp_ns(one) == taken_ns:
-                    return self.cameras.decoder(taken_ns, recorded_ns, one.data)()
+            for message in reader.messages([self.topic], recorded_ns, recorded_ns + 1):
+                if _peek_stamp_ns(message) == taken_ns:
+                    return self.cameras.decoder(taken_ns, recorded_ns, message.data)()
         raise DatasetError(f'{self.bag}: image {place} of {self.topic} is gone; start again')
 
 

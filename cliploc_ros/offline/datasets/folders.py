@@ -114,19 +114,19 @@ def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Ca
     if layout is None or layout.key == 'rgbd':
         return read_tum(folder), *find_camera(intrinsics, folder)
     capture = layout.read(folder, FolderOptions(intrinsics))
-    cameras = {one.camera for one in capture.files}
+    cameras = {file.camera for file in capture.files}
     if len(cameras) > 1 or not capture.is_metric or any(
-            one.number is not None for one in capture.files):
+            file.number is not None for file in capture.files):
         raise DatasetError(f'{folder}: {layout.name} with {len(cameras)} cameras: a recording '
                            'needs image files of one camera, and poses in metres')
     files = placing.place_images(capture.files, capture.axes,
                                  map_from_stored=placing.UP[capture.up or 'z'])
-    posed = {one.stamp_ns: one.pose for one in files if one.pose is not None}
+    posed = {file.stamp_ns: file.pose for file in files if file.pose is not None}
     trajectory = TimedPoses.from_samples(
         list(posed), [[*pose[:3, 3], *transforms.quaternion_from_transform(pose)]
                       for pose in posed.values()], str(folder))
-    return (TumSequence(folder, tuple(one.stamp_ns for one in files),
-                        tuple(one.color for one in files), trajectory), cameras.pop(),
+    return (TumSequence(folder, tuple(file.stamp_ns for file in files),
+                        tuple(file.color for file in files), trajectory), cameras.pop(),
             intrinsics or f'those of {layout.name}')
 
 
@@ -147,7 +147,7 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
         _check_trajectory(folder, capture.files, capture.trajectory)
     axes, scale, turn = options.axes or capture.axes, options.scale, placing.UP[capture.up or 'z']
     files = placing.place_images(capture.files, axes)
-    notes = [f'read as {layout.name}: {sum(one.pose is not None for one in files)} of '
+    notes = [f'read as {layout.name}: {sum(file.pose is not None for file in files)} of '
              f'{max(len(files), capture.images)} images have poses', *capture.notes,
              placing.check_axes(capture.files, axes, folder)]
     if options.known_distance is not None:
@@ -158,7 +158,7 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
                            'of a unit (1 where they are metres), a `known_distance` or an '
                            '`object_size`')
     files = placing.place_images(capture.files, axes, scale or 1.0, turn)
-    poses = np.array([one.pose for one in files if one.pose is not None]).reshape(-1, 4, 4)
+    poses = np.array([file.pose for file in files if file.pose is not None]).reshape(-1, 4, 4)
     if options.level:
         found = find_tilt(poses)
         if found is None:
@@ -172,10 +172,10 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
     if not capture.is_metric:  # its depth is in the unit of its poses
         form = replace(form, scale=1.0 if options.depth.unit_m else form.scale * (scale or 1.0))
     frames = folder_frames(folder, files, form)
-    flat = sum(one.depth is None for one in files)
+    flat = sum(file.depth is None for file in files)
     if 0 < flat < len(files):
         notes.append(f'{flat} of {len(files)} images have no depth image')
-    posed = [(one, one.pose) for one in files if one.pose is not None]
+    posed = [(file, file.pose) for file in files if file.pose is not None]
     digest = ' '.join(hashlib.sha256(repr(known).encode()).hexdigest()[:12] for known in (
         [(one.color.name, one.stamp_ns, one.camera) for one, _ in posed],
         [np.round(pose, 6).tolist() for _, pose in posed]))
@@ -259,7 +259,7 @@ def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
         files.append(ImageFile(
             stamp, path, camera, None if map_from_depth is None
             else map_from_depth @ depth_from_color, depth if depth.exists() else None))
-    if all(one.pose is None for one in files):
+    if all(file.pose is None for file in files):
         raise DatasetError(f'{folder}: no image has a valid .pose.txt beside it')
     return Capture(tuple(files), depth=form)
 

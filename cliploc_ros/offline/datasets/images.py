@@ -104,7 +104,7 @@ def open_images(path: Path, topics: BagTopics, cameras: Sequence[str] = ('',),
     if (layout := find_layout(path, folder.layout)) is not None:
         capture = layout.read(path, folder)
         files = capture.files
-        return Images(np.array([one.stamp_ns for one in files], dtype=np.int64),
+        return Images(np.array([file.stamp_ns for file in files], dtype=np.int64),
                       lambda place: read_color(files[place]), (),
                       lambda place: (None if files[place].depth is None
                                      else read_depth(files[place], capture.depth)))

@@ -193,7 +193,7 @@ def save_queries(path: str | Path, queries: Queries) -> None:
     frames = queries.frames
 
     def rows(name: str, none: NDArray[Any]) -> NDArray[Any]:
-        return np.concatenate([none, *(getattr(one, name) for one in frames)])
+        return np.concatenate([none, *(getattr(frame, name) for frame in frames)])
 
     try:
         arrays = {
@@ -201,7 +201,7 @@ def save_queries(path: str | Path, queries: Queries) -> None:
             'intrinsics_fx_fy_cx_cy': np.array(queries.intrinsics_fx_fy_cx_cy, dtype=np.float64),
             'frame_offsets': np.cumsum([0, *map(len, frames)], dtype=np.int64),
             'boxes_xyxy': rows('bboxes_xyxy', np.empty((0, 4))),
-            'class_ids': np.array([name for one in frames for name in one.class_ids],
+            'class_ids': np.array([name for frame in frames for name in frame.class_ids],
                                   dtype=np.str_),
             'scores': rows('scores', np.empty(0)),
             'similarities': rows('similarities', np.empty((0, len(queries.landmark_ids)))
@@ -210,12 +210,12 @@ def save_queries(path: str | Path, queries: Queries) -> None:
             'map_from_camera': np.array([one.map_from_camera for one in frames]).reshape(-1, 4, 4),
             # Python's division of integers rounds once, NumPy's twice.
             'timestamps': np.array([frame.stamp_ns / NS_PER_S for frame in frames]),
-            'query_group': np.array([one.group for one in frames], dtype=np.int64),
-            'is_main': np.array([one.is_main for one in frames], dtype=np.bool_),
+            'query_group': np.array([frame.group for frame in frames], dtype=np.int64),
+            'is_main': np.array([frame.is_main for frame in frames], dtype=np.bool_),
             'stamps_ns': np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
-            **{name: np.array([getattr(one, name) for one in frames]) for name in _STAGES},
+            **{name: np.array([getattr(frame, name) for frame in frames]) for name in _STAGES},
         }
-        if any(one.depths is not None for one in frames):
+        if any(frame.depths is not None for frame in frames):
             arrays['depths'] = np.concatenate([
                 np.full(len(one), np.nan) if one.depths is None else one.depths for one in frames])
     except ValueError as error:  # arrays of different widths

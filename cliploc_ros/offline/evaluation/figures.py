@@ -90,7 +90,7 @@ def spread_names(figure: Figure) -> None:
     renderer = FigureCanvasAgg(figure).get_renderer()
     for axes in figure.axes:
         taken: list[NDArray[np.float64]] = []
-        for name in [one for one in axes.texts if one.get_gid() == _NAME]:
+        for name in [text for text in axes.texts if text.get_gid() == _NAME]:
             box = np.reshape(name.get_window_extent(renderer).extents, (2, 2))
             size, place = box[1] - box[0], name.get_position()
             for across, up in _STEPS:
@@ -180,7 +180,7 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
         'top_view': _top_view(landmark_map, queries,
                               [one for one in results if one.method == best.method], best.method),
     }
-    if sampled := [one for one in summaries if not one.method.endswith('_bf')]:
+    if sampled := [summary for summary in summaries if not summary.method.endswith('_bf')]:
         figures['best_iteration'] = _drawn('iteration that found the best pose', '',
                                            _best_iteration, sampled)
     if sweep:
@@ -235,11 +235,11 @@ def add_legend(figure: Figure) -> None:
 
 def _success_over_threshold(axes: Axes, summaries: Sequence[Summary]) -> None:
     limits = np.linspace(0.0, _MAX_ERROR_M, 401)
-    for one in summaries:
-        color, line, _ = _style(one.method)
-        errors = np.sort(one.errors_m.ravel())
+    for summary in summaries:
+        color, line, _ = _style(summary.method)
+        errors = np.sort(summary.errors_m.ravel())
         axes.plot(limits, np.searchsorted(errors, limits) / errors.size, color=color,
-                  linestyle=line, linewidth=1.4, label=one.method)
+                  linestyle=line, linewidth=1.4, label=summary.method)
     axes.set(xlim=(0, _MAX_ERROR_M), ylim=(0, 1))
 
 
@@ -257,11 +257,11 @@ def _success_over_iterations(axes: Axes, sweep: Mapping[str, Mapping[int, Summar
 
 
 def _best_iteration(axes: Axes, summaries: Sequence[Summary]) -> None:
-    found = [one.best_iterations[np.isfinite(one.errors_m)] for one in summaries]
+    found = [summary.best_iterations[np.isfinite(summary.errors_m)] for summary in summaries]
     boxes = axes.boxplot(found, orientation='horizontal', widths=0.6, showfliers=False,
                          patch_artist=True, medianprops={'color': 'black'})
-    for patch, one in zip(boxes['boxes'], summaries, strict=True):
-        patch.set(facecolor=_style(one.method)[0], alpha=0.6)
+    for patch, summary in zip(boxes['boxes'], summaries, strict=True):
+        patch.set(facecolor=_style(summary.method)[0], alpha=0.6)
     axes.set_yticks(range(1, len(summaries) + 1), [one.method for one in summaries])
     axes.invert_yaxis()
     axes.set_title('median, quartiles, and 1.5 of their distance', fontsize=9)
@@ -271,11 +271,11 @@ def _success_by_boxes(axes: Axes, summaries: Sequence[Summary]) -> None:
     boxes = summaries[0].boxes
     bins = [(low, high, (boxes >= low) & (boxes <= high)) for low, high in _BOX_BINS]
     bins = [one for one in bins if one[2].any()]
-    for one in summaries:
-        color, line, marker = _style(one.method)
-        rates = [(one.errors_m[:, chosen] < _SUCCESS_M).mean() for _, _, chosen in bins]
+    for summary in summaries:
+        color, line, marker = _style(summary.method)
+        rates = [(summary.errors_m[:, chosen] < _SUCCESS_M).mean() for _, _, chosen in bins]
         axes.plot(range(len(bins)), rates, color=color, linestyle=line, marker=marker,
-                  markersize=4, linewidth=1.2, label=one.method)
+                  markersize=4, linewidth=1.2, label=summary.method)
     names = [f'{low} to {high}' if high < _BOX_BINS[-1][1] else f'{low} or more'
              for low, high, _ in bins]
     axes.set_xticks(range(len(bins)), [f'{name}\n{int(chosen.sum())} images'
@@ -331,8 +331,8 @@ def _consistency(axes: Axes, summaries: Sequence[Summary]) -> None:
               label='ideal')
     axes.axvline(chi2.ppf(0.95, _FREEDOM), color='#888888', linewidth=0.8, linestyle=':',
                  label='95 % ellipsoid')
-    judged = {one.method: one.nees[one.accepted] for one in summaries
-              if one.nees.size and one.accepted.any()}
+    judged = {summary.method: summary.nees[summary.accepted] for summary in summaries
+              if summary.nees.size and summary.accepted.any()}
     for (name, squares), color in zip(judged.items(), cycle(_JUDGED_COLORS), strict=False):
         axes.plot(levels, np.searchsorted(np.sort(squares), levels, side='right') / len(squares),
                   color=color, linewidth=1.4,
@@ -345,19 +345,19 @@ def _time_by_stage(axes: Axes, summaries: Sequence[Summary], observing_ms: Mappi
     rows = np.arange(len(summaries))
     start = np.zeros(len(summaries))
     stages: dict[str, Any] = dict(observing_ms)
-    if any(one.has_keyframes for one in summaries):
+    if any(summary.has_keyframes for summary in summaries):
         stages['keyframes'] = np.array([one.keyframes_ms.mean() if one.has_keyframes else 0.0
                                         for one in summaries])
     for stage, duration in stages.items():
         axes.barh(rows, duration, left=start, color=_STAGE_COLORS[stage], label=stage)
         start += duration
-    search = np.array([one.mean_search_ms for one in summaries])
-    axes.barh(rows, search, left=start, color=[_style(one.method)[0] for one in summaries])
+    search = np.array([summary.mean_search_ms for summary in summaries])
+    axes.barh(rows, search, left=start, color=[_style(summary.method)[0] for summary in summaries])
     for row, total, own in zip(rows, start + search, search, strict=True):
         axes.annotate(f'search {own:,.1f}' + (f', all {total:,.1f}' if total > own else ''),
                       (total, row), xytext=(3, 0), va='center', fontsize=8,
                       textcoords='offset points')
-    axes.set_yticks(rows, [one.method for one in summaries])
+    axes.set_yticks(rows, [summary.method for summary in summaries])
     axes.invert_yaxis()
     if not stages and search.max() > 50 * search.min():
         axes.set_xscale('log')
@@ -367,7 +367,7 @@ def _time_by_stage(axes: Axes, summaries: Sequence[Summary], observing_ms: Mappi
 def _top_view(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], results: Sequence[Result],
               method: str) -> Figure:
     truth = {query.number: query.map_from_camera for query in queries}
-    first = [one for one in results if one.trial == 0]
+    first = [result for result in results if result.trial == 0]
     positions = np.array([pose[:2, 3] for pose in truth.values()])
     points = np.concatenate([landmark_map.centers[:, :2], positions])
     low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M

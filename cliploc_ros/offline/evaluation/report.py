@@ -37,8 +37,8 @@ def write_report(folder: Path, summaries: Sequence[Summary], rows: Sequence[Sequ
         (f'{100 * best.success(1.0):.0f} %', 'of the poses within 1 m of the truth', True),
         (f'{int(best.accepted.sum())} of {count}', 'accepted', bool(best.accepted.any())),
         (str(wrong), 'accepted, but wrong by more than 1 m', not wrong)])
-    drawn = {one.stem: html.figure(one.read_bytes(), CAPTIONS[one.stem], one.stem)
-             for one in pictures}
+    drawn = {picture.stem: html.figure(picture.read_bytes(), CAPTIONS[picture.stem], picture.stem)
+             for picture in pictures}
     head, *brief = [[row[column] for column in _BRIEF] for row in rows]
     top_view = drawn.pop(_TOP_VIEW, '')
     write_text(folder / PAGE, html.page(

@@ -165,10 +165,10 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
     running
         trials, workers, scheduler, layer, noisy: see run_methods.
     """
-    swept = [replace(one, name=f'{one.name}{_AT}{count}',
-                     options=replace(one.options, iterations=count))
-             for one in methods if not one.draws_nothing
-             for count in sweep if figures and count != one.options.iterations]
+    swept = [replace(method, name=f'{method.name}{_AT}{count}',
+                     options=replace(method.options, iterations=count))
+             for method in methods if not method.draws_nothing
+             for count in sweep if figures and count != method.options.iterations]
     everything = [*methods, *swept]
     unfinished = out / 'unfinished.jsonl'
     if unfinished.exists() and not resume:
@@ -187,7 +187,7 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
 
             results = run_methods(landmark_map, everything, queries, done=done, advance=advance,
                                   **running)
-        own = [one for one in results if _AT not in one.method]
+        own = [result for result in results if _AT not in result.method]
         summaries = summary.summarize(own)
         rows = summary.table_rows(summaries)
         write_trajectories(out / 'trajectories', queries, own)
@@ -248,7 +248,7 @@ def describe(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], methods: 
             'digest': _digest([*(query.image.of_pass(is_thorough=False)[0].descriptors
                                  for query in queries if query.image is not None),
                                layer.map_from_camera, layer.points, layer.descriptors]),
-            'methods': [one.name for one in methods if one.keyframes]}}
+            'methods': [method.name for method in methods if method.keyframes]}}
 
 
 def _digest(parts: Iterable[object]) -> str:
@@ -291,8 +291,8 @@ def write_trajectories(folder: Path, queries: Sequence[PosedQuery], results: Seq
     write_text(folder / 'ground_truth.txt', _tum_text(
         (query.observation.stamp_ns / NS_PER_S, query.map_from_camera) for query in queries))
     for method in dict.fromkeys(result.method for result in results):
-        found = [(one, np.array(one.map_from_camera)) for one in results
-                 if one.method == method and one.trial == 0 and one.solved]
+        found = [(result, np.array(result.map_from_camera)) for result in results
+                 if result.method == method and result.trial == 0 and result.solved]
         write_text(folder / f'{method}.txt',
                    _tum_text((one.timestamp, pose) for one, pose in found))
         write_text(folder / f'{method}.accepted.txt',

@@ -219,12 +219,12 @@ def table_rows(summaries: Sequence[Summary]) -> list[tuple[str, ...]]:
     queries.
     """
     best = find_best(summaries)
-    rows = [_HEADER, *(_row(one, best) for one in summaries)]
-    if not any(one.has_keyframes for one in summaries):
+    rows = [_HEADER, *(_row(summary, best) for summary in summaries)]
+    if not any(summary.has_keyframes for summary in summaries):
         return rows
-    cells = [(' / '.join(str(int((one.sources == source).sum())) for source in _SOURCES),
-              f'{np.median(one.keyframe_inliers):.0f}', f'{one.keyframes_ms.mean():.1f}')
-             if one.has_keyframes else ('',) * len(_KEYFRAMES) for one in summaries]
+    cells = [(' / '.join(str(int((summary.sources == source).sum())) for source in _SOURCES),
+              f'{np.median(summary.keyframe_inliers):.0f}', f'{summary.keyframes_ms.mean():.1f}')
+             if summary.has_keyframes else ('',) * len(_KEYFRAMES) for summary in summaries]
     return [row + more for row, more in zip(rows, [_KEYFRAMES, *cells], strict=True)]
 
 
@@ -256,7 +256,7 @@ def _rate(value: float) -> str:
 def notes(summaries: Sequence[Summary]) -> list[str]:
     """Return sentences that explain the table."""
     best = find_best(summaries)
-    counts = [len(one.errors_m) for one in summaries]
+    counts = [len(summary.errors_m) for summary in summaries]
     alone = ' (one of bf and auto, which draw no samples)' if min(counts) < max(counts) else ''
     over = 'trials, of the time over searches' if max(counts) > 1 else 'searches'
     lines = [f'{len(best.queries)} queries, trials: {max(counts)}{alone}; ± is the standard '
@@ -266,7 +266,7 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
     lines += [f'{one.method} compared {one.crops_share:.0%} of the crops of a query with labels, '
               'on average: --crops all compares all.'
               for one in summaries if 0.0 < one.crops_share < 1.0]
-    if any(one.has_keyframes for one in summaries):
+    if any(summary.has_keyframes for summary in summaries):
         lines.append('Keyframes: number of poses from each source, median of the points that '
                      'agree, and mean time outside the search; --no-keyframes leaves them out.')
     if len(summaries) > 1:
@@ -313,8 +313,8 @@ def relative_errors(results: Iterable[Result], truth: Mapping[int, NDArray[np.fl
     Methods without such a pair are left out. The true poses are given by the number of the query.
     """
     errors: dict[str, list[tuple[float, float]]] = {}
-    solved = [(one, np.array(one.map_from_camera)) for one in results
-              if one.map_from_camera is not None]
+    solved = [(result, np.array(result.map_from_camera)) for result in results
+              if result.map_from_camera is not None]
     for (method, _), trial in groupby(solved, key=lambda one: (one[0].method, one[0].trial)):
         ordered = sorted(trial, key=lambda one: one[0].timestamp)
         for (one, pose), (following, next_pose) in pairwise(ordered):

@@ -100,13 +100,13 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
     With `every_frame` the neighbouring frames are queries, too. DatasetError: the queries were
     recorded against another map.
     """
-    column = {one: number for number, one in enumerate(queries.landmark_ids)}
+    column = {landmark_id: number for number, landmark_id in enumerate(queries.landmark_ids)}
     missing = [one for one in landmark_map.landmark_ids if one not in column]
     if missing:
         more = f' and {len(missing) - 1} more' if missing[1:] else ''
         raise DatasetError(f"the queries lack the map's landmark '{missing[0]}'{more}: they were "
                            'recorded with another map')
-    columns = [column[one] for one in landmark_map.landmark_ids]
+    columns = [column[landmark_id] for landmark_id in landmark_map.landmark_ids]
     fx, fy, cx, cy = queries.intrinsics_fx_fy_cx_cy
     # the file does not hold the size of the image, and localizing does not use it
     camera = Camera(max(1, round(2 * cx)), max(1, round(2 * cy)), fx, fy, cx, cy)
@@ -281,7 +281,7 @@ def with_neighbours(queries: Sequence[PosedQuery], groups: Sequence[int], noise_
         frames = sorted((one for one, its in zip(queries, groups, strict=True) if its == group),
                         key=lambda one: one.observation.stamp_ns)
         rng = np.random.default_rng([seed, abs(group), 1])
-        joined = [replace(one.observation, odom_from_camera=pose) for one, pose in zip(
+        joined = [replace(frame.observation, odom_from_camera=pose) for frame, pose in zip(
             frames, _odometry(frames, noise_m, noise_deg, rng), strict=True)]
         for row, query in enumerate(frames):
             near = sorted(range(len(frames)), key=lambda other: abs(other - row))[1:MAX_FRAMES]

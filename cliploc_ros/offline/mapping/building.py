@@ -339,12 +339,12 @@ class _Builder(NamedTuple):
         weights = [_class_weights(self.detections, boxes) for boxes in group_boxes(shown, count)]
         details = tuple(
             evidence.details(row, LandmarkDetails(
-                class_weights=one if len(one) > 1 else None,
+                class_weights=weight if len(weight) > 1 else None,
                 shared_sigma=None if shared is None else float(shared[row, 0]),
                 shared_sigma_deg=None if shared is None else float(shared[row, 1]),
                 source=self.options.source))
-            for row, one in enumerate(weights))
-        names = tuple(one[0][0] for one in weights)
+            for row, weight in enumerate(weights))
+        names = tuple(weight[0][0] for weight in weights)
         return LandmarkMap(self.options.frame_id, unused_ids(names), names, names,
                            landmarks.centers, *landmarks.axes_and_quats(), details)
 

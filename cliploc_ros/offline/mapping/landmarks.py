@@ -203,9 +203,9 @@ class Landmarks(NamedTuple):
     @staticmethod
     def joined(*parts: 'Landmarks') -> 'Landmarks':
         """Return the landmarks of all parts."""
-        starts = np.cumsum([0, *(len(one.classes) for one in parts)])
-        shifted = [one._replace(others=one.others + np.array([start, 0]))
-                   for one, start in zip(parts, starts[:-1].tolist(), strict=True)]
+        starts = np.cumsum([0, *(len(part.classes) for part in parts)])
+        shifted = [part._replace(others=part.others + np.array([start, 0]))
+                   for part, start in zip(parts, starts[:-1].tolist(), strict=True)]
         columns = zip(Landmarks.none(), *shifted, strict=True)
         return Landmarks(*(np.concatenate(column) for column in columns))
 

@@ -80,7 +80,7 @@ class PosedDetections:
         """Return the detections of a frame."""
         rows = slice(*self.frame_offsets[frame:frame + 2])
         return Detections(self.bboxes_xyxy[rows], tuple(
-            self.class_names[one] for one in self.classes[rows]), self.scores[rows])
+            self.class_names[kind] for kind in self.classes[rows]), self.scores[rows])
 
     def name_of(self, frame: int) -> str:
         """Return the name of a frame's camera; '' where there is one without a name."""

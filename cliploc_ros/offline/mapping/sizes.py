@@ -44,8 +44,8 @@ def log_sizes(names: Iterable[str]) -> NDArray[np.float64]:
     The factor within which nearly all objects lie counts as two standard deviations.
     """
     sizes = [size_of_class(name) for name in names]
-    return np.array([NO_SIZE if one is None else
-                     (np.log(0.5 * one.extent_m), 2.0 / np.log(one.factor)) for one in sizes])
+    return np.array([NO_SIZE if size is None else
+                     (np.log(0.5 * size.extent_m), 2.0 / np.log(size.factor)) for size in sizes])
 
 
 @cache
@@ -63,7 +63,7 @@ def scale_by_sizes(landmark_map: LandmarkMap) -> float | None:
     tell, or they fit.
     """
     ratios: dict[str, list[float]] = {}
-    sides = [one.baseline_deg for one in landmark_map.details] or [None] * len(landmark_map)
+    sides = [detail.baseline_deg for detail in landmark_map.details] or [None] * len(landmark_map)
     for name, semi_axes, seen_deg in zip(landmark_map.class_ids, landmark_map.semi_axes, sides,
                                          strict=True):
         size = size_of_class(name)

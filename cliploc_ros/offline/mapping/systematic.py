@@ -111,7 +111,7 @@ class _Fit(NamedTuple):
 
     @property
     def is_significant(self) -> bool:
-        return any(one.is_significant for one in self.corrections)
+        return any(correction.is_significant for correction in self.corrections)
 
 
 def find_corrections(detections: PosedDetections, views: Views, landmarks: Landmarks,
@@ -135,8 +135,8 @@ def find_corrections(detections: PosedDetections, views: Views, landmarks: Landm
                 again = _fit(cause, best.views, best.landmarks, shown)
                 more = again.corrections[0].explained * (1.0 - best.corrections[0].explained)
                 follows = not (again.is_significant and more > _MIN_EXPLAINED)
-            found += [replace(one, name=one.name + name, follows=follows)
-                      for one in fit.corrections]
+            found += [replace(correction, name=correction.name + name, follows=follows)
+                      for correction in fit.corrections]
     return found
 
 

@@ -198,20 +198,20 @@ def _assemble(landmark_map: LandmarkMap, cameras: Sequence[Camera],
               images: Sequence[PosedFeatures], points: Sequence[NDArray[np.float64]],
               kept: Sequence[NDArray[np.int64]], deviation_per_metre: float, kind: FeatureKind
               ) -> KeyframeLayer:
-    descriptors = np.concatenate([one.descriptors[rows]
-                                  for one, rows in zip(images, kept, strict=True)])
+    descriptors = np.concatenate([image.descriptors[rows]
+                                  for image, rows in zip(images, kept, strict=True)])
     pixels = np.concatenate([
-        one.bearings[rows] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-        for one, rows, camera in zip(images, kept, cameras, strict=True)])
+        image.bearings[rows] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        for image, rows, camera in zip(images, kept, cameras, strict=True)])
     camera, *others = dict.fromkeys(cameras)
     vocabulary = learn_words(descriptors, kind)
     return KeyframeLayer(
         landmark_map.frame_id, landmark_map.landmark_ids,
         landmark_map.centers.astype(np.float32), camera,
-        np.array([one.map_from_camera for one in images]),
+        np.array([image.map_from_camera for image in images]),
         np.cumsum([0, *map(len, kept)]),
         np.clip(np.round(pixels * PIXEL_SCALE), 0, 65535).astype(np.uint16),
-        np.concatenate([one[rows] for one, rows in zip(points, kept, strict=True)]
+        np.concatenate([point[rows] for point, rows in zip(points, kept, strict=True)]
                        ).astype(np.float32),
         descriptors, nearest_words(kind.units(descriptors), kind.units(vocabulary)
                                    ).astype(np.uint16), vocabulary, deviation_per_metre,
@@ -227,7 +227,7 @@ def triangulate(images: Sequence[PosedFeatures], row: int, kind: FeatureKind = S
     with which most matches agree is kept, or that with the widest angle. NaN: no point.
     """
     ours = images[row]
-    poses = np.array([one.map_from_camera for one in images])
+    poses = np.array([image.map_from_camera for image in images])
     distances = np.linalg.norm(poses[:, :3, 3] - poses[row, :3, 3], axis=1)
     cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], poses[row, :3, :3]) - 1.0)
     fit = (distances > _LEAST_M) & (distances < _MOST_M) & (cosines > _MOST_COS)
@@ -235,12 +235,12 @@ def triangulate(images: Sequence[PosedFeatures], row: int, kind: FeatureKind = S
     neighbours = [int(one) for one in order[fit[order]][:_NEIGHBOURS]]
     count = len(ours.bearings)
     seen = np.full((len(neighbours), count, 2), np.nan)
-    cameras = np.array([invert_transform(images[one].map_from_camera) @ ours.map_from_camera
-                        for one in neighbours]).reshape(-1, 4, 4)
+    cameras = np.array([invert_transform(images[neighbour].map_from_camera) @ ours.map_from_camera
+                        for neighbour in neighbours]).reshape(-1, 4, 4)
     descriptors = kind.units(ours.descriptors)
-    for number, one in enumerate(neighbours):
-        pairs, _ = kind.match(descriptors, kind.units(images[one].descriptors))
-        seen[number, pairs[:, 0]] = images[one].bearings[pairs[:, 1]]
+    for number, neighbour in enumerate(neighbours):
+        pairs, _ = kind.match(descriptors, kind.units(images[neighbour].descriptors))
+        seen[number, pairs[:, 0]] = images[neighbour].bearings[pairs[:, 1]]
     best = np.full((count, 3), np.nan)
     scores = np.zeros(count)
     for number in range(len(neighbours)):

@@ -297,7 +297,7 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log,
     entries, _ = log.read()
     seen: dict[int, SeenFrame] = {}
     if entries[:1] == [run]:
-        seen = {one.place: one for one in entries[1:] if isinstance(one, SeenFrame)}
+        seen = {entry.place: entry for entry in entries[1:] if isinstance(entry, SeenFrame)}
     else:
         log.restart([run])
     unusable: list[str] = []

@@ -171,7 +171,7 @@ class Desk:
         """Return the bounds of the landmarks and of the cameras that saw them."""
         studio = self.studio
         source = studio.layer if studio.recording is None else studio.recording.detections
-        return extent_of([one.center for one in studio.document.landmarks.values()],
+        return extent_of([landmark.center for landmark in studio.document.landmarks.values()],
                          None if source is None else source.map_from_camera)
 
     def look(self, client: viser.ClientHandle | None, name: str, is_flat: bool = False) -> None:

@@ -288,12 +288,12 @@ class Document:
             self._journal.close() if is_needed else self._journal.remove()
 
     def _landmarks_of_file(self) -> dict[str, Landmark]:
-        return {key: replace(one, look=self._look_file.looks.get(key))
-                for key, one in self._file.landmarks.items()}
+        return {key: replace(landmark, look=self._look_file.looks.get(key))
+                for key, landmark in self._file.landmarks.items()}
 
     def _note_unknown_fields(self) -> None:
-        unknown = {name: key for key, one in self.landmarks.items()
-                   for name in one.fields if name not in KNOWN_FIELDS}
+        unknown = {name: key for key, landmark in self.landmarks.items()
+                   for name in landmark.fields if name not in KNOWN_FIELDS}
         for name, landmark_id in list(unknown.items())[:5]:
             self.notes += (f"field '{name}' (landmark '{landmark_id}') is kept, but the "
                            'relocalizer refuses a map with unknown fields',)
@@ -309,8 +309,8 @@ class Document:
         return {'base': self._file.digest, 'marks': self._marks()}
 
     def _marks(self) -> dict[str, Any]:
-        return {key: asdict(one.marks) for key, one in self.landmarks.items()
-                if one.marks != Marks()}
+        return {key: asdict(landmark.marks) for key, landmark in self.landmarks.items()
+                if landmark.marks != Marks()}
 
     def _replay(self, entries: list[dict[str, Any]]) -> None:
         """Do again the edits in the journal, from the content that the file has."""
@@ -352,7 +352,7 @@ class Document:
             marks |= {key: one['marks'] for key, one in entry.get('after', {}).items() if one}
         looks = {} if last == entries[-1:] else last[0].get('looks', {})
         self.landmarks = self._saved = {
-            key: replace(one, marks=Marks(**marks.get(key, {})),
+            key: replace(landmark, marks=Marks(**marks.get(key, {})),
                          look=(Encoded.from_json(looks[key]) if isinstance(looks.get(key), dict)
-                               else one.look))
-            for key, one in self.landmarks.items()}
+                               else landmark.look))
+            for key, landmark in self.landmarks.items()}

@@ -49,8 +49,8 @@ class Change(NamedTuple):
 
     def apply(self, landmarks: Landmarks) -> dict[str, Landmark]:
         """Return the landmarks after the change."""
-        return {**{key: one for key, one in landmarks.items()
-                   if self.after.get(key, one) is not None},
+        return {**{key: landmark for key, landmark in landmarks.items()
+                   if self.after.get(key, landmark) is not None},
                 **{key: one for key, one in self.after.items() if one is not None}}
 
     def undoing(self, landmarks: Landmarks) -> 'Change':
@@ -182,9 +182,9 @@ def merge(landmarks: Landmarks, landmark_ids: Sequence[str],
     parts = [_get(landmarks, key) for key in ids]
     if fit is None:
         # A solid ellipsoid with the shape matrix S has the covariance S / 5.
-        centers, bases = (np.array([getattr(one, name) for one in parts])
+        centers, bases = (np.array([getattr(part, name) for part in parts])
                           for name in ('center', 'basis'))
-        weights = np.array([one.semi_axes.prod() for one in parts])
+        weights = np.array([part.semi_axes.prod() for part in parts])
         weights = weights / weights.sum()
         center = weights @ centers
         offsets = np.sqrt(5.0) * (centers - center)[:, :, None]
@@ -195,8 +195,8 @@ def merge(landmarks: Landmarks, landmark_ids: Sequence[str],
     merged = replace(
         parts[0].changed(**shape_fields(*fit), **_NO_EVIDENCE,
                          class_weights=None if classes is None else dict(classes)),
-        look=merge_looks([one.look for one in parts],
-                         [one.details.support or 1 for one in parts]))
+        look=merge_looks([part.look for part in parts],
+                         [part.details.support or 1 for part in parts]))
     return _change_of(f'merge {", ".join(ids)}', landmarks,
                       {ids[0]: merged, **dict.fromkeys(ids[1:])})
 

@@ -156,14 +156,14 @@ def map_of(landmarks: Landmarks, frame_id: Any = 'map', source: str = 'studio') 
 
     MapError: there are none, or one is invalid. Names the source, the landmark and the field.
     """
-    known = {landmark_id: {name: value for name, value in one.fields.items()
-                           if name in KNOWN_FIELDS} for landmark_id, one in landmarks.items()}
+    known = {landmark_id: {name: value for name, value in landmark.fields.items()
+                           if name in KNOWN_FIELDS} for landmark_id, landmark in landmarks.items()}
     return LandmarkMap.from_mapping({'frame_id': frame_id, 'landmarks': known}, source)
 
 
 def fields_of(landmarks: Landmarks) -> dict[str, Mapping[str, Any]]:
     """Return the fields of landmarks, which tell whether a map was edited; locks do not."""
-    return {key: one.fields for key, one in landmarks.items()}
+    return {key: landmark.fields for key, landmark in landmarks.items()}
 
 
 def rounded(values: Iterable[float]) -> list[float]:

@@ -142,11 +142,11 @@ def draw_keyframes(scene: viser.SceneApi, layer: KeyframeLayer) -> list[Any]:
 
 def draw_answers(scene: viser.SceneApi, answers: Mapping[int, Trial]) -> list[Any]:
     """Draw the relocalizer's answers: a sphere at the true pose, a line to the pose it found."""
-    colors = [_VERDICT_RGB[one.verdict] for one in answers.values()]
-    found = [(one, rgb) for one, rgb in zip(answers.values(), colors, strict=True)
-             if one.estimate is not None]
+    colors = [_VERDICT_RGB[answer.verdict] for answer in answers.values()]
+    found = [(answer, rgb) for answer, rgb in zip(answers.values(), colors, strict=True)
+             if answer.estimate is not None]
     return [_dots(scene, '/answers/places', np.reshape(
-        [one.position for one in answers.values()], (-1, 3)), 0.03, colors or (0, 0, 0)),
+        [answer.position for answer in answers.values()], (-1, 3)), 0.03, colors or (0, 0, 0)),
             _lines(scene, '/answers/lines', [(one.position, one.estimate) for one, _ in found],
                    np.repeat([rgb for _, rgb in found] or np.empty((0, 3)), 2, axis=0).reshape(
                        -1, 2, 3).astype(np.uint8), 2.0)]
@@ -191,12 +191,12 @@ def draw_look_alikes(scene: viser.SceneApi, places: Coverage) -> list[Any]:
     angles = np.linspace(0.0, 2.0 * np.pi, _CIRCLE_POINTS + 1)
     ring = RADIUS_M * np.column_stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)])
     segments = [np.empty((0, 2, 3))]
-    for one in places.look_alikes[:_MAX_LOOK_ALIKES]:
-        for middle in (one.first, one.second):
+    for look_alike in places.look_alikes[:_MAX_LOOK_ALIKES]:
+        for middle in (look_alike.first, look_alike.second):
             circle = ring + np.array([*middle[:2], _floor(places) + 2 * _LIFT_M])
             segments.append(np.stack([circle[:-1], circle[1:]], axis=1))
         segments.append(np.array([[places.landmarks[key].center for key in pair]
-                                  for pair in one.matched]))
+                                  for pair in look_alike.matched]))
     return [_lines(scene, '/look_alikes', np.concatenate(segments), _rgb(LOOK_ALIKE), 2.5)]
 
 

@@ -290,8 +290,8 @@ class LookFile(NamedTuple):
         of another program is not overwritten. Return the file after that, and the reason if it
         does not hold these looks, otherwise ''. MapError: it cannot be written.
         """
-        known = {key: one.look for key, one in landmarks.items()
-                 if one.look is not None and one.look.encoder_key == self.encoder_key}
+        known = {key: landmark.look for key, landmark in landmarks.items()
+                 if landmark.look is not None and landmark.look.encoder_key == self.encoder_key}
         if not self.encoder_key or known == self.looks:
             return self, ''
         if _state_of(self.path) != self.state:
@@ -301,9 +301,9 @@ class LookFile(NamedTuple):
         nothing = Encoded(np.zeros(size, np.float16), np.empty((0, size), np.float16), '')
         rows = [known.get(key, nothing) for key in landmarks]
         save_landmark_embeddings(self.path, LandmarkEmbeddings(
-            self.encoder_key, tuple(landmarks), np.array([one.mean for one in rows]),
-            np.concatenate([one.medoids for one in rows]),
-            np.cumsum([0, *(len(one.medoids) for one in rows)]), self.set_digest))
+            self.encoder_key, tuple(landmarks), np.array([row.mean for row in rows]),
+            np.concatenate([row.medoids for row in rows]),
+            np.cumsum([0, *(len(row.medoids) for row in rows)]), self.set_digest))
         return self._replace(looks=known, state=_state_of(self.path)), ''
 
 

@@ -34,7 +34,7 @@ def parts_of(desk: Desk) -> dict[str, Any]:
             'step': 1 if studio.recording is None else studio.recording.film_step,
             'has_boxes': review.has_boxes, 'images': studio.recording is not None
             and studio.recording.images is not None,
-            'classes': sorted({one.class_id for one in document.landmarks.values()})},
+            'classes': sorted({landmark.class_id for landmark in document.landmarks.values()})},
         'rows': [[key, one.label, one.class_id, one.marks.is_locked, one.marks.is_hidden,
                   review.severity(key), one.marks.decision,
                   '#{:02x}{:02x}{:02x}'.format(*studio.color_of(one.class_id))]
@@ -82,8 +82,8 @@ def _view_parts(studio: Studio) -> dict[str, Any]:
     new, recording, view = studio.new, studio.recording, studio.view
     assert recording is not None and new is not None
     selection, seen = studio.document.selection, recording.detections.detections_of(view)
-    shown = [one for number, one in enumerate(recording.outlines(studio.shown(), view))
-             if number < _MAX_OUTLINES or one.landmark_id in selection]
+    shown = [outline for number, outline in enumerate(recording.outlines(studio.shown(), view))
+             if number < _MAX_OUTLINES or outline.landmark_id in selection]
     guess = {} if new.fit is None else {'': Landmark(shape_fields(new.fit.center, new.fit.basis))}
     return {
         'view': {
@@ -92,7 +92,7 @@ def _view_parts(studio: Studio) -> dict[str, Any]:
             'boxes': [[*box, name] for box, name in zip(
                 seen.bboxes_xyxy.round(1).tolist(), seen.class_ids, strict=True)],
             'outlines': [[one.landmark_id, *_axes_of(one.ellipse)] for one in shown],
-            'guess': [_axes_of(one.ellipse) for one in recording.outlines(guess, view)],
+            'guess': [_axes_of(outline.ellipse) for outline in recording.outlines(guess, view)],
             'guide': new.guide(view).round(1).tolist()},
         'new': {'boxes': sorted(new.boxes.items()), 'class_id': new.class_id, 'doubt': new.doubt}}
 

@@ -211,4 +211,4 @@ class Recording:
 
 
 def _array(landmarks: Landmarks, name: str) -> NDArray[np.float64]:
-    return np.array([getattr(one, name) for one in landmarks.values()])
+    return np.array([getattr(landmark, name) for landmark in landmarks.values()])

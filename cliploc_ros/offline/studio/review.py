@@ -167,5 +167,5 @@ class ReviewQueue:
         found = check_landmarks(landmark_map, witness, overlaps)
         ids = list(landmarks)
         self._checks = {one.landmark_id: one for one in found}
-        self._duplicates = [(ids[one.first], ids[one.second]) for one in overlaps
-                            if one.is_duplicate]
+        self._duplicates = [(ids[overlap.first], ids[overlap.second]) for overlap in overlaps
+                            if overlap.is_duplicate]

@@ -161,8 +161,8 @@ class Labels:
         tops = np.array([one.center + float(np.linalg.norm(one.basis.T @ self._up)) * self._up
                          for one in landmarks.values()]).reshape(-1, 3)
         keys, texts = list(landmarks), [
-            _shortened(f'{key}: {one.label}', _MAX_LABEL_LENGTH) if key in selection
-            else _shortened(key, _SHORT_LABEL_LENGTH) for key, one in landmarks.items()]
+            _shortened(f'{key}: {landmark.label}', _MAX_LABEL_LENGTH) if key in selection
+            else _shortened(key, _SHORT_LABEL_LENGTH) for key, landmark in landmarks.items()]
         rows = dict(self._with_room(tops, texts, np.isin(keys, selection)) if keys else ())
         for key in self._handles.keys() - landmarks.keys():
             self._handles.pop(key).remove()

@@ -92,7 +92,7 @@ class Studio:
         self._found_sightings = Background[list[Sighting]](self.changed.set)
         self._sightings: tuple[str, list[Sighting] | None] = '', None
         self._colors: dict[str, Rgb] = {}
-        for class_id in sorted({one.class_id for one in document.landmarks.values()}):
+        for class_id in sorted({landmark.class_id for landmark in document.landmarks.values()}):
             self.color_of(class_id)
         if recording is not None and recording.detections.encoder_key:
             document.take_encoder(recording.detections.encoder_key)
@@ -167,8 +167,8 @@ class Studio:
 
     def shown(self) -> dict[str, Landmark]:
         """Return the landmarks that are not hidden."""
-        return {key: one for key, one in self.document.landmarks.items()
-                if not one.marks.is_hidden}
+        return {key: landmark for key, landmark in self.document.landmarks.items()
+                if not landmark.marks.is_hidden}
 
     def select(self, id: str, joins: bool = False) -> None:
         """Select a landmark, or toggle it in the selection."""
@@ -244,8 +244,8 @@ class Studio:
 
     def refit_all(self) -> str:
         """Fit all unlocked landmarks to their boxes."""
-        return self._refit([key for key, one in self.document.landmarks.items()
-                            if not one.marks.is_locked])
+        return self._refit([key for key, landmark in self.document.landmarks.items()
+                            if not landmark.marks.is_locked])
 
     def _refit(self, landmark_ids: Sequence[str]) -> str:
         change, reasons = self.seen().refitted(self.document.landmarks, landmark_ids)

@@ -285,8 +285,8 @@ class FrameSource:
         useful_ns = (stamp_ns(msg.header.stamp) if oldest is None
                      else stamp_ns(oldest[0].header.stamp)) - self._depth_tolerance_ns
         while len(self._depths) > 1 and sum(
-                len(one.data) for one in self._depths) > _MAX_DEPTH_BYTES:
-            stamps = [stamp_ns(one.header.stamp) for one in self._depths]
+                len(depth.data) for depth in self._depths) > _MAX_DEPTH_BYTES:
+            stamps = [stamp_ns(depth.header.stamp) for depth in self._depths]
             del self._depths[0 if stamps[0] < useful_ns or len(stamps) < 3 else 1 + min(
                 range(len(stamps) - 2), key=lambda row: stamps[row + 2] - stamps[row])]
 
@@ -312,15 +312,15 @@ class FrameSource:
             self._unsure = Frame(
                 image, complete['camera_info'][0], detections, image_at,
                 max(image_at, detected_at), min(
-                    (one for one in self._depths
-                     if abs(stamp_ns(one.header.stamp) - at_ns) <= self._depth_tolerance_ns),
+                    (depth for depth in self._depths
+                     if abs(stamp_ns(depth.header.stamp) - at_ns) <= self._depth_tolerance_ns),
                     key=lambda one: abs(stamp_ns(one.header.stamp) - at_ns), default=None),
                 self.heard.get('depth_camera_info', (None, 0.0))[0], self._camera,
                 image_topic=self.image_topic)
         frame = self._unsure
         # a single stamp may be that of the next images, too
         if frame is None or not (self._stamps['image'].are_own or all(
-                one.is_repeated(frame.stamp_ns) for one in self._stamps.values())):
+                stamp.is_repeated(frame.stamp_ns) for stamp in self._stamps.values())):
             return None
         self._unsure, self._arrived_at = None, (frame.received_at, frame.detected_at)
         return frame
@@ -334,10 +334,10 @@ class FrameSource:
             return self._stamps[name].add(msg.header.stamp, (
                 msg.header.frame_id, len(msg.data), bytes(
                     memoryview(msg.data)[::1 + len(msg.data) // _SAMPLE])), received_at)
-        boxes = [one.bbox for one in msg.detections]
+        boxes = [detection.bbox for detection in msg.detections]
         return self._stamps[name].add(msg.header.stamp, np.array(
-            [(one.center.position.x, one.center.position.y, one.size_x, one.size_y)
-             for one in boxes]).tobytes(), received_at)
+            [(box.center.position.x, box.center.position.y, box.size_x, box.size_y)
+             for box in boxes]).tobytes(), received_at)
 
     def _stamp_problems(self) -> list[str]:
         """Return the fault of the stamps of images and detections, and the remedy."""

@@ -329,7 +329,7 @@ def _is_silence(poses: Sequence[_Pose], gap_ns: int) -> bool:
     """Return whether the next pose comes later than some lost messages explain."""
     if gap_ns <= _MAX_GAP_NS:
         return False
-    period_ns = float(np.median(np.diff([one.stamp_ns for one in poses]))) \
+    period_ns = float(np.median(np.diff([pose.stamp_ns for pose in poses]))) \
         if len(poses) > 1 else _SLOW_NS
     return gap_ns > _MOST_PERIODS * period_ns
 

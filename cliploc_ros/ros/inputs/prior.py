@@ -68,8 +68,8 @@ class PriorSource:
 
     def close(self) -> None:
         """Unsubscribe."""
-        for one in self._subscriptions:
-            self._node.destroy_subscription(one)
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
         self._subscriptions = []
 
     def hear(self, msg: PoseWithCovarianceStamped) -> None:

@@ -51,7 +51,7 @@ class _Instant:
     @property
     def stamps_ns(self) -> list[int]:
         """Return the stamps of its images [ns]."""
-        return [one.stamp_ns for one in self.frames.values()]
+        return [frame.stamp_ns for frame in self.frames.values()]
 
     def take(self, frame: Frame, tolerance_ns: float) -> bool:
         """Take a frame of this instant; return whether it is one."""
@@ -142,11 +142,11 @@ class CameraRig:
                                       after, sources)
                 left_s = end - time.monotonic()
                 if (frame is not None and not frame.left_out) or left_s <= 0.0 or any(
-                        one.is_closed for one in sources.values()):
+                        source.is_closed for source in sources.values()):
                     break
                 # messages may be lost: the next instant may have all cameras
                 self._changed.wait(min(left_s, _CHECK_PERIOD_S))
-            why = '' if frame else '; '.join(one.why_none(after) for one in sources.values())
+            why = '' if frame else '; '.join(source.why_none(after) for source in sources.values())
             for source in sources.values():
                 source.want_no_more(deadline, linger_s)  # which may forget both
         if frame is None:
@@ -195,7 +195,7 @@ class CameraRig:
         """Pass on instants that waited long enough; unsubscribe once no frame is wanted."""
         self._pass_on()
         with self._changed:
-            subscribed = [one.rest() for one in self.sources.values()]
+            subscribed = [source.rest() for source in self.sources.values()]
             if not any(subscribed):
                 self._pending.clear()
                 self._passed.clear()
@@ -206,8 +206,8 @@ class CameraRig:
 
         Of several with as many cameras the newest one: the last of `instants`.
         """
-        fullest = max(({name: one for name, one in frames.items()
-                        if name in names and one.received_at >= after}
+        fullest = max(({name: frame for name, frame in frames.items()
+                        if name in names and frame.received_at >= after}
                        for frames in reversed([*instants])),
                       key=len, default={})
         return self._joined(fullest, names) if fullest else None

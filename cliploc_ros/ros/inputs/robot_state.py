@@ -173,7 +173,7 @@ class VerticalSource(qos.Listener):
         with self._lock:
             frame, samples = self._imu_frame, list(self._samples)
             newest_is_empty = self._newest_is_empty
-        near = [one for one in samples if abs(one.stamp_ns - at_ns) <= WINDOW_NS]
+        near = [sample for sample in samples if abs(sample.stamp_ns - at_ns) <= WINDOW_NS]
         topic = self._node.resolve_topic_name('imu')
         if not near and self.problem:
             raise NoVerticalError(self.problem)
@@ -228,9 +228,9 @@ def _contradiction_deg(samples: Sequence[Sample]) -> float:
     The median over all samples, not those about the image alone: a robot that starts or brakes
     deflects its accelerometer for a moment. 0 where no sample measures both at rest.
     """
-    cosines = [float(one.up @ one.acceleration) / float(np.linalg.norm(one.acceleration))
-               for one in samples if one.up is not None and one.acceleration is not None
-               and _is_gravity(one.acceleration)]
+    cosines = [float(sample.up @ sample.acceleration) / float(np.linalg.norm(sample.acceleration))
+               for sample in samples if sample.up is not None and sample.acceleration is not None
+               and _is_gravity(sample.acceleration)]
     return float(np.degrees(np.median(np.arccos(np.clip(cosines, -1.0, 1.0))))) \
         if cosines else 0.0
 

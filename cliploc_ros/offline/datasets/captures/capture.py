@@ -76,9 +76,9 @@ class Capture:
         Notes say which of them and of their depth images are missing.
         """
         arranged = arrange(files, where)
-        missing = [[one.color for one in files if beside(one.color) is None],
-                   [one.depth for one in files if one.depth is not None
-                    and beside(one.depth) is None]]
+        missing = [[file.color for file in files if beside(file.color) is None],
+                   [file.depth for file in files if file.depth is not None
+                    and beside(file.depth) is None]]
         left_out = [f'{len(paths)} of {len(files)} {what} that are listed are missing, such as '
                     f'{paths[0]}' for what, paths in zip(('images', 'depth images'), missing,
                                                          strict=True) if paths]
@@ -98,7 +98,7 @@ def arrange(files: Sequence[ImageFile], where: object) -> tuple[ImageFile, ...]:
     DatasetError
         No image is there or has a pose, two are one file, or a pose is not a rigid transform.
     """
-    present = [one for one in files if beside(one.color) is not None]
+    present = [file for file in files if beside(file.color) is not None]
     if not present:
         raise DatasetError(f'{where}: none of {len(files)} images is there' + (
             f', such as {files[0].color}; give the folder of the images with `images`'

@@ -108,18 +108,18 @@ def read_colmap(folder: Path, options: capture.FolderOptions) -> capture.Capture
             color = next(filter(None, (capture.beside(root / name) for name in (
                 one.name.replace('\\', '/'), PureWindowsPath(one.name).name))), color)
         files.append(ImageFile(NO_STAMP, color, cameras[one.camera_id], one.pose))
-    there = sum(one.suffix.lower() in capture.IMAGES for one in root.rglob('*'))
+    there = sum(file.suffix.lower() in capture.IMAGES for file in root.rglob('*'))
     return capture.Capture.of(files, model, 'opencv', is_metric=False, notes=notes, images=there)
 
 
 def _check_same(model: Path, cameras: Mapping[int, Camera], images: Sequence[_Posed]) -> None:
     """Refuse a model whose text and binary files say different things."""
     text = dict(_cameras(model, 'txt'))
-    poses = {one.name: one.pose for one in _images(model, 'txt')}
+    poses = {image.name: image.pose for image in _images(model, 'txt')}
     if any(not np.allclose(camera.matrix, text[number].matrix, rtol=1e-3)
            for number, camera in cameras.items() if number in text) or any(
-               one.pose is not None and (other := poses.get(one.name)) is not None
-               and not np.allclose(one.pose, other, atol=1e-3) for one in images):
+               image.pose is not None and (other := poses.get(image.name)) is not None
+               and not np.allclose(image.pose, other, atol=1e-3) for image in images):
         raise DatasetError(f'{model}: the .bin and .txt files of the model say different cameras '
                            'or poses: remove those that are old')
 

@@ -126,8 +126,8 @@ def read_stray(folder: Path, options: capture.FolderOptions) -> capture.Capture:
 
 def _size_of(folder: Path, video: Path | None) -> tuple[int, int]:
     """Return width and height of the images of Stray Scanner, which no file tells."""
-    first = next((one for one in sorted((folder / 'rgb').glob('*.*'))
-                  if one.suffix in capture.IMAGES), None)
+    first = next((file for file in sorted((folder / 'rgb').glob('*.*'))
+                  if file.suffix in capture.IMAGES), None)
     size = None
     if first is not None:
         size = capture.size_of_image(first)

@@ -50,8 +50,8 @@ def place_images(files: Sequence[ImageFile], axes: str, scale: float = 1.0,
     DatasetError
         A pose is too far from the origin; names its image.
     """
-    placed = tuple(one if one.pose is None else one._replace(pose=move_poses(
-        np.array(AXES[axes](one.pose))[None], scale, map_from_stored)[0]) for one in files)
+    placed = tuple(file if file.pose is None else file._replace(pose=move_poses(
+        np.array(AXES[axes](file.pose))[None], scale, map_from_stored)[0]) for file in files)
     for one in placed:
         if one.pose is not None and (far := np.abs(one.pose[:3, 3]).max()) > _MOST_M:
             raise DatasetError(f'pose of {one.color} is {far:.3g} m from the origin')
@@ -66,10 +66,10 @@ def find_scale(files: Sequence[ImageFile], first: str, second: str, metres: floa
     """
     places = []
     for name in (first, second):
-        found = [one.pose[:3, 3] for one in files
-                 if one.pose is not None and str(one.color).endswith(f'/{name}')]
+        found = [file.pose[:3, 3] for file in files
+                 if file.pose is not None and str(file.color).endswith(f'/{name}')]
         if len(found) != 1:
-            posed = [one for one in files if one.pose is not None]
+            posed = [file for file in files if file.pose is not None]
             shown = ', '.join(one.color.name for one in posed[:3])
             raise DatasetError(f'{where}: {len(found) or "no"} images with a pose are named {name}'
                                f'; there are {shown} and so on')
@@ -91,13 +91,13 @@ def check_axes(files: Sequence[ImageFile], axes: str, where: object) -> str:
     readings['quaternions w x y z'] = Reading(
         'name the columns in the first line, as `# timestamp tx ty tz qw qx qy qz`',
         lambda pose: AXES[axes](w_first(pose)))
-    stored = [one for one in files if one.number is None][::max(1, len(files) // _TRIED)]
+    stored = [file for file in files if file.number is None][::max(1, len(files) // _TRIED)]
     ask_to_turn = any(not np.array_equal(read_color(one)[0], read_color(one, True)[0])
                       for one in stored)
     if ask_to_turn:
         readings['turned by EXIF'] = Reading(
             'turn the pixels, as with mogrify -auto-orient', AXES[axes], upright=True)
-    note = check_agreement([View(one.pose, partial(read_color, one)) for one in files],
+    note = check_agreement([View(file.pose, partial(read_color, file)) for file in files],
                            readings, where)
     return note or ('images ask by EXIF to be turned, and are read as stored: poses and '
                     'intrinsics must be of stored pixels' if ask_to_turn else '')

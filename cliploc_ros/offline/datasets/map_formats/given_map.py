@@ -110,7 +110,7 @@ def place(given: GivenMap, source: str, frame_id: str, scale: float,
         frame_id, ids, labels, class_ids,
         np.array(centers) * scale @ turn.T + map_from_given[:3, 3],
         np.array(semi_axes) * scale, rotations.as_quat(),
-        tuple(_with_errors(replace(one, source=source), scale, errors) for one in details))
+        tuple(_with_errors(replace(detail, source=source), scale, errors) for detail in details))
     return ImportedMap(landmark_map, tuple(left_out), tuple(given.notes))
 
 

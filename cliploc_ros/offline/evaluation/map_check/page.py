@@ -84,11 +84,11 @@ def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, byt
     cards = [_card(number, one, views) for number, one in enumerate(report.to_do, start=1)]
     parts = [html.first_screen(
         [said, html.tiles((one.show(one.value), one.name, not one.is_missed) for one in told),
-         html.bars(_bar(one) for one in report.measures),
+         html.bars(_bar(measure) for measure in report.measures),
          '<h2>What to do first</h2>', *cards[:FIRST_ADVICE]], [first])]
     if rest := cards[FIRST_ADVICE:]:
         parts.append(html.fold(f'{len(rest)} more to do', *rest))
-    faulty = sum(grade(one) == 'faulty' for one in report.landmarks)
+    faulty = sum(grade(landmark) == 'faulty' for landmark in report.landmarks)
     parts += [html.fold('All figures', html.table(('', ''), _figures(report))),
               html.fold('Pictures', *others),
               html.fold(f'Landmarks, worst first: {faulty} of {len(report.landmarks)} with a '
@@ -97,9 +97,9 @@ def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, byt
         parts.append(html.fold(f'{len(report.look_alikes)} pairs of places that look alike',
                                _look_alikes(report)))
     if report.recording is not None:
-        rows = [(str(number), str(one.frames), str(one.landmarks), str(one.boxes.boxes),
-                 f'{one.boxes.explained:.1%}', f'{one.boxes.median_iou:.3f}')
-                for number, one in enumerate(report.recording.folds, start=1)]
+        rows = [(str(number), str(fold.frames), str(fold.landmarks), str(fold.boxes.boxes),
+                 f'{fold.boxes.explained:.1%}', f'{fold.boxes.median_iou:.3f}')
+                for number, fold in enumerate(report.recording.folds, start=1)]
         parts += [html.fold('Held-out boxes', html.note(
             'Blocks of time take turns in being judged; landmarks are fitted to the other '
             'blocks.'), html.table(('#fold', '#frames', '#landmarks', '#boxes', '#explained',
@@ -129,7 +129,7 @@ def summary_lines(report: CheckReport) -> list[str]:
 
 
 def _figures(report: CheckReport) -> list[tuple[str, str]]:
-    faulty = sum(grade(one) == 'faulty' for one in report.landmarks)
+    faulty = sum(grade(landmark) == 'faulty' for landmark in report.landmarks)
     rows = [('landmarks', str(len(report.landmarks))),
             ('with a serious fault', f'{faulty} ({report.faulty:.0%})'),
             ('pairs of duplicates', str(report.duplicates)),
@@ -217,12 +217,12 @@ def _look_alikes(report: CheckReport) -> str:
 def _corrections(recording: RecordingCheck) -> str:
     if not recording.corrections:
         return html.note('Too few boxes to tell.')
-    rows = [(one.cause, one.name, f'{one.value:+.2f} {one.unit}',
-             f'{one.deviation:.2f} {one.unit}', f'{one.effect_px:.1f}',
-             f'{one.explained:.1%}', '' if not one.is_significant else (
-                 'may follow from the cause that explains most' if one.follows
+    rows = [(correction.cause, correction.name, f'{correction.value:+.2f} {correction.unit}',
+             f'{correction.deviation:.2f} {correction.unit}', f'{correction.effect_px:.1f}',
+             f'{correction.explained:.1%}', '' if not correction.is_significant else (
+                 'may follow from the cause that explains most' if correction.follows
                  else 'significant'))
-            for one in recording.corrections]
+            for correction in recording.corrections]
     return (html.note('The correction that fits the edges of the boxes best, each cause on its '
                       'own. A turned mount and a shifted principal point look much the same.')
             + html.table(('cause', 'what', '#correction', '#deviation', '#effect [px]',

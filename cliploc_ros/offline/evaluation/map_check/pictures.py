@@ -132,7 +132,7 @@ def _grid_figure(canvas: _Canvas) -> Figure:
         handles += [Line2D([], [], color=INK, linewidth=1.0, linestyle=(0, (4, 2)),
                            label='path of the recording'),
                     Patch(facecolor='white', edgecolor='#555555', label='near the recording')]
-    wrong = [one for one in grid.trials if one.verdict == 'misled']
+    wrong = [trial for trial in grid.trials if trial.verdict == 'misled']
     for one in wrong:
         x, y = one.position[:2]
         ahead = one.forward[:2] / max(float(np.linalg.norm(one.forward[:2])), 1e-9)
@@ -189,13 +189,13 @@ def _frames_figure(canvas: _Canvas, trials: Sequence[Trial]) -> Figure:
 def _time_figure(trials: Sequence[Trial]) -> Figure:
     figure = Figure(figsize=(9.0, 2.8), layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.08))
     axes = figure.add_subplot()
-    stamps = np.array([one.stamp_s or 0.0 for one in trials])
+    stamps = np.array([trial.stamp_s or 0.0 for trial in trials])
     stamps -= stamps[0]
     width = 0.8 * (float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0)
     handles: list[Line2D | Patch] = []
     for verdict, color in page.VERDICT_COLORS.items():
-        chosen = np.array([one.verdict == verdict for one in trials])
-        counts = np.array([one.landmarks for one in trials])
+        chosen = np.array([trial.verdict == verdict for trial in trials])
+        counts = np.array([trial.landmarks for trial in trials])
         style: dict[str, Any] = {
             'edgecolor': color, 'linewidth': 1.0,
             'facecolor': 'white' if verdict == 'refused' else color,
@@ -213,10 +213,10 @@ def _time_figure(trials: Sequence[Trial]) -> Figure:
 
 def _landmarks_figure(canvas: _Canvas) -> Figure:
     landmark_map, checks = canvas.map, canvas.report.landmarks
-    grades = {one.landmark_id: page.grade(one) for one in checks}
+    grades = {check.landmark_id: page.grade(check) for check in checks}
     colors = [page.GRADE_COLORS[grades[name]] for name in landmark_map.landmark_ids]
     figure, axes = canvas.figure('Landmarks', colors, alpha=0.6)
-    named = [one for one in checks if one.faults]
+    named = [check for check in checks if check.faults]
     if len(named) > _MOST_NAMES:
         named = [one for one in named if page.grade(one) == 'faulty'][:_MOST_NAMES]
     for one in named:

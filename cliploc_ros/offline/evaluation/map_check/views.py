@@ -48,9 +48,9 @@ class ViewPainter:
     def of(self, advice: Advice) -> Picture | None:
         """Return the view that shows best what an advice is about; None if there is none."""
         if advice.landmarks:
-            rows = [self._map.landmark_ids.index(one) for one in advice.landmarks]
+            rows = [self._map.landmark_ids.index(landmark) for landmark in advice.landmarks]
             words = 'outlined: ' + ' and '.join(advice.landmarks)
-            found = [(one.view, words) for one in find_sightings(
+            found = [(sighting.view, words) for sighting in find_sightings(
                 self._detections, self._shown[rows[0]], self._map.centers[rows[0]],
                 self._map.shapes[rows[0]], len(self._detections))]
         elif advice.view is not None:

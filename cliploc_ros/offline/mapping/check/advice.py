@@ -77,12 +77,12 @@ def _on_look_alikes(report: CheckReport) -> list[Advice]:
 
 def _on_landmarks(report: CheckReport) -> Iterator[Advice]:
     """Yield advice on duplicates, on too few views, and on faults of single landmarks."""
-    pairs = [(report.map_ids[one.first], report.map_ids[one.second])
-             for one in report.overlaps if one.is_duplicate]
+    pairs = [(report.map_ids[overlap.first], report.map_ids[overlap.second])
+             for overlap in report.overlaps if overlap.is_duplicate]
     yield from _some([Advice(f'{" and ".join(pair)} are the same object: delete one of them', pair)
                       for pair in pairs], 'pairs of duplicates')
     if report.recording is not None:
-        frames = float(np.median([one.support or 0 for one in report.landmarks]))
+        frames = float(np.median([landmark.support or 0 for landmark in report.landmarks]))
         unexplained = 1.0 - report.recording.as_given.explained
         if frames < _FEW_FRAMES and unexplained > _MANY_UNEXPLAINED:
             yield Advice(
@@ -173,7 +173,7 @@ def _on_grid(report: CheckReport) -> Iterator[Advice]:
     """Yield advice on areas without an accepted heading, and on those without a keyframe."""
     grid = report.grid
     for rows in _areas(grid, np.nonzero(grid.is_near & (grid.accepted == 0))[0])[:_MOST_OF_A_KIND]:
-        if np.mean([_sees_double(one, report) for one in grid.positions[rows]]) <= 0.5:
+        if np.mean([_sees_double(position, report) for position in grid.positions[rows]]) <= 0.5:
             best = int(grid.visible[rows].max())
             fullest = int(rows[0] * grid.headings + grid.visible[rows[0]].argmax())
             reached = report.keyframes is not None and (report.keyframes.headings[rows] > 0).all()
@@ -191,7 +191,7 @@ def _on_grid(report: CheckReport) -> Iterator[Advice]:
 def _misled(report: CheckReport) -> list[Trial]:
     trials = [*(report.recording.trials if report.recording else ()), *report.queries,
               *report.grid.trials]
-    return [one for one in trials if one.verdict == 'misled']
+    return [trial for trial in trials if trial.verdict == 'misled']
 
 
 def _takes_for(trial: Trial, pair: LookAlike) -> bool:

@@ -143,7 +143,7 @@ def judge_grid(grid: Grid, model: DetectorModel, trials: Sequence[Trial], headin
     """
     count = len(trials) // headings
     trials = trials[:count * headings]
-    verdicts = np.array([one.verdict for one in trials]).reshape(count, headings)
+    verdicts = np.array([trial.verdict for trial in trials]).reshape(count, headings)
     visible = np.array([model.expected_detections(pose) for pose in grid.poses[:len(trials)]])
     return GridCheck(
         grid.positions[:count], grid.is_near[:count], grid.poses[:len(trials)], grid.spacing_m,

@@ -128,7 +128,7 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
     for one in overlaps:
         partners[one.first].append((one.second, one))
         partners[one.second].append((one.first, one))
-    supports = [one.support for one in landmark_map.details]
+    supports = [detail.support for detail in landmark_map.details]
     misspelt = (misspelt_classes(classes, shipped_classes()) if witness is None
                 else misspelt_classes(classes, witness.class_names, all_known=True))
     by_words = {tuple(_words(name)): name for name in sorted(set(classes), reverse=True)}

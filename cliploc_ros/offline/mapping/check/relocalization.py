@@ -182,8 +182,8 @@ class Trial:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the trial as plain values, for JSON, without the whole answer."""
-        values = {one.name: getattr(self, one.name) for one in fields(self)
-                  if one.name != 'result'}
+        values = {field.name: getattr(self, field.name) for field in fields(self)
+                  if field.name != 'result'}
         return {name: value.round(4).tolist() if isinstance(value, np.ndarray) else value
                 for name, value in values.items()}
 
@@ -291,7 +291,7 @@ def try_observations(landmark_map: LandmarkMap, observations: Sequence[PosedObse
 
 def count_verdicts(trials: Sequence[Trial]) -> dict[str, int]:
     """Return how many trials were accepted, refused and misled."""
-    return {name: sum(one.verdict == name for one in trials)
+    return {name: sum(trial.verdict == name for trial in trials)
             for name in ('accepted', 'refused', 'misled')}
 
 
@@ -301,11 +301,11 @@ def refused_spans(trials: Sequence[Trial]) -> Iterator[list[Trial]]:
     Frames that do not tell are left out.
     """
     runs: list[list[Trial]] = [[]]
-    for one in trials:
-        if one.verdict == 'accepted' or not one.is_judged:
+    for trial in trials:
+        if trial.verdict == 'accepted' or not trial.is_judged:
             runs.append([])
         else:
-            runs[-1].append(one)
+            runs[-1].append(trial)
     yield from sorted((run for run in runs if run), key=len, reverse=True)
 
 

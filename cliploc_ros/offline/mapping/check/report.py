@@ -89,7 +89,7 @@ class RecordingCheck:
     @property
     def judged(self) -> tuple[Trial, ...]:
         """Return the recorded frames by which the map can be judged."""
-        return tuple(one for one in self.trials if one.is_judged)
+        return tuple(trial for trial in self.trials if trial.is_judged)
 
     @property
     def can_judge_frames(self) -> bool:
@@ -106,13 +106,13 @@ class RecordingCheck:
         return {
             'frames': self.frames, 'boxes': self.boxes, 'duration_s': self.duration_s,
             'as_given': asdict(self.as_given), 'held_out': asdict(self.held_out),
-            'folds': [asdict(one) for one in self.folds], 'edge_scale': self.edge_scale,
+            'folds': [asdict(fold) for fold in self.folds], 'edge_scale': self.edge_scale,
             'verdicts': count_verdicts(self.trials),
             'verdicts_by_objects': count_by_objects(self.trials),
             'judged_frames': len(self.judged),
             'verdicts_with_simulated_boxes': count_verdicts(self.simulated),
-            'corrections': [asdict(one) for one in self.corrections],
-            'trials': [one.as_dict() for one in self.trials]}
+            'corrections': [asdict(correction) for correction in self.corrections],
+            'trials': [trial.as_dict() for trial in self.trials]}
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class GridCheck(Grid):
                 for row, near, accepted, misled, visible in zip(
                     self.positions.round(3).tolist(), self.is_near, self.accepted,
                     self.misled, self.visible, strict=True)],
-            'misled': [one.as_dict() for one in self.trials if one.verdict == 'misled']}
+            'misled': [trial.as_dict() for trial in self.trials if trial.verdict == 'misled']}
 
 
 @dataclass(frozen=True)
@@ -226,7 +226,7 @@ class CheckReport:
     @property
     def verdict(self) -> str:
         """Return passed, failed, or keyframes only: all is well but that objects carry nothing."""
-        missed = [one.name for one in self.measures if one.is_missed]
+        missed = [measure.name for measure in self.measures if measure.is_missed]
         return 'passed' if not missed else 'keyframes only' if missed == [BY_OBJECTS] else 'failed'
 
     @property
@@ -285,7 +285,7 @@ class CheckReport:
     @property
     def duplicates(self) -> int:
         """Return the number of pairs of landmarks that are one object."""
-        return sum(one.is_duplicate for one in self.overlaps)
+        return sum(overlap.is_duplicate for overlap in self.overlaps)
 
     @property
     def faulty(self) -> float:
@@ -294,7 +294,7 @@ class CheckReport:
         A landmark counts as often as it was seen: one of a few frames is seen as rarely again.
         """
         return sum(one.weight for one in self.landmarks if one.severity >= SERIOUS) / sum(
-            one.weight for one in self.landmarks)
+            landmark.weight for landmark in self.landmarks)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as plain values, for JSON."""
@@ -304,14 +304,14 @@ class CheckReport:
             'failures': list(self.failures), 'advice': list(self.advice),
             'notes': list(self.notes), 'faulty_landmarks': self.faulty,
             'duplicates': self.duplicates,
-            'landmarks': [asdict(one) for one in self.landmarks],
+            'landmarks': [asdict(landmark) for landmark in self.landmarks],
             'overlaps': [{'first': self.map_ids[one.first], 'second': self.map_ids[one.second],
                           'distance': one.distance, 'is_duplicate': one.is_duplicate}
                          for one in self.overlaps],
-            'look_alikes': [asdict(one) for one in self.look_alikes],
+            'look_alikes': [asdict(look_alike) for look_alike in self.look_alikes],
             'grid': self.grid.as_dict(),
             'recording': None if self.recording is None else self.recording.as_dict(),
-            'queries': [one.as_dict() for one in self.queries],
+            'queries': [query.as_dict() for query in self.queries],
             'keyframes': None if self.keyframes is None else self.keyframes.as_dict()}
 
 
@@ -372,8 +372,8 @@ def check_keyframes(layer: KeyframeLayer, grid: GridCheck,
                     recorded: NDArray[np.float64] | None) -> KeyframeCheck:
     """Return the coverage by keyframes; recorded (F, 4, 4) has the poses of a recording."""
     poses = np.empty((0, 4, 4)) if recorded is None else recorded
-    reached = in_reach(layer, np.array([one.position for one in grid.trials]),
-                       np.array([one.forward for one in grid.trials]))
+    reached = in_reach(layer, np.array([trial.position for trial in grid.trials]),
+                       np.array([trial.forward for trial in grid.trials]))
     return KeyframeCheck(
         len(layer), int(layer.offsets[-1]), in_reach(layer, poses[:, :3, 3], poses[:, :3, 2]),
         reached.reshape(grid.visible.shape).sum(axis=1), grid)

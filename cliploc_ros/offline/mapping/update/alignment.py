@@ -66,8 +66,8 @@ class OldMap(NamedTuple):
 def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...]) -> OldMap:
     """Return the landmarks of a map for a recording with some classes."""
     details = old.details or (LandmarkDetails(),) * len(old)
-    sigmas = np.array([_UNKNOWN_SIGMA_M if one.position_sigma is None
-                       else one.position_sigma for one in details])
+    sigmas = np.array([_UNKNOWN_SIGMA_M if detail.position_sigma is None
+                       else detail.position_sigma for detail in details])
     return OldMap(replace(old, details=details), landmarks_of_map(old, class_names),
                   np.maximum(sigmas, _LEAST_SIGMA_M))
 

@@ -185,8 +185,8 @@ def _probability_there(known: OldMap, sight: Sight) -> NDArray[np.float64]:
     """
     seen = sight.seen > 0
     share = float(sight.seen[seen].sum()) / max(1.0, float(sight.expected[seen].sum()))
-    given = np.array([np.nan if one.seen_ratio is None else one.seen_ratio
-                      for one in known.map.details])
+    given = np.array([np.nan if detail.seen_ratio is None else detail.seen_ratio
+                      for detail in known.map.details])
     ratios = np.where(np.isnan(given), min(_SEEN_RATIO, share), given)
     told = seen & ~np.isnan(given)
     if told.any():
@@ -257,9 +257,9 @@ def _find_new(detections: PosedDetections, views: Views, is_free: NDArray[np.boo
         return nothing._replace(left_out=error.left_out)
     return Finds(landmarks_of_map(built.landmark_map, detections.class_names),
                  built.landmark_map.class_ids, built.landmark_map.details, built.report.left_out,
-                 tuple('' if (one.baseline_deg or 0.0) >= options.min_baseline_deg else
-                       f'seen from one side only: {one.baseline_deg:.1f} degrees, not '
-                       f'{options.min_baseline_deg:g}' for one in built.landmark_map.details))
+                 tuple('' if (detail.baseline_deg or 0.0) >= options.min_baseline_deg else
+                       f'seen from one side only: {detail.baseline_deg:.1f} degrees, not '
+                       f'{options.min_baseline_deg:g}' for detail in built.landmark_map.details))
 
 
 def _with_displaced(finds: Finds, refits: Refits, displaced: NDArray[np.bool_],

@@ -246,7 +246,7 @@ def _notes(known: OldMap, aligned: Aligned, detections: PosedDetections) -> list
     if unseen:
         notes.append(f'the recording has no box of the class {", ".join(unseen[:5])}; '
                      'landmarks of it are kept: the detector may not know it')
-    last_seen = max((one.last_seen or 0.0 for one in known.map.details), default=0.0)
+    last_seen = max((detail.last_seen or 0.0 for detail in known.map.details), default=0.0)
     if last_seen > float(detections.stamps_s[-1]):
         notes.append(f'the recording ends at {detections.stamps_s[-1]:.0f} s, before the map was '
                      f'last seen at {last_seen:.0f} s: an older recording, or another clock')
@@ -325,9 +325,9 @@ def _one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], f
     return replace(
         joined, centers=updated.centers[shapes], semi_axes=updated.semi_axes[shapes],
         quats_xyzw=updated.quats_xyzw[shapes],
-        details=tuple(replace(joined.details[shape], labels=one.labels,
-                              class_weights=one.class_weights)
-                      for shape, one in zip(shapes, joined.details, strict=True))
+        details=tuple(replace(joined.details[shape], labels=detail.labels,
+                              class_weights=detail.class_weights)
+                      for shape, detail in zip(shapes, joined.details, strict=True))
     ).select(kept.tolist()), numbers[shown], int(np.sum(kept < first_new)), notes
 
 
