@@ -125,7 +125,8 @@ def make_parser() -> argparse.ArgumentParser:
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('sequence', choices=[*_NAMES, 'all'])
     parser.add_argument('--yes', action='store_true', help='do not ask')
-    parser.add_argument('--plan', action='store_true', help='only say what would be done, and ask')
+    parser.add_argument('--plan', action='store_true', help='say what would be done, ask where '
+                        'there is a terminal, and end')
     parser.add_argument('--out', type=Path, default=Path('reproduction'), metavar='DIR',
                         help='of downloads and results (%(default)s)')
     parser.add_argument('--trials', type=positive_int, default=5, metavar='N',
@@ -141,8 +142,11 @@ def run(options: argparse.Namespace) -> int:
     names = _NAMES if options.sequence == 'all' else (options.sequence,)
     if missing := [name for name in names if name not in sources.recordings]:
         raise OptionsError(f'{options.sources}: has no sequence {missing[0]}')
-    make_folder(out)
+    if not options.plan:
+        make_folder(out)
     _say_plan(names, sources, out)
+    if options.plan and not sys.stdin.isatty():
+        return 0
     if not options.yes and not _is_agreed():
         print('nothing was downloaded')
         return 1

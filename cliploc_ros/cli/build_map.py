@@ -101,6 +101,7 @@ def build(options: argparse.Namespace) -> int:
     """Build as the command line asks; return the exit code."""
     # Late, so that --help is fast.
     from cliploc_ros.cli import sources
+    from cliploc_ros.core.keyframes.layer import layer_path
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.datasets.frames import move_frames
     from cliploc_ros.offline.make_map import find_labeller, update_map, write_made_map
@@ -143,6 +144,9 @@ def build(options: argparse.Namespace) -> int:
         if made.mount is not None:
             lines.append(_mount_option(options, made.mount.given_from_corrected))
     else:
+        if layer_path(update).exists():
+            note = ('the new map has no keyframes, which need all images: objects alone localize; '
+                    'build a new map to have both')
         with _reporting_failure(options.report):
             made = update_map(update, detections, labeller, mapping)
         _write_report(options.report, made.report.as_dict())

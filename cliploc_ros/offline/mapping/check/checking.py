@@ -112,9 +112,8 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
             landmark_map, detections, views, witness, models, options, tell,
             None if layer is None or image_of is None else RecordedKeyframes(layer, image_of))
         notes += _notes_on(recording)
-        if note := tilt_note(detections.map_from_camera):
-            notes.append(note)
-    notes.append(_where_cameras_can_be(recorded))
+    tilt = '' if detections is None else tilt_note(detections.map_from_camera)
+    notes.append(tilt or _where_cameras_can_be(recorded))  # of a tilted map, heights mean nothing
     overlaps = find_map_overlaps(landmark_map, witness, views)
     places = make_grid(landmark_map, None if detections is None else detections.of_first_camera,
                        options)
