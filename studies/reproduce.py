@@ -125,8 +125,9 @@ def make_parser() -> argparse.ArgumentParser:
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('sequence', choices=[*_NAMES, 'all'])
     parser.add_argument('--yes', action='store_true', help='do not ask')
-    parser.add_argument('--plan', action='store_true', help='say what would be done, ask where '
-                        'there is a terminal, and end')
+    parser.add_argument('--plan', action='store_true', help='say what would be done, and end')
+    # The script asks before it installs PyTorch.
+    parser.add_argument('--ask', action='store_true', help=argparse.SUPPRESS)
     parser.add_argument('--out', type=Path, default=Path('reproduction'), metavar='DIR',
                         help='of downloads and results (%(default)s)')
     parser.add_argument('--trials', type=positive_int, default=5, metavar='N',
@@ -145,12 +146,12 @@ def run(options: argparse.Namespace) -> int:
     if not options.plan:
         make_folder(out)
     _say_plan(names, sources, out)
-    if options.plan and not sys.stdin.isatty():
+    if options.plan:
         return 0
     if not options.yes and not _is_agreed():
         print('nothing was downloaded')
         return 1
-    if options.plan:
+    if options.ask:
         return 0
     with _alone_in(out):
         networks = list(sources.options)

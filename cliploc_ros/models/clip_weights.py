@@ -109,9 +109,14 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
 
 
 def names_onnx(options: ClipOptions) -> bool:
-    """Return whether the options name ONNX files: a folder, or OWNER/NAME of the hub."""
+    """Return whether the options name ONNX files: a folder, or OWNER/NAME of the hub.
+
+    A folder may have the name of a tag, such as 'openai': then it has to hold the files.
+    """
     named = options.checkpoint_path or options.pretrained
-    return Path(named).expanduser().is_dir() or is_hub_name(named)
+    folder = Path(named).expanduser()
+    return bool(named) and (is_hub_name(named) or (folder.is_dir() and (
+        os.sep in named or any((folder / file).exists() for file in IMAGE_TOWERS))))
 
 
 def runs_in_openvino(options: ClipOptions) -> bool:

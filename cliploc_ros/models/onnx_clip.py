@@ -35,6 +35,8 @@ from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, read_config
 _FILTERS = {2: 'bilinear', 3: 'bicubic'}
 # Of a CLIP.
 _DEFAULTS = {'max_position_embeddings': 77, 'vocab_size': 49_408}
+# Longest side of what a tower sees; the largest published towers take 1024 px.
+_MOST_PX = 2048
 # A tokenizer uses nearly all of the tokens that its text tower knows.
 _LEAST_SHARE = 0.9
 _EMBEDDINGS = ('image_embeds', 'text_embeds', 'embedding')
@@ -53,7 +55,6 @@ class OnnxTower:
                               'f32' if options.precision == 'fp32' else None)
         self._network, self._input = network, network.image_input()
         self.prepare = CropPreparation(read_preparation(weights.file, self._input.shape[2:]))
-        self._output = ''
         probe = self.prepare(np.zeros((32, 32, 3), dtype=np.uint8))[None]
         self._output = _embedding(network, self._run(probe), weights)
 
@@ -92,16 +93,19 @@ def read_preparation(folder: Path, fixed: Sequence[int]) -> dict[str, Any]:
         size = size.get('shortest_edge', (size.get('height'), size.get('width')))
     try:
         height, width = map(int, (size, size) if isinstance(size, int) else tuple(size))  # type: ignore[arg-type]
-        mean, std = (np.array(found[name], np.float32).reshape(3).tolist()
-                     for name in ('mean', 'std'))
-    except (LookupError, ValueError, TypeError) as error:
-        raise ModelError(f'{file} does not say how images are prepared: it needs their size, and '
-                         'a mean and a standard deviation of three numbers') from error
+        mean, std = (np.array(found[name], np.float32).reshape(3) for name in ('mean', 'std'))
+        if not (0 < height <= _MOST_PX and 0 < width <= _MOST_PX and np.isfinite(mean).all()
+                and np.isfinite(std).all() and (std > 0.0).all()):
+            raise ValueError('a number is out of range')
+    except (LookupError, ValueError, TypeError, OverflowError) as error:
+        raise ModelError(f'{file} does not say how images are prepared: it needs their size, at '
+                         f'most {_MOST_PX} x {_MOST_PX}, and a mean and a standard deviation of '
+                         'three numbers') from error
     if (height, width) != tuple(want if want != ANY else has for want, has in
-                                zip(fixed, (height, width), strict=True)) or min(mean + std) < 0:
+                                zip(fixed, (height, width), strict=True)):
         raise ModelError(f'{file} says that images have {height} x {width} pixels, the network '
                          f'takes {fixed[0]} x {fixed[1]}: they are not of the same CLIP')
-    return found | {'size': (height, width), 'mean': mean, 'std': std}
+    return found | {'size': (height, width), 'mean': mean.tolist(), 'std': std.tolist()}
 
 
 class OnnxTextTower:
@@ -117,7 +121,7 @@ class OnnxTextTower:
         texts = [each for each in network.inputs if 'mask' not in each.name]
         if len(texts) != 1 or len(masks) > 1 or any(
                 len(each.shape) != 2 or each.type not in (np.int32, np.int64)
-                for each in network.inputs):
+                or each.shape[1] in (0, 1, 2) for each in network.inputs):
             raise ModelError(f'{network.file} takes no tokens: its inputs are '
                              f'{network.described_inputs()}, expected (texts, tokens)')
         self._text, self._masks = texts[0], masks

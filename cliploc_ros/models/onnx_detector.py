@@ -255,11 +255,10 @@ class DetrHead:
         scores: NDArray[Any]
         if self._has_nothing:
             shares: NDArray[np.float64] = np.exp(logits - logits.max(axis=1, keepdims=True))
-            scores = (
-                shares / shares.sum(axis=1, keepdims=True))[:, :-1]
+            scores = (shares / shares.sum(axis=1, keepdims=True))[:, :-1]
             queries, classes = np.arange(len(scores)), scores.argmax(axis=1)
         else:
-            # as the library: the best pairs of query and class, as many as there are queries
+            # The library keeps the best pairs of query and class, one for each query on average.
             scores = 1.0 / (1.0 + np.exp(-logits))
             best = np.argsort(-scores, axis=None, kind='stable')[:len(scores)]
             queries, classes = np.unravel_index(best, scores.shape)

@@ -3,7 +3,6 @@
 """Networks in ONNX files, run by OpenVINO on a CPU; compiled once and kept on disk."""
 
 import contextlib
-import ctypes
 import glob
 import hashlib
 import json
@@ -37,7 +36,6 @@ _FLOATS: dict[str, type[np.number[Any]]] = {'f32': np.float32, 'f16': np.float16
 _INTEGERS: dict[str, type[np.number[Any]]] = {'i64': np.int64, 'i32': np.int32}
 #: A size of an input that varies.
 ANY = -1
-_MADV_DONTNEED = 4
 
 logger = logging.getLogger(__name__)
 
@@ -172,12 +170,11 @@ def _stored(folder: Path, precision: str | None) -> tuple[Any, dict[str, str]]:
     """
     about = parse_json(read_file(folder / _ABOUT))
     openvino = import_openvino()
-    # Mapped, the file takes no memory beside the weights of the compiled network.
-    blob = np.memmap(folder / _BLOB, dtype=np.uint8, mode='r')
-    if hashlib.sha256(blob).hexdigest() != about['sha256']:
+    # A copy of the file: OpenVINO reads it later, too, and a mapped file may be cut short.
+    blob = openvino.Tensor(np.memmap(folder / _BLOB, dtype=np.uint8, mode='r'))
+    if hashlib.sha256(blob.data).hexdigest() != about['sha256']:
         raise ValueError(f'{_BLOB} is damaged')
-    compiled = openvino.Core().import_model(openvino.Tensor(blob), 'CPU', _settings(precision))
-    _release_pages(folder / _BLOB)
+    compiled = openvino.Core().import_model(blob, 'CPU', _settings(precision))
     with contextlib.suppress(OSError):  # a read-only cache works too
         os.utime(folder)
     return compiled, dict(about['metadata'])
@@ -222,24 +219,6 @@ def _write(compiled: Any, metadata: dict[str, str], folder: Path) -> None:
             file.write(written)
             file.flush()
             os.fsync(file.fileno())
-
-
-def _release_pages(file: Path) -> None:
-    """Release the memory of a mapped file; the system reads again what is used again.
-
-    The CPU's kernels have copies of the weights in layouts of their own, and read the file only
-    while they are compiled.
-    """
-    madvise = getattr(ctypes.CDLL(None), 'madvise', None)
-    if madvise is None:
-        return
-    inode = str(file.stat().st_ino)
-    with contextlib.suppress(OSError):  # only Linux has it
-        for line in Path('/proc/self/maps').read_text().splitlines():
-            fields = line.split(maxsplit=5)
-            if fields[4] == inode and fields[-1].endswith(file.name):
-                start, end = (int(bound, 16) for bound in fields[0].split('-'))
-                madvise(ctypes.c_void_p(start), ctypes.c_size_t(end - start), _MADV_DONTNEED)
 
 
 def _unreadable(file: Path, reason: str) -> ModelError:

@@ -20,7 +20,7 @@ from tokenizers import Tokenizer, models, pre_tokenizers, processors
 from cliploc_ros.cli.export_network import main as export_network
 from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
-from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.models.clip_weights import ClipOptions, names_onnx, resolve_clip_weights
 from cliploc_ros.models.onnx_clip import OnnxTextTower
 from demo import ASSETS
 
@@ -165,6 +165,8 @@ def other_words(file: Path) -> None:
     (lambda folder: (folder / 'preprocessor_config.json').unlink(), 'preprocessor_config.json is'),
     (lambda folder: text_of(folder / 'preprocessor_config.json', image_mean=[1]), 'standard dev'),
     (lambda folder: text_of(folder / 'preprocessor_config.json', crop_size=256), '256 x 256'),
+    (lambda folder: text_of(folder / 'preprocessor_config.json', crop_size=10**9), 'at most 2048'),
+    (lambda folder: text_of(folder / 'preprocessor_config.json', image_std=[0, 1, 1]), 'deviat'),
     (lambda folder: (folder / 'onnx/vision_model.onnx').unlink(), 'vision_model.onnx'),
     (lambda folder: (folder / 'onnx/text_model.onnx').unlink(), 'text_model.onnx'),
     (lambda folder: (folder / 'tokenizer.json').unlink(), 'tokenizer.json is missing'),
@@ -181,6 +183,14 @@ def test_what_is_no_clip(published, cache, tmp_path, change, named):
     with pytest.raises(ModelError) as caught:
         load(folder, cache)[0].encode_labels(['a cup'])
     assert named in str(caught.value) and str(folder) in str(caught.value)
+
+
+def test_a_folder_may_have_the_name_of_a_tag(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'openai').mkdir()
+    assert not names_onnx(ClipOptions('ViT-B-32', 'openai'))
+    assert not names_onnx(ClipOptions('ViT-B-32', ''))
+    assert names_onnx(ClipOptions('', './openai')) and names_onnx(ClipOptions('', 'some/one'))
 
 
 def test_a_network_is_exported_to_a_new_place_only(exported, tmp_path, capsys):

@@ -234,8 +234,11 @@ def test_it_says_what_it_downloads_and_asks(server, write_sources, run_here, tmp
         assert said in done.stdout
     done = run_here(reproduce.main, *given)  # the input has ended
     assert done.returncode == 1 and 'give --yes' in done.stderr
-    assert run_here(reproduce.main, *given, '--yes', '--plan').returncode == 0
-    assert not server.asked
+    assert run_here(reproduce.main, *given, '--ask').returncode == 1, 'the script installs nothing'
+    assert run_here(reproduce.main, *given, '--yes', '--ask').returncode == 0
+    planned = run_here(reproduce.main, *given[:-1], tmp_path / 'other', '--plan')
+    assert planned.returncode == 0 and 'to download' in planned.stdout
+    assert not server.asked and not (tmp_path / 'other').exists()
 
 
 def test_what_cannot_be_downloaded(server, write_sources, refused, tmp_path):
@@ -244,7 +247,7 @@ def test_what_cannot_be_downloaded(server, write_sources, refused, tmp_path):
     said = refused(*given)
     assert 'cannot download' in said and '404' in said and 'Check network and address' in said
     server.files['yolo.onnx'] = weights
-    # of another file, longer than the one that is there now
+    # The server's file is shorter now than what was downloaded of an older one.
     part = tmp_path / 'out/downloads/yolo.onnx.partial'
     part.write_bytes(bytes(len(weights) + 1))
     assert '416' in refused(*given)
