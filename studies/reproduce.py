@@ -192,7 +192,8 @@ def _say_plan(names: Sequence[str], sources: Sources, out: Path) -> None:
         print('Their licences hold for you, and for the results. By going on you accept them.')
     total = sum(one.megabytes for one in missing)
     room = total + sum(one.unpacked for one in missing if isinstance(one, Recording))
-    free = shutil.disk_usage(out).free / 1e6
+    there = next(each for each in (out.absolute(), *out.absolute().parents) if each.exists())
+    free = shutil.disk_usage(there).free / 1e6
     slow, fast = (sum(sources.recordings[name].minutes[column] for name in names)
                   for column in (1, 0))
     print(f'{total:.0f} MB to download, {total / _MEGABYTES_A_S / 60:.0f} minutes at '
