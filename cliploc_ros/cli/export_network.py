@@ -7,11 +7,13 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from cliploc_ros.cli.options import add_weights_options
 from cliploc_ros.command import option, run_main
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.files.storage import MAKE_ROOM, make_folder
 
 EPILOG = """\
 It needs PyTorch (script/setup models). A robot runs the files without it: name them as its
@@ -59,21 +61,32 @@ def export_network(options: argparse.Namespace) -> int:
         raise OptionsError(f'{options.out} exists: name a new {"folder" if is_clip else "file"}')
     if not is_clip and options.out.suffix != '.onnx':
         raise OptionsError(f'--out {options.out}: the name of a detector ends on .onnx')
-    if not options.out.absolute().parent.is_dir():
-        raise OptionsError(f'{options.out.absolute().parent} is no folder: make it first')
+    options.out = options.out.absolute()
+    make_folder(options.out.parent)
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_export_') as desk:
-        found = (_export_clip if is_clip else _export_detector)(options, Path(desk))
-        shutil.move(found, options.out)
+        found = (_export_clip if is_clip else _export_detector)(options, Path(desk) / 'network')
+        _place(found, options.out)
     files = [options.out] if options.out.is_file() else options.out.rglob('*')
     print(f'{options.out}: {sum(file.stat().st_size for file in files) / 1e6:.1f} MB, results '
           'equal to those of PyTorch')
     return 0
 
 
+def _place(export: Path, out: Path) -> None:
+    """Copy a file or folder to its place, where it appears as a whole."""
+    copy = shutil.copytree if export.is_dir() else shutil.copy
+    try:
+        with tempfile.TemporaryDirectory(dir=out.parent, prefix='.',
+                                         ignore_cleanup_errors=True) as desk:
+            Path(copy(export, Path(desk) / out.name)).rename(out)
+    except OSError as error:
+        raise OptionsError(f'{out}: cannot be written: {error.strerror}; {MAKE_ROOM}') from error
+
+
 def _export_detector(options: argparse.Namespace, desk: Path) -> Path:
     from cliploc_ros.cli.sources import detector_options
     from cliploc_ros.models.devices import needs_pytorch
-    from cliploc_ros.models.exports import DETECTOR
+    from cliploc_ros.models.exports import DETECTOR, run_export
     from cliploc_ros.models.yolo_weights import resolve_published
 
     detector = detector_options(options)
@@ -81,7 +94,7 @@ def _export_detector(options: argparse.Namespace, desk: Path) -> Path:
     with needs_pytorch('an export'):
         from cliploc_ros.models.yolo_detector import export_detector
 
-        export_detector(file, detector, desk, options.half)
+        run_export(str(file), partial(export_detector, file, detector, half=options.half), desk)
     return desk / DETECTOR
 
 
@@ -89,6 +102,7 @@ def _export_clip(options: argparse.Namespace, desk: Path) -> Path:
     from cliploc_ros.cli.sources import clip_options
     from cliploc_ros.models.clip_weights import resolve_clip_weights
     from cliploc_ros.models.devices import needs_pytorch
+    from cliploc_ros.models.exports import run_export
 
     weights = resolve_clip_weights(clip_options(options))
     if weights.is_onnx:
@@ -96,10 +110,8 @@ def _export_clip(options: argparse.Namespace, desk: Path) -> Path:
     with needs_pytorch('an export'):
         from cliploc_ros.models.export import export_clip
 
-        folder = desk / 'clip'
-        folder.mkdir()
-        export_clip(weights, folder, options.half)
-    return folder
+        run_export(weights.model, partial(export_clip, weights, half=options.half), desk)
+    return desk
 
 
 if __name__ == '__main__':

@@ -133,7 +133,7 @@ def _of_onnx(folder: Path, name: str) -> ClipWeights:
     vision = config.get('vision_config')
     embed_dim = (config.get('projection_dim') or config.get('embed_dim')
                  or (vision.get('hidden_size') if isinstance(vision, dict) else None))
-    if not isinstance(embed_dim, int) or not 0 < embed_dim < 2**16:
+    if type(embed_dim) is not int or not 0 < embed_dim < 2**16:  # a boolean is an int, too
         raise ModelError(f"{folder / CONFIG} names the length of an embedding neither in "
                          "'projection_dim' nor in 'embed_dim': add it")
     key = export_key(folder) or 'onnx:' + ':'.join(map(fingerprint_file, files))

@@ -56,7 +56,8 @@ def describe_export(folder: Path, key: str) -> None:
 
 def export_key(folder: Path) -> str:
     """Return the key of the weights in a folder of ours; '' for others and changed ones."""
-    with contextlib.suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError,
+                             RecursionError):
         about: dict[str, Any] = parse_json(read_file(folder / _ABOUT))
         if all(fingerprint_file(folder / name) == fingerprint
                for name, fingerprint in about['files'].items()):
@@ -68,7 +69,7 @@ def find_export(cache_dir: str, name: str, identity: Sequence[str]) -> Path | No
     """Return the folder of an export in the cache, if it is there and sound."""
     folder = _folder(cache_dir, name, identity)
     if folder in _unkept:
-        return Path(_unkept[folder].name)
+        return Path(_unkept[folder].name) / folder.name
     if not folder.exists():
         return None
     if not export_key(folder):
@@ -91,31 +92,38 @@ def keep_export(cache_dir: str, name: str, identity: Sequence[str],
     """
     folder, started = _folder(cache_dir, name, identity), time.monotonic()
     if folder in _unkept:
-        return Path(_unkept[folder].name)
+        return Path(_unkept[folder].name) / folder.name
     if export_key(folder):
         return folder
     logger.info('exporting %s to ONNX: once, into %s', name, folder)
     # A library that meets a full disk raises the errors of a network that it cannot export, so it
     # writes elsewhere.
     desk = tempfile.TemporaryDirectory(prefix='cliploc_ros_export_')
+    written = Path(desk.name) / folder.name
+    run_export(name, export, written)
     try:
-        export(Path(desk.name))
+        keep_folder(folder, _MOST_EXPORTS, partial(shutil.copytree, written))
+    except OSError as error:
+        warn_not_kept('the exported network is not cached and the next start is slow again: '
+                      f'cannot write {folder} ({first_line(error)}); make room, or choose a '
+                      'writable cache_dir')
+        _unkept[folder], folder = desk, written
+    free_memory()
+    logger.info('%s is exported after %.0f s', name, time.monotonic() - started)
+    return folder
+
+
+def run_export(name: str, export: Callable[[Path], None], folder: Path) -> None:
+    """Export a network into a new folder; errors as of keep_export, which name the network."""
+    folder.mkdir()  # others may read it, unlike a temporary folder
+    try:
+        export(folder)
     except ExportError as error:
         raise ExportError(f'{name}: {error}') from error
     except (CliplocError, ModuleNotFoundError):
         raise
     except Exception as error:  # tracing and exporting raise exceptions of all kinds
         raise ExportError(f'{name} cannot be exported to ONNX: {first_line(error)}') from error
-    try:
-        keep_folder(folder, _MOST_EXPORTS, partial(shutil.copytree, desk.name))
-    except OSError as error:
-        warn_not_kept('the exported network is not cached and the next start is slow again: '
-                      f'cannot write {folder} ({first_line(error)}); make room, or choose a '
-                      'writable cache_dir')
-        _unkept[folder], folder = desk, Path(desk.name)
-    free_memory()
-    logger.info('%s is exported after %.0f s', name, time.monotonic() - started)
-    return folder
 
 
 def _folder(cache_dir: str, name: str, identity: Sequence[str]) -> Path:

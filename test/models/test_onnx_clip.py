@@ -50,6 +50,7 @@ def load(folder: Path, cache: str, **changes) -> tuple[ClipEncoder, ClipOptions]
 
 
 def test_an_export_gives_the_embeddings_of_open_clip(small_clip, exported, cache, image_rgb):
+    assert exported.stat().st_mode & 0o055 == 0o055, 'other users may read it'
     encoder, options = load(exported, cache)
     bounds = BBOXES.astype(int)
     cosines = [np.sum(encoder.encode_crops(image_rgb, BBOXES)
@@ -71,9 +72,13 @@ def test_a_changed_export_has_another_key(exported, cache, tmp_path):
     network = onnx.load(changed / 'visual/model.onnx')
     network.producer_name = 'someone'
     onnx.save(network, changed / 'visual/model.onnx')
-    keys = [resolve_clip_weights(ClipOptions(pretrained=str(folder), cache_dir=cache)).key
-            for folder in (exported, changed)]
-    assert keys[0] != keys[1] and keys[1].startswith('onnx:')
+    def key(folder):
+        return resolve_clip_weights(ClipOptions(pretrained=str(folder), cache_dir=cache)).key
+
+    assert key(exported) != key(changed) and key(changed).startswith('onnx:')
+    for content in ('{"files": 3, "key": "x"}', '[]', '{"files": {"gone": 0}, "key": "x"}'):
+        (changed / 'export.json').write_text(content)
+        assert key(changed).startswith('onnx:')
 
 
 def test_tokens_equal_those_of_open_clip(exported, cache):
@@ -161,6 +166,7 @@ def other_words(file: Path) -> None:
 @pytest.mark.parametrize(('change', 'named'), [
     (lambda folder: (folder / 'config.json').unlink(), 'config.json is missing'),
     (lambda folder: text_of(folder / 'config.json', projection_dim='x'), "'projection_dim'"),
+    (lambda folder: text_of(folder / 'config.json', projection_dim=True), "'projection_dim'"),
     (lambda folder: text_of(folder / 'config.json', projection_dim=99), 'expected one output'),
     (lambda folder: (folder / 'preprocessor_config.json').unlink(), 'preprocessor_config.json is'),
     (lambda folder: text_of(folder / 'preprocessor_config.json', image_mean=[1]), 'standard dev'),
