@@ -127,6 +127,51 @@ def answer_table[One: Answer](answers: Iterable[One], by: Sequence[str],
                   *(name.replace('_', ' ') for name in more)], rows)
 
 
+def crossed_table[One: Answer](answers: Iterable[One], row: str, column: str,
+                               cell: Callable[[list[One]], str]) -> str:
+    """Return a Markdown table with a row and a column for each value of two fields.
+
+    Parameters
+    ----------
+    cell : callable
+        Returns the text for the answers that have both values; see success_cell.
+    """
+    groups = grouped(answers, [row, column])
+    rows, columns = (list(dict.fromkeys(key[index] for key in groups)) for index in (0, 1))
+    return table([row, *columns], [
+        [name, *(cell(groups[name, of]) if (name, of) in groups else '' for of in columns)]
+        for name in rows])
+
+
+def success_cell(answers: Sequence[Answer]) -> str:
+    """Return the share within .5 m; the number accepted, and of these false."""
+    within = np.mean([answer.error_m < FAR_M for answer in answers])
+    return f'{short(float(within))}; {accepted_cell(answers)}'
+
+
+def accepted_cell(answers: Sequence[Answer]) -> str:
+    """Return the number of accepted answers, and of these false."""
+    accepted = [answer for answer in answers if answer.accepted]
+    return f'{len(accepted)}, {sum(not answer.right for answer in accepted)}'
+
+
+def recall_cell(answers: Sequence[Answer]) -> str:
+    """Return the number of accepted answers, of these false; the share of right ones accepted."""
+    accepted = [answer.accepted for answer in answers if answer.right]
+    recall = short(float(np.mean(accepted))) if accepted else '-'
+    return f'{accepted_cell(answers)}; {recall}'
+
+
+def short(share: float) -> str:
+    """Return a share with two digits and no leading zero."""
+    return f'{share:.2f}'.removeprefix('0')
+
+
+def print_section(heading: str, text: str) -> None:
+    """Print a section of Markdown; script/document copies sections into pages by their heading."""
+    print(f'## {heading}\n\n{text}\n')
+
+
 def confidence_table(answers: Iterable[Answer], by: Sequence[str], thresholds: Sequence[float]
                      ) -> str:
     """Return what several values of min_confidence accept, and the best recall at .99 precision.

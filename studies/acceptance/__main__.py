@@ -28,7 +28,19 @@ from cliploc_ros.files.storage import make_folder
 from studies.acceptance import fit, searches
 from studies.acceptance.places import MODES, ONE, Simulated, add_arguments, chosen_places
 from studies.acceptance.troubles import BY_LABELS, FAMILIES, PRIORS, TROUBLES, exchange_landmarks
-from studies.reports import answer_table, confidence_table, draw_judged, judged_by, run_all, table
+from studies.reports import (
+    accepted_cell,
+    answer_table,
+    confidence_table,
+    crossed_table,
+    draw_judged,
+    judged_by,
+    print_section,
+    recall_cell,
+    run_all,
+    success_cell,
+    table,
+)
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
 
@@ -62,6 +74,7 @@ def _judge(options: argparse.Namespace) -> None:
     found = _searched(options, [
         searches.Task(place, mode, plain, seed=place.seed)
         for place in chosen_places(options) for mode in MODES], ('place', 'mode'), ('mode',))
+    print_section('At a glance', crossed_table(found, 'place', 'mode', success_cell))
     if options.out is not None:
         draw_judged(options.out / 'reliability.png', 'confidence of the best pose',
                     judged_by(found, 'mode'))
@@ -85,12 +98,21 @@ def _recorded(options: argparse.Namespace) -> None:
                      (there, ('trouble', 'place')), (there, ('trouble', 'matching', 'mode')),
                      (there, ('trouble',))):
         print(confidence_table(some, by, options.min_confidence), end='\n\n')
+    print_section('At a glance', crossed_table(_as_asked(here), 'matching', 'mode', recall_cell))
+    print_section('All objects exchanged, at a glance', crossed_table(
+        _as_asked(there), 'matching', 'mode', accepted_cell))
     if options.out is not None:
         make_folder(options.out)
         (options.out / 'outcomes.json').write_text(
             json.dumps([asdict(one) for one in (*here, *there)]))
         draw_judged(options.out / 'reliability.png', 'poses that at least three objects support',
                     judged_by(here, 'mode'))
+
+
+def _as_asked(outcomes: Iterable[searches.Outcome]) -> list[searches.Outcome]:
+    """Return the outcomes of the default min_confidence."""
+    least = RelocalizerOptions.min_confidence
+    return [replace(outcome, accepted=outcome.confidence >= least) for outcome in outcomes]
 
 
 def _stress(options: argparse.Namespace) -> None:

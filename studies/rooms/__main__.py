@@ -30,7 +30,17 @@ from cliploc_ros.command import not_negative, positive_int, run_command
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.storage import make_folder, write_text
 from studies.blame import CAUSES
-from studies.reports import answer_table, run_all, table
+from studies.reports import (
+    SUCCESS_M,
+    answer_table,
+    crossed_table,
+    grouped,
+    print_section,
+    run_all,
+    short,
+    success_cell,
+    table,
+)
 from studies.rooms import asking
 from studies.rooms.rooms import ROBOT, Room, RoomOptions, read_room
 
@@ -85,7 +95,7 @@ def run() -> int:
         [asking.Task(room.name, kind, part) for room in rooms for kind, part, *_ in room.parts()
          if kind in options.kinds], 'parts', options.workers)
     for heading, text in _tables(found, rooms):
-        print(f'## {heading}\n\n{text}\n')
+        print_section(heading, text)
     write_text(options.out / 'outcomes.json', json.dumps(
         [asdict(outcome) for one in found for outcome in one.outcomes], indent=0))
     return 0
@@ -102,6 +112,8 @@ def _tables(answers: Sequence[asking.Answers], rooms: Sequence[Room]) -> Iterato
     here = [outcome for outcome in outcomes if outcome.is_here]
     objects = [one for one in here if one.way == asking.OBJECTS]
     yield 'Rooms', _room_table(answers, rooms)
+    yield 'At a glance', crossed_table(here, 'way', 'room', _glance)
+    yield 'By distance', crossed_table(here, 'way', 'room', _by_distance)
     yield 'Success and acceptance', answer_table(here, ['room', 'kind', 'way', 'known'])
     yield 'All splits of a room', answer_table(here, ['room', 'way', 'known'])
     posed = [one for one in here if one.error_m < inf and one.way != asking.BASELINE]
@@ -112,11 +124,25 @@ def _tables(answers: Sequence[asking.Answers], rooms: Sequence[Room]) -> Iterato
     elsewhere = [outcome for outcome in outcomes if not outcome.is_here]
     yield 'Images of other rooms: all accepted are false', '\n\n'.join(
         answer_table(elsewhere, by) for by in (['room', 'way'], ['way']))
+    yield 'Other rooms at a glance', table(['way', 'images of other rooms', 'accepted'], [
+        (way, len(own), sum(outcome.accepted for outcome in own))
+        for (way,), own in grouped(elsewhere, ['way']).items()])
     yield 'Why objects fail by more than .5 m', answer_table(
         [one for one in objects if one.known == asking.NOTHING], ['room', 'kind'],
         **{cause: _count(cause) for cause in CAUSES})
     yield 'Boxes that an image needs', answer_table(
         sorted(objects, key=lambda one: one.boxes_from), ['room', 'known', 'boxes_from'])
+
+
+def _glance(outcomes: Sequence[asking.Outcome]) -> str:
+    text = success_cell(outcomes)
+    # the baseline has no acceptance
+    return text.partition(';')[0] if outcomes[0].way == asking.BASELINE else text
+
+
+def _by_distance(outcomes: Sequence[asking.Outcome]) -> str:
+    return ' '.join(short(float(np.mean([outcome.error_m < limit for outcome in outcomes])))
+                    for limit in SUCCESS_M)
 
 
 def _share_right(low: float, high: float) -> Callable[[Sequence[asking.Outcome]], str]:

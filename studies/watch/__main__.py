@@ -26,6 +26,7 @@ from cliploc_ros.offline.datasets.observations import load_observations, load_re
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
 from cliploc_ros.offline.mapping.building import build_map
 from studies.acceptance.fit import FITTED_KINDS
+from studies.reports import print_section
 from studies.watch import fit, judge
 from studies.watch.recordings import watch_recording, write_watch
 from studies.worlds.places import KINDS
@@ -85,9 +86,10 @@ def _print(drives: Iterable[judge.Drive], count: int, wrong_poses: bool, title: 
         one, its = judge.judge(drive, number, wrong_poses)
         right.append(one)
         alarms += its
-    print(f'{title}\n\n{judge.right_table(right)}\n')
+    print_section(f'{title}: right poses', judge.right_table(right))
     if alarms:
-        print(f'{judge.alarm_table(alarms)}\n')
+        print_section(f'{title}: wrong poses', judge.alarm_table(alarms))
+        print_section(f'{title}, at a glance', judge.glance_table(right, alarms))
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
