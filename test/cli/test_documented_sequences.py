@@ -4,9 +4,12 @@
 
 import importlib
 import json
+import re
+import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,6 +22,7 @@ from without_pytorch import hide_pytorch
 from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.layer import layer_path
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import BagWriter
 from cliploc_ros.offline.datasets.folders import read_sequence
@@ -176,3 +180,22 @@ def test_the_nodes_answer_as_the_page_says(built, monkeypatch):
             process.send_signal(signal.SIGINT)
         for process in processes:
             process.wait(60)
+
+
+def test_the_demos_room_gives_the_figures_of_the_page(tmp_path, monkeypatch, capsys):
+    """The section for readers without a recording, with the files that it copies."""
+    section = PAGES[0].read_text().split('\n## Without a recording')[1]
+    images, limit_m, accepted, landmarks = map(float, re.search(
+        r'All (\d+) images are within (\.\d+) m, (\d+) are accepted, and the map has (\d+)',
+        section).groups())
+    shutil.copytree(ASSETS, tmp_path / 'room')
+    monkeypatch.chdir(tmp_path)
+    for command in commands_of(PAGES[0]):
+        module, arguments = program_of(command)
+        if module and 'room/yolo.onnx' in arguments:
+            assert main_of(module.rpartition('.')[2])(arguments) == 0, capsys.readouterr().err
+    results = json.loads(Path('room/result/results.json').read_text())
+    assert len(results) == images
+    assert max(result['error_m'] for result in results) < limit_m
+    assert sum(result['accepted'] for result in results) == accepted
+    assert abs(len(LandmarkMap.from_file('room/built.yaml')) - landmarks) <= 2

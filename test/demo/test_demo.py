@@ -19,7 +19,8 @@ from disks import small_disk
 
 PROJECT = Path(__file__).resolve().parents[2]
 
-WAKE_UPS = 5
+WAKE_UPS = 10  # the demo's default, which the page shows
+PAGE = PROJECT / 'doc/first_relocalization.md'
 PATIENCE_S = 300.0
 ROW = re.compile(r'^(\d+) .*?(accepted|refused) .*?\(?([0-9.]+) m [0-9.]+°', re.MULTILINE)
 
@@ -39,7 +40,7 @@ def run(*arguments):
 def finished(tmp_path_factory):
     """Run the demo to its end; return the folder of its pictures and its output."""
     out = tmp_path_factory.mktemp('demo') / 'pictures'
-    code, output, errors = run('--out', out, '--rviz', '--wake-ups', WAKE_UPS)
+    code, output, errors = run('--out', out, '--rviz')
     assert code == 0, errors
     return out, output
 
@@ -54,6 +55,23 @@ def test_poses_are_right_or_refused(finished):
     assert max(errors_m) < 0.5
 
 
+def test_the_page_shows_what_the_demo_prints(finished):
+    (shown,), (printed,) = (re.findall(r'^\d+ wake-ups: .* at most', text, re.MULTILINE)
+                            for text in (PAGE.read_text(), finished[1]))
+    assert re.sub(r'0\.\d+', '', shown) == re.sub(r'0\.\d+', '', printed)
+    errors_m = [[float(error) for error in re.findall(r'0\.\d+', text)]
+                for text in (shown, printed)]
+    np.testing.assert_allclose(*errors_m, atol=0.1)
+    assert abs(errors_m[0][0] - errors_m[1][0]) < 0.02, 'the median'
+    assert run_of_page('script/demo') == [10, 10, round(errors_m[0][0], 2)]
+
+
+def run_of_page(command):
+    """Return the numbers in the row of the page about a run of the demo."""
+    (row,) = re.findall(rf'^\| `{command}` \| (.*) \|$', PAGE.read_text(), re.MULTILINE)
+    return [float(number) for number in re.findall(r'\d*\.?\d+', row)]
+
+
 def test_a_disk_that_fills_up_is_named_in_one_line(tmp_path):
     done = subprocess.run([*small_disk(tmp_path), sys.executable, '-m', 'demo', '--out', tmp_path,
                            '--wake-ups', '1', '--rate', '100'], text=True, cwd=PROJECT,
@@ -65,13 +83,15 @@ def test_a_disk_that_fills_up_is_named_in_one_line(tmp_path):
 
 @pytest.mark.clock  # the request takes the cameras whose images come in time
 def test_four_cameras_need_not_turn(tmp_path):
-    code, output, errors = run('--out', tmp_path, '--cameras', 4, '--wake-ups', 2)
+    code, output, errors = run('--out', tmp_path, '--cameras', 4)
     assert code == 0, errors
     print(output)
-    assert '2 wake-ups: 2 accepted, 0 refused, none wrong' in output
-    assert '4 cameras; with the first of them alone, 1 of 2 would be accepted' in output
+    accepted, places, *alone = run_of_page('--cameras 4')
+    assert f'{places:.0f} wake-ups: {accepted:.0f} accepted, 0 refused, none wrong' in output
+    assert any(f'4 cameras; with the first of them alone, {number:.0f} of {places:.0f} would be '
+               'accepted' in output for number in alone)
     page = (tmp_path / 'index.html').read_text()
-    assert page.count(', 4 cameras') == 2
+    assert page.count(', 4 cameras') == places
     assert 'The robot has 4 cameras, front, left, back, right,' in page
     assert 'rank its place' not in page, 'the pictures have no list'
     height, width = cv2.imread(str(tmp_path / 'wake_up_01.png')).shape[:2]
@@ -89,8 +109,10 @@ def test_a_kidnapped_robot_is_noticed_stops_and_gets_its_pose_back(tmp_path):
         'carried', 'noticed', 'it', 'relocalized', 'delivered', 'the']
     seconds = [float(second) for second, *_ in steps]
     assert seconds == sorted(seconds), 'nothing is done before it stops'
-    assert int(steps[1][1]) <= 5
-    assert float(re.search('delivered: ([0-9.]+) m', output)[1]) < 0.5
+    carried_m, most_looks, within_m = run_of_page('--kidnapped')
+    assert int(steps[1][1]) <= most_looks
+    assert float(re.search('delivered: ([0-9.]+) m', output)[1]) < within_m
+    assert abs(carried_m - float(re.search(r'carried by ([0-9.]+) m', output)[1])) < 0.1
     assert cv2.imread(str(tmp_path / 'kidnapped.png')).std() > 20
 
 
@@ -134,6 +156,8 @@ def test_the_built_map_holds_the_room(mapped):
     assert found / objects >= limits['found']
     assert false <= limits['most_false']
     assert offset_cm / 100 <= limits['center_offset_m']
+    on_page = run_of_page('--map')
+    assert on_page[1] == objects and abs(on_page[0] - found) <= 1 and abs(on_page[2] - false) <= 1
 
 
 @pytest.mark.full
