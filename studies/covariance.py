@@ -31,7 +31,7 @@ from studies.acceptance.places import (
     add_arguments,
     chosen_places,
 )
-from studies.reports import draw, interval, table
+from studies.reports import draw, interval, print_section, table
 from studies.wrong_sensors import with_mount_error
 
 MODES = ('one image', 'vertical', 'five images', 'five, vertical')
@@ -90,8 +90,8 @@ def run(arguments: Sequence[str]) -> int:
         whole, position, orientation = shares(its)
         rows.append([mode, len(its), f'{whole:.3f} ({interval(whole * len(its), len(its), 3)})',
                      f'{position:.3f}', f'{orientation:.3f}'])
-    print(table(['known', 'accepted, right', 'pose (95 % interval)', 'position', 'orientation'],
-                rows))
+    print_section('Share within the 95 % ellipsoid', table(
+        ['known', 'accepted, right', 'pose (95 % interval)', 'position', 'orientation'], rows))
     if options.out is not None and squares:
         _draw(options.out, squares)
     return 0

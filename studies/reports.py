@@ -144,19 +144,19 @@ def crossed_table[One: Answer](answers: Iterable[One], row: str, column: str,
 
 
 def success_cell(answers: Sequence[Answer]) -> str:
-    """Return the share within .5 m; the number accepted, and of these false."""
+    """Return the share within .5 m; how many are accepted, and of these false."""
     within = np.mean([answer.error_m < FAR_M for answer in answers])
     return f'{short(float(within))}; {accepted_cell(answers)}'
 
 
 def accepted_cell(answers: Sequence[Answer]) -> str:
-    """Return the number of accepted answers, and of these false."""
+    """Return how many answers are accepted, and of these false."""
     accepted = [answer for answer in answers if answer.accepted]
-    return f'{len(accepted)}, {sum(not answer.right for answer in accepted)}'
+    return f'{len(accepted)} of {len(answers)}, {sum(not answer.right for answer in accepted)}'
 
 
 def recall_cell(answers: Sequence[Answer]) -> str:
-    """Return the number of accepted answers, of these false; the share of right ones accepted."""
+    """Return how many answers are accepted, and of these false; the share of right ones accepted."""
     accepted = [answer.accepted for answer in answers if answer.right]
     recall = short(float(np.mean(accepted))) if accepted else '-'
     return f'{accepted_cell(answers)}; {recall}'

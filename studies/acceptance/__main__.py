@@ -97,7 +97,7 @@ def _recorded(options: argparse.Namespace) -> None:
     for some, by in ((here, ('place', 'matching', 'mode')), (here, ('matching', 'mode')),
                      (there, ('trouble', 'place')), (there, ('trouble', 'matching', 'mode')),
                      (there, ('trouble',))):
-        print(confidence_table(some, by, options.min_confidence), end='\n\n')
+        print_section(f'By {", ".join(by)}', confidence_table(some, by, options.min_confidence))
     print_section('At a glance', crossed_table(_as_asked(here), 'matching', 'mode', recall_cell))
     print_section('All objects exchanged, at a glance', crossed_table(
         _as_asked(there), 'matching', 'mode', accepted_cell))

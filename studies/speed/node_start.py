@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from demo import ASSETS
-from studies.reports import table
+from studies.reports import print_section, table
 
 _PROJECT = Path(__file__).resolve().parents[2]
 _READY = 'landmarks in frame'
@@ -65,5 +65,6 @@ def run(arguments: Sequence[str]) -> int:
             rows += [[matching, kind, *(f'{time_s:.1f}' for time_s in _start(
                 package, matching, Path(name, 'kernels'), Path(name, cache)))]
                 for kind, cache in _STARTS.items()]
-    print(table(['matching', 'first start after', 'processor time [s]', 'wall time [s]'], rows))
+    print_section('Time until ready', table(
+        ['matching', 'first start after', 'processor time [s]', 'wall time [s]'], rows))
     return 0
