@@ -156,7 +156,7 @@ def accepted_cell(answers: Sequence[Answer]) -> str:
 
 
 def recall_cell(answers: Sequence[Answer]) -> str:
-    """Return how many answers are accepted, and of these false; the share of right ones accepted."""
+    """Return accepted_cell, and the share of right answers that is accepted."""
     accepted = [answer.accepted for answer in answers if answer.right]
     recall = short(float(np.mean(accepted))) if accepted else '-'
     return f'{accepted_cell(answers)}; {recall}'

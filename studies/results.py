@@ -86,7 +86,7 @@ def _files(word: str) -> list[str]:
 
 
 def _revision() -> str:
-    return subprocess.run(['git', 'describe', '--always', '--dirty'], cwd=FOLDER.parent,
+    return subprocess.run(['git', 'describe', '--always', '--dirty'], cwd=COMMANDS.parent,
                           stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
 
 
