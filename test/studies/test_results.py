@@ -23,7 +23,7 @@ def test_an_edit_by_hand_is_noticed(tmp_path, monkeypatch):
     results.measure('small', 'studies.acceptance judge --worlds 1 --kinds room', tmp_path)
     for edited in (path.read_text().replace(' of ', ' out of ', 1), 'no digest\n'):
         path.write_text(edited)
-        with pytest.raises(ValueError, match=r'small\.md was edited: run python -m studies.results'):
+        with pytest.raises(ValueError, match=r'small\.md was edited: run python -m'):
             results.section('small', 'At a glance')
 
 
