@@ -29,6 +29,7 @@ from cliploc_ros.offline.mapping.pose_noise import (
     significant_pose_errors,
 )
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.sizes import reasons_by_size
 from cliploc_ros.offline.mapping.systematic import MountCorrection, refine_mount
 from cliploc_ros.offline.mapping.triangulation import (
     SUPPORT_IOU,
@@ -243,9 +244,13 @@ class _Builder(NamedTuple):
             self.tell('fitting landmarks', number / _DISCOVERY_ROUNDS)
             landmarks, shown = self._settle(views, Landmarks.joined(landmarks, found))
         evidence = gather_evidence(views, landmarks, shown)
-        reasons = reasons_against(landmarks, evidence, self.options)
+        names = [self.detections.class_names[number] for number in landmarks.classes]
+        extents_m = 2.0 * np.linalg.norm(landmarks.bases, axis=1).max(axis=1)
+        reasons = [reason or too_long for reason, too_long in zip(
+            reasons_against(landmarks, evidence, self.options),
+            reasons_by_size(names, extents_m), strict=True)]
         left_out = tuple(LeftOut(
-            self.detections.class_names[landmarks.classes[row]], rounded(landmarks.centers[row]),
+            names[row], rounded(landmarks.centers[row]),
             int(evidence.support[row]), int(evidence.viewpoints[row]), reason)
             for row, reason in enumerate(reasons) if reason is not None)
         landmarks = landmarks.select(np.array([one is None for one in reasons], dtype=np.bool_))
