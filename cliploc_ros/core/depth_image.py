@@ -3,7 +3,7 @@
 """Depth images, and the depth of the objects in boxes.
 
 Depth is never exact: it has holes, errors of scale, and a small offset to the colour image. The
-depth of a box is therefore a robust mean over its inner half, together with the spread there.
+depth of a box is therefore the median over its inner half, together with the spread there.
 """
 
 from dataclasses import dataclass, field
@@ -116,7 +116,7 @@ def depths_of_boxes(depth: DepthImage, camera: Camera, bboxes_xyxy: NDArray[np.f
 
 def points_in_color(depth: DepthImage, camera: Camera, step: int
                     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return the known depths (p,) [m], and their pixels (2, p) in the colour image first.
+    """Return the pixels (2, p) of known depths in the colour image, and the depths (p,) [m].
 
     Only every `step`-th row and column of the depth image is used.
     """

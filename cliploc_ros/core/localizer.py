@@ -66,7 +66,7 @@ class ImageCrops(Protocol):
 
 
 class CropSource(Protocol):
-    """Compares crops of images with the labels of a map, see cliploc_ros.models.observer."""
+    """Compare crops of images with the labels of a map, see cliploc_ros.models.observer."""
 
     def crops(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64],
               known: Mapping[int, NDArray[np.float32]] | None = None) -> ImageCrops:
@@ -76,7 +76,7 @@ class CropSource(Protocol):
         """
 
     def crops_within(self, left_s: float) -> int:
-        """Return the number of crops that can be compared in a time [s]."""
+        """Return the number of crops that can be compared in the time left [s]."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Crops:
 
 
 def can_do_without_crops(options: RelocalizerOptions) -> bool:
-    """Return whether frames can be localized without all crops. Only hybrid_auto can do that."""
+    """Return whether a frame can be localized before all crops are compared: for hybrid_auto."""
     return options.algorithm == 'auto' and options.matching == 'hybrid'
 
 
@@ -118,8 +118,8 @@ def recorded_crops(observation: Observation, options: RelocalizerOptions) -> Cro
 def informative_first(landmark_map: LandmarkMap, observation: Observation) -> NDArray[np.int64]:
     """Return the detections (n,), sorted by how informative their crops are, best first.
 
-    A crop distinguishes the landmarks of its class. It is the more informative, the more such
-    landmarks there are, and the larger it is, because large crops are more reliable.
+    A crop distinguishes the landmarks of its class, so its information grows with their number. It
+    also grows with the size of the crop, because large crops are more reliable.
     """
     classes = landmark_map.classes.classes_of(observation.detections.class_ids)
     sizes = landmark_map.classes.sizes_of(classes)
@@ -188,8 +188,8 @@ class KeptInstant(NamedTuple):
     """The searched frames of one instant, and the anchor of its view."""
 
     searched: tuple[SearchedFrame, ...]
-    #: (4, 4): odom_from_camera of the last camera, at the first of the successive instants with an
-    #: equal view, which the newest one replaces. A slowly creeping camera thus leaves the view.
+    #: (4, 4): odom_from_camera of the last camera. If this instant replaced earlier instants with
+    #: the same view, it is that of the first of them, so that a creeping camera leaves the view.
     anchor: NDArray[np.float64]
 
     @property
@@ -401,7 +401,7 @@ class Localizer:
     def covariance_for_filter(self, found: Relocalization) -> NDArray[np.float64] | None:
         """Return the covariance (6, 6) of the newest result for a filter that fuses all results.
 
-        Call this once for each accepted result that the filter gets. Without odometry, the
+        Call this once for each accepted result that is passed to the filter. Without odometry, the
         covariance of the result is returned unchanged.
         """
         assert self.query is not None

@@ -231,7 +231,7 @@ class Relocalizer:
     def begin(self, frames: int, cameras: int = 1) -> TimeBudget:
         """Return the time budget of a relocalization with a number of frames; it starts now.
 
-        Several cameras of one instant have one budget each, which are added.
+        For several cameras of one instant, the time budget is multiplied by their number.
         """
         return TimeBudget(used_time_s(), cameras * self.options.time_budget_s, frames)
 

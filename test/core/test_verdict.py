@@ -382,7 +382,7 @@ def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
      'confidence 0.77 < 0.99; pose found'),
     (Evidence(5, 0.995), {'iterations': 100, 'algorithm': 'b-prosac'}, 'iterations 100 < 500'),
     (Evidence(5, 0.995, earlier=(0.0,) * 6), {},
-     'mean confidence 0.14 < 0.5 of the last 7 frames in this pose'),
+     'mean confidence 0.14 < 0.5 in this pose over the last 7 frames'),
     (Evidence(5, 0.995, earlier=(0.0, 0.99, 0.0)), {}, 'mean confidence 0.49 < 0.5'),
     (Evidence(5, 0.995, earlier=(0.0, 0.99)), {}, '')])
 def test_refusal_names_its_reason(evidence, options, reason):

@@ -178,7 +178,7 @@ def looks_of(joined: JoinedFrames, pose: Finalist) -> list[CameraLook]:
         information = fit.information / square
         vector = information @ fit.errors + fit.errors / _WRONG ** 2 / square
         if not np.isfinite([*information.ravel(), *vector]).all():
-            continue  # NaN or infinity would spoil the sum forever
+            continue  # NaN or infinity would corrupt the sum over all later looks
         weight = _TERMS.view / max(_TERMS.view, odds_of(information, vector).log_odds)
         looks.append(CameraLook(
             seen.camera_name, seen.stamp_ns == last.stamp_ns,

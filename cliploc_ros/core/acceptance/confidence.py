@@ -149,8 +149,8 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
                     landmark_map, frame, map_from_camera, distinct), strict=True):
                 rows.setdefault(int(landmark_map.objects[match.landmark]), {})[
                     number, match.detection] = row
-        # Detections of a class that landmarks are only mistaken for are not unexplained: that a
-        # teddy bear sometimes looks like a person does not mean that a map shows all people.
+        # A class that landmarks are only mistaken for does not count as unexplained: people are
+        # not expected in a map just because a teddy bear sometimes looks like a person.
         matched, others = [match.detection for match in found], frame.are_own.copy()
         others[matched] = False
         alone = 1.0 - frame.same[others][:, matched].max(axis=1, initial=0.0)
@@ -230,7 +230,7 @@ class Setting(NamedTuple):
 
     @property
     def vertical(self) -> float:
-        """Return how many attitudes the vertical excludes, as a logarithm: 3.8 at 1 degree."""
+        """Return the log ratio of vague to known deviation: 3.8 at 1 degree, 0 if unknown."""
         terms = CALIBRATION.objects
         return math.log(terms.vague_vertical_deg / min(
             max(self.vertical_deg, terms.best_vertical_deg), terms.vague_vertical_deg))
@@ -299,7 +299,7 @@ def points_utility(place: RecognizedPlace, calibration: Calibration = CALIBRATIO
 
 
 def objects_utility(support: Support, calibration: Calibration = CALIBRATION) -> float:
-    """Return the evidence of objects for a pose that keyframes propose: log odds."""
+    """Return the log odds of a pose that keyframes propose, from its objects alone."""
     terms = calibration.keyframes
     return (terms.explained * min(terms.most_objects, support.inliers)
             + terms.unexplained * min(terms.most_objects, support.unexplained))

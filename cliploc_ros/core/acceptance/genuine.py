@@ -55,9 +55,9 @@ def compare_motion(deviation_per_metre: float, first: RecognizedPlace, second: R
     first_from_second : ndarray (4, 4)
         Motion of the camera by odometry.
     """
-    # A wrong pose of a keyframe moves both looks at it alike, so it does not count as far as both
-    # use the same keyframes. Errors that grow with the distance from a keyframe count for the
-    # distance between the looks.
+    # An error in the pose of a keyframe shifts both looks equally, so it is not counted to the
+    # extent that both looks use the same keyframes. Errors that grow with the distance from a
+    # keyframe are counted for the distance between the looks.
     shares = dict(zip(second.keyframes, second.shares, strict=True))
     same = sum(min(share, shares.get(keyframe, 0.0))
                for keyframe, share in zip(first.keyframes, first.shares, strict=True))

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Places that look alike, such as two rooms with the same furniture.
 
-A camera sees the same at two places if a turn about the vertical and a shift map the landmarks of
-one place onto those of the other. Such twins of the best pose are searched for in the map, so that
-they count as rivals even if the search found only one of the places. `check_map` lists the places
-of a map that have twins.
+A camera has the same view at two places if a turn about the vertical and a shift map the landmarks
+of one place onto those of the other. The map is searched for such twins of the best pose, so that
+they count as rivals even if the search of poses found only one of the places. `check_map` lists
+the places of a map that have twins.
 
 Landmarks on one axis look the same from all directions around it. The pose turned about an axis
 that most matched landmarks share therefore counts as a twin, too.

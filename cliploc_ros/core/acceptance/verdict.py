@@ -184,8 +184,8 @@ def refusal(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
     if refused or evidence.mean_confidence >= needed:
         return refused
     return Refusal(RefusalKind.FRAMES_DISAGREE,
-                   f'mean confidence {_rounded_down(evidence.mean_confidence)} < {needed:g} of '
-                   f'the last {len(evidence.earlier) + 1} frames in this pose; {_LOOK_ABOUT}')
+                   f'mean confidence {_rounded_down(evidence.mean_confidence)} < {needed:g} in '
+                   f'this pose over the last {len(evidence.earlier) + 1} frames; {_LOOK_ABOUT}')
 
 
 def needed_confidence(evidence: Evidence, options: RelocalizerOptions) -> float:
@@ -201,7 +201,7 @@ def needed_confidence(evidence: Evidence, options: RelocalizerOptions) -> float:
 
 
 def _too_little(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
-    """Refuse a search that was too short or matched too few objects; None if it did neither."""
+    """Return the refusal if the search was too short or matched too few objects; else None."""
     kind, least = RefusalKind.SEARCH_CUT_SHORT, int(CALIBRATION.search.least_samples)
     if evidence.coverage < 1.0 and options.algorithm == 'auto':
         if evidence.tried < least:
@@ -221,7 +221,7 @@ def _too_little(evidence: Evidence, options: RelocalizerOptions) -> Refusal | No
 
 
 def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
-    """Refuse a pose with too low a confidence, and name the main cause; None if it is enough."""
+    """Return the refusal, with the main cause, if the confidence is too low; else None."""
     confidence, needed = evidence.confidence, needed_confidence(evidence, options)
     if confidence >= needed:
         return None

@@ -79,7 +79,7 @@ def corrected(pairs, errors):
 
 @compiled
 def camera_jacobian(pairs, vertical, errors, rotation, translation, residuals):
-    """Return the derivatives (5 * m + 3, 13) of the residuals by the pose and by the errors.
+    """Return the Jacobian (5 * m + 3, 13) of the residuals with respect to pose and errors.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def _equations(pairs, is_edge, vertical, errors, rotation, translation, residual
 
 @compiled
 def _moves(information):
-    """Return the derivatives (6, 7) of the best pose by the errors."""
+    """Return the Jacobian (6, 7) of the best pose with respect to the errors."""
     moves, column = np.zeros((6, ERRORS)), np.zeros(6)
     for error in range(ERRORS):
         if not solve(information[:6, :6].copy(), -information[:6, 6 + error].copy(), column):

@@ -45,7 +45,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform, pose_differen
 _TERMS = CALIBRATION.covariance
 #: (6,): variance in directions that the boxes do not determine [m^2] [rad^2].
 PRIOR_VARIANCES = np.repeat([_TERMS.unfixed_m2, _TERMS.unfixed_rad2], 3)
-# A camera that moves less stands still, up to rounding [m] [rad].
+# A camera that moves less than this stands still; the motion is a rounding error [m] [rad].
 _STANDS_STILL = 1e-9
 # Grid of weights of the first pose on which covariance intersection searches for the minimum.
 _WEIGHTS = np.linspace(0.0, 1.0, 11)
@@ -58,8 +58,8 @@ POSE_UNKNOWN = np.diag(PRIOR_VARIANCES)
 def odometry_deviations(first_from_second: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the standard deviations (6,) of odometry between two frames.
 
-    They are those of position [m] and rotation [rad] on each axis, and 0 if the camera did not
-    move. The motion of the camera is first_from_second (4, 4).
+    The first three are those of the position [m], the others those of the rotation [rad]. All are
+    0 if the camera did not move. The motion of the camera is first_from_second (4, 4).
     """
     way_m = float(np.linalg.norm(first_from_second[:3, 3]))
     angle = float(Rotation.from_matrix(first_from_second[:3, :3]).magnitude())
@@ -154,7 +154,7 @@ class _Fit(NamedTuple):
     numbers: NDArray[np.int64]  #: (n,): landmark of each object
     verticals: NDArray[np.float64]  #: (F, 6, 6): information of each frame's vertical
     cameras: NDArray[np.float64]  #: (F, 4, 4): map_from_camera
-    #: (F, 6, 7): derivative of each frame's gradient by the errors of its camera, see camera_fit
+    #: (F, 6, 7): change of each frame's gradient with the errors of its camera, see camera_fit
     calibrations: NDArray[np.float64]
 
     @property
@@ -224,9 +224,9 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
 
 def moves_with_cameras(rig: Rig, inliers: Inliers, rotation: NDArray[np.float64],
                        translation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the derivatives (F, 6, 7) of a refined pose by the camera errors of each frame.
+    """Return the Jacobian (F, 6, 7) of a refined pose for the camera errors of each frame.
 
-    The derivative by the errors of a camera, see camera_fit, is the sum over its frames. For the
+    The Jacobian for the errors of a camera, see camera_fit, is the sum over its frames. For the
     parameters see refined_covariance.
     """
     fit = _linearize(inliers, rig.sigmas, rotation, translation)

@@ -134,7 +134,7 @@ def robust_cost(residuals):
 def jacobian_of(pairs, vertical, rotation, translation):
     """Return the derivatives (5 * m + 3, 6) of the residuals, see residuals_of.
 
-    The derivatives are by the camera's position [m] and by rotations about the map's axes [rad].
+    Columns are the camera's position [m] and rotations about the map's axes [rad].
     """
     jacobian = np.zeros((5 * len(pairs) + 3, 6))
     for row in range(len(pairs)):

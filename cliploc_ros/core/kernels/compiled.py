@@ -120,7 +120,7 @@ class KernelFolders:
             yield resolve_cache_dir('') / 'kernels'
 
     def _write(self, file: Path, content: bytes) -> str:
-        """Write a file in one step; return what failed, or ''."""
+        """Write a file atomically; return a description of the failure, or ''."""
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
             with replace_file(file) as partial:
