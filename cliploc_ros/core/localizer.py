@@ -189,7 +189,8 @@ class KeptInstant(NamedTuple):
 
     searched: tuple[SearchedFrame, ...]
     #: (4, 4): odom_from_camera of the last camera. If this instant replaced earlier instants with
-    #: the same view, it is that of the first of them, so that a creeping camera leaves the view.
+    #: the same view, the anchor is that of the first of them. A camera that creeps slowly away from
+    #: the anchor is therefore noticed.
     anchor: NDArray[np.float64]
 
     @property

@@ -6,7 +6,7 @@ The poses found by the search of objects and the poses found by keyframes compet
 pose is scored on the detections of all frames and on the points of the keyframes. The most likely
 pose leads, and the evidence about it alone decides whether it is accepted.
 
-A wrong pose may explain a mirrored image well, such as that of a mirror or of a flipped camera: a
+An image may be mirrored, by a mirror or a flipped camera. A wrong pose may then explain it well: a
 camera on the other side of a plane sees the points of the plane mirrored, at the same distances.
 For example, it sees objects on a table from below, or objects along a wall from behind. The image
 is therefore mirrored back, and the best pose of the mirrored image competes with the pose found.
@@ -245,8 +245,8 @@ class Comparison:
     def _not_mirrored(self, by_points: float) -> float:
         """Return the probability that the image is not mirrored.
 
-        The features of a mirrored image match nothing. A pose that keyframes alone confirm is
-        therefore not checked, and neither is a pose that is refused anyway, to save time.
+        The features of a mirrored image match no keyframe, so a pose that keyframes alone confirm
+        is not checked. To save time, a pose that is refused anyway is not checked either.
         """
         best, options = self.by_objects, self._joined.options
         if (best is None or not options.refine or by_points >= options.min_confidence

@@ -12,11 +12,11 @@ chance, and a known vertical excludes some of them. Probabilities are proportion
 exponentials of the utilities, so the poses of an ambiguous scene share the probability. The
 probabilities of poses that agree (1 m, 45 degrees) are added.
 
-The search of objects selects its poses from many by their support. Keyframes propose poses by
-points. The evidence of objects for such a pose is added to the utility of no pose being right,
-whatever the size of the map. If points and objects lead to one place, their evidence adds up,
-because features and boxes agree by chance independently. For the exception, features and boxes in
-a picture, see cliploc_ros.core.acceptance.genuine.
+The search of objects selects its poses from many by their support. Keyframes propose poses from
+matched points instead. The evidence of objects for such a pose is added to the utility of the case
+that no pose is right, whatever the size of the map. If points and objects lead to one place, their
+evidence is added, because chance agreements of features and of boxes are independent. The
+exception is a picture that shows both, see cliploc_ros.core.acceptance.genuine.
 
 A prior region, where the robot probably is, counts as evidence and excludes no pose. The region is
 right with probability p; otherwise the robot may be anywhere in the map. A pose therefore has the
