@@ -189,8 +189,8 @@ class KeptInstant(NamedTuple):
 
     searched: tuple[SearchedFrame, ...]
     #: (4, 4): odom_from_camera of the last camera. If this instant replaced earlier instants with
-    #: the same view, the anchor is that of the first of them. A camera that creeps slowly away from
-    #: the anchor is therefore noticed.
+    #: the same view, the anchor is that of the first of them, so that a camera which creeps slowly
+    #: away from it gets a new view in the end.
     anchor: NDArray[np.float64]
 
     @property
