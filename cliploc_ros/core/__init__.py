@@ -5,25 +5,25 @@
 Imports point downwards only, in this order (test/test_layout.py checks it):
 
 localizer, succession, relocalizer, warm_up, detector_check
-    Frame after frame of a moving camera; frames to a result.
+    Successive frames of a moving camera; localization of given frames.
 watch
-    Evidence that a localizer's pose is right, look by look.
+    Evidence that a localizer's pose is right, added up look by look.
 acceptance
     Confidence, and the decision to accept or refuse.
 fit
     Verification, refinement, several frames, covariance.
 keyframes
-    Poses from local features of the place as it was mapped.
+    Poses from local features that match images taken during mapping.
 search
-    Observation and map to candidates, minimal samples, and the best hypotheses of one frame.
+    Correspondence candidates, minimal samples, and the best hypotheses of one frame.
 observation, options
     Inputs: the frame, and the caller's options.
 map
-    One map or several with their files; landmarks by class, by similarity of labels, by place.
+    One map or several, and their files; indices of landmarks by class, label and place.
 geometry
     Transforms, camera, ellipses, ellipsoids, minimal solvers.
 kernels
     Functions compiled to machine code.
 calibration
-    The numbers that decide, read from calibration.yaml.
+    The numbers that decide about poses, read from calibration.yaml.
 """

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Depth images, and the depth of the objects in boxes.
 
-Depth is never exact: it has holes, its scale errs, and it does not quite fit the colour image. A
-box therefore gets one robust value from its inner half, and the spread of the values there.
+Depth is never exact: it has holes, errors of scale, and a small offset to the colour image. The
+depth of a box is therefore the median over its inner half, together with the spread there.
 """
 
 from dataclasses import dataclass, field
@@ -16,13 +16,13 @@ from cliploc_ros.errors import DatasetError
 
 #: Units of a 16-bit depth image: the conventions of ROS and of the TUM RGB-D dataset [m].
 MILLIMETRE, TUM_UNIT = 1e-3, 1 / 5000
-# The inner part of a box that counts, in each direction, and how many values it needs.
+# The share of a box, in each direction, whose depths are used, and the minimum number of depths.
 _INNER_SHARE = 0.5
 _LEAST_VALUES = 12
 _LEAST_SHARE = 0.1
-# Every second pixel in each direction is enough for a median.
+# Step between the pixels that are used [px]: every second pixel is enough for a median.
 _STEP = 2
-#: Rooms and halls: the typical depth of a recording lies between these [m].
+#: Range of the typical depth of a recording in rooms and halls [m].
 PLAUSIBLE_DEPTH_M = (0.15, 40.0)
 
 
@@ -35,39 +35,39 @@ class DepthCamera:
     fy: float
     cx: float
     cy: float
-    #: (4, 4): its pose, seen from the colour camera
+    #: (4, 4): pose of the depth camera in the coordinate frame of the colour camera
     color_from_depth: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
 
 
 @dataclass(frozen=True)
 class DepthImage:
-    """Depths along z [m], float32 (h, w); NaN where there is none.
+    """A depth image, registered to the colour image or with its own camera."""
 
-    ``camera`` is None for depth that is registered to the colour image.
-    """
-
-    depths_m: NDArray[np.float32]
-    camera: DepthCamera | None = None
+    depths_m: NDArray[np.float32]  #: (h, w): depths along z [m]; NaN where unknown
+    camera: DepthCamera | None = None  #: None if the depths are registered to the colour image
 
 
 def depth_from_counts(counts: NDArray[np.generic], unit_m: float | None, where: str
                       ) -> NDArray[np.float32]:
-    """Return the depths (h, w) [m] of a decoded depth image, NaN where there is none.
-
-    DatasetError: the image is of another type.
+    """Convert a decoded depth image to depths (h, w) [m], NaN where unknown.
 
     Parameters
     ----------
     counts : ndarray (h, w)
-        uint16, with 0 and 65535 for none, or float.
+        uint16, with 0 and 65535 for unknown depth, or float.
     unit_m : float or None
         Metres of one count. None: 1 mm for uint16, 1 m for float.
     where : str
-        File or message, for the error.
+        Name of the file or message, for the error.
+
+    Raises
+    ------
+    DatasetError
+        The image has another type or shape.
     """
     if counts.ndim != 2 or counts.dtype not in (np.uint16, np.float32, np.float64):
-        raise DatasetError(f'{where}: is not a depth image of 16-bit integers or floats, but '
-                           f'{counts.dtype} with shape {counts.shape}')
+        raise DatasetError(f'{where}: {counts.dtype} with shape {counts.shape} is not a depth '
+                           'image of 16-bit integers or floats')
     is_integer = counts.dtype == np.uint16
     depths = counts.astype(np.float32) * np.float32(
         unit_m or (MILLIMETRE if is_integer else 1.0))
@@ -81,22 +81,22 @@ def depth_from_counts(counts: NDArray[np.generic], unit_m: float | None, where: 
 
 def depths_of_boxes(depth: DepthImage, camera: Camera, bboxes_xyxy: NDArray[np.float64]
                     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the depth of the objects in boxes, and its spread.
+    """Return the depths of the objects in boxes, and their spreads.
 
     Parameters
     ----------
     camera : Camera
         Camera of the colour image.
     bboxes_xyxy : ndarray (n, 4)
-        Boxes in the colour image, as detected.
+        Boxes in the distorted colour image [px].
 
     Returns
     -------
     depths_m : ndarray (n,) float32
-        Median over the inner half of each box, along z of the colour camera [m]; NaN where too
-        few pixels have depth.
+        Median over the inner half of each box, along z of the colour camera [m]; NaN if too few
+        pixels have depth.
     spreads_m : ndarray (n,) float32
-        Half the distance between the 16th and 84th percentile there [m].
+        Half the difference of the 84th and 16th percentiles there [m].
     """
     pixels, values = points_in_color(depth, camera, _STEP)
     depths = np.full(len(bboxes_xyxy), np.nan, dtype=np.float32)
@@ -116,14 +116,17 @@ def depths_of_boxes(depth: DepthImage, camera: Camera, bboxes_xyxy: NDArray[np.f
 
 def points_in_color(depth: DepthImage, camera: Camera, step: int
                     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return the colour pixels (2, p) of the depth pixels that have a value, and the values."""
+    """Return the pixels (2, p) of known depths in the colour image, and the depths (p,) [m].
+
+    Only every `step`-th row and column of the depth image is used.
+    """
     height, width = depth.depths_m.shape
     v, u = np.mgrid[0:height:step, 0:width:step]
     values = depth.depths_m[::step, ::step]
     valid = np.isfinite(values)
     u, v, values = u[valid].astype(np.float64), v[valid].astype(np.float64), values[valid]
     own = depth.camera
-    if own is None:  # scaled, where the depth image is smaller than the colour image
+    if own is None:  # the depth image may be smaller than the colour image
         return np.stack([u * camera.width / width, v * camera.height / height]), values
     points = np.stack([(u - own.cx) / own.fx * values, (v - own.cy) / own.fy * values, values],
                       axis=1) @ own.color_from_depth[:3, :3].T + own.color_from_depth[:3, 3]

@@ -17,46 +17,47 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.relocalizer import Relocalization
 from cliploc_ros.errors import did_you_mean
 
-# Frames that are remembered, and detections without which nothing is said of a detector (guesses).
+# Number of frames that are kept, and minimum number of detections for a verdict. Both are guesses.
 _MOST_FRAMES, _LEAST = 20, 3
-# Names in a message, and their characters.
+# Maximum number of names in a message, and of their characters.
 _MOST_NAMES, _MOST_CHARACTERS = 5, 30
-# Refusals for which a detector is the cause, if it has a fault.
+# Kinds of refusals that a faulty detector explains.
 _ITS_KINDS = (RefusalKind.TOO_FEW_OBJECTS, RefusalKind.UNEXPLAINED)
 _TURN = '; turn the camera'
 
 
 class _Tally(NamedTuple):
-    """Numbers of detections in some frames."""
+    """Numbers of detections in one frame or several."""
 
-    given: int = 0
-    scored: int = 0  #: With a finite score
-    usable: int = 0
-    of_map: int = 0  #: Usable, and of a class of the map
-    odd_score: float | None = None  #: A score that is not from 0 to 1
-    bad_box: str = ''  #: A box that is not usable
+    given: int = 0  #: All detections
+    scored: int = 0  #: Detections with a finite score
+    usable: int = 0  #: Detections that are fit for localization
+    of_map: int = 0  #: Usable detections of a class of the map
+    odd_score: float | None = None  #: Example of a score that is not from 0 to 1
+    bad_box: str = ''  #: Example of a box that is not usable
     classes: Counter[str] = Counter()  # noqa: RUF012 (never changed)
 
 
 class DetectorCheck:
-    """Counts the detections of the last frames that are fit for localization, and the others.
+    """Count the usable and unusable detections of the last frames.
 
     Parameters
     ----------
     by_class : bool
-        Classes are matched, so that they have to be those of the map.
+        Whether classes are matched, so that the detector must use the classes of the map.
     frames : int, optional
-        How many frames are remembered; None: all.
+        Number of last frames that are kept; None keeps all frames.
     """
 
     def __init__(self, landmark_map: LandmarkMap, by_class: bool,
                  frames: int | None = _MOST_FRAMES) -> None:
         self._known = landmark_map.classes.numbers
-        self._by_class = by_class and len(landmark_map) > 0  # of keyframes alone: any class
+        # a map without landmarks, of keyframes alone, needs no classes
+        self._by_class = by_class and len(landmark_map) > 0
         self._frames: deque[_Tally] = deque(maxlen=frames)
 
     def add(self, given: Detections, usable: Detections) -> None:
-        """Take in the detections of a frame, and those of them that are used."""
+        """Add the detections of a frame, and the usable ones among them."""
         scores, boxes = given.scores, given.bboxes_xyxy
         scored = np.isfinite(scores)
         odd = scores[scored & ((scores < 0.0) | (scores > 1.0))]
@@ -80,9 +81,9 @@ class DetectorCheck:
         return found
 
     def explain(self, found: Relocalization) -> Relocalization:
-        """Return the result of the last frame, with the cause if its detections are unusable.
+        """Add the fault of the detections, if there is one, to the refusal of the last frame.
 
-        Turning the camera does not help then.
+        It replaces the advice to turn the camera, which does not help then.
         """
         last = self._frames[-1] if self._frames else _Tally()
         certain = self._certain(last)
@@ -96,7 +97,7 @@ class DetectorCheck:
 
     @property
     def _pooled(self) -> _Tally:
-        """Return the numbers of all frames."""
+        """Return the numbers of all frames together."""
         frames = self._frames
         return _Tally(
             sum(frame.given for frame in frames), sum(frame.scored for frame in frames),
@@ -106,25 +107,25 @@ class DetectorCheck:
             sum((frame.classes for frame in frames), Counter()))
 
     def _certain(self, tally: _Tally) -> list[Fault]:
-        """Return why no detection of some frames is of use; nothing if one is."""
+        """Return the fault that makes all detections unusable, in a list; empty without one."""
         text = ''
         if tally.given and not tally.scored:
             text = f'none of its {tally.given} scores is a number'
         elif tally.given and not tally.usable:
-            text = (f'none of its {tally.given} boxes is within the image and a pixel wide, such '
-                    f'as {tally.bad_box}: publish pixels of the image')
+            text = (f'none of its {tally.given} boxes lies in the image and is at least a pixel '
+                    f'wide, for example {tally.bad_box}: publish pixels of the image')
         elif tally.usable and self._by_class and not tally.of_map:
             names = [name for name, _ in tally.classes.most_common()]
             numbers = ', which are numbers' if all(name.isdigit() for name in names) else ''
             hint = next(filter(None, (did_you_mean(name, self._known)
                                       for name in names[:_MOST_NAMES])), '')
-            text = (f'no class of the map is among its {_in_words(names)}{numbers}{hint}; the map '
-                    f'has {_in_words(self._known)}: use the detector of the map, or class_map')
+            text = (f'none of its classes is in the map: {_in_words(names)}{numbers}{hint}; the '
+                    f'map has {_in_words(self._known)}: use the detector of the map, or class_map')
         return [Fault(text, True)] if text else []
 
 
 def _in_words(names: Iterable[str]) -> str:
-    """Return some names in a line; strangers may have written them."""
+    """List names in one line, shortened and printable, as their source is not trusted."""
     shown = [*islice(names, _MOST_NAMES + 1)]
     cut = [''.join(char if char.isprintable() else ' ' for char in name[:_MOST_CHARACTERS])
            or 'no name' for name in shown[:_MOST_NAMES]]

@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Answering query after query of one moving robot: all programs answer by this module.
+"""Answer the successive queries of one moving robot. All programs use this module.
 
-A localizer fuses each frame with the last few that odometry links to it, and accepts a pose only
-where the successive looks are sure of it on average.
+A localizer fuses each frame with the last few frames that odometry links to it. It accepts a pose
+only if the mean confidence of the successive looks in it is high enough.
 
-Crops are compared on demand. A network that embeds crops takes longer than all else on a CPU. The
-frame is first localized by classes alone, then with more and more of its crops, the most
-informative ones first, until the pose is accepted or no crop is left. Each of these searches is
-another chance of a false accept. So a pose from a part of the crops needs a greater confidence,
-see cliploc_ros.core.acceptance.verdict.
+Crops are compared on demand, because embedding them takes most of the time on a CPU. A frame is
+first localized by classes alone, then with more and more of its crops, the most informative crops
+first, until the pose is accepted or no crop is left. Each of these searches is another chance of a
+false accept. A pose from a part of the crops therefore needs a higher confidence, see
+cliploc_ros.core.acceptance.verdict.
 """
 
 import math
@@ -42,12 +42,13 @@ from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.core.succession import FilterState, succeed
 from cliploc_ros.units import NS_PER_S
 
-# These are limits of time, so not in calibration.yaml. How sure a pose from a part of the crops
-# has to be is there, see its section search.
-#: Crops between two searches. A search takes less time than one crop of most networks on a CPU.
+# These are time limits and therefore not in calibration.yaml. The confidence that a pose from a
+# part of the crops needs is there, in the section search.
+#: Number of crops between two searches. A search takes less time than most networks need for one
+#: crop on a CPU.
 BATCH = 4
-# Time that a request needs after its last crops [s]: for a search, which may take most of a fifth
-# of the time that is left, and for the answer. Guesses.
+# Time that a request needs after its last crops: for searches, in units of the time budget and at
+# most this share of the time left, and for the answer [s]. Guesses.
 _SEARCHES, _MOST_SHARE, _ANSWER_S = 2.0, 0.2, 0.1
 _NO_LOOKS = Looks()
 _NO_ROWS = np.empty(0, dtype=np.int64)
@@ -58,55 +59,55 @@ class ImageCrops(Protocol):
 
     @property
     def known(self) -> NDArray[np.int64]:
-        """Return the detections (m,) whose similarities cost nothing."""
+        """Return the detections (m,) whose embeddings are known, so that they take no time."""
 
     def compare(self, rows: NDArray[np.int64]) -> Similarities:
-        """Return the similarities (m, L) of some detections (m,) and the labels."""
+        """Return the similarities (m, L) of detections (m,) to the labels."""
 
 
 class CropSource(Protocol):
-    """Compares crops of images with the labels of a map, see cliploc_ros.models.observer."""
+    """Compare crops of images with the labels of a map, see cliploc_ros.models.observer."""
 
     def crops(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64],
               known: Mapping[int, NDArray[np.float32]] | None = None) -> ImageCrops:
         """Return the crops of an image (h, w, 3) at boxes (n, 4) [px].
 
-        `known` has embeddings by their row; by default those of earlier images.
+        `known` has the known embeddings by row; by default the embeddings of earlier images.
         """
 
     def crops_within(self, left_s: float) -> int:
-        """Return how many crops there is time for [s]."""
+        """Return the number of crops that can be compared in the time left [s]."""
 
 
 @dataclass(frozen=True)
 class Crops:
-    """The crops of one frame, which a search compares with the labels as it needs them."""
+    """The crops of one frame, which are compared with the labels on demand."""
 
-    #: Takes the rows of m detections; returns their similarities (m, L)
+    #: Returns the similarities (m, L) of the detections of m rows
     compare: Callable[[NDArray[np.int64]], Similarities]
-    #: (m,): detections whose similarities cost nothing; the first search has them
+    #: (m,): detections that the first search uses, because their similarities take no time
     known: NDArray[np.int64] = field(default_factory=_NO_ROWS.copy)
-    room: Callable[[], int] = lambda: BATCH  #: Returns how many crops to compare next; 0 ends
+    room: Callable[[], int] = lambda: BATCH  #: Returns how many crops to compare next; 0: stop
 
 
 def can_do_without_crops(options: RelocalizerOptions) -> bool:
-    """Return whether a frame can be localized without some of its crops: by hybrid_auto alone."""
+    """Return whether a frame can be localized before all crops are compared: for hybrid_auto."""
     return options.algorithm == 'auto' and options.matching == 'hybrid'
 
 
 def by_classes(observation: Observation, landmarks: int) -> Observation:
-    """Return an observation whose crops CLIP did not see, for a map with a number of landmarks.
+    """Return an observation without similarities, for a map with a number of landmarks.
 
-    The node compares crops of one camera only; this is what the others of a rig saw.
+    The node compares the crops of one camera only. This is used for the other cameras of a rig.
     """
     return replace(observation, similarities=np.empty((0, landmarks), dtype=np.float32),
                    compared=np.empty(0, dtype=np.int64))
 
 
 def recorded_crops(observation: Observation, options: RelocalizerOptions) -> Crops | None:
-    """Return the crops on demand of an observation that has all similarities.
+    """Return the crops of an observation that has all similarities, to be compared on demand.
 
-    A search gets only the crops that it needs; None if the options give it all at once.
+    None if the options compare all crops at once.
     """
     if options.crops != 'on_demand' or not can_do_without_crops(options):
         return None
@@ -115,10 +116,10 @@ def recorded_crops(observation: Observation, options: RelocalizerOptions) -> Cro
 
 
 def informative_first(landmark_map: LandmarkMap, observation: Observation) -> NDArray[np.int64]:
-    """Return the detections in the order in which their crops say most about the pose.
+    """Return the detections (n,), sorted by how informative their crops are, best first.
 
-    A crop tells the landmarks of its class apart, the more of them there are; a large crop does
-    so more reliably.
+    A crop distinguishes the landmarks of its class, so its information grows with their number. It
+    also grows with the size of the crop, because large crops are more reliable.
     """
     classes = landmark_map.classes.classes_of(observation.detections.class_ids)
     sizes = landmark_map.classes.sizes_of(classes)
@@ -139,22 +140,23 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
     earlier : sequence of SearchedFrame
         Frames before it, linked by odometry.
     crops : Crops, optional
-        They take the place of its similarities; without them it is localized once, as it is.
+        The crops of the frame, which replace its similarities. Without crops, the frame is
+        localized once with the similarities that it has.
     looks : Looks, optional
-        Results of earlier frames, which have to agree.
+        Earlier looks, which must agree with the pose.
     recognizer : ImageRecognizer, optional
-        Recognizer of the keyframes.
+        Search of keyframes for the image of the frame.
     budget : TimeBudget, optional
-        Budget of the first search; by default a new one, as for each search after it.
+        Time budget of the first search, by default a new one. Each further search has a new one.
     cameras : CameraCheck, optional
-        What is known of the cameras.
+        Evidence about the cameras; by default there is none.
 
     Returns
     -------
     frame : SearchedFrame
-        With the crops that it took.
+        The frame with the similarities of the crops that were compared.
     found : Relocalization
-        Its time is that of all searches.
+        The result of the last search, with the time of all searches.
 
     Raises
     ------
@@ -183,13 +185,12 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
 
 
 class KeptInstant(NamedTuple):
-    """The searched frames of one instant, and the odom_from_camera (4, 4) of its last camera.
-
-    That is of the first instant that this one replaced: a camera that creeps moves away from this
-    anchor in the end.
-    """
+    """The searched frames of one instant, and the anchor of its view."""
 
     searched: tuple[SearchedFrame, ...]
+    #: (4, 4): odom_from_camera of the last camera. If this instant replaced earlier instants with
+    #: the same view, the anchor is that of the first of them, so that a camera which creeps slowly
+    #: away from it gets a new view in the end.
     anchor: NDArray[np.float64]
 
     @property
@@ -199,12 +200,12 @@ class KeptInstant(NamedTuple):
 
 
 class Localizer:
-    """Answer each query together with the queries before it.
+    """Answer successive queries, each together with the queries before it.
 
     Parameters
     ----------
     keyframes : KeyframeLocalizer, optional
-        Localizer among the keyframes of the map.
+        Localization by the keyframes of the map.
     """
 
     def __init__(self, relocalizer: Relocalizer, keyframes: KeyframeLocalizer | None = None
@@ -215,36 +216,38 @@ class Localizer:
         self._filter: FilterState | None = None
         self._run: int | None = -1
         self._stamp_ns = 0
-        #: The newest query, with all that its answer depended on: with it the same answer comes
-        #: again.
+        #: The newest query with everything that its answer depended on, so that it can be repeated
         self.query: Query | None = None
-        #: Depth is not used any more once it is wrong.
+        #: Scale of the depths; once it is wrong, depths are ignored
         self.depth_scale = DepthScale()
         self.cameras = CameraCheck()
 
     def answer(self, query: Query, crops: CropSource | None = None, deadline: float = math.inf,
                begin_stage: Callable[[str], None] = lambda stage: None) -> Relocalization:
-        """Localize with the frames of an instant and, where odometry places it, those before it.
+        """Localize with the frames of an instant and, if odometry links them, earlier instants.
 
-        Odometry links all instants of one run. A new run or a stamp before the last one forgets
-        instants and looks. Looks persist until a pose is accepted, whatever the query's length.
+        Odometry links all instants of one run. A new run, or a stamp before the last stamp, drops
+        all earlier instants and looks. Looks are kept until a pose is accepted, whatever the
+        length_s of the query.
 
         Parameters
         ----------
         query : Query
-            Its newest frame is localized. Without odom_from_camera or run it is localized alone,
-            and instants and looks do not change.
+            Its newest frame is localized. Without odom_from_camera or run, the frame is localized
+            alone, and instants and looks do not change.
         crops : CropSource, optional
-            Compares the crops that the query has no similarities of, until the pose is accepted.
+            Compares the crops for which the query has no similarities, until the pose is accepted.
         deadline : float
-            No crops are compared and no keyframes matched then (monotonic clock) [s].
+            After this time, no crops are compared and no keyframes are matched (monotonic clock)
+            [s].
         begin_stage : callable
-            Takes the name of a stage that begins: 'CLIP', 'keyframes', and 'search' after them.
+            Called with the name of each stage that begins: 'CLIP', 'keyframes', and 'search' after
+            them.
 
         Raises
         ------
         OptionsError
-            See Relocalizer.relocalize. The localizer drops this instant.
+            See Relocalizer.relocalize. The localizer then drops this instant.
         """
         if self.depth_scale.is_wrong:
             query = replace(query, frames=tuple(replace(frame, depths=None)
@@ -262,7 +265,7 @@ class Localizer:
         if found.accepted and found.depth is not None:
             self.depth_scale.add(found.depth)
         if others and found.accepted and found.frame_matches:
-            # where nothing is accepted, the map may be out of date
+            # refused poses are not counted, because the map may be out of date
             index = self._relocalizer.landmark_map.classes
             self.cameras.add_instant(query.frames, [int(index.are_own(index.classes_of(
                 frame.detections.class_ids)).sum()) for frame in query.frames], [
@@ -272,7 +275,7 @@ class Localizer:
     def recognizer(self, query: Query, deadline: float = math.inf,
                    begin_stage: Callable[[str], None] = lambda stage: None
                    ) -> ImageRecognizer | None:
-        """Return the keyframe search of the newest image; None without keyframes or image."""
+        """Return the search of keyframes for the newest image; None without keyframes or image."""
         if self._keyframes is None or not query.images or not query.by_keyframes:
             return None
         features = ImageFeatures(lambda: query.images[-1], query.newest.camera,
@@ -282,9 +285,9 @@ class Localizer:
 
     def with_free_crops(self, query: Query, row: int, source: CropSource | None,
                         begin_stage: Callable[[str], None] = lambda stage: None) -> Observation:
-        """Return a frame of a query with the crops that cost nothing, or that were compared.
+        """Return a frame of a query with the similarities that take no time to compute.
 
-        The paper's algorithms compare all crops, however long that takes.
+        For the paper's algorithms, all crops are compared, however long that takes.
         """
         frame, options = query.frames[row], self._relocalizer.options
         compares_all = not can_do_without_crops(options)
@@ -299,7 +302,7 @@ class Localizer:
 
     def _crops(self, query: Query, source: CropSource | None, deadline: float,
                begin_stage: Callable[[str], None]) -> tuple[Observation, Crops | None]:
-        """Return the newest frame, and the crops that its search compares as it needs them."""
+        """Return the newest frame, and its crops that are compared on demand, if any."""
         newest, options, last = query.newest, self._relocalizer.options, len(query.frames) - 1
         on_demand = options.crops == 'on_demand'
         if not can_do_without_crops(options):
@@ -332,7 +335,7 @@ class Localizer:
 
     def _crops_of(self, query: Query, row: int, source: CropSource | None, remembers: bool,
                   begin_stage: Callable[[str], None]) -> Crops | None:
-        """Return the crops of a frame, recorded or cut from its image; None without both."""
+        """Return the crops of a frame, recorded or cut from its image; None if it has neither."""
         frame = query.frames[row]
         given, rows = frame.similarities, frame.similarity_rows
         if given is not None and (source is None or not query.images
@@ -343,7 +346,8 @@ class Localizer:
             return None
         known: dict[int, NDArray[np.float32]] | None = None if remembers else {}
         if isinstance(given, CropSimilarities):
-            known = {one: given.crops[its] for one, its in enumerate(rows.tolist()) if its >= 0}
+            known = {detection: given.crops[row_of_crop]
+                     for detection, row_of_crop in enumerate(rows.tolist()) if row_of_crop >= 0}
         of_image = source.crops(query.images[row], frame.detections.bboxes_xyxy, known)
 
         def compare(wanted: NDArray[np.int64]) -> Similarities:
@@ -355,7 +359,7 @@ class Localizer:
 
     def _localize(self, query: Query, others: Sequence[Observation], newest: Observation,
                   crops: Crops | None, recognizer: ImageRecognizer | None) -> Relocalization:
-        """Search the newest frame beside the others, and keep what the answer depended on."""
+        """Localize the newest frame together with the other frames, and store the full query."""
         budget = self._relocalizer.begin(len(others) + 1, len(others) + 1) if others else None
         beside = [self._relocalizer.search(other, budget.search_end(number, len(others) + 1))
                   for number, other in enumerate(others, start=1)] if budget else []
@@ -376,11 +380,12 @@ class Localizer:
             looks = self._looks
             earlier, anchor = instants_to_fuse(self._instants, newest, query.limit,
                                                query.length_s)
-            while earlier and sum(len(one.searched) for one in earlier) + len(beside) \
+            while earlier and sum(len(instant.searched) for instant in earlier) + len(beside) \
                     >= MAX_FRAMES:
                 del earlier[0]
         searched, found = localize_on_demand(
-            self._relocalizer, [*(frame for one in earlier for frame in one.searched), *beside],
+            self._relocalizer,
+            [*(frame for instant in earlier for frame in instant.searched), *beside],
             newest, crops, looks, recognizer, budget, self.cameras)
         self.query = replace(query, frames=(*others, searched.observation), rooms=tuple(rooms),
                              is_thorough=found.recognition is not None
@@ -395,10 +400,10 @@ class Localizer:
         return found
 
     def covariance_for_filter(self, found: Relocalization) -> NDArray[np.float64] | None:
-        """Return the covariance of the newest, accepted result for a filter that fuses all.
+        """Return the covariance (6, 6) of the newest result for a filter that fuses all results.
 
-        To be called once for each result that such a filter gets. Without odometry it is that of
-        the result.
+        Call this once for each accepted result that is passed to the filter. Without odometry, the
+        covariance of the result is returned unchanged.
         """
         assert self.query is not None
         odom_from_camera = self.query.newest.odom_from_camera
@@ -411,10 +416,14 @@ class Localizer:
 
 
 def repeat(case: Case, localizer: Localizer, crops: CropSource | None = None) -> Relocalization:
-    """Answer a recorded request again, by a new localizer: on the same map the answer is equal.
+    """Repeat a recorded request with a new localizer. On the same map, the answer is identical.
 
-    `crops` are needed where the options compare crops with labels. CliplocError: the case does
-    not belong to the map, or is broken.
+    `crops` are required if the options compare crops with labels.
+
+    Raises
+    ------
+    CliplocError
+        The case is damaged, or was not recorded with this map.
     """
     for query in case.queries:
         found = localizer.answer(query, crops)
@@ -423,22 +432,23 @@ def repeat(case: Case, localizer: Localizer, crops: CropSource | None = None) ->
 
 def instants_to_fuse(instants: Sequence[KeptInstant], observation: Observation, limit: int,
                      length_s: float) -> tuple[list[KeptInstant], NDArray[np.float64]]:
-    """Return the instants to fuse a new one with, oldest first, and the anchor of the new one.
+    """Select the instants to fuse a new instant with, oldest first; also return its anchor.
 
-    Of too many instants those remain that are furthest apart, so a camera that turns is localized
-    by all that it saw on its way.
+    If there are too many instants, those furthest apart are kept, so that a camera that turns is
+    localized with everything that it saw on the way.
     """
     first_ns = observation.stamp_ns - round(length_s * NS_PER_S)
-    # an instant without detections has nothing to fuse
-    earlier = [one for one in instants if first_ns <= one.stamp_ns < observation.stamp_ns
-               and any(len(frame.observation.detections) for frame in one.searched)]
+    # skip instants without detections
+    earlier = [instant for instant in instants
+               if first_ns <= instant.stamp_ns < observation.stamp_ns
+               and any(len(frame.observation.detections) for frame in instant.searched)]
     anchor = observation.odom_from_camera
     assert anchor is not None
     if earlier and max(_steps(earlier[-1].anchor, anchor)) <= 1.0:
         anchor = earlier.pop().anchor
     while len(earlier) >= limit:
-        # the instant nearest to those before and after it goes, neither end if possible
-        anchors = [*(one.anchor for one in earlier), anchor]
+        # drop the instant nearest to its neighbours, but neither end if possible
+        anchors = [*(instant.anchor for instant in earlier), anchor]
         ways = [sum(_steps(anchors[row - 1], anchors[row])
                     + _steps(anchors[row], anchors[row + 1]))
                 for row in range(1, len(anchors) - 1)]
@@ -447,6 +457,6 @@ def instants_to_fuse(instants: Sequence[KeptInstant], observation: Observation, 
 
 
 def _steps(before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the distance and turn of a camera, in units of the limits of an equal view."""
+    """Return distance and angle between two camera poses, in units of the tolerance SAME_VIEW."""
     distance_m, angle_deg = pose_error(before, after)
     return distance_m / SAME_VIEW.distance_m, angle_deg / SAME_VIEW.angle_deg

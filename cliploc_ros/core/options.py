@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from cliploc_ros.errors import OptionsError
 
 MATCHINGS = ('class', 'clip', 'hybrid')
-#: What crops are compared with: the map's labels, its images, or both.
+#: What crops are compared with: the text labels of the map, its images, or both.
 COMPARED = ('text', 'image', 'both')
 ALGORITHMS = ('auto', 'bf', 'ransac', 'prosac', 'b-prosac')
 #: Which crops of a frame are compared with labels.
@@ -21,76 +21,77 @@ _RANGES = {'k': (1, math.inf), 'iterations': (1, 1_000_000), 'iou_threshold': (0
            'min_inliers': (3, math.inf), 'min_confidence': (0.0, 1.0)}
 
 
-# A search that waits, on a busy machine, ends after ten times its budget at the latest.
+# The share of waiting time that counts. A search that only waits, on a busy machine, thus ends
+# after ten times its budget.
 _WAITING_SHARE = 0.1
 
 
 def used_time_s() -> float:
     """Return the clock of time budgets [s]: the processor time of this thread.
 
-    A tenth of the time that it waits counts, too: programs beside it on the processor hardly
-    shorten a search, and one that is stopped ends as well.
+    A tenth of its waiting time is added. Other programs on the processor therefore hardly shorten
+    a search, but a search that gets no processor time still ends.
     """
     return ((1.0 - _WAITING_SHARE) * time.thread_time() + _WAITING_SHARE * time.perf_counter())
 
 
 @dataclass(frozen=True)
 class RelocalizerOptions:
-    """Options of the method; the defaults are the paper's where the paper has one.
+    """Options of the method. The defaults are those of the paper if it states a value.
 
     Raises
     ------
     OptionsError
-        Names the option and what it allows.
+        An option has an invalid value; the message states the option and the valid values.
     """
 
     #: 'class', 'clip' or 'hybrid': which pairs are correspondence candidates
     matching: str = 'hybrid'
-    #: Which minimal samples are tried. 'bf', 'ransac', 'prosac' and 'b-prosac' are the paper's.
-    #: 'auto' tries all samples that boxes and map allow, in the order of b-prosac and without
-    #: repetition, until `iterations` or `time_budget_s` end it. In hybrid matching it goes on to
-    #: candidates of equal class after those of CLIP.
+    #: Which minimal samples are tried. 'bf', 'ransac', 'prosac' and 'b-prosac' are the algorithms
+    #: of the paper. 'auto' tries all samples that boxes and map allow, in the order of b-prosac
+    #: and without repetition, until `iterations` or `time_budget_s` is reached. In hybrid
+    #: matching, it continues with candidates of equal class after those of CLIP.
     algorithm: str = 'auto'
     k: int = 3  #: Number of landmarks retrieved for each crop, at least 1
-    #: Number of minimal samples drawn; for auto the most samples tried; bf ignores it. The paper's
-    #: 500 find the best pose less often, and its rivals less often, too.
+    #: Number of minimal samples drawn; for auto the maximum number; bf ignores it. With the
+    #: paper's 500, the search finds the best pose and its rivals less often.
     iterations: int = 10_000
     #: A detection is an inlier of a landmark if their IoU exceeds this, 0 to 1
     iou_threshold: float = 0.2
-    random_seed: int = 0  #: Equal seed and input give equal output. Below 0 every search differs.
-    #: Limit of association, search and refinement [s], kept to within 10 %, of processor time: see
-    #: used_time_s. A search that it cuts is refused, except for auto. Such results depend on the
-    #: machine, so iterations should end a search first: 10,000 took at most 32 ms on the 258
-    #: recorded frames (40 landmarks, one idle core). Crowded maps take longer.
+    random_seed: int = 0  #: Equal seed and input give equal output. If negative, searches differ.
+    #: Limit of the processor time for association, search and refinement [s], kept to within 10 %,
+    #: see used_time_s. A search that exceeds it is refused, except for auto. Such results depend
+    #: on the machine, so iterations should end a search first: 10,000 took at most 32 ms on the
+    #: 258 recorded frames (40 landmarks, one idle core). Crowded maps take longer.
     time_budget_s: float = math.inf
-    #: Least and greatest height of the camera in the map [m]; other poses are dropped
+    #: Minimum and maximum height of the camera in the map [m]; other poses are dropped
     height_range_m: tuple[float, float] = (-math.inf, math.inf)
-    #: The most that the camera may be tilted against upright [deg]; 180 allows any pose. Where the
-    #: vertical is known, the limit for poses from three points against that vertical.
+    #: Maximum tilt of the camera against upright [deg]; 180 allows any pose. If the vertical is
+    #: known, this limits the tilt of poses from three points against that vertical.
     max_tilt_deg: float = 180.0
     #: Standard deviation of the camera's tilt against upright [deg], see
-    #: cliploc_ros.core.acceptance.confidence. It counts in the confidence where no vertical is
-    #: known. 0: every attitude is as likely, as in a map whose z axis is not up.
+    #: cliploc_ros.core.acceptance.confidence. It affects the confidence if no vertical is known.
+    #: 0: all attitudes are equally likely, as in a map whose z axis is not up.
     tilt_deviation_deg: float = 40.0
-    #: Standard deviation of a known vertical [deg]. With one, auto samples two candidates instead
-    #: of three.
+    #: Standard deviation of a known vertical [deg]. If the vertical is known, auto samples two
+    #: candidates instead of three.
     vertical_deviation_deg: float = 1.0
     #: Refine the best hypotheses on all their inliers, then choose the most likely pose. The paper
     #: does not refine, and chooses the pose with the greatest score.
     refine: bool = True
-    #: Standard deviations of the mounts of several cameras, against each other, on each axis
+    #: Standard deviations of the mounts of several cameras relative to each other, on each axis
     #: [m] [deg]
     mount_deviation: tuple[float, float] = (0.01, 0.5)
     min_inliers: int = 3  #: A pose with fewer matched objects is refused
-    #: A pose that is within 1 m of the truth with less probability is refused, 0 to 1, see
-    #: cliploc_ros.core.acceptance.confidence
+    #: A pose is refused if the probability that it is within 1 m of the truth is lower than this,
+    #: 0 to 1, see cliploc_ros.core.acceptance.confidence
     min_confidence: float = 0.9
     #: 'all' or 'on_demand': which crops are compared with labels, see cliploc_ros.core.localizer.
-    #: hybrid_auto alone uses this.
+    #: Only hybrid_auto uses this.
     crops: str = 'on_demand'
 
     def __post_init__(self) -> None:
-        """Refuse values that an option does not allow."""
+        """Raise OptionsError for invalid values."""
         for name, choices in _CHOICES.items():
             if (chosen := getattr(self, name)) not in choices:
                 raise OptionsError(f"{name}: '{chosen}' is none of {', '.join(choices)}")
@@ -102,7 +103,7 @@ class RelocalizerOptions:
                 raise OptionsError(f'{name}: {value} must lie within {low:g} and {high:g}')
         heights = self.height_range_m
         if len(heights) != 2 or not heights[0] < heights[1]:
-            raise OptionsError(f'height_range_m: {list(heights)} must be a lower and a greater '
+            raise OptionsError(f'height_range_m: {list(heights)} must be a lower and a higher '
                                'height')
         mounts = self.mount_deviation
         if len(mounts) != 2 or not all(0.0 <= mount < math.inf for mount in mounts):

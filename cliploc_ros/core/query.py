@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A query: all that an answer depends on but map and options; and queries in a file.
+"""Queries, which hold everything that an answer depends on except map and options.
 
-A case is a request: its queries, the oldest first, and a report of its answer. A localizer with
-the same map and options that answers all of them in their order repeats the answer bit by bit.
+A case is a recorded request: its queries, oldest first, and a report of its answer. A localizer
+with the same map and options that answers these queries in order reproduces the answer bit by bit.
 """
 
 import json
@@ -34,22 +34,23 @@ from cliploc_ros.files.storage import parse_json
 class Query:
     """The frames of one instant, with mount, vertical and prior."""
 
-    #: One of each camera, with one stamp and a camera_name each; the camera to localize is last.
-    #: odom_from_camera links the cameras of an instant, and the instants of one run.
+    #: One frame of each camera, with equal stamps and different names; the camera to localize is
+    #: last. odom_from_camera links the cameras of an instant, and the instants of one run.
     frames: tuple[Observation, ...]
-    #: (h, w, 3) uint8, red first: of each frame; empty if nothing is read from images
+    #: (h, w, 3) uint8: RGB image of each frame; empty if images are not needed
     images: tuple[NDArray[np.uint8], ...] = ()
-    #: Number of the run of odometry; None: this instant is linked to no other
+    #: Number of the run of odometry; None: this instant is not linked to others
     run: int | None = 0
-    #: The most instants to fuse, this one included, and how old they may be [s]
+    #: Maximum number of instants to fuse, including this instant, and their maximum age [s]
     limit: int = 1
     length_s: float = 0.0
     by_keyframes: bool = True  #: Whether there is time for keyframes
-    is_thorough: bool = True  #: Whether to search them thoroughly where a fast pass is refused
-    #: Evidence of earlier looks about the cameras; None: the localizer knows it
+    #: Whether to search keyframes thoroughly if the result of the fast search is refused
+    is_thorough: bool = True
+    #: Evidence of earlier looks about the cameras; None: use that of the localizer
     cameras: CameraCheck | None = None
-    #: How many crops of the last frame the first search had, and how many each further search was
-    #: given room for: 0 where time ended. Empty: as the options and the time allow.
+    #: Number of crops of the last frame in the first search, and the maximum number of crops added
+    #: for each further search, 0 when time was up. Empty: as the options and the time allow.
     rooms: tuple[int, ...] = ()
 
     @property
@@ -67,7 +68,7 @@ class Case:
 
     @property
     def options(self) -> RelocalizerOptions:
-        """Return the options of the case; no clock cuts the search. DatasetError: they are bad."""
+        """Return the options of the case, without a time limit; DatasetError: they are invalid."""
         defaults = vars(RelocalizerOptions())
         try:
             given: dict[str, Any] = {
@@ -77,15 +78,15 @@ class Case:
             return RelocalizerOptions(**given | {'time_budget_s': math.inf})
         except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError,
                 CliplocError) as error:
-            raise DatasetError(f'the options of this case are broken: {error}') from error
+            raise DatasetError(f'the options of this case are invalid: {error}') from error
 
 
-# No coordinate, pixel or time of a case is greater.
+# Limit of the coordinates, pixels and times of a case.
 _MOST = 1e9
 
 CASE = Schema('case', {
-    'about': Field('uint8', ('t',)),  # JSON: report and queries, without what follows
-    'images': Field('uint8', ('b',)),  # PNG, of each frame that has one
+    'about': Field('uint8', ('t',)),  # JSON: report and queries, without images and crops
+    'images': Field('uint8', ('b',)),  # PNG of each frame that has an image
     'image_offsets': Field('integers', ('f',), (Offsets('images', 'bytes'),)),
     'crops': Field('float32', ('c', 'd')),  # embeddings or similarities
     'crop_offsets': Field('integers', ('g',), (Offsets('crops', 'crops'),)),
@@ -93,17 +94,18 @@ CASE = Schema('case', {
 
 
 def case_arrays(case: Case) -> Arrays:
-    """Return the arrays of a file of a case, see CASE."""
+    """Convert a case to the arrays of its file, see CASE."""
     images, crops = list[NDArray[np.uint8]](), list[NDArray[np.float32]]()
     for query in case.queries:
         images += [cv2.imencode('.png', cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].ravel()
                    for image in query.images]
-        # embeddings, or where these are unknown, similarities
-        crops += [one.similarities.crops if isinstance(one.similarities, CropSimilarities)
-                  else one.similarities for one in query.frames if one.similarities is not None]
+        # embeddings, or similarities if the embeddings are unknown
+        crops += [frame.similarities.crops if isinstance(frame.similarities, CropSimilarities)
+                  else frame.similarities for frame in query.frames
+                  if frame.similarities is not None]
     about = {'report': case.report, 'queries': [_fields_of(query) for query in case.queries]}
     return {
-        # arrays and numbers of NumPy as JSON has them
+        # NumPy arrays and scalars become lists and numbers
         'about': np.frombuffer(json.dumps(about, default=lambda value: value.tolist()).encode(),
                                dtype=np.uint8),
         'image_offsets': np.cumsum([0, *map(len, images)]),
@@ -113,21 +115,22 @@ def case_arrays(case: Case) -> Arrays:
 
 
 def read_case(path: Path) -> Case:
-    """Read a case; DatasetError: the message names what is missing or broken.
+    """Read a case; DatasetError: the message states what is missing or damaged.
 
-    Similarities from embeddings have no labels: a localizer compares them with those of its map.
+    Similarities from embeddings have no labels. A localizer compares them with the labels of its
+    map.
     """
     arrays = CASE.read(path)
     try:
         about = parse_json(arrays['about'].tobytes())
         images, crops = _parts(arrays, 'image'), _parts(arrays, 'crop')
-        first, *others = (_query_of(one, images, crops) for one in about['queries'])
+        first, *others = (_query_of(fields, images, crops) for fields in about['queries'])
         report = dict(about['report'])
         _expect(isinstance(report.get('parameters', {}), dict), 'parameters')
         return Case((first, *others), report)
     except (ArithmeticError, AttributeError, LookupError, StopIteration, TypeError, ValueError,
             RecursionError, cv2.error, CliplocError) as error:
-        raise CASE.invalid(path, f'is broken: {error!r}') from error
+        raise CASE.invalid(path, f'is damaged: {error!r}') from error
 
 
 def _parts(arrays: Arrays, name: str) -> Iterator[NDArray[Any]]:
@@ -135,7 +138,7 @@ def _parts(arrays: Arrays, name: str) -> Iterator[NDArray[Any]]:
 
 
 def _fields_of(query: Query) -> dict[str, Any]:
-    """Return the fields of a query for JSON."""
+    """Convert a query to fields for JSON."""
     return {
         **{name: getattr(query, name) for name in
            ('run', 'limit', 'length_s', 'by_keyframes', 'is_thorough', 'rooms')},
@@ -149,9 +152,10 @@ def _fields_of(query: Query) -> dict[str, Any]:
 
 def _query_of(about: Mapping[str, Any], images: Iterator[NDArray[np.uint8]],
               crops: Iterator[NDArray[np.float32]]) -> Query:
-    """Return a query; ValueError, or another error of Python: it is broken."""
-    frames = tuple(_frame_of(one, crops) for one in about['frames'])
-    decoded = tuple(_decoded(next(images), one.camera) for one in frames if about['has_images'])
+    """Return the query of JSON fields; any Python error means that they are damaged."""
+    frames = tuple(_frame_of(fields, crops) for fields in about['frames'])
+    decoded = tuple(_decoded(next(images), frame.camera)
+                    for frame in frames if about['has_images'])
     run, rooms, cameras = about['run'], tuple(map(_count, about['rooms'])), about['cameras']
     _expect(bool(frames) and (not rooms or frames[-1].compared is not None), 'frames')
     return Query(frames, decoded, None if run is None else _count(run), _count(about['limit']),
@@ -161,14 +165,14 @@ def _query_of(about: Mapping[str, Any], images: Iterator[NDArray[np.uint8]],
 
 
 def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) -> Observation:
-    """Return a frame; ValueError, or another error of Python: it is broken."""
+    """Return the frame of JSON fields; any Python error means that they are damaged."""
     known = dict(about)
     camera, seen, region = dict(known['camera']), known['detections'], known['region']
     camera |= {name: _count(camera[name]) for name in ('width', 'height')}
     camera['distortion'] = tuple(camera['distortion'])
     boxes = np.reshape(_numbers(seen['bboxes_xyxy'], None), (-1, 4))
     count, class_ids = len(boxes), tuple(seen['class_ids'])
-    _expect(all(isinstance(one, str) for one in (known['camera_name'], *class_ids)), 'names')
+    _expect(all(isinstance(name, str) for name in (known['camera_name'], *class_ids)), 'names')
     _expect(len(class_ids) == count, 'class_ids')
     poses = [known['odom_from_camera']]
     if region is not None:
@@ -201,15 +205,21 @@ def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) ->
 
 
 def _decoded(image_png: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
-    """Return an image (h, w, 3), red first; ValueError: it is none of its camera."""
-    # a small file may declare any size, and decoding takes the memory of it
+    """Decode a PNG image to RGB (h, w, 3); ValueError: its size is not that of its camera."""
+    # a small file may declare a huge size, for which decoding would allocate memory
     _expect(image_png[16:24].tobytes() == struct.pack('>II', camera.width, camera.height), 'image')
     image = cv2.imdecode(image_png, cv2.IMREAD_COLOR)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
 def _numbers(value: Any, *shape: int | None, nan: bool = False) -> NDArray[np.float64]:
-    """Return numbers of a shape, None for any length. ValueError, TypeError: they differ."""
+    """Return numbers as an array; None in the shape stands for any length.
+
+    Raises
+    ------
+    ValueError, TypeError
+        The shape differs, or there are values that are not numbers or too large.
+    """
     found = np.array(value, dtype=np.float64)
     if None not in shape:
         _expect(found.shape == shape, 'the shape of numbers')
@@ -218,11 +228,11 @@ def _numbers(value: Any, *shape: int | None, nan: bool = False) -> NDArray[np.fl
 
 
 def _count(value: Any) -> int:
-    """Return a whole number, 0 or more; ValueError: it is none."""
+    """Return a non-negative integer; ValueError: the value is something else."""
     _expect(isinstance(value, int) and 0 <= value < 2**63, 'whole numbers')
     return int(value)
 
 
 def _expect(is_right: bool, what: str) -> None:
     if not is_right:
-        raise ValueError(f'{what} are out of place')
+        raise ValueError(f'{what} are invalid')

@@ -34,10 +34,11 @@ from cliploc_ros.core.options import RelocalizerOptions, used_time_s
 from cliploc_ros.core.search.frame_search import SearchedFrame, check_k, coverage_of, search_frame
 from cliploc_ros.core.warm_up import call_every_kernel
 
-# Shares of the budget at which the search and the refinement end; acceptance takes the rest.
+# Shares of the budget at which the search and the refinement end. Acceptance uses the remaining
+# time.
 _SEARCH_SHARE, _REFINEMENT_SHARE = 0.8, 0.9
-# Both end earlier by this time [s] for each frame, up to five, since poses are scored and compared
-# on all frames. A budget below _SHORT_BUDGET_S scales these times down.
+# Search and refinement end earlier by these times [s] for each frame, up to five frames, because
+# poses are scored and compared on all frames. A budget below _SHORT_BUDGET_S scales them down.
 _EARLIER_SEARCH_S, _EARLIER_REFINEMENT_S, _SHORT_BUDGET_S = 0.0065, 0.003, 0.05
 _MOST_FRAMES = 5
 _NO_LOOKS = Looks()
@@ -49,11 +50,11 @@ class Hypothesis:
 
     map_from_camera: NDArray[np.float64]  #: (4, 4)
     score: float  #: Sum of the IoUs of its inliers
-    #: Probability that it is within 1 m of the truth, 0 to 1. Each position is taken for as
-    #: uncertain as that of the best hypothesis.
+    #: Probability that the pose is within 1 m of the truth, 0 to 1. All positions are assumed to
+    #: be as uncertain as that of the best hypothesis.
     confidence: float
-    support: Support  #: Basis of the confidence
-    #: Log odds that its attitude takes from it, see cliploc_ros.core.acceptance.confidence
+    support: Support  #: Evidence of the objects, on which the confidence is based
+    #: Log odds subtracted for its attitude, see cliploc_ros.core.acceptance.confidence
     handicap: float = 0.0
 
 
@@ -61,31 +62,34 @@ class Hypothesis:
 class Relocalization:
     """The hypotheses of a relocalization, and whether the best one is accepted."""
 
-    accepted: bool  #: Whether to act on the pose
-    reason: str  #: Reason of a refusal, in one line; empty when accepted
-    #: The best distinct hypotheses, best first; empty when nothing was found
+    accepted: bool  #: Whether to use the pose
+    reason: str  #: Reason for a refusal, in one line; empty when accepted
+    #: The best distinct hypotheses, best first; empty if no pose was found
     hypotheses: tuple[Hypothesis, ...] = ()
-    #: Inliers of the best hypothesis in each frame, the newest last; empty when nothing was found
-    frame_matches: tuple[tuple[Match, ...], ...] = ()
-    #: Evidence for the best hypothesis, which decided; None when nothing was found
-    evidence: Evidence | None = None
-    #: (6, 6): of the best hypothesis, see cliploc_ros.core.fit.covariance; None when nothing was
+    #: Inliers of the best hypothesis in each frame, the newest frame last; empty if no pose was
     #: found
+    frame_matches: tuple[tuple[Match, ...], ...] = ()
+    #: Evidence for the best hypothesis, on which the decision is based; None if no pose was found
+    evidence: Evidence | None = None
+    #: (6, 6): covariance of the best hypothesis, see cliploc_ros.core.fit.covariance; None if no
+    #: pose was found
     covariance: NDArray[np.float64] | None = None
     tried: int = 0  #: Number of hypotheses tried
-    #: Iteration that found the best hypothesis, from 1; 0 when nothing was found
+    #: Iteration that found the best hypothesis, from 1; 0 if no pose was found
     best_iteration: int = 0
     coverage: float = 1.0  #: Share of its samples that the search tried, 0 to 1
     search_ms: float = 0.0  #: Time of association, search and verification [ms]
     stamp_ns: int = 0  #: Stamp of the newest observation [ns]
     source: str = 'objects'  #: The source of the best pose: 'objects', 'keyframes' or 'both'
-    #: Kind of the refusal, which programs compare; None when accepted
+    #: Kind of the refusal, for use by programs; None when accepted
     refusal_kind: RefusalKind | None = None
-    #: Result of the keyframes, whatever the source of the best pose; None without keyframes
+    #: Result of the search of keyframes, whatever the source of the best pose; None without
+    #: keyframes
     recognition: Recognition | None = None
-    #: Whether the depths of the objects can be right; None without depth
+    #: Check of the depths of the objects; None without depth
     depth: DepthCheck | None = None
-    #: What a pose that depends on boxes, and is accepted with right cameras, says of the cameras
+    #: Evidence about the cameras, from a pose that depends on boxes and would be accepted if the
+    #: cameras were right
     cameras: tuple[CameraLook, ...] = ()
 
     @property
@@ -100,7 +104,7 @@ class Relocalization:
 
     @property
     def keyframe_search(self) -> str:
-        """Return how far the search of keyframes went: 'none', 'fast' or 'thorough'."""
+        """Return which search of keyframes was run last: 'none', 'fast' or 'thorough'."""
         if self.recognition is None:
             return 'none'
         return 'thorough' if self.recognition.is_thorough else 'fast'
@@ -112,32 +116,33 @@ class Relocalization:
 
     @property
     def map_from_camera(self) -> NDArray[np.float64] | None:
-        """Return the best pose (4, 4), accepted or not; None when there is none."""
+        """Return the best pose (4, 4), accepted or not; None if no pose was found."""
         return self.hypotheses[0].map_from_camera if self.hypotheses else None
 
     @property
     def confidence(self) -> float:
-        """Return the probability that the best pose is within 1 m; 0 when nothing was found."""
+        """Return the probability that the best pose is within 1 m; 0 if no pose was found."""
         return self.hypotheses[0].confidence if self.hypotheses else 0.0
 
     @property
     def score(self) -> float:
-        """Return the best score; 0 when nothing was found."""
+        """Return the score of the best pose; 0 if no pose was found."""
         return self.hypotheses[0].score if self.hypotheses else 0.0
 
 
 def in_its_map(found: Relocalization, landmark_map: LandmarkMap
                ) -> tuple[Relocalization, MapPart]:
-    """Return a result in the coordinate frame of the map of its best pose, and this map.
+    """Transform a result to the coordinate frame of the map of its best pose; return this map too.
 
-    It was found in landmark_map, which may be a JoinedMap. Poses on other maps are left out: they
-    have no place in this coordinate frame. The reason of a refusal names the map. A result from a
-    single map stays as it is.
+    The result was found in landmark_map, which may be a JoinedMap. Poses on other maps are
+    dropped, because they have no coordinates in this coordinate frame. The reason for a refusal
+    names the map. A result from a single map is returned unchanged.
     """
     parts = parts_of(landmark_map)
     if found.map_from_camera is None or len(parts) == 1:
         return found, parts[0]
-    places = [place_of(landmark_map, one.map_from_camera) for one in found.hypotheses]
+    places = [place_of(landmark_map, hypothesis.map_from_camera)
+              for hypothesis in found.hypotheses]
     part, name = places[0].part, places[0].name
     rows = range(part.first, part.first + len(part.landmark_map))
     reason = found.reason and f'in {name}: {found.reason}'
@@ -146,27 +151,28 @@ def in_its_map(found: Relocalization, landmark_map: LandmarkMap
         hypotheses=tuple(replace(hypothesis, map_from_camera=place.map_from_camera)
                          for hypothesis, place in zip(found.hypotheses, places, strict=True)
                          if place.name == name),
-        frame_matches=tuple(tuple(replace(one, landmark=one.landmark - part.first)
-                                  for one in of_frame if one.landmark in rows)
+        frame_matches=tuple(tuple(replace(match, landmark=match.landmark - part.first)
+                                  for match in of_frame if match.landmark in rows)
                             for of_frame in found.frame_matches)), part
 
 
 @dataclass(frozen=True)
 class TimeBudget:
-    """A time budget that runs from `start`. Times are those of used_time_s [s]."""
+    """A time budget that starts at `start`. Times are on the clock of used_time_s [s]."""
 
     start: float
     total_s: float  #: Infinite for no limit
     frames: int  #: Number of frames that are localized together
-    begun_s: float = field(default_factory=time.perf_counter)  #: When it began, of perf_counter
+    #: Start on the clock of time.perf_counter
+    begun_s: float = field(default_factory=time.perf_counter)
 
     def search_end(self, number: int = 1, count: int = 1) -> float:
-        """Return when the search of a frame ends: the number-th of count frames to search."""
+        """Return the time when the search of frame `number`, from 1, of `count` frames ends."""
         return self.start + self._time_s(_SEARCH_SHARE, _EARLIER_SEARCH_S) * number / count
 
     @property
     def refinement_end(self) -> float:
-        """Return when the refinement ends."""
+        """Return the time when the refinement ends."""
         return self.start + self._time_s(_REFINEMENT_SHARE, _EARLIER_REFINEMENT_S)
 
     @property
@@ -181,7 +187,7 @@ class TimeBudget:
 
 
 class Relocalizer:
-    """Finds camera poses in one map.
+    """Find camera poses in one map.
 
     Raises
     ------
@@ -192,31 +198,29 @@ class Relocalizer:
     def __init__(self, landmark_map: LandmarkMap, options: RelocalizerOptions) -> None:
         if options.needs_similarities:
             check_k(options.k, len(landmark_map))
-        #: The map
         self.landmark_map = landmark_map
         landmark_map.prepare()
-        #: The options
         self.options = options
 
     def warm_up(self) -> None:
-        """Compile the kernels, or read them from disk, before the first request needs them."""
+        """Compile the kernels, or read them from disk, before the first request."""
         warm_up(call_every_kernel)
 
     def relocalize(self, observations: Sequence[Observation],
                    recognizer: ImageRecognizer | None = None) -> Relocalization:
-        """Find where the camera was when it saw the last of some frames.
+        """Find the pose of the camera at the last of one or more frames.
 
-        Several frames, up to MAX_FRAMES of one moving camera, are localized as one: each of them
-        gives hypotheses, which are scored and refined on all of them. Each frame's search gets an
-        equal share of the time budget. The recognizer is of the keyframes, for the image of the
+        Up to MAX_FRAMES frames of one moving camera are localized together: each frame gives
+        hypotheses, which are scored and refined on all frames. The search of each frame has an
+        equal share of the time budget. The recognizer searches the keyframes for the image of the
         last frame.
 
         Raises
         ------
         OptionsError
-            Similarities that the matching type needs are missing or of the wrong shape; the
-            vertical is not a unit vector; odom_from_camera is missing or no rigid transform; there
-            are no frames or too many.
+            Similarities that the matching type needs are missing or have the wrong shape; the
+            vertical is not a unit vector; odom_from_camera is missing or not a rigid transform;
+            there are no frames or too many.
         """
         budget = self.begin(len(observations))
         frames = [self.search(observation, budget.search_end(number, len(observations)))
@@ -225,9 +229,9 @@ class Relocalizer:
                                recognizer=recognizer)
 
     def begin(self, frames: int, cameras: int = 1) -> TimeBudget:
-        """Return the time budget of a relocalization with some frames; it starts now.
+        """Return the time budget of a relocalization with a number of frames; it starts now.
 
-        What several cameras see at one instant has the time of each.
+        For several cameras of one instant, the time budget is multiplied by their number.
         """
         return TimeBudget(used_time_s(), cameras * self.options.time_budget_s, frames)
 
@@ -238,11 +242,25 @@ class Relocalizer:
     def locate(self, frames: Sequence[SearchedFrame], budget: TimeBudget | None = None,
                looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None,
                cameras: CameraCheck | None = None) -> Relocalization:
-        """Find where the camera was when it saw the last of some searched frames.
+        """Find the pose of the camera at the last of one or more searched frames.
 
-        The budget is the time left for the refinement, by default a new one. Earlier looks have to
-        agree. The recognizer is of the keyframes, for the image of the last frame. What is known
-        of the cameras counts, by default nothing. Raises OptionsError, see relocalize.
+        Parameters
+        ----------
+        frames : sequence of SearchedFrame
+            Frames that odometry links, the frame to localize last.
+        budget : TimeBudget, optional
+            Time budget that limits the refinement; by default a new budget.
+        looks : Looks, optional
+            Earlier looks, which must agree with the pose.
+        recognizer : ImageRecognizer, optional
+            Search of keyframes for the image of the last frame.
+        cameras : CameraCheck, optional
+            Evidence about the cameras; by default there is none.
+
+        Raises
+        ------
+        OptionsError
+            See relocalize.
         """
         budget = budget or self.begin(len(frames))
         joined = join_frames(self.landmark_map, self.options, frames)
@@ -263,14 +281,14 @@ class Relocalizer:
         evidence = compared.evidence(covariance)
         seen: list[CameraLook] = []
         if compared.by_boxes is not None and self.options.refine:
-            # an uncertain position may be the camera's fault
+            # a wrong camera may be the cause of an uncertain position
             if refusal(replace(evidence, near=1.0), self.options) is None:
                 seen = looks_of(joined, compared.by_boxes.finalist)
             camera, fault = (cameras or CameraCheck()).judge(seen, covariance)
             evidence = replace(evidence, camera=camera, camera_fault=fault)
         refused = refusal(evidence, self.options)
         shown = compared.by_objects or compared.contenders[0]
-        # the pose that leads, and the best one of each other place
+        # the leading pose, and the best pose at each other place
         poses = np.array([pose, *compared.poses[1:]])
         confidences = (compared.likely * evidence.found * evidence.certainty).tolist()
         confidences[0] = evidence.confidence
@@ -288,9 +306,10 @@ class Relocalizer:
     def look_again(self, found: Relocalization, frames: Sequence[SearchedFrame],
                    looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None,
                    cameras: CameraCheck | None = None) -> Relocalization:
-        """Return a result of locate; a refused one after a thorough search of the keyframes.
+        """Repeat a refused result of locate with a thorough search of the keyframes.
 
-        It stays where there is no time for that, or too little. Arguments as for locate.
+        The result is returned unchanged if it was accepted, or if there is not enough time. The
+        other arguments are those of locate.
         """
         if found.accepted or recognizer is None or not recognizer.begin_thorough():
             return found
@@ -300,16 +319,16 @@ class Relocalizer:
         return replace(kept, search_ms=found.search_ms + again.search_ms)
 
     def _meet(self, joined: JoinedFrames, budget: TimeBudget) -> list[Contender]:
-        """Return the best poses that the search met, see search_contenders."""
+        """Return the best poses that the search found, see search_contenders."""
         return search_contenders(joined, *find_with_rivals(
             joined.frames, joined.rig, self.options.refine, budget.refinement_end))
 
 
 def _nothing_found(landmark_map: LandmarkMap, frames: Sequence[SearchedFrame]
                    ) -> tuple[RefusalKind, str]:
-    """Return why there is no pose."""
+    """Return kind and reason of the refusal if no pose was found."""
     if not len(landmark_map):
-        return RefusalKind.TOO_FEW_OBJECTS, ('the map has keyframes alone, and none fits the '
+        return RefusalKind.TOO_FEW_OBJECTS, ('the map has only keyframes, and none matches the '
                                              'image; turn the camera to a recorded view')
     if any(frame.has_samples for frame in frames):
         kind, reason = RefusalKind.UNEXPLAINED, 'no pose explains the detections'

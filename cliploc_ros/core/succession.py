@@ -3,10 +3,11 @@
 """The covariance of an answer for a filter that fuses successive answers.
 
 Answers share images, landmarks and their errors. A filter that fuses ten answers as independent
-measurements is three times too certain of the pose. A filter therefore gets only the information
-that the earlier answers, carried on by odometry, did not give. In each direction it ends up as
-certain as the better of the two, never more. That is safe fusion (Gustafsson, "Statistical Sensor
-Fusion", 2010), seen from the sensor.
+measurements underestimates its standard deviation by a factor of three. Each answer is therefore
+given a covariance with only the information that the earlier answers, propagated by odometry, did
+not contain. In each direction, the filter then becomes as certain as the better of the two
+estimates, but not more. This is safe fusion (Gustafsson, "Statistical Sensor Fusion", 2010),
+computed on the side of the sensor.
 """
 
 from typing import NamedTuple
@@ -24,35 +25,44 @@ from cliploc_ros.core.geometry.transforms import (
     pose_difference,
 )
 
-# Odometry as a random walk: deviation on each axis after a metre and after a radian, the share of
-# cliploc_ros.core.fit.covariance. A filter that trusts its odometry less is less certain, not
-# wrong.
+# Odometry as a random walk: standard deviation on each axis after a metre and after a radian, as
+# in cliploc_ros.core.fit.covariance. A filter that assumes more drift stays consistent.
 _DRIFT = CALIBRATION.covariance.odometry_drift
-# These are not in calibration.yaml: the input of a filter decides about no pose.
+# The following are not in calibration.yaml, because the input of a filter affects no decision
+# about a pose.
 # Answers further apart than this quantile contradict each other.
 _CONTRADICTION = float(chi2.ppf(0.99, 6))
-# An answer keeps this share of its information in directions in which it says nothing new: a
-# covariance must be finite.
+# The share of its information that an answer keeps in directions without new information, because
+# a covariance must be finite.
 _LEAST_SHARE = 1e-4
 
 
 class FilterState(NamedTuple):
-    """The state of a filter that fused all answers of one run of odometry."""
+    """The state of a filter that has fused all answers of one run of odometry."""
 
-    #: (4, 4): at the last answer
+    #: (4, 4), (4, 4): poses at the last answer
     odom_from_camera: NDArray[np.float64]
     map_from_camera: NDArray[np.float64]
-    covariance: NDArray[np.float64]  #: (6, 6): as of Relocalization
+    covariance: NDArray[np.float64]  #: (6, 6): covariance of the pose, see Relocalization
 
 
 def succeed(known: FilterState | None, odom_from_camera: NDArray[np.float64],
             map_from_camera: NDArray[np.float64], covariance: NDArray[np.float64]
             ) -> tuple[NDArray[np.float64], FilterState]:
-    """Return the covariance of an answer to a filter, and the state of the filter after it.
+    """Return the covariance (6, 6) of an answer for a filter, and the filter state after it.
 
-    An answer that contradicts its predecessors makes both less certain: one of them is wrong. So
-    an outlier hardly moves the filter, and a filter that it misled recovers. Poses (4, 4) and
-    covariance (6, 6) are of the answer alone; known is None for the first one.
+    If an answer contradicts the earlier answers, one of them is wrong, and the covariances of both
+    are increased. An outlier therefore hardly moves the filter, and a filter misled by an outlier
+    recovers.
+
+    Parameters
+    ----------
+    known : FilterState or None
+        State of the filter before the answer; None for the first answer.
+    odom_from_camera, map_from_camera : ndarray (4, 4)
+        Poses of the camera, from this answer alone.
+    covariance : ndarray (6, 6)
+        Covariance of map_from_camera.
     """
     if known is None:
         return covariance, FilterState(odom_from_camera, map_from_camera, covariance)
@@ -61,7 +71,7 @@ def succeed(known: FilterState | None, odom_from_camera: NDArray[np.float64],
     square = float(innovation @ np.linalg.solve(before.covariance + covariance, innovation))
     doubt = max(1.0, square / _CONTRADICTION)
     prior, own = doubt * before.covariance, doubt * covariance
-    # The covariance that makes a filter of a prior as certain as the better of both.
+    # The covariance with which the filter becomes as certain as the better of prior and answer.
     root = np.linalg.cholesky(prior)
     whitened = np.linalg.solve(root, np.linalg.solve(root, own).T)
     ratios, axes = np.linalg.eigh((whitened + whitened.T) / 2)
@@ -75,7 +85,7 @@ def succeed(known: FilterState | None, odom_from_camera: NDArray[np.float64],
 
 
 def _carried(known: FilterState, odom_from_camera: NDArray[np.float64]) -> FilterState:
-    """Return the state after the camera moved on by odometry."""
+    """Return the filter state propagated to a later pose of odometry."""
     motion = invert_transform(known.odom_from_camera) @ odom_from_camera
     pose = known.map_from_camera @ motion
     covariance = move_covariance(known.covariance, pose[:3, 3] - known.map_from_camera[:3, 3])

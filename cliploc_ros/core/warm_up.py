@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A tiny problem that calls every compiled kernel once.
+"""Call every compiled kernel once, on a tiny problem.
 
     python -m cliploc_ros.core.warm_up
 
-compiles them, as script/setup does.
+compiles the kernels, as script/setup does.
 """
 
 import logging
@@ -95,8 +95,8 @@ def _make_scene() -> tuple[Scene, NDArray[np.int64]]:
 
 
 def main() -> None:
-    """Compile the kernels that are not on disk yet, on two cores; say where they are kept."""
-    # The kernels of the fit are on disk when this process comes to them.
+    """Compile the kernels that are not on disk yet, on two cores, and log where they are kept."""
+    # The other process has stored the kernels of the fit when this process needs them.
     beside = Process(target=call_fit_kernels)
     beside.start()
     logging.basicConfig(level=logging.INFO, format='%(message)s')

@@ -78,7 +78,7 @@ def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
     # boxes that the objects' search accepts, in an image of another place
     contradicted = tester.relocalize((image, info, make_frame()[2]))
     assert not contradicted.success
-    assert 'keyframes lead ' in contradicted.message
+    assert 'keyframes give poses ' in contradicted.message
     health = diagnostics_of(tester)
     assert health['keyframes'] == '8'
     assert health['keyframes file'] == str(layer_path(room_map))

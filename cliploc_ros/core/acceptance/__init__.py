@@ -2,23 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Acceptance of a pose.
 
-The modules in the order in which a pose passes them:
+The modules, in the order in which they process a pose:
 
 contenders
-    The poses that may be right, of objects and of keyframes, and the odds of each.
+    The poses that may be right, found by objects or by keyframes, and the odds of each pose.
 depth_check
     Check of the depths of a request.
 confidence
-    The evidence of the objects for a pose, what a region known before says, and from these odds to
-    the probability of each pose, given its rivals.
+    The evidence of the objects and of a prior region for a pose; the probability of each pose,
+    given its rivals.
 comparison
-    The contenders in one list: which one leads, and all evidence about it; mirror images.
+    All contenders in one list; the evidence about the leading pose; mirror images.
 look_alikes, genuine
-    Other reasons to be wrong: a place that looks alike, a picture or a change.
+    Other reasons why a pose may be wrong: a place that looks alike, a picture, a changed place.
 looks
     The earlier looks of a moving robot.
 camera_check
-    Whether boxes, camera_info, mounts and map agree, over all looks of a localizer.
+    Check that boxes, camera_info, mounts and map agree, over all looks of a localizer.
 verdict
-    Accept or refuse, with the reason.
+    The decision to accept or refuse, with the reason.
 """

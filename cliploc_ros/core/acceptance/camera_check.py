@@ -2,27 +2,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check that the boxes of a camera agree with its image, camera_info, mount and the map.
 
-A wrong camera_info, or boxes in other pixels, displace all boxes by one rule. One image hardly
-shows it, because the pose adapts. Many images do, because their poses differ and the rule stays. A
-look is the evidence of one frame about the errors of its camera, with the pose eliminated, see
-cliploc_ros.core.fit.camera_fit: an information matrix and a vector, which add up over looks.
-Looks from one view share the errors of their boxes, so they count as one, with their mean.
+A wrong camera_info, or boxes in the pixels of another image, displace all boxes systematically.
+One image hardly shows this error, because the pose adapts to it. Many images show it, because
+their poses differ and the error stays the same. A look is the evidence of one frame about the
+errors of its camera, with the pose eliminated, see cliploc_ros.core.fit.camera_fit. It consists of
+an information matrix and a vector, which add up over looks. Looks from one view share the errors
+of their boxes. Their mean therefore counts as one look.
 
-A camera is right, with the small errors of any calibration, or wrong in one of a few ways (kinds),
-with large errors. The Bayes factor of wrong against right is a mean of likelihood ratios. With a
-right camera it ever exceeds N with a probability of at most 1 / N, however often it is computed
-(Ville, "Etude critique de la notion de collectif", 1939). At odds of 1000, at most one right
-camera in 1000 is therefore called wrong, if the looks of different views are independent. No
-single view counts more than e^3, because its boxes may be matched by mistake.
+A camera is either right, with the small errors of any calibration, or wrong in one of a few ways
+(kinds), with large errors. The Bayes factor of wrong against right is a mean of likelihood ratios.
+For a right camera, the probability that it ever exceeds N is at most 1 / N, however often it is
+computed (Ville, "Etude critique de la notion de collectif", 1939). At odds of 1000, at most one
+right camera in 1000 is therefore called wrong, if the looks from different views are independent.
+The evidence of a single view is limited to e^3, because its boxes may be matched by mistake.
 
-Until the odds are clear, the confidence of a pose is weighted by the probability that it is right
-under each kind. A pose from a few far objects needs a camera that looks have verified; a pose from
-many objects at different distances does not.
+Until the odds are clear, the confidence of a pose is weighted by the probability that the pose is
+right under each kind of error. A pose from a few distant objects needs a camera that looks have
+verified. A pose from many objects at different distances does not.
 
-A detector's boxes end at the border of the image that it sees. Where many end at one line inside
-of the image, and none beyond, they are in the pixels of another image. This counts as evidence for
-some kinds of errors, at most as e^8, because a border within the image itself, such as black bars,
-looks the same; then the looks decide.
+A detector's boxes end at the border of the image that it processed. If many boxes end at one line
+inside the image and none extend beyond it, the boxes are in the pixels of another image. This
+counts as evidence for some kinds of errors, but at most as e^8, because a border within the image
+itself, such as black bars, looks the same. In that case, the looks decide.
 """
 
 import math
@@ -55,14 +56,15 @@ from cliploc_ros.core.geometry.transforms import (
 from cliploc_ros.core.observation import Observation
 
 _TERMS = CALIBRATION.camera
-# Deviations of the errors of a right camera and of a wrong one, see camera_fit.
+# Standard deviations of the errors of a right camera and of a wrong one, see camera_fit.
 _RIGHT = np.array([_TERMS.focal, _TERMS.aspect, _TERMS.point, _TERMS.point, _TERMS.corner,
                    _TERMS.corner, _TERMS.size])
-#: Deviations of the errors of a right camera_info.
+#: Standard deviations of the errors of a right camera_info.
 CALIBRATED = np.where(np.arange(ERRORS) < 4, _TERMS.calibrated * _RIGHT, 0.0)
 _WRONG = np.array([_TERMS.wrong_focal, _TERMS.wrong_aspect, _TERMS.wrong_point, _TERMS.wrong_point,
                    _TERMS.wrong_corner, _TERMS.wrong_corner, _TERMS.wrong_size])
-# The errors that are large in each kind of wrong camera, the others are those of a right one.
+# The errors that are large in each kind of wrong camera. The others are as small as for a right
+# camera.
 _KINDS = {'image': (0, 2, 3), 'focal length': (0,), 'aspect': (1,), 'principal point': (2, 3),
           'stretched image': (0, 1, 2, 3), 'convention': (4, 5), 'size': (6,)}
 _OF_OTHER_PIXELS = np.array([name in ('image', 'principal point', 'stretched image')
@@ -72,7 +74,7 @@ _DEVIATIONS = np.array([_RIGHT, *(np.where(np.isin(np.arange(ERRORS), errors), _
 _LOG_DEVIATIONS = np.log(_DEVIATIONS).sum(axis=1)
 _WEIGHTS = np.array([1.0 - _TERMS.wrong, *[_TERMS.wrong / len(_KINDS)] * len(_KINDS)])
 _PRIORS = _DEVIATIONS[:, :, None] ** -2.0 * np.eye(ERRORS)
-# No box that was recorded reaches further: a file with one that does is broken.
+# The largest coordinate of a recorded box [px]. A file with a larger one is damaged.
 _FAR = 1e9
 
 
@@ -80,9 +82,9 @@ class CameraLook(NamedTuple):
     """The evidence of a frame about the errors of its camera."""
 
     camera_name: str
-    is_new: bool  #: Whether it is of the newest instant
+    is_new: bool  #: Whether the frame belongs to the newest instant
     map_from_camera: NDArray[np.float64]  #: (4, 4)
-    #: (7, 7), (7,): of the errors; information times the most likely errors
+    #: (7, 7), (7,): information matrix of the errors; its product with the most likely errors
     information: NDArray[np.float64]
     vector: NDArray[np.float64]
     #: (3, 7): how the position of the newest camera moves with each error [m]
@@ -96,11 +98,11 @@ def _log_mean(logs: NDArray[np.float64]) -> float:
 
 
 class CameraOdds(NamedTuple):
-    """The odds that a camera is right, or wrong in one of k ways."""
+    """The odds of 1 + k hypotheses: the camera is right, or wrong in one of k ways."""
 
-    odds: NDArray[np.float64]  #: (1 + k,): log likelihood of each, up to a constant
-    means: NDArray[np.float64]  #: (1 + k, 7): errors under each
-    squares: NDArray[np.float64]  #: (1 + k, 7, 7): their mean squares
+    odds: NDArray[np.float64]  #: (1 + k,): log likelihood of each hypothesis, up to a constant
+    means: NDArray[np.float64]  #: (1 + k, 7): mean errors under each hypothesis
+    squares: NDArray[np.float64]  #: (1 + k, 7, 7): second moments of the errors
 
     @property
     def log_odds(self) -> float:
@@ -113,12 +115,12 @@ class CameraOdds(NamedTuple):
         return self.log_odds > _TERMS.sure
 
     def share_near(self, covariance: NDArray[np.float64], moves: NDArray[np.float64]) -> float:
-        """Return the factor by which errors of the camera lower the chance of a pose within 1 m.
+        """Return by what factor camera errors lower the probability that a pose is within 1 m.
 
         Parameters
         ----------
         covariance : ndarray (6, 6)
-            Covariance of the pose, with a right camera.
+            Covariance of the pose if the camera is right.
         moves : ndarray (3, 7)
             See CameraLook.
         """
@@ -132,14 +134,14 @@ class CameraOdds(NamedTuple):
 
 def odds_of(information: NDArray[np.float64], vector: NDArray[np.float64], extent: float = 0.0
             ) -> CameraOdds:
-    """Return the evidence of looks about a camera.
+    """Return the odds of a camera from its looks.
 
     Parameters
     ----------
     information, vector : ndarray (7, 7), (7,)
-        Their sums.
+        Sums of information and vector over the looks, see CameraLook.
     extent : float
-        Log odds that boxes are in other pixels, by their extent.
+        Log odds, from the extent of the boxes, that they are in the pixels of another image.
     """
     covariances = np.linalg.inv(information + _PRIORS)
     means = covariances @ vector
@@ -149,7 +151,10 @@ def odds_of(information: NDArray[np.float64], vector: NDArray[np.float64], exten
 
 
 def looks_of(joined: JoinedFrames, pose: Finalist) -> list[CameraLook]:
-    """Return the evidence of each frame about its camera, given a pose of the last frame."""
+    """Return the look of each frame at its camera, given the pose of the last frame.
+
+    Frames with too few matches give no look.
+    """
     inliers = one_to_one(joined.rig, verify_rig(joined.rig, pose.rotation, pose.translation),
                          pose.rotation, pose.translation)
     looks, last = [], joined.frames[-1].observation
@@ -173,7 +178,7 @@ def looks_of(joined: JoinedFrames, pose: Finalist) -> list[CameraLook]:
         information = fit.information / square
         vector = information @ fit.errors + fit.errors / _WRONG ** 2 / square
         if not np.isfinite([*information.ravel(), *vector]).all():
-            continue  # it would stay in the sum
+            continue  # NaN or infinity would corrupt the sum over all later looks
         weight = _TERMS.view / max(_TERMS.view, odds_of(information, vector).log_odds)
         looks.append(CameraLook(
             seen.camera_name, seen.stamp_ns == last.stamp_ns,
@@ -184,19 +189,19 @@ def looks_of(joined: JoinedFrames, pose: Finalist) -> list[CameraLook]:
 
 
 class Views(NamedTuple):
-    """The looks of a camera from v views: the mean of the looks from each."""
+    """The looks of a camera from v views, as the mean of the looks from each view."""
 
     poses: NDArray[np.float64] = np.empty((0, 4, 4))  #: (v, 4, 4): map_from_camera
-    counts: NDArray[np.int64] = np.empty(0, dtype=np.int64)  #: (v,): of looks
+    counts: NDArray[np.int64] = np.empty(0, dtype=np.int64)  #: (v,): number of looks
     informations: NDArray[np.float64] = np.empty((0, ERRORS, ERRORS))  #: (v, 7, 7)
     vectors: NDArray[np.float64] = np.empty((0, ERRORS))  #: (v, 7)
 
     def with_look(self, look: CameraLook) -> 'Views':
-        """Return these views and a look; of too many the newest remain."""
+        """Return these views with a look added; the oldest views are dropped if too many."""
         same = np.nonzero(SAME_BOXES.agreeing(self.poses, look.map_from_camera[None])[:, 0])[0]
         if not len(same):
             new = (look.map_from_camera, 1, look.information, look.vector)
-            return self.joined(Views(*(np.array([one]) for one in new)))
+            return self.joined(Views(*(np.array([field]) for field in new)))
         row, counts = same[0], self.counts.copy()
         informations, vectors = self.informations.copy(), self.vectors.copy()
         counts[row] += 1
@@ -205,40 +210,40 @@ class Views(NamedTuple):
         return Views(self.poses, counts, informations, vectors)
 
     def joined(self, other: 'Views') -> 'Views':
-        """Return these views and others; only the last views remain."""
+        """Return these views followed by others; the oldest views are dropped if too many."""
         return Views(*(np.concatenate(both)[-int(_TERMS.most_views):]
                        for both in zip(self, other, strict=True)))
 
     def odds(self, extent: float = 0.0) -> CameraOdds:
-        """Return the evidence of all looks together."""
+        """Return the odds of the camera from all looks; for extent see odds_of."""
         return odds_of(self.informations.sum(axis=0), self.vectors.sum(axis=0), extent)
 
 
 class Extent:
-    """The borders at which the boxes of a camera end, over some frames, accepted or not."""
+    """The area that the boxes of a camera cover, over accepted and refused frames."""
 
     def __init__(self) -> None:
         self.boxes = np.empty((0, 4))  #: (n, 4) [px]
 
     def add(self, boxes: NDArray[np.float64]) -> None:
-        """Take in the boxes (n, 4) of a frame; those that were seen before count once."""
+        """Add the boxes (n, 4) of a frame; boxes that were seen before are not added again."""
         is_known = (box_ious(boxes, self.boxes) > _TERMS.same_box).any(axis=1)
         self.boxes = np.concatenate([self.boxes, boxes[~is_known]])[-int(_TERMS.most_boxes):]
 
     @property
     def reach(self) -> NDArray[np.float64]:
-        """Return the left, top, right and bottom end (4,) of all boxes [px]."""
+        """Return the bounding box (4,) of all boxes: left, top, right, bottom [px]."""
         return np.append(self.boxes[:, :2].min(axis=0), self.boxes[:, 2:].max(axis=0))
 
     def log_odds(self, camera: Camera) -> float:
-        """Return the log odds that the boxes are in the pixels of another image, 0 or more."""
+        """Return the log odds, at least 0, that the boxes are in the pixels of another image."""
         count, size = len(self.boxes), np.array([camera.width, camera.height])
         if not count:
             return 0.0
-        # by how much each box reaches to the right, down, left and up
+        # how far each box extends to the right, down, left and up
         reaches = np.hstack([self.boxes[:, 2:], size - self.boxes[:, :2]])
         lines, lengths = reaches.max(axis=0), np.tile(size, 2)
-        # others that end at the same line, and the density of those that end near it
+        # how many other boxes end at the same line; density of the boxes that end near it
         ends = (reaches > lines - _TERMS.border_px).sum(axis=0) - 1
         near = (reaches > lines - _TERMS.near_share * lengths).sum(axis=0) - ends
         density = np.maximum(_TERMS.least_density * count, near / _TERMS.near_share) / lengths
@@ -247,34 +252,34 @@ class Extent:
         beyond = int(((middles < 0.0) | (middles > size)).any(axis=1).sum())
         chances = [*np.where(is_line, pdtrc(ends - 1, _TERMS.border_px * density), 1.0),
                    float(bdtrc(beyond - 1, count, _TERMS.beyond)) if beyond else 1.0]
-        # a chance p is evidence of 1 / (2 sqrt(p)) at most (Vovk and Wang 2021)
+        # a p-value p is evidence of at most 1 / (2 sqrt(p)) (Vovk and Wang 2021)
         evidence = _log_mean(-0.5 * np.log(np.maximum(chances, 1e-99))) - math.log(2.0)
         return float(np.clip(evidence, 0.0, _TERMS.extent))
 
 
 class _Record:
-    """The knowledge about one camera."""
+    """The evidence about one camera."""
 
     def __init__(self, name: str, camera: Camera) -> None:
         self.name, self.camera = name, camera
         self.views, self.since, self.extent = Views(), Views(), Extent()
         self.by_looks, self.by_extent = 0.0, 0.0  # log odds that the camera is wrong
-        self.odds = self.views.odds()  # by both
+        self.odds = self.views.odds()  # from looks and extent
 
     def see(self, observation: Observation) -> None:
-        """Take in the boxes of a frame, unless looks have verified the camera."""
+        """Add the boxes of a frame, unless looks have verified the camera."""
         if self.by_looks > _TERMS.fits or self.by_extent > 0.0:
             self.extent.add(observation.detections.bboxes_xyxy)
             self.by_extent = self.extent.log_odds(self.camera)
             self.odds = self.views.odds(self.by_extent)
 
     def add(self, look: CameraLook) -> None:
-        """Take in a look. After a verdict "wrong", looks decide whether the camera is repaired."""
+        """Add a look. After a verdict "wrong", new looks decide whether the camera is repaired."""
         if self.by_looks <= _TERMS.sure:
             self.views, self.since = self.views.with_look(look), Views()
         else:
             self.since = self.since.with_look(look)
-            # by how much they raise the odds of the errors that the looks before have shown
+            # by how much the looks since the verdict raise the odds of the same errors
             gain = self.views.joined(self.since).odds().log_odds - self.by_looks
             if gain > _TERMS.view:
                 self.views, self.since = self.views.joined(self.since), Views()
@@ -284,20 +289,20 @@ class _Record:
         self.odds, self.by_looks = self.views.odds(self.by_extent), self.views.odds().log_odds
 
     def copied(self) -> '_Record':
-        """Return the present state. Views and boxes are replaced, and never change."""
+        """Return a copy of the state. Views and boxes are shared, as they are never modified."""
         same = copy(self)
         same.extent = copy(self.extent)
         return same
 
     def fields(self) -> dict[str, Any]:
-        """Return the state, as lists and numbers."""
+        """Return the state as lists and numbers."""
         return {'camera': asdict(self.camera), 'boxes': self.extent.boxes.tolist(),
                 **{name: [part.tolist() for part in getattr(self, name)]
                    for name in ('views', 'since')}}
 
     @classmethod
     def of_fields(cls, name: str, fields: Mapping[str, Any]) -> '_Record':
-        """Return the state of `fields`; KeyError, TypeError or ValueError: it is broken."""
+        """Restore a state; KeyError, TypeError or ValueError if `fields` are damaged."""
         camera = dict(fields['camera'])
         record = cls(name, Camera(**camera | {'distortion': tuple(camera['distortion'])}))
         record.extent.boxes = np.array(fields['boxes'], dtype=np.float64).reshape(-1, 4)
@@ -307,7 +312,7 @@ class _Record:
             for some in ('views', 'since'))
         if not (np.abs(record.extent.boxes) < _FAR).all() or not all(
                 np.isfinite(part).all() for part in (*record.views, *record.since)):
-            raise ValueError('values that are not finite, or boxes far away')
+            raise ValueError(f'values must be finite, and box coordinates below {_FAR:g} px')
         record.by_extent = record.extent.log_odds(record.camera)
         record.odds = record.views.odds(record.by_extent)
         record.by_looks = record.views.odds().log_odds
@@ -315,31 +320,32 @@ class _Record:
 
     @property
     def fault(self) -> str:
-        """Return the certain faults of the camera; empty without any."""
+        """Return what is certainly wrong with the camera; empty if nothing is."""
         return self.in_words(self.odds) if self.odds.is_wrong else ''
 
     def in_words(self, odds: CameraOdds) -> str:
-        """Return the errors of a wrong camera in a line."""
+        """Describe the errors of a wrong camera in one line."""
         row = 1 + int(np.argmax(odds.odds[1:]))
         kind, (focal, aspect, *shift, across, along, size) = list(_KINDS)[row - 1], odds.means[row]
-        one, where = self.camera, f'{self.name}: ' if self.name else ''
+        camera, where = self.camera, f'{self.name}: ' if self.name else ''
         if self.by_extent > _TERMS.view and _OF_OTHER_PIXELS[row - 1]:
             reach = self.extent.reach
             return (f'{where}boxes reach from ({reach[0]:.0f}, {reach[1]:.0f}) to '
-                    f'({reach[2]:.0f}, {reach[3]:.0f}) of {one.width} x {one.height} px')
+                    f'({reach[2]:.0f}, {reach[3]:.0f}) of {camera.width} x {camera.height} px')
         if kind == 'convention':
             return (f'{where}boxes are off by {across:+.2f} of their widths and {along:+.2f} of '
                     'their heights')
         if kind == 'size':
             return f'{where}boxes are {math.exp(size):.2f} times as large as those of the map'
-        fx, fy = one.fx * math.exp(focal + aspect / 2), one.fy * math.exp(focal - aspect / 2)
-        cx, cy = one.cx + one.fx * shift[0], one.cy + one.fy * shift[1]
+        fx = camera.fx * math.exp(focal + aspect / 2)
+        fy = camera.fy * math.exp(focal - aspect / 2)
+        cx, cy = camera.cx + camera.fx * shift[0], camera.cy + camera.fy * shift[1]
         return (f'{where}boxes fit fx {fx:.0f} fy {fy:.0f} cx {cx:.0f} cy {cy:.0f} px, not '
-                f'{one.fx:.0f} {one.fy:.0f} {one.cx:.0f} {one.cy:.0f}')
+                f'{camera.fx:.0f} {camera.fy:.0f} {camera.cx:.0f} {camera.cy:.0f}')
 
 
 class CameraCheck:
-    """The evidence of a localizer's looks about its cameras, by name."""
+    """The evidence of a localizer's looks about its cameras, by camera name."""
 
     def __init__(self) -> None:
         self._records: dict[str, _Record] = {}
@@ -347,24 +353,24 @@ class CameraCheck:
             maxlen=int(_TERMS.most_instants))
 
     def copied(self) -> 'CameraCheck':
-        """Return the evidence of the looks so far; it never changes."""
+        """Return a copy that later looks do not change."""
         same = CameraCheck()
         same._records = {name: record.copied() for name, record in self._records.copy().items()}
         return same
 
     def fields(self) -> dict[str, Any]:
-        """Return the state that decides about poses, as lists and numbers, for a file."""
+        """Return the state that affects poses as lists and numbers, to be stored in a file."""
         return {name: record.fields() for name, record in self._records.items()}
 
     @classmethod
     def of_fields(cls, fields: Mapping[str, Any]) -> 'CameraCheck':
-        """Return the state of `fields`; KeyError, TypeError or ValueError: it is broken."""
+        """Restore a state; KeyError, TypeError or ValueError if `fields` are damaged."""
         check = cls()
         check._records = {name: _Record.of_fields(name, field) for name, field in fields.items()}
         return check
 
     def see(self, observation: Observation) -> None:
-        """Take in the boxes of a frame, accepted or not; another camera_info forgets all looks."""
+        """Add the boxes of an accepted or refused frame; a new camera_info resets the evidence."""
         name, camera = observation.camera_name, observation.camera
         record = self._records.get(name)
         if record is None or not _is_same(record.camera, camera):
@@ -372,17 +378,17 @@ class CameraCheck:
         record.see(observation)
 
     def add(self, looks: Sequence[CameraLook]) -> None:
-        """Take in the looks of a pose that is accepted, or would be by a right camera."""
+        """Add the looks of a pose that is accepted, or would be if the camera were right."""
         for look in looks:
             if look.is_new:
                 self._records[look.camera_name].add(look)
 
     def judge(self, looks: Sequence[CameraLook], covariance: NDArray[np.float64]
               ) -> tuple[float, str]:
-        """Return the effect of the cameras on a pose, with its looks, which are not taken in.
+        """Return the effect of camera errors on a pose, without adding its looks.
 
-        That is the factor of CameraOdds.share_near, and what is wrong with a camera that is
-        certainly wrong; empty without one. The covariance (6, 6) is that of the pose.
+        The effect is the factor of CameraOdds.share_near, and a description of what is certainly
+        wrong with a camera, empty if nothing is. The covariance (6, 6) is that of the pose.
         """
         share, fault = 1.0, ''
         for name in dict.fromkeys(look.camera_name for look in looks):
@@ -397,12 +403,12 @@ class CameraCheck:
 
     @property
     def faults(self) -> list[str]:
-        """Return the faults of cameras that are certainly wrong."""
+        """Return a description of each camera that is certainly wrong."""
         return [record.fault for record in self._records.copy().values() if record.fault]
 
     @property
     def values(self) -> dict[str, str]:
-        """Return the log odds that each camera is wrong, for the diagnostics."""
+        """Return the log odds that each camera is wrong, as text for the diagnostics."""
         return {f'camera check {name}'.rstrip():
                 f'{record.odds.log_odds:+.1f} log odds that boxes or camera_info are wrong, by '
                 f'{len(record.views.poses)} views'
@@ -410,8 +416,16 @@ class CameraCheck:
 
     def add_instant(self, seen: Sequence[Observation], known: Sequence[int],
                     matched: Sequence[int]) -> None:
-        """Take in an accepted pose: of each camera, objects of the map's classes and matches."""
-        self._instants.append({one.camera_name: (of_map, found) for one, of_map, found
+        """Add an accepted pose.
+
+        Parameters
+        ----------
+        seen : sequence of Observation
+            The frame of each camera.
+        known, matched : sequence of int
+            Numbers of detections of the map's classes, and of matches, in each frame.
+        """
+        self._instants.append({frame.camera_name: (of_map, found) for frame, of_map, found
                                in zip(seen, known, matched, strict=True)})
 
     @property
@@ -420,12 +434,12 @@ class CameraCheck:
         names = dict.fromkeys(name for instant in self._instants for name in instant)
         counts = {name: np.array([instant[name] for instant in self._instants if name in instant])
                   for name in names}
-        every = np.sum([of_one.sum(axis=0) for of_one in counts.values()], axis=0)
+        every = np.sum([of_camera.sum(axis=0) for of_camera in counts.values()], axis=0)
         found = []
-        for name, of_one in counts.items():
-            known, matched = of_one.sum(axis=0)
+        for name, of_camera in counts.items():
+            known, matched = of_camera.sum(axis=0)
             others_known, others_matched = every - (known, matched)
-            if (len(of_one) >= _TERMS.mount_instants and min(known, others_known)
+            if (len(of_camera) >= _TERMS.mount_instants and min(known, others_known)
                     >= _TERMS.mount_objects and matched < _TERMS.mount_share * known
                     and matched / known < _TERMS.mount_others * others_matched / others_known):
                 found.append(name)
@@ -433,7 +447,7 @@ class CameraCheck:
 
 
 def _is_same(one: Camera, other: Camera) -> bool:
-    """Return whether intrinsics differ by little, as those of an autofocus do."""
+    """Return whether two cameras differ at most by the intrinsics that an autofocus changes."""
     if one == other:
         return True
     changes = np.array([one.fx, one.fy, one.cx, one.cy]) - [other.fx, other.fy, other.cx, other.cy]

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Compare the poses of all sources: the most likely pose, and the evidence about it.
+"""Compare the poses of all sources: find the most likely pose, and the evidence about it.
 
-Poses that the search of objects met and poses that keyframes recognized compete in one list. Each
-is measured on the detections of all frames and on the points of the keyframes. The most likely
-pose leads, and the evidence for it is all that decides whether it is accepted.
+The poses found by the search of objects and the poses found by keyframes compete in one list. Each
+pose is scored on the detections of all frames and on the points of the keyframes. The most likely
+pose leads, and the evidence about it alone decides whether it is accepted.
 
-A pose may explain a mirror image well: of a room in a mirror, or of a flipped camera. A camera on
-the other side of a plane sees the points of the plane mirrored, at the same distances: objects on
-a table from below, those along a wall from behind. The image is therefore mirrored back,
-and the best pose for the mirrored image competes with the pose found. It starts at reflections of
-the camera in planes through the matched objects.
+An image may be mirrored, by a mirror or a flipped camera. A wrong pose may then explain it well: a
+camera on the other side of a plane sees the points of the plane mirrored, at the same distances.
+For example, it sees objects on a table from below, or objects along a wall from behind. The image
+is therefore mirrored back, and the best pose of the mirrored image competes with the pose found.
+The search for it starts at reflections of the camera in planes through the matched objects.
 """
 
 import math
@@ -62,18 +62,19 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 def search_contenders(joined: JoinedFrames, finalists: Sequence[Finalist],
                       is_upright: NDArray[np.bool_]) -> list[Contender]:
-    """Return the poses that the search met as contenders, one of each place, best first.
+    """Return the poses found by the search as contenders, one for each place, best first.
 
-    Poses that ignore the known vertical (not is_upright, (m,)) come last. Without refinement the
-    greatest score is first, as in the paper.
+    Poses that ignore the known vertical (not is_upright, (m,)) come last. Without refinement, the
+    pose with the greatest score comes first, as in the paper.
     """
     contenders = contenders_of(joined, finalists, is_upright.tolist())
     if not joined.options.refine:
         return contenders
-    contenders.sort(key=lambda one: -one.rank)
-    kinds = [[one for one in contenders if one.is_upright == known] for known in (True, False)]
-    return [some[row] for some in kinds for row in SAME_PLACE.distinct(
-        np.array([one.pose for one in some]).reshape(-1, 4, 4), MAX_DISTINCT)]
+    contenders.sort(key=lambda contender: -contender.rank)
+    kinds = [[contender for contender in contenders if contender.is_upright == upright]
+             for upright in (True, False)]
+    return [kind[row] for kind in kinds for row in SAME_PLACE.distinct(
+        np.array([contender.pose for contender in kind]).reshape(-1, 4, 4), MAX_DISTINCT)]
 
 
 class Comparison:
@@ -82,11 +83,11 @@ class Comparison:
     Parameters
     ----------
     met : sequence of Contender
-        Those that the search met.
+        Contenders found by the search of objects.
     looks : Looks, optional
-        Earlier looks, which have to agree.
+        Earlier looks, which must agree with the pose.
     recognizer : ImageRecognizer, optional
-        Recognizer of the keyframes for the last image; its places compete, too.
+        Search of keyframes for the last image. The places that it recognizes compete, too.
     """
 
     def __init__(self, joined: JoinedFrames, met: Sequence[Contender], looks: Looks = _NO_LOOKS,
@@ -98,28 +99,33 @@ class Comparison:
             guesses = contenders[:int(CALIBRATION.keyframes.guesses)]
             seen = recognizer.recognize([guess.pose for guess in guesses],
                                         constraint_of(self._last, joined.options))
-            if seen.is_complete:  # what keyframes near a pose do not recognize
-                places = np.array([one.map_from_camera for one in seen.places]).reshape(-1, 4, 4)
+            if seen.is_complete:  # a pose is less likely where keyframes cover it but do not match
+                places = np.array([place.map_from_camera
+                                   for place in seen.places]).reshape(-1, 4, 4)
                 contenders = [
-                    one if SAME_ANSWER.agreeing(one.pose[None], places).any() else one._replace(
-                        odds=one.odds + CALIBRATION.keyframes.missed
-                        * recognizer.coverage(one.pose)) for one in contenders]
+                    contender if SAME_ANSWER.agreeing(contender.pose[None], places).any()
+                    else contender._replace(odds=contender.odds + CALIBRATION.keyframes.missed
+                                            * recognizer.coverage(contender.pose))
+                    for contender in contenders]
             contenders += self._proposed(seen, contenders)
-            contenders.sort(key=lambda one: (not one.is_upright, -one.rank))
-        #: The leading one first; of those of one source, one of each place
+            contenders.sort(key=lambda contender: (not contender.is_upright, -contender.rank))
+        #: The leading contender first; each source has at most one contender for each place
         self.contenders = contenders
-        self.poses = np.array([one.pose for one in contenders]).reshape(-1, 4, 4)  #: (m, 4, 4)
+        #: (m, 4, 4): map_from_camera of each contender
+        self.poses = np.array([contender.pose for contender in contenders]).reshape(-1, 4, 4)
         rows = np.arange(len(contenders))
-        #: (m,): probability of each, shared by those that agree
+        #: (m,): probability of each contender; contenders that agree share one probability
         self.likely = self._confidences(rows, [contender.odds for contender in contenders])
-        self.recognition = seen  #: Result of the keyframes
-        #: (m,): which contenders agree with the leading one
+        self.recognition = seen  #: Result of the search of keyframes
+        #: (m,): whether each contender agrees with the leading one
         self.leading = SAME_ANSWER.agreeing(self.poses[:1], self.poses).ravel()
-        there = [contenders[row] for row in rows[self.leading]]
-        #: The best contender of the leading place that the search of objects met
-        self.by_objects = next((one for one in there if one.recognized is None), None)
-        self._by_keyframes = next((one for one in there if one.recognized is not None), None)
-        #: The leading place as keyframes recognize it, if they do
+        agreeing = [contenders[row] for row in rows[self.leading]]
+        #: The best contender at the leading place that the search of objects found
+        self.by_objects = next((contender for contender in agreeing
+                                if contender.recognized is None), None)
+        self._by_keyframes = next((contender for contender in agreeing
+                                   if contender.recognized is not None), None)
+        #: The leading place if keyframes recognize it; else None
         self.place = self._by_keyframes.recognized if self._by_keyframes else None
 
     @property
@@ -131,42 +137,43 @@ class Comparison:
 
     @property
     def by_boxes(self) -> Contender | None:
-        """Return by_objects if its boxes decide where the pose is; None if points do."""
+        """Return by_objects if the pose depends on its boxes; None if points determine it."""
         return self.by_objects if self.place is None or (
             self.place.inliers < CALIBRATION.keyframes.good_covariance) else None
 
     def _confidences(self, rows: NDArray[np.int64], odds: Sequence[float]
                      ) -> NDArray[np.float64]:
-        """Return the probability (r,) of some contenders with the odds given."""
+        """Return the probabilities (r,) of the contenders of some rows, given their odds."""
         return confidences(np.array(odds), self.poses[rows], self._none, prior=np.array(
             [self.contenders[row].prior for row in rows]))
 
     def _proposed(self, seen: Recognition, met: Sequence[Contender]) -> list[Contender]:
         """Return the places that keyframes recognize, as contenders.
 
-        Points add to the odds of the pose that the search of objects met there, if there is one.
-        They never take any: a dozen points agree by chance.
+        If the search of objects found a pose at the same place, the points add to its odds. They
+        never lower them: a dozen points agree by chance.
         """
         most = CALIBRATION.attitude.vertical_sigmas
-        found = contenders_of(self._joined, [unrefined(one.map_from_camera)
-                                             for one in seen.places],
-                              [one.tilt_error <= most for one in seen.places])
+        found = contenders_of(self._joined, [unrefined(place.map_from_camera)
+                                             for place in seen.places],
+                              [place.tilt_error <= most for place in seen.places])
         proposed = []
-        for one, place in zip(found, seen.places, strict=True):
-            points, objects = points_utility(place), objects_utility(one.support)
-            alone = self._none + points - one.handicap
-            there = [other.odds for other in met if SAME_ANSWER.agree(one.pose, other.pose)]
-            proposed.append(one._replace(
+        for contender, place in zip(found, seen.places, strict=True):
+            points, objects = points_utility(place), objects_utility(contender.support)
+            alone = self._none + points - contender.handicap
+            agreeing = [other.odds for other in met
+                        if SAME_ANSWER.agree(contender.pose, other.pose)]
+            proposed.append(contender._replace(
                 recognized=place, by_points=alone + min(0.0, objects),
-                odds=max([alone + objects, *(odds + max(0.0, points) for odds in there)])))
+                odds=max([alone + objects, *(odds + max(0.0, points) for odds in agreeing)])))
         return proposed
 
     def pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pose (4, 4) of the leading place and its covariance (6, 6).
 
-        A pose of many points stays as it is: objects are rougher. One of few points can be off by
-        more than its covariance says, so it is made less certain, and fused with that of the
-        objects.
+        A pose from many points is returned unchanged, because objects are less accurate. The error
+        of a pose from few points may exceed its covariance. Its covariance is therefore increased,
+        and the pose is fused with that of the objects.
         """
         found = None
         if (best := self.by_objects) is not None:
@@ -175,10 +182,12 @@ class Comparison:
                                        joined.landmark_map.shared_sigmas,
                                        options.mount_deviation, CALIBRATED)
             if best.finalist.information is not None:
-                others = [one for one in self.contenders if one.recognized is None]
-                others.sort(key=lambda one: one is not best)
-                covariance = covariance + spread(np.array([other.pose for other in others]),
-                                                 np.array([other.odds for other in others]))
+                found_by_objects = [contender for contender in self.contenders
+                                    if contender.recognized is None]
+                found_by_objects.sort(key=lambda contender: contender is not best)
+                covariance = covariance + spread(
+                    np.array([contender.pose for contender in found_by_objects]),
+                    np.array([contender.odds for contender in found_by_objects]))
             found = best.pose, covariance
         if self._by_keyframes is None or self.place is None:
             assert found is not None
@@ -190,7 +199,7 @@ class Comparison:
                                                                              covariance)
 
     def evidence(self, covariance: NDArray[np.float64]) -> Evidence:
-        """Return the evidence for the leading pose, whose covariance (6, 6) is given."""
+        """Return the evidence for the leading pose, given its covariance (6, 6)."""
         best, frames = self.by_objects or self.contenders[0], self._joined.frames
         coverage, by_points = coverage_of(frames), self._by_points()
         distinct, twin = self._distinct()
@@ -199,7 +208,7 @@ class Comparison:
             rival=self._rival(), distinct=distinct,
             place=place_of(self._joined.landmark_map, self.poses[0]).position,
             twin=twin and twin.position, twin_map=twin.name if twin else '',
-            # as in the paper, the position's deviation refuses no pose that was not refined
+            # as in the paper, unrefined poses are not refused for an uncertain position
             near=1.0 if self.place is None and best.finalist.information is None
             else share_within(RIGHT_M, CALIBRATION.covariance.caution * covariance),
             deviation_m=math.sqrt(np.trace(covariance[:3, :3])), coverage=coverage,
@@ -217,7 +226,7 @@ class Comparison:
     def _signs(self, best: Contender) -> Signs | None:
         """Return the signs that the leading place is not a picture; None without keyframes there.
 
-        In the last frame, since keyframes are recognized there.
+        They come from the last frame, because only its image is compared with keyframes.
         """
         if self.place is None:
             return None
@@ -225,7 +234,7 @@ class Comparison:
         return signs_of(self.place, best.support, boxes, self._last.camera)
 
     def _motion(self) -> Motion | None:
-        """Return the motion since an earlier look by keyframes, if there was one."""
+        """Compare the motion since an earlier look by keyframes; None without such a look."""
         passed = self._looks.passed(self._last)
         if (self.place is None or self._recognizer is None or passed is None
                 or passed[0].recognized is None):
@@ -236,8 +245,8 @@ class Comparison:
     def _not_mirrored(self, by_points: float) -> float:
         """Return the probability that the image is not mirrored.
 
-        Features of a mirror image match nothing, so keyframes exclude it, where they are sure. A
-        pose that is refused anyway is not worth the time.
+        The features of a mirrored image match no keyframe, so a pose that keyframes alone confirm
+        is not checked. To save time, a pose that is refused anyway is not checked either.
         """
         best, options = self.by_objects, self._joined.options
         if (best is None or not options.refine or by_points >= options.min_confidence
@@ -247,12 +256,14 @@ class Comparison:
         return _chance_not_mirrored(self._joined, best)
 
     def _uncontradicted(self) -> float:
-        """Return the probability that keyframes are wrong which recognize another place only.
+        """Return the probability that keyframes are wrong if they recognize only other places.
 
-        They count where they are sure. The evidence of a dozen points is in the comparison.
+        Only confident recognitions count here. The comparison itself includes the evidence of a
+        dozen points.
         """
-        chance = max((1.0 / (1.0 + math.exp(-points_utility(one.recognized)))
-                      for one in self.contenders if one.recognized is not None), default=0.0)
+        chance = max((1.0 / (1.0 + math.exp(-points_utility(contender.recognized)))
+                      for contender in self.contenders if contender.recognized is not None),
+                     default=0.0)
         return 1.0 if self.place or chance < self._joined.options.min_confidence else 1.0 - chance
 
     def _rival(self) -> Rival | None:
@@ -267,7 +278,7 @@ class Comparison:
                      place.name, same_source is None)
 
     def _by_points(self) -> float:
-        """Return the probability of the leading place without what objects say for it."""
+        """Return the probability of the leading place without the evidence of objects for it."""
         if self.place is None:
             return 0.0
         rows = np.array([row for row, contender in enumerate(self.contenders)
@@ -279,10 +290,10 @@ class Comparison:
         return float(found[near].max())
 
     def _distinct(self) -> tuple[float, Place | None]:
-        """Return the probability that no place that looks alike has the leading pose's camera.
+        """Return the probability that the camera is not at a place that looks alike.
 
-        Next to it is where the camera would be at the most likely of these places. Keyframes tell
-        a twin apart as far as they cover it.
+        The second value is the pose of the camera at the most likely of these places; None if
+        there is none. Keyframes distinguish a twin as far as they cover it.
         """
         joined, landmark_map = self._joined, self._joined.landmark_map
         best, (low, high) = self.contenders[0], joined.options.height_range_m
@@ -294,9 +305,9 @@ class Comparison:
         inside = np.nonzero((low <= found[:, 2, 3]) & (found[:, 2, 3] <= high))[0]
         places = [refined(joined, unrefined(found[row])) for row in inside]
         poses = np.array([best.pose, *(place.map_from_camera for place in places)])
-        # a place that refinement moved back to the leading pose is no other one
+        # drop the places that refinement moved back to the leading pose
         elsewhere = ~SAME_ANSWER.agreeing(poses)[0]
-        # of each place, the first
+        # keep the first pose at each place
         before = np.tril(SAME_PLACE.agreeing(poses) & elsewhere, -1)
         others = np.nonzero(elsewhere & ~before.any(axis=1))[0]
         if len(others) == 0:
@@ -308,7 +319,7 @@ class Comparison:
             if row < len(twins):
                 by_objects = lead_over_twin(best.support, rival.support, float(alike.shares[row]),
                                             bool(rooms[row]))
-            else:  # as much as if the search had met it, see confidences
+            else:  # the same lead as if the search had found the rival, see confidences
                 by_objects = (1.0 + CALIBRATION.objects.slope) * (best.odds - rival.odds)
             leads[number] += best.prior - rival.prior + by_objects
         chance = float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum()))
@@ -318,8 +329,8 @@ class Comparison:
                          ) -> NDArray[np.float64]:
         """Return the log odds (m,) by which keyframes prefer the leading place to each twin.
 
-        They say nothing about a room of its own that they do not cover: it may show the same
-        points.
+        They are no evidence against a twin in another room that they do not cover: it may show the
+        same points.
         """
         leading = self._by_keyframes
         if self._recognizer is None or self.place is None or leading is None:
@@ -334,25 +345,25 @@ class Comparison:
 
 
 def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean square of the differences between a pose and those that agree with it.
+    """Return the mean square of the differences between a pose and the poses that agree with it.
 
-    The right pose need not be among those found. So their mean square is added in all directions,
-    too.
+    The right pose may be missing among the poses found. Their mean square is therefore also added
+    in all directions.
 
     Parameters
     ----------
     poses : ndarray (m, 4, 4)
-        map_from_camera; the first one is the pose.
+        map_from_camera. The first pose is compared with all of them.
     odds : ndarray (m,)
-        Logarithm of the odds of each, up to a constant.
+        Logarithm of the odds of each pose, up to a constant.
 
     Returns
     -------
     ndarray (6, 6)
-        Of position [m] and rotation about the map's axes [rad].
+        Mean square of position [m] and rotation about the map's axes [rad].
     """
     agreeing = SAME_ANSWER.agreeing(poses)[0]
-    # poses near each other share landmarks and errors: their supports differ by less than they say
+    # poses near each other share landmarks and errors, so their odds exaggerate the difference
     weights = np.exp(CALIBRATION.covariance.sharpness * (odds[agreeing] - odds[agreeing].max()))
     turns = Rotation.from_matrix(poses[agreeing, :3, :3] @ poses[0, :3, :3].T).as_rotvec()
     steps = np.concatenate([poses[agreeing, :3, 3] - poses[0, :3, 3], turns], axis=1)
@@ -362,19 +373,20 @@ def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.
 
 
 def _chance_not_mirrored(joined: JoinedFrames, best: Contender) -> float:
-    """Return the probability that no mirror image explains the detections instead."""
+    """Return the probability that the image is not mirrored, given the best mirrored pose."""
     terms = CALIBRATION.mirror
     first = [row for row, found in enumerate(best.matches) if found][-int(terms.frames):][0]
     joined = join_frames(joined.landmark_map, joined.options, joined.frames[first:])
     matches = best.matches[first:]
     mirrored = _mirrored(joined)
     centers = joined.landmark_map.centers[
-        sorted({one.landmark for found in matches for one in found})]
+        sorted({match.landmark for of_frame in matches for match in of_frame})]
     starts = [unrefined(pose) for pose in _reflections(centers) @ best.pose @ _FLIP]
-    starts.sort(key=lambda one: -verify_rig(mirrored.rig, one.rotation, one.translation).score)
+    starts.sort(key=lambda start: -verify_rig(mirrored.rig, start.rotation,
+                                              start.translation).score)
     found = [refined(mirrored, start) for start in starts[:int(terms.refined)]]
-    supports = supports_of(mirrored, np.array([one.map_from_camera for one in found]),
-                           [matches_of(mirrored.rig, one) for one in found])
+    supports = supports_of(mirrored, np.array([pose.map_from_camera for pose in found]),
+                           [matches_of(mirrored.rig, pose) for pose in found])
     own, = utilities([best.support] if len(joined.frames) == len(best.matches)
                      else supports_of(joined, best.pose[None], [matches]))
     lead = CALIBRATION.attitude.not_mirrored + float(own - utilities(supports).max())
@@ -382,9 +394,9 @@ def _chance_not_mirrored(joined: JoinedFrames, best: Contender) -> float:
 
 
 def _mirrored(joined: JoinedFrames) -> JoinedFrames:
-    """Return frames whose images are mirrored left to right, searched for nothing.
+    """Return the frames with their images mirrored left to right, without a new search.
 
-    They are mirrored on the plane z = 1, where a lens distorts nothing.
+    The boxes are mirrored on the plane z = 1, where there is no distortion.
     """
     frames = []
     for frame in joined.frames:
@@ -403,9 +415,9 @@ def _mirrored(joined: JoinedFrames) -> JoinedFrames:
 
 
 def _reflections(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the transforms (m, 4, 4) that reflect at planes through points (n, 3).
+    """Return the reflections (m, 4, 4) in planes through points (n, 3).
 
-    The planes are level, fitted to all points, and through three points each.
+    The planes are a level plane, a plane fitted to all points, and planes through three points.
     """
     middle = points.mean(axis=0)
     triples = np.array([*combinations(range(len(points)), 3)], dtype=np.int64).reshape(-1, 3)

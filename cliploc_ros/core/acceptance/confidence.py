@@ -2,28 +2,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """The evidence for and against poses, and their confidence.
 
-The support of a pose is the evidence of the frames for it and against it. It is weighed against
-the support of the other poses.
+The support of a pose is the evidence of the frames for and against it. It is weighed against the
+support of the other poses.
 
-A conditional logit (McFadden, "Conditional Logit Analysis of Qualitative Choice Behavior", 1974):
-each distinct pose has a utility, linear in its support. The case that no pose is right has a
-utility, too: more landmarks in the map let more wrong poses fit by chance, and a known vertical
-leaves fewer. Probabilities are proportional to the exponentials of the utilities, so the poses of
-an ambiguous scene share the probability. Poses that agree (1 m, 45 degrees) share one sum.
+The model is a conditional logit (McFadden, "Conditional Logit Analysis of Qualitative Choice
+Behavior", 1974). Each distinct pose has a utility, which is linear in its support. The case that
+no pose is right has a utility, too: the more landmarks a map has, the more wrong poses fit by
+chance, and a known vertical excludes some of them. Probabilities are proportional to the
+exponentials of the utilities, so the poses of an ambiguous scene share the probability. The
+probabilities of poses that agree (1 m, 45 degrees) are added.
 
-The search of objects chooses its poses among many by their support. Keyframes propose theirs by
-points: what the objects say of such a pose counts from the utility of none being right, whatever
-the size of the map. Points and objects that lead to one place add up theirs: by chance, features
-and boxes do so independently. Where they see one picture, see
-cliploc_ros.core.acceptance.genuine.
+The search of objects selects its poses from many by their support. Keyframes propose poses from
+matched points instead. The evidence of objects for such a pose is added to the utility of the case
+that no pose is right, whatever the size of the map. If points and objects lead to one place, their
+evidence is added, because chance agreements of features and of boxes are independent. The
+exception is a picture that shows both, see cliploc_ros.core.acceptance.genuine.
 
-Where the robot probably is, a region, is evidence, never a cut. A region is right with its
-probability p; otherwise the robot may be anywhere in the map. So a pose has the density
-p N(pose) + (1 - p) u, where u is uniform over the map. Its logarithm over u is bounded: 0 in the
-region, a constant elsewhere. So a region never raises a pose against the case that no pose is
-right, and lifts none that its objects support weakly: the confidence of a pose stays below that
-without its rivals. Nor does it decide alone between two places that look the same: the robot may
-have been told the wrong one of them.
+A prior region, where the robot probably is, counts as evidence and excludes no pose. The region is
+right with probability p; otherwise the robot may be anywhere in the map. A pose therefore has the
+density p N(pose) + (1 - p) u, where u is uniform over the map. The logarithm of this density over
+u is limited: it is 0 in the region and a negative constant far from it. A region therefore never
+raises a pose against the case that no pose is right. It does not help a pose that its objects
+support weakly either: the confidence of the pose stays below its confidence without rivals. A
+region alone does not decide between two places that look the same, because it may be that of the
+wrong place.
 """
 
 import math
@@ -50,61 +52,61 @@ from cliploc_ros.core.map.similarities import (
 from cliploc_ros.core.observation import Detections, Region
 from cliploc_ros.core.search.scene import Scene
 
-# No image reaches further [px]: areas stay finite.
+# Box coordinates are clipped to this, so that areas stay finite [px].
 _FAR_PX = 1e6
 
 
 @dataclass(frozen=True)
 class Support:
-    """The support of a pose; each thing counts once."""
+    """The support of a pose; each object counts once."""
 
-    #: Number of things that are where the map has them: boxes that overlap show one thing
+    #: Number of matched objects. Boxes that overlap count as one object.
     inliers: float = 0.0
-    score: float = 0.0  #: Sum of their IoUs
-    #: How far the edges of their boxes are from the outlines: Cauchy's robust sum
+    score: float = 0.0  #: Sum of the IoUs of the matched objects
+    #: Sum of Cauchy's losses of the distances from the edges of their boxes to the outlines
     misfit: float = 0.0
     #: How much more similar their crops are to the labels of their landmarks than to the map's
     #: labels on average, in standard deviations, summed
     likeness: float = 0.0
-    #: Summed over the objects that have a class of their landmark: the logarithm of the number of
-    #: things for each thing of this class, in the map or in any building. A rare class is matched
-    #: by chance less often than a common one. A class that the detector takes the landmark for at
-    #: times counts by its share, see ClassIndex.shares.
+    #: Sum of the rarities of the matched classes. The rarity is minus the logarithm of the share
+    #: of a class among all objects of the map or of any building. A rare class is matched by
+    #: chance less often than a common one. A class that the detector sometimes mistakes the
+    #: landmark for counts by its share, see ClassIndex.shares.
     rarity: float = 0.0
-    unlabelled: float = 0.0  #: Number of the objects that were matched by class alone
-    #: Number of other detected objects of the map's classes, which no landmark explains
+    unlabelled: float = 0.0  #: Number of objects that were matched by class alone
+    #: Number of detected objects of the map's classes that no landmark explains
     unexplained: float = 0.0
-    #: Log odds of their depths, against those of objects that are somewhere else
+    #: Log odds of the depths of the matched objects, against depths of wrong matches
     depth: float = 0.0
     _: KW_ONLY
-    #: For each detection that shows an object, (frame, row): its share (7,) of inliers, score,
-    #: misfit, likeness, rarity, unlabelled and depth
+    #: For each matched detection, (frame, row): its share (7,) of inliers, score, misfit,
+    #: likeness, rarity, unlabelled and depth
     shown: Mapping[tuple[int, int], NDArray[np.float64]] = field(
         default_factory=dict, compare=False, repr=False)
 
 
 class ComparedFrame(NamedTuple):
-    """A frame to measure supports in: data of its n detections that all poses share."""
+    """A frame and the data of its n detections that the supports of all poses need."""
 
     scene: Scene
-    classes: NDArray[np.int64]  #: (n,): the map's number of each class
-    #: (n,): the logarithm of the number of things for each thing of this class
+    classes: NDArray[np.int64]  #: (n,): the map's number of the class of each detection
+    #: (n,): minus the logarithm of the share of each detection's class, see Support.rarity
     rarities: NDArray[np.float64]
-    #: (n,): whether the class is a landmark's own, not only a class that it is mistaken for
+    #: (n,): whether the map has landmarks of the class, not only landmarks mistaken for it
     are_own: NDArray[np.bool_]
-    similarities: Similarities | None  #: None where classes alone are matched
-    #: (n,): row of similarities of each detection; -1 where its class alone is matched
+    similarities: Similarities | None  #: None if detections are matched by class alone
+    #: (n,): row of similarities of each detection; -1 if it is matched by class alone
     similarity_rows: NDArray[np.int64]
-    means: NDArray[np.float64]  #: (n,): of the similarities of each detection
-    deviations: NDArray[np.float64]  #: (n,): of the same
-    #: (n, n): to what degree two boxes show one thing, 0 to 1, see one_thing
+    means: NDArray[np.float64]  #: (n,): mean of the similarities of each detection
+    deviations: NDArray[np.float64]  #: (n,): standard deviation of these similarities
+    #: (n, n): to what degree two boxes show the same object, 0 to 1, see one_thing
     same: NDArray[np.float64]
 
 
 def compared_frame(landmark_map: LandmarkMap, detections: Detections, scene: Scene,
                    similarities: Similarities | None, similarity_rows: NDArray[np.int64]
                    ) -> ComparedFrame:
-    """Return a frame to measure supports in; see ComparedFrame for the arguments."""
+    """Compute the data of a frame that supports need; see ComparedFrame for the arguments."""
     index = landmark_map.classes
     classes = index.classes_of(detections.class_ids)
     # a class that is rare in the map may be common in the place where the camera is
@@ -123,20 +125,21 @@ def compared_frame(landmark_map: LandmarkMap, detections: Detections, scene: Sce
 
 def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
             map_from_cameras: NDArray[np.float64], matches: Sequence[Sequence[Match]]) -> Support:
-    """Return the support of a pose in F frames, seen from map_from_cameras (F, 4, 4).
+    """Return the support of a pose in F frames with cameras at map_from_cameras (F, 4, 4).
 
-    Several boxes on one landmark count as the best of them, and boxes that overlap share the
-    weight of one. So do boxes that no landmark explains; a box of an explained thing does not
-    count.
-    Frames that show the same object share the error of its shape in the map, so their agreement is
-    no more evidence than one of them: the object counts with their mean.
+    Of several boxes on one landmark, the best one counts. Boxes that overlap share the weight of
+    one box. The same holds for boxes that no landmark explains, but those that show a matched
+    object do not count as unexplained.
+
+    Frames that show the same object share the error of its shape in the map. Several such frames
+    are no more evidence than one frame, so the object counts with their mean.
     """
-    # by object: maps have duplicates
+    # for each object, as maps have duplicate landmarks
     rows: dict[int, dict[tuple[int, int], NDArray[np.float64]]] = {}
     unexplained = 0.0
     for number, (frame, map_from_camera, found) in enumerate(zip(
             frames, map_from_cameras, matches, strict=True)):
-        best: dict[int, Match] = {}  # of each object
+        best: dict[int, Match] = {}  # the best match of each object
         for match in sorted(found, key=lambda match: -match.iou):
             best.setdefault(int(landmark_map.objects[match.landmark]), match)
         if distinct := [*best.values()]:
@@ -146,16 +149,16 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
                     landmark_map, frame, map_from_camera, distinct), strict=True):
                 rows.setdefault(int(landmark_map.objects[match.landmark]), {})[
                     number, match.detection] = row
-        # A class that a landmark is only mistaken for does not count: a real person is not
-        # expected in a map because a teddy bear sometimes looks like one.
+        # A class that landmarks are only mistaken for does not count as unexplained: people are
+        # not expected in a map just because a teddy bear sometimes looks like a person.
         matched, others = [match.detection for match in found], frame.are_own.copy()
         others[matched] = False
         alone = 1.0 - frame.same[others][:, matched].max(axis=1, initial=0.0)
         unexplained += float((alone / frame.same[others][:, others].sum(axis=1)).sum())
     if not rows:
         return Support()
-    shown = {one: row / len(of_object) for of_object in rows.values()
-             for one, row in of_object.items()}
+    shown = {detection: row / len(of_object) for of_object in rows.values()
+             for detection, row in of_object.items()}
     total = np.sum([*shown.values()], axis=0)
     views_of_each = len(shown) / len(rows)
     return Support(*map(float, [*total[:-1], unexplained / views_of_each, total[-1]]),
@@ -165,7 +168,7 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
 def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
                    map_from_camera: NDArray[np.float64], matches: Sequence[Match]
                    ) -> NDArray[np.float64]:
-    """Return the terms of each match (m, 7) in a support."""
+    """Return the contribution (m, 7) of each match to the support, see Support.shown."""
     detections = np.array([match.detection for match in matches])
     landmarks = np.array([match.landmark for match in matches])
     rows, likenesses = frame.similarity_rows[detections], np.zeros(len(matches))
@@ -174,7 +177,7 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
         likenesses[compared] = pair_similarities(
             frame.similarities, rows[compared], landmarks[compared])
         likenesses = (likenesses - frame.means[detections]) / frame.deviations[detections]
-    # 0 if the class of a detection is none of its landmark
+    # 0 if the landmark is never detected as this class
     shares = landmark_map.classes.shares(landmarks, frame.classes[detections])
     terms, scene = CALIBRATION.objects, frame.scene
     sigmas = landmark_map.position_sigmas[landmarks]
@@ -183,7 +186,7 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
     outlines = project_ellipsoids(camera_from_map, centers, shapes)
     boxes, halves = scene.box_ellipses[detections], np.sqrt(outlines[:, [2, 4]])
     depths = centers @ camera_from_map[2, :3] + camera_from_map[2, 3]
-    # the calibration's maps are no worse than the default
+    # the deviations were calibrated on maps with the default sigma
     more = np.sqrt(np.maximum(0.0, sigmas ** 2 - DEFAULT_SIGMA_M ** 2)) / depths
     deviations = np.hypot(terms.edge_share * boxes[:, 2:].mean(axis=1) + terms.edge_floor,
                           more)[:, None]
@@ -201,7 +204,7 @@ def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
 
 
 def one_thing(bboxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return to what degree each two of n boxes show one thing (n, n), 0 to 1."""
+    """Return to what degree each pair of n boxes shows the same object (n, n), 0 to 1."""
     boxes = np.clip(np.nan_to_num(bboxes_xyxy), -_FAR_PX, _FAR_PX)
     least, most = CALIBRATION.objects.two_things, CALIBRATION.objects.one_thing
     found = np.clip((box_ious(boxes, boxes) - least) / (most - least), 0.0, 1.0)
@@ -210,23 +213,24 @@ def one_thing(bboxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class Setting(NamedTuple):
-    """The setting of a pose: with the supports, it determines the chance of a wrong pose."""
+    """The conditions that, with the supports, determine the probability of a wrong pose."""
 
     landmarks: int  #: Number of landmarks in the map
-    #: Standard deviation of the known vertical [deg]; infinite if none is known
+    #: Standard deviation of the known vertical [deg]; infinite if it is unknown
     vertical_deg: float = math.inf
 
     @property
     def map_size(self) -> float:
-        """Return the logarithm of the number of landmarks.
+        """Return the logarithm of the number of landmarks, limited below by least_size.
 
-        Boxes may show all things of the building: a small map lacks some that look like its own.
+        Boxes may show any object of the building, and a small map lacks many that look like its
+        landmarks.
         """
         return math.log(max(CALIBRATION.objects.least_size, self.landmarks))
 
     @property
     def vertical(self) -> float:
-        """Return the log of the attitudes that it rules out: 3.8 to 1 degree, 0 for none."""
+        """Return the log ratio of vague to known deviation: 3.8 at 1 degree, 0 if unknown."""
         terms = CALIBRATION.objects
         return math.log(terms.vague_vertical_deg / min(
             max(self.vertical_deg, terms.best_vertical_deg), terms.vague_vertical_deg))
@@ -237,9 +241,10 @@ def confidences(odds: NDArray[np.float64], poses: NDArray[np.float64], none: flo
                 prior: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """Return the probability (m,) that each pose (m, 4, 4) is within 1 m of the truth.
 
-    The rest to 1 is the probability that another pose is right, or none. Odds (m,) are the
-    utilities of the poses, none is that of the case that none of them is right. The prior (m,)
-    is log odds of 0 or less, so it raises no pose against none.
+    The probability that another pose, or none of them, is right makes up the difference to 1. Odds
+    (m,) are the utilities of the poses; `none` is the utility of the case that none of them is
+    right. The prior (m,) consists of log odds of at most 0, so it raises no pose against that
+    case.
     """
     if len(odds) == 0:
         return np.empty(0)
@@ -252,11 +257,11 @@ def confidences(odds: NDArray[np.float64], poses: NDArray[np.float64], none: flo
     log_odds += calibration.objects.slope * np.maximum(0.0, log_odds - calibration.objects.knee)
     sharpened = 1.0 / (1.0 + np.exp(-log_odds))
     lead = int(np.argmax(likely))
-    # the other places lose what the leading place gains
+    # the other places lose the probability that the leading place gains
     lost = (1.0 - sharpened[lead]) / (1.0 - likely[lead])
     if prior is None or not prior.any():
         return np.minimum(np.where(agreeing[lead], sharpened, likely * lost), most)
-    # the odds of the prior are no evidence of objects, and not steepened
+    # the prior is not evidence of objects, so its odds are not sharpened
     kept = np.where(agreeing[lead], sharpened[lead] / likely[lead], lost)
     weighted = shares * kept * np.exp(prior)
     none_of_them = max(0.0, 1.0 - float(shares @ kept))
@@ -265,12 +270,12 @@ def confidences(odds: NDArray[np.float64], poses: NDArray[np.float64], none: flo
 
 def utilities(supports: Sequence[Support], calibration: Calibration = CALIBRATION
               ) -> NDArray[np.float64]:
-    """Return the utility (m,) of each support by objects: its log odds, up to a constant."""
+    """Return the utility (m,) of each support by objects: log odds, up to a constant."""
     terms = calibration.objects
     return np.array([
-        terms.score * one.score + terms.misfit * one.misfit + terms.likeness * one.likeness
-        + terms.rarity * one.rarity + terms.unlabelled * one.unlabelled
-        + terms.unexplained * one.unexplained + terms.depth * one.depth for one in supports])
+        terms.score * pose.score + terms.misfit * pose.misfit + terms.likeness * pose.likeness
+        + terms.rarity * pose.rarity + terms.unlabelled * pose.unlabelled
+        + terms.unexplained * pose.unexplained + terms.depth * pose.depth for pose in supports])
 
 
 def none_right(setting: Setting, calibration: Calibration = CALIBRATION) -> float:
@@ -281,20 +286,20 @@ def none_right(setting: Setting, calibration: Calibration = CALIBRATION) -> floa
 
 
 def counted_points(place: RecognizedPlace, calibration: Calibration = CALIBRATION) -> float:
-    """Return how many of the features that agree with a place count, 1 or more."""
+    """Return how many of the features that agree with a place count as evidence, at least 1."""
     share = calibration.keyframes.thorough if place.is_thorough else 1.0
     return max(1.0, share * place.inliers)
 
 
 def points_utility(place: RecognizedPlace, calibration: Calibration = CALIBRATION) -> float:
-    """Return the evidence of its points for a place: log odds, against a place by chance."""
+    """Return the log odds of a recognized place by its points, against a chance agreement."""
     terms = calibration.keyframes
     return min(terms.most, terms.none + terms.confirmed * place.confirmed
                + terms.inliers * math.log(counted_points(place, calibration)))
 
 
 def objects_utility(support: Support, calibration: Calibration = CALIBRATION) -> float:
-    """Return the log odds by objects of a pose that keyframes propose, against none."""
+    """Return the log odds of a pose that keyframes propose, from its objects alone."""
     terms = calibration.keyframes
     return (terms.explained * min(terms.most_objects, support.inliers)
             + terms.unexplained * min(terms.most_objects, support.unexplained))
@@ -302,14 +307,14 @@ def objects_utility(support: Support, calibration: Calibration = CALIBRATION) ->
 
 def tilt_handicaps(map_from_cameras: NDArray[np.float64], deviation_deg: float
                    ) -> NDArray[np.float64]:
-    """Return the log odds (m,) that the tilt of each camera takes from its pose, 0 to 4.6.
+    """Return the log odds (m,), 0 to 4.6, to subtract from each pose for the tilt of its camera.
 
     Parameters
     ----------
     map_from_cameras : ndarray (m, 4, 4)
         Poses in a map whose third axis is up.
     deviation_deg : float
-        Standard deviation of the tilt [deg], see RelocalizerOptions; 0 for none.
+        Standard deviation of the tilt [deg], see RelocalizerOptions; 0 subtracts nothing.
     """
     if deviation_deg == 0.0:
         return np.zeros(len(map_from_cameras))
@@ -322,9 +327,9 @@ def tilt_handicaps(map_from_cameras: NDArray[np.float64], deviation_deg: float
 
 def region_odds(landmark_map: LandmarkMap, region: Region, poses: NDArray[np.float64]
                 ) -> NDArray[np.float64]:
-    """Return the log odds (m,), 0 or less, that a region gives to camera poses (m, 4, 4) of a map.
+    """Return the log odds (m,), at most 0, of camera poses (m, 4, 4) of a map, given a region.
 
-    A region of a map that is not there says nothing.
+    They are 0 if the region belongs to a map that is not loaded.
     """
     parts = parts_of(landmark_map)
     shift = next((part.shift for part in parts if part.landmark_map.frame_id == region.frame_id),
@@ -344,7 +349,7 @@ def region_odds(landmark_map: LandmarkMap, region: Region, poses: NDArray[np.flo
                + steps[:, 2] ** 2 / yaw)
     area = sum(float(np.prod(np.ptp(part.landmark_map.centers[:, :2], axis=0)
                              + 2.0 * terms.margin_m)) for part in parts)
-    # a region wider than the map is as good as the map
+    # a region wider than the map says no more than the map itself
     peak = (max(0.0, math.log(area / (2.0 * math.pi)) - 0.5 * np.linalg.slogdet(spot)[1])
             + max(0.0, 0.5 * math.log(2.0 * math.pi / yaw)))
     p = min(max(region.probability, 1e-9), 1.0 - 1e-9)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The poses that may be right, of every source, and the evidence of the objects for each."""
+"""The poses that may be right, from all sources, and the evidence of objects for each pose."""
 
 import math
 from collections.abc import Sequence
@@ -33,13 +33,13 @@ _NONE = np.empty(0, dtype=np.int64)
 
 
 class JoinedFrames(NamedTuple):
-    """The data that poses are compared on: searched frames of one camera, in a map."""
+    """The data on which poses are compared: F searched frames, joined to a rig, and the map."""
 
     landmark_map: LandmarkMap
     options: RelocalizerOptions
     frames: Sequence[SearchedFrame]
-    rig: Rig  #: The same frames
-    cameras: NDArray[np.float64]  #: (F, 4, 4): each camera from the last
+    rig: Rig  #: The rig of these frames
+    cameras: NDArray[np.float64]  #: (F, 4, 4): camera_from_last of each frame
 
     @property
     def knows_vertical(self) -> bool:
@@ -48,17 +48,19 @@ class JoinedFrames(NamedTuple):
 
     @property
     def setting(self) -> Setting:
-        """Return the setting: with the supports, it determines the chance of a wrong pose."""
+        """Return the conditions that, with the supports, determine the risk of a wrong pose."""
         return Setting(len(self.landmark_map),
                        self.options.vertical_deviation_deg if self.knows_vertical else math.inf)
 
 
 def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
                 frames: Sequence[SearchedFrame]) -> JoinedFrames:
-    """Return some searched frames, of which the last is to be localized.
+    """Join searched frames, the last of which is to be localized.
 
-    OptionsError: odom_from_camera is missing or no rigid transform; there are no frames or too
-    many.
+    Raises
+    ------
+    OptionsError
+        odom_from_camera is missing or not a rigid transform; there are no frames or too many.
     """
     cameras = cameras_from_last([frame.observation for frame in frames])
     rig = make_rig([frame.scene for frame in frames], cameras,
@@ -67,7 +69,7 @@ def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
 
 
 def without_depth(joined: JoinedFrames) -> JoinedFrames:
-    """Return frames as of cameras without depth."""
+    """Return the joined frames without their depths."""
     return join_frames(joined.landmark_map, joined.options, [frame._replace(
         observation=replace(frame.observation, depths=None),
         scene=frame.scene._replace(depths=np.zeros_like(frame.scene.depths)))
@@ -77,31 +79,31 @@ def without_depth(joined: JoinedFrames) -> JoinedFrames:
 class Contender(NamedTuple):
     """A pose that may be right, and its support."""
 
-    finalist: Finalist  #: Finalist of the search of objects, or the pose of keyframes
+    finalist: Finalist  #: The pose, found by the search of objects or by keyframes
     pose: NDArray[np.float64]  #: (4, 4): map_from_camera
     matches: list[tuple[Match, ...]]  #: Inliers in each of F frames
-    support: Support  #: By objects
-    is_upright: bool  #: Whether it uses the known vertical, or agrees with it
-    handicap: float  #: Log odds that its attitude takes from it
-    #: Logarithm of its odds, up to a constant that all contenders share: the utility of its
-    #: support less the handicap. For poses of keyframes, that of points, objects and handicap.
+    support: Support  #: Evidence of the objects
+    is_upright: bool  #: Whether the pose uses the known vertical, or agrees with it
+    handicap: float  #: Log odds that are subtracted for the attitude of the pose
+    #: Log odds of the pose, up to a constant that all contenders share: the utility of its support
+    #: minus the handicap. For poses from keyframes, the utility of points and objects minus it.
     odds: float
-    #: Log odds, 0 or less, that a region known before gives it; never steepened
+    #: Log odds, at most 0, of the pose given the prior region; they are never sharpened
     prior: float = 0.0
     #: The place that keyframes recognize, if they propose the pose
     recognized: RecognizedPlace | None = None
-    #: The odds of a pose that keyframes propose, without what objects say for it
+    #: Log odds of a pose that keyframes propose, without the evidence of objects for it
     by_points: float = -math.inf
 
     @property
     def landmarks(self) -> NDArray[np.int64]:
-        """Return the landmarks (n,) that it matches in any frame, in order."""
-        return np.array(sorted({one.landmark for found in self.matches for one in found}),
-                        dtype=np.int64)
+        """Return the sorted landmarks (n,) that the pose matches in any frame."""
+        return np.array(sorted({match.landmark for of_frame in self.matches
+                                for match in of_frame}), dtype=np.int64)
 
     @property
     def rank(self) -> float:
-        """Return the log odds by which it competes with other contenders."""
+        """Return the log odds by which the contenders are ranked."""
         return self.odds + self.prior
 
 
@@ -135,13 +137,13 @@ def supports_of(joined: JoinedFrames, poses: NDArray[np.float64],
 
 
 def unrefined(map_from_camera: NDArray[np.float64]) -> Finalist:
-    """Return a pose (4, 4) of another source like those that a search met."""
+    """Return a pose (4, 4) of another source as a finalist without score or sample."""
     pose = invert_transform(map_from_camera)
     return Finalist(np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy(), 0.0, 0, 0, _NONE)
 
 
 def refined(joined: JoinedFrames, start: Finalist) -> Finalist:
-    """Return a pose that no search met, refined like those that it met."""
+    """Refine a pose that the search did not find, if the options ask for refinement."""
     if not joined.options.refine:
         return start
     return start._replace(**refine_rig(joined.rig, start.rotation, start.translation)._asdict())

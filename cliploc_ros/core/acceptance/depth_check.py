@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Check the depths of a request: wrong depths must do no harm.
+"""Check the depths of a request, so that wrong depths do no harm.
 
-Depth may have another unit or scale, another camera, or be noise. Then it fits no pose that the
-boxes allow. Right depths hardly change a pose that the boxes fix, and agree with it.
+Depth may have a wrong unit or scale, be of another camera, or be noise. Then it agrees with no
+pose that fits the boxes. Right depths agree with the pose that the boxes determine, and hardly
+change it.
 """
 
 import math
@@ -31,16 +32,17 @@ _TERMS = CALIBRATION.depth
 
 
 class DepthCheck(NamedTuple):
-    """The depths of the objects that a pose explains, against their boxes."""
+    """The agreement of depths and boxes of the objects that a pose matches."""
 
     objects: int  #: Number of matches with depth
-    lacking: float  #: Log odds that they lack, against depths that agree exactly: their sum
-    spoilt: float  #: Loss of the boxes' fit by the depth: Cauchy's sum
-    ratio: float  #: Median of measured depths over those that the boxes alone say
+    #: Log odds of depths that agree exactly minus those of the measured depths, summed
+    lacking: float
+    spoilt: float  #: By how much the depths raise the robust cost of the boxes
+    ratio: float  #: Median ratio of the measured depths to the depths from the boxes alone
 
     @property
     def is_passed(self) -> bool:
-        """Return whether the depths can be right."""
+        """Return whether the depths are plausible."""
         return self.lacking + _TERMS.spoilt * self.spoilt <= _TERMS.lacking * self.objects
 
 
@@ -51,22 +53,22 @@ class DepthScale:
         self._ratios: deque[float] = deque(maxlen=int(_TERMS.most_poses))
 
     def add(self, check: DepthCheck) -> None:
-        """Count an accepted pose."""
+        """Add the check of an accepted pose."""
         self._ratios.append(check.ratio)
 
     @property
     def ratio(self) -> float:
-        """Return measured over true depth; 1 before enough poses tell."""
+        """Return the ratio of measured to true depth; 1 until there are enough poses."""
         return median(self._ratios) if len(self._ratios) >= _TERMS.least_poses else 1.0
 
     @property
     def is_wrong(self) -> bool:
-        """Return whether depth is of no use."""
+        """Return whether the scale is too far off for the depths to be used."""
         return abs(math.log(self.ratio)) > math.log(_TERMS.most_ratio)
 
 
 def check_depth(rig: Rig, pose: Finalist) -> DepthCheck | None:
-    """Return the check of a pose that depth helped to find; None if no match of it has depth."""
+    """Check the depths at a pose that was found with them; None if no match has depth."""
     if not rig.scene.depths.any():
         return None
     found = verify_rig(rig, pose.rotation, pose.translation)
@@ -82,7 +84,7 @@ def check_depth(rig: Rig, pose: Finalist) -> DepthCheck | None:
     free = refine_rig(boxes, pose.rotation, pose.translation)
     edges = one_to_one(boxes, found, pose.rotation, pose.translation)
     costs = [robust_cost(residuals) if in_front else math.inf for in_front, residuals in (
-        residuals_of_rig(edges, one.rotation, one.translation) for one in (pose, free))]
+        residuals_of_rig(edges, fit.rotation, fit.translation) for fit in (pose, free))]
     measured = one_to_one(rig, found, free.rotation, free.translation).pairs[:, 14]
     return DepthCheck(
         int(known.sum()), float(lacking.sum()), costs[0] - costs[1],

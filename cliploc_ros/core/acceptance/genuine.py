@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Check that a recognized place is genuine: neither a picture of the place nor changed.
+"""Check that a recognized place is genuine: neither a picture of the place nor a changed place.
 
-Objects and points that lie in a picture of a place agree on where it was taken. Neither judges
-the other: they see the same pixels. The differences lie around the picture, in its size and
-aspect, which other intrinsics would explain, and how it moves.
+Objects and points in a picture of a place agree on where the picture was taken. They cannot check
+each other, because they come from the same pixels. A picture differs from the place by its
+surroundings, by its size and aspect, which look like other intrinsics, and by its motion.
 
-A picture of the room shows the same points as the room, but moves as a plane: where the robot
-drives sideways, the poses of its keyframes turn instead. Two looks of a moving robot show that.
+A picture of a room shows the same points as the room, but it moves as a plane: if the robot drives
+sideways, the poses from its keyframes turn instead. Two looks of a moving robot reveal this.
 """
 
 import math
@@ -28,17 +28,17 @@ from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import find_pose
 
 _TERMS = CALIBRATION.genuine
-#: Largest squared Mahalanobis distance of the motion between right poses (dof 6).
+#: Largest plausible squared Mahalanobis distance between right poses and odometry (dof 6).
 SURE_MOTION = float(chi2.ppf(_TERMS.sure_motion, 6))
 
 
 class Motion(NamedTuple):
-    """Agreement of two looks with odometry: squared Mahalanobis distances, dof 6."""
+    """Agreement of two looks with odometry: squared Mahalanobis distances with dof 6."""
 
     square: float  #: Squared distance between the motion of the two poses and odometry
-    #: The least that a picture of the place, 1 to 3 m away, would have. Where it is small, the
-    #: motion does not tell a picture from the place: a camera that only turns sees both move
-    #: alike.
+    #: The least squared distance that a picture of the place, 1 to 3 m away, would have. If it is
+    #: small, the motion does not distinguish a picture from the place. For a camera that only
+    #: turns, both move alike.
     picture: float
 
 
@@ -48,17 +48,22 @@ def compare_motion(deviation_per_metre: float, first: RecognizedPlace, second: R
 
     Parameters
     ----------
+    deviation_per_metre : float
+        Error of a pose for each metre from its keyframe, see KeyframeLayer [m / m].
+    first, second : RecognizedPlace
+        The places that the two looks recognized.
     first_from_second : ndarray (4, 4)
         Motion of the camera by odometry.
     """
-    # A wrong pose of a keyframe moves both looks at it alike, so it does not count where the same
-    # keyframes are seen. What their points add with the distance counts for the way between.
+    # An error in the pose of a keyframe shifts both looks equally, so it is not counted to the
+    # extent that both looks use the same keyframes. Errors that grow with the distance from a
+    # keyframe are counted for the distance between the looks.
     shares = dict(zip(second.keyframes, second.shares, strict=True))
     same = sum(min(share, shares.get(keyframe, 0.0))
                for keyframe, share in zip(first.keyframes, first.shares, strict=True))
     way, turn = first_from_second[:3, 3], Rotation.from_matrix(first_from_second[:3, :3])
     grown = (deviation_per_metre * np.linalg.norm(way), PER_RADIAN * turn.magnitude())
-    before, after = (one.covariance - same * one.shared for one in (first, second))
+    before, after = (place.covariance - same * place.shared for place in (first, second))
     information = np.linalg.inv(
         move_covariance(before, first.map_from_camera[:3, :3] @ way) + after + np.diag(
             odometry_deviations(first_from_second) ** 2 + same * np.repeat(grown, 3) ** 2))
@@ -67,7 +72,7 @@ def compare_motion(deviation_per_metre: float, first: RecognizedPlace, second: R
     def square(pose: NDArray[np.float64]) -> float:
         step = pose_difference(expected, pose)
         return float(step @ information @ step)
-    # where the second image is recognized if both show a picture that faced the first
+    # the pose of the second image if both images show a picture that faces the first camera
     points = first.points[::1 + len(first.points) // int(_TERMS.picture_points)]
     inside = (points - first.map_from_camera[:3, 3]) @ first.map_from_camera[:3, :3]
     picture = np.inf
@@ -80,16 +85,16 @@ def compare_motion(deviation_per_metre: float, first: RecognizedPlace, second: R
 
 
 class Signs(NamedTuple):
-    """Signs that a place is there, and as it was mapped."""
+    """Signs that a place is genuine and unchanged."""
 
-    points: float  #: Logarithm of the number of features that agree, of 40 at most
+    points: float  #: Logarithm of the number of features that agree, limited to 40 features
     confirmed: float  #: See RecognizedPlace
-    #: How far the focal length and the aspect that the points suggest are from the camera's, as
-    #: logarithms of ratios: 0 to 0.25
+    #: Log ratios, 0 to 0.25, between the focal length and aspect that fit the points and those of
+    #: the camera
     focal: float
     aspect: float
-    #: Extent of the agreeing points and boxes, as a share of the image's width or height,
-    #: whichever is greater: a picture ends within the image
+    #: Extent of the agreeing points and boxes as a share of the image's width or height, whichever
+    #: share is greater. A picture ends within the image.
     reach: float
     #: Share of the detected objects of the map's classes that the pose does not explain
     unexplained: float
@@ -97,12 +102,12 @@ class Signs(NamedTuple):
 
 def signs_of(place: RecognizedPlace, support: Support, boxes: NDArray[np.float64],
              camera: Camera) -> Signs:
-    """Return the signs at a recognized place.
+    """Return the signs that a recognized place is genuine and unchanged.
 
     Parameters
     ----------
     boxes : ndarray (b, 4)
-        Boxes that the pose explains: left, top, right, bottom [px].
+        Boxes of the detections that the pose explains: left, top, right, bottom [px].
     """
     size = np.array([camera.width, camera.height], dtype=np.float64)
     corners = np.clip(boxes.reshape(-1, 2), 0.0, size)
@@ -119,7 +124,7 @@ def signs_of(place: RecognizedPlace, support: Support, boxes: NDArray[np.float64
 
 def chance_genuine(signs: Signs, motion: Motion | None = None,
                    calibration: Calibration = CALIBRATION) -> float:
-    """Return the probability that a place is there, and as it was mapped."""
+    """Return the probability that a place is genuine and unchanged."""
     terms = calibration.genuine
     odds = terms.none + sum(getattr(terms, name) * sign for name, sign in signs._asdict().items())
     if motion is not None:
@@ -130,6 +135,6 @@ def chance_genuine(signs: Signs, motion: Motion | None = None,
 
 
 def _error(ratio: float, deviation: float) -> float:
-    """Return the logarithm of a ratio, less the part that its deviation explains."""
+    """Return the absolute log ratio minus the part that its standard deviation explains."""
     return min(max(abs(math.log(ratio)) - _TERMS.sure_deviations * deviation, 0.0),
                _TERMS.most_error)

@@ -2,17 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Places that look alike, such as two rooms with the same furniture.
 
-A camera sees the same at two places whose landmarks a turn about the vertical and a shift lay on
-each other. Such twins of the best pose are found in the map, so they count as rivals even if the
-search met one of the places only. `check_map` lists the places of a map that have twins.
+A camera has the same view at two places if a turn about the vertical and a shift map the landmarks
+of one place onto those of the other. The map is searched for such twins of the best pose, so that
+they count as rivals even if the search of poses found only one of the places. `check_map` lists
+the places of a map that have twins.
 
-Landmarks on one axis look the same from all around it. So the pose turned about an axis that most
-matched landmarks share is such a place, too.
+Landmarks on one axis look the same from all directions around it. The pose turned about an axis
+that most matched landmarks share therefore counts as a twin, too.
 
-Two poses at places that look alike explain the same detections. Which of them matches one object
-more, or fits better, then says little: maps lack objects, and objects move. Labels tell the
-places apart. All objects that only one of the places explains have one cause: that one of them is
-out of date. So they count together, not each.
+Two poses at places that look alike explain the same detections. It is then weak evidence that one
+of them matches one object more, or fits better, because maps lack objects, and objects move.
+Labels distinguish the places. All objects that only one of the places explains have one common
+cause: the map of one place is out of date. They therefore count once, not separately.
 """
 
 import math
@@ -37,9 +38,9 @@ from cliploc_ros.core.map.pairs import find_repeats
 _TERMS = CALIBRATION.twins
 _SAME_TURN = np.cos(np.radians(SAME_MOVE.angle_deg))
 _OWN_TURN = np.cos(np.radians(SAME_ANSWER.angle_deg))
-# Both places are upright: one is moved onto the other by a turn about the vertical.
+# Both places are upright, so a turn about the vertical maps one onto the other.
 _MOST_TILT = np.cos(np.radians(_TERMS.most_tilt_deg))
-# How near a landmark must lie to one of its class, each time after the move is fitted [m].
+# How near a moved landmark must lie to a landmark of its class, in successive fits of a move [m].
 _NEAR_M = (_TERMS.first_near_m, _TERMS.second_near_m, _TERMS.last_near_m)
 # Columns of Support.shown.
 _COUNT, _LIKENESS, _UNLABELLED = 0, 3, 5
@@ -50,25 +51,26 @@ _NOBODY, _NOWHERE = np.empty(0, dtype=np.int64), np.empty((0, 4, 4))
 
 
 class Alike(NamedTuple):
-    """Places that look like one place, the most alike first."""
+    """The m places that look like a given place, the most similar place first."""
 
-    #: (m, 4, 4): each takes the place onto another one: a turn about the vertical and a shift
+    #: (m, 4, 4): moves of the given place onto each other place: a turn about the vertical and a
+    #: shift
     moves: NDArray[np.float64]
-    landmarks: NDArray[np.int64]  #: (r,): landmarks of the place
-    #: (m, r): the landmark of its class at the same spot of the other place, where found
+    landmarks: NDArray[np.int64]  #: (r,): landmarks of the given place
+    #: (m, r): the corresponding landmark of the same class at the other place, if found
     others: NDArray[np.int64]
-    found: NDArray[np.bool_]  #: (m, r)
+    found: NDArray[np.bool_]  #: (m, r): whether there is a corresponding landmark
 
     @property
     def shares(self) -> NDArray[np.float64]:
-        """Return the share of the landmarks that is found at each place (m,)."""
+        """Return the share (m,) of the given place's landmarks that are found at each place."""
         return np.asarray(self.found.sum(axis=1) / max(1, len(self.landmarks)))
 
     @property
     def are_rooms(self) -> NDArray[np.bool_]:
-        """Return which places (m,) are rooms of their own, of landmarks not around this one.
+        """Return which places (m,) are separate rooms, with landmarks of their own.
 
-        Whoever furnished them alike may have hung the same posters, too.
+        Rooms that are furnished alike may have the same posters, too.
         """
         elsewhere = self.found & ~np.isin(self.others, self.landmarks)
         return np.asarray(elsewhere.sum(axis=1) >= _TERMS.least_share * len(self.landmarks))
@@ -77,11 +79,11 @@ class Alike(NamedTuple):
 def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
                matched: NDArray[np.int64] = _NOBODY,
                moves: NDArray[np.float64] = _NOWHERE) -> Alike:
-    """Return the places that look like the one around a position.
+    """Find the places that look like the place around a position.
 
-    A place looks like another one if at least four landmarks, .38 of those around it, and .4 of
-    those matched have one of their class at the same spot there. Moves that leave the position
-    within 1 m and 45 degrees lead to no other place.
+    Two places look alike if the move between them takes enough landmarks near landmarks of their
+    class: at least four landmarks, .38 of the landmarks around the position, and .4 of the matched
+    landmarks. Moves that change the position by less than 1 m and 45 degrees are ignored.
 
     Parameters
     ----------
@@ -89,11 +91,11 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
         L landmarks, z up.
     position : ndarray (3,)
     matched : ndarray (n,) of int, optional
-        Landmarks that belong to the place wherever they are.
+        Landmarks that belong to the place whatever their distance.
     moves : ndarray (k, 4, 4), optional
         Moves to try in addition to those that the map suggests.
     """
-    # those matched, then those around, the nearest first
+    # first the matched landmarks, then those around, nearest first
     ranks = [*range(1, min(int(_TERMS.around), len(landmark_map)) + 1)]
     distances, rows = landmark_map.tree.query(
         position, ranks, distance_upper_bound=_TERMS.radius_m) if ranks else (
@@ -109,7 +111,7 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
     shares = found.mean(axis=1)
     alike = shares >= _TERMS.least_share
     if len(matched):
-        # what the image shows may have moved at a place that is alike all around
+        # objects in the image may have been moved, although the rest of the place looks alike
         alike &= ((found[:, :len(matched)].mean(axis=1) >= _TERMS.least_matched)
                   | (shares >= _TERMS.enough))
     ends = np.einsum('nij,rj->nri', moves[:, :3, :3], landmark_map.centers[rows])
@@ -123,20 +125,20 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
 def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
                matched: NDArray[np.int64], others: NDArray[np.float64]
                ) -> tuple[NDArray[np.float64], Alike]:
-    """Return where a camera would be at the places that look most like that of a pose.
+    """Return the camera poses at the places that look most like the place of a pose.
 
     Parameters
     ----------
     map_from_camera : ndarray (4, 4)
     matched : ndarray (n,) of int
-        Landmarks that the pose explains detections with; all around it count where there are none.
+        Landmarks that the pose matches. If there are none, all landmarks around the pose count.
     others : ndarray (k, 4, 4)
-        Poses that a search met elsewhere, best first: the places of five are compared, too.
+        Poses that a search found elsewhere, best first. The first five are compared, too.
 
     Returns
     -------
     poses : ndarray (m, 4, 4)
-        At most 3, the place that is most alike first.
+        At most 3 poses, that of the most similar place first.
     alike : Alike
         These places.
     """
@@ -151,17 +153,17 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
 
 def turned_about_axis(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
                       matched: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return a camera pose turned about an axis that most matched landmarks share (m, 4, 4).
+    """Return a pose turned about an axis that most matched landmarks share, as poses (m, 4, 4).
 
-    Landmarks on one axis fix all but the turn about it: the camera sees the same from all around.
-    The axis is upright, through one of the landmarks, or fitted to all. There is no such pose
-    where fewer than half of the landmarks reach to either axis.
+    Landmarks on one axis determine a pose up to a turn about the axis, because the camera sees the
+    same from all around. The axis is either vertical through one of the landmarks, or a line
+    fitted to all of them. An axis that touches less than half of the landmarks gives no pose.
 
     Parameters
     ----------
     map_from_camera : ndarray (4, 4)
     matched : ndarray (n,) of int
-        Landmarks that the pose explains detections with.
+        Landmarks that the pose matches.
     """
     if len(matched) < 2:
         return _NOWHERE
@@ -185,31 +187,35 @@ def turned_about_axis(landmark_map: LandmarkMap, map_from_camera: NDArray[np.flo
 
 def lead_over_twin(its: Support, twin: Support, place_share: float = 0.0,
                    is_room: bool = True) -> float:
-    """Return the log odds by which objects prefer a pose to one at a place that looks alike.
+    """Return the log odds by which objects prefer a pose to its twin at a place that looks alike.
 
-    Labels tell objects apart that both poses explain. An object that only one pose explains counts
-    as its label says, where the places share few objects. Where they share many, one of both is
-    out of date, or was furnished like the other: that one cause explains all such objects.
+    Objects that both poses explain distinguish the poses by their labels. If the places share few
+    objects, an object that only one pose explains counts by its label. If they share many, one of
+    the two places is out of date, or was furnished like the other. This one cause then accounts
+    for all objects that only one pose explains.
 
     Parameters
     ----------
+    its, twin : Support
+        Support of the pose and of its twin.
     place_share : float
         Share of the landmarks around the pose that the other place has, too.
     is_room : bool
-        Whether the other place is a room of its own. Whoever furnished and labelled rooms alike
-        erred alike, so that their labels count less; a place repeats itself by chance.
+        Whether the other place is a separate room. Rooms that are furnished alike may have the
+        same errors in their labels, so the labels count less. Within a room, places look alike by
+        chance.
     """
     terms = CALIBRATION.places
     common = its.shown.keys() & twin.shown.keys()
     lead, counts, further = 0.0, 0.0, 0.0
     for sign, shown in ((1.0, its.shown), (-1.0, twin.shown)):
-        for one, row in shown.items():
-            said = sign * (terms.likeness * row[_LIKENESS] + terms.unlabelled * row[_UNLABELLED])
-            if one in common:
-                lead += said
+        for detection, row in shown.items():
+            odds = sign * (terms.likeness * row[_LIKENESS] + terms.unlabelled * row[_UNLABELLED])
+            if detection in common:
+                lead += odds
             else:
-                further, counts = further + said, counts + sign * row[_COUNT]
-    share = sum(its.shown[one][_COUNT] for one in common) / max(its.inliers, 1e-9)
+                further, counts = further + odds, counts + sign * row[_COUNT]
+    share = sum(its.shown[detection][_COUNT] for detection in common) / max(its.inliers, 1e-9)
     alike = max(
         float(np.interp(share, (terms.differ, terms.alike), (0.0, 1.0))),
         float(np.interp(place_share, (terms.differ_around, terms.alike_around), (0.0, 1.0))))
@@ -220,7 +226,7 @@ def lead_over_twin(its: Support, twin: Support, place_share: float = 0.0,
 
 
 def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the moves (m, 4, 4) of a place onto others for which most pairs vote."""
+    """Return the moves (m, 4, 4) of a place onto other places with the most votes of pairs."""
     repeats = find_repeats(landmark_map.pairs, rows[:int(_TERMS.looked_up)])
     order = np.argsort(-repeats.votes, kind='stable')[:int(_TERMS.compared)]
     moves = _upright_moves(repeats.turns[order], landmark_map.centers[repeats.landmarks[order]],
@@ -230,7 +236,7 @@ def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray
     middle = landmark_map.centers[rows].mean(axis=0)
     weights = _are_same(moves, middle) * repeats.votes[order]
     votes = weights.sum(axis=1)
-    # each move is the mean of those that are the same
+    # each move is replaced by the mean of the moves that are the same
     ends = weights @ (moves[:, :3, :3] @ middle + moves[:, :3, 3]) / votes[:, None]
     moves = _upright_moves(np.arctan2(weights @ moves[:, 1, 0], weights @ moves[:, 0, 0]),
                            middle, ends)[np.argsort(-votes, kind='stable')]
@@ -239,7 +245,10 @@ def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray
 
 def _upright_moves(turns: NDArray[np.float64], before: NDArray[np.float64],
                    after: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the moves (m, 4, 4) by some turns that take points (m, 3) to others (m, 3)."""
+    """Return the moves (m, 4, 4) with given yaw angles (m,) that take points to other points.
+
+    Points are `before` (3,) or (m, 3), and `after` (m, 3).
+    """
     moves = np.tile(np.eye(4), (len(turns), 1, 1))
     moves[:, 0, 0] = moves[:, 1, 1] = np.cos(turns)
     moves[:, 1, 0], moves[:, 0, 1] = np.sin(turns), -np.sin(turns)
@@ -249,7 +258,7 @@ def _upright_moves(turns: NDArray[np.float64], before: NDArray[np.float64],
 
 
 def _are_same(moves: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which moves (m, m) take a point to the same place by the same turn."""
+    """Return which pairs of moves (m, m) take a point to the same place with the same turn."""
     ends = moves[:, :3, :3] @ point + moves[:, :3, 3]
     cosines = moves[:, None, 0, 0] * moves[:, 0, 0] + moves[:, None, 1, 0] * moves[:, 1, 0]
     near = np.linalg.norm(ends[:, None] - ends, axis=2) < SAME_MOVE.distance_m
@@ -259,7 +268,10 @@ def _are_same(moves: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray
 def _verified(landmark_map: LandmarkMap, rows: NDArray[np.int64], moves: NDArray[np.float64],
               position: NDArray[np.float64]
               ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Return moves (m, 4, 4) fitted to a place, and its landmarks (m, r) after each."""
+    """Fit moves (m, 4, 4) to the landmarks of a place, and drop moves that fit too few of them.
+
+    Also returns the corresponding landmarks (m, r) of each move, and whether they were found.
+    """
     centers = landmark_map.centers[rows]
     for near_m in _NEAR_M:
         ends = np.einsum('nij,rj->nri', moves[:, :3, :3], centers) + moves[:, None, :3, 3]
@@ -267,7 +279,7 @@ def _verified(landmark_map: LandmarkMap, rows: NDArray[np.int64], moves: NDArray
         kept = found.sum(axis=1) >= _TERMS.least_landmarks
         moves, others, found = moves[kept], others[kept], found[kept]
         if near_m > _NEAR_M[-1]:
-            # The upright moves (m, 4, 4) that take points (r, 3) nearest to others (m, r, 3).
+            # least-squares fit of upright moves that take centers (r, 3) to after (m, r, 3)
             after = landmark_map.centers[others]
             weights = found / np.maximum(1, found.sum(axis=1, keepdims=True))
             first, second = weights @ centers, np.einsum('nr,nrj->nj', weights, after)

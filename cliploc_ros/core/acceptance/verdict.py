@@ -19,11 +19,11 @@ Point = tuple[float, float, float]
 
 
 class RefusalKind(StrEnum):
-    """Why a pose is refused."""
+    """The kinds of refusals of a pose."""
 
-    #: Too few detections, candidates or matched objects for a pose.
+    #: There are too few detections, candidates or matched objects for a pose.
     TOO_FEW_OBJECTS = auto()
-    #: Another pose found is too likely.
+    #: The search found another pose that is too likely.
     AMBIGUOUS = auto()
     #: The map has another place that looks the same.
     LOOK_ALIKE = auto()
@@ -31,11 +31,11 @@ class RefusalKind(StrEnum):
     UNCERTAIN_POSITION = auto()
     #: The matches are too weak, or too much of the image does not fit.
     UNEXPLAINED = auto()
-    #: Too few samples to have met the rivals of the pose.
+    #: The search tried too few samples to find the rivals of the pose.
     SEARCH_CUT_SHORT = auto()
-    #: Enough for all crops, but time ended before all were compared.
+    #: The confidence is too low for a pose from a part of the crops, and time is up.
     NOT_ALL_CROPS = auto()
-    #: The looks before this one were too unsure of the pose.
+    #: The confidence of earlier looks in the pose is too low.
     FRAMES_DISAGREE = auto()
     #: Objects and keyframes lead to different places.
     CONTRADICTION = auto()
@@ -43,32 +43,32 @@ class RefusalKind(StrEnum):
     CHANGED = auto()
     #: Boxes, camera_info and map do not agree, or no look has verified that they do.
     WRONG_CAMERA = auto()
-    #: The time of the request ended before a frame was localized.
+    #: The request timed out before a frame was localized.
     TIME_UP = auto()
     #: The map has none of the detector's classes, or no score or box is usable.
     WRONG_DETECTIONS = auto()
 
 
-# Factors of the confidence other than likely and found. Of equal factors, the first is named.
+# Factors of the confidence other than likely and found. A refusal names the first of equal ones.
 _FACTORS = ('distinct', 'near', 'camera', 'genuine', 'not_mirrored', 'uncontradicted')
 # Kind and message of a refusal, by the weakest factor of its Evidence.
 _ADVICE = {
     'near': (RefusalKind.UNCERTAIN_POSITION, 'position uncertain by {0.deviation_m:.2g} m; turn '
                                              'the camera to more or nearer objects'),
     'camera': (RefusalKind.WRONG_CAMERA,
-               'another focal length or other pixels of the boxes may fit; turn the camera to '
-               'nearer objects, or check camera_info'),
-    'genuine': (RefusalKind.CHANGED, '{0.recognized.inliers} points of keyframes agree as in a '
-                                     'picture or a changed place; move, request again'),
-    'not_mirrored': (RefusalKind.AMBIGUOUS, 'mirrored, the image fits another pose; turn the '
+               'camera_info or the pixels of the boxes may be wrong; turn the camera to nearer '
+               'objects, or check camera_info'),
+    'genuine': (RefusalKind.CHANGED, '{0.recognized.inliers} points of keyframes look like a '
+                                     'picture or a changed place; move and request again'),
+    'not_mirrored': (RefusalKind.AMBIGUOUS, 'the mirrored image fits another pose; turn the '
                                             'camera to more objects'),
     'found': (RefusalKind.SEARCH_CUT_SHORT,
-              'pose met only {0.meetings:g} times in {0.tried} samples; raise iterations or set '
+              'pose found only {0.meetings:g} times in {0.tried} samples; raise iterations or set '
               'algorithm to auto')}
 
 
 class Refusal(NamedTuple):
-    """A kind, and the reason in one line."""
+    """The kind of a refusal, and the reason in one line."""
 
     kind: RefusalKind
     reason: str
@@ -78,9 +78,9 @@ class Refusal(NamedTuple):
 class Rival:
     """The most likely pose that disagrees with the leading pose."""
 
-    likely: float  #: Its probability
-    place: Point  #: Where its camera is [m]
-    map: str = ''  #: Name of its map, where there are several
+    likely: float  #: Probability of the pose
+    place: Point  #: Position of the camera at this pose [m]
+    map: str = ''  #: Name of its map if there are several
     #: Whether keyframes propose one of the two poses and objects the other
     is_other_source: bool = False
 
@@ -89,62 +89,62 @@ class Rival:
 class Evidence:
     """Evidence for and against the leading pose."""
 
-    inliers: int  #: Number of objects that it explains
-    #: Probability that it is right, given all poses found, see
+    inliers: int  #: Number of objects that the pose explains
+    #: Probability that the pose is right, given all poses found, see
     #: cliploc_ros.core.acceptance.confidence
     likely: float
     _: KW_ONLY
-    #: The same without the objects; 0 where keyframes do not propose it
+    #: Probability that the pose is right by keyframes alone; 0 if they do not propose it
     by_points: float = 0.0
     rival: Rival | None = None
-    distinct: float = 1.0  #: Probability that no look-alike place is mistaken for its place
-    #: Where the camera is, and where it would be at the most likely look-alike place [m]
+    distinct: float = 1.0  #: Probability that the pose is not at a place that looks alike
+    #: Position of the camera at this pose, and at the most likely place that looks alike [m]
     place: Point = (0.0, 0.0, 0.0)
     twin: Point | None = None
-    twin_map: str = ''  #: Name of the twin's map, where there are several
-    near: float = 1.0  #: Probability that it is within 1 m if it is right, given its covariance
-    #: By how much errors of a camera lower that, and what is certainly wrong with one; empty if
-    #: nothing is, see cliploc_ros.core.acceptance.camera_check
+    twin_map: str = ''  #: Name of the twin's map if there are several
+    near: float = 1.0  #: Probability, by the covariance, that a right pose is within 1 m
+    #: Factor by which camera errors lower that probability, and a description of what is certainly
+    #: wrong with a camera, empty if nothing is, see cliploc_ros.core.acceptance.camera_check
     camera: float = 1.0
     camera_fault: str = ''
-    deviation_m: float = 0.0  #: Standard deviation of its position [m]
+    deviation_m: float = 0.0  #: Standard deviation of the position [m]
     coverage: float = 1.0  #: Share of its samples that the search tried, 0 to 1
     tried: int = 0  #: Number of samples that the search tried
-    #: Number of these samples that hold only inliers of the best pose of objects; infinite for a
+    #: Number of these samples that consist of inliers of the best pose of objects; infinite for a
     #: search that tried all samples
     meetings: float = math.inf
-    unexplained: float = 0.0  #: Number of other detected objects of the map's classes
+    unexplained: float = 0.0  #: Number of detected objects of the map's classes that do not match
     #: Signs that the place is real, not a picture; None if keyframes do not propose the pose
     signs: Signs | None = None
-    motion: Motion | None = None  #: Since an earlier look by keyframes
-    #: Probability that the image is not a mirror image, see cliploc_ros.core.acceptance.comparison
+    motion: Motion | None = None  #: Motion since an earlier look by keyframes
+    #: Probability that the image is not mirrored, see cliploc_ros.core.acceptance.comparison
     not_mirrored: float = 1.0
-    #: Probability that keyframes are wrong which recognize another place only
+    #: Probability that keyframes are wrong if they recognize only other places
     uncontradicted: float = 1.0
     recognized: RecognizedPlace | None = None  #: The place that keyframes recognize at the pose
-    prior: float = 0.0  #: Log odds, 0 or less, that a region known before gives the pose
+    prior: float = 0.0  #: Log odds, at most 0, of the pose given the prior region
     #: Confidence of each earlier look in this pose, see cliploc_ros.core.acceptance.looks
     earlier: tuple[float, ...] = ()
-    crops_left: int = 0  #: Number of crops that were not compared with labels yet
+    crops_left: int = 0  #: Number of crops that have not been compared with labels yet
 
     @property
     def found(self) -> float:
         """Return the probability that the search of objects has not missed a better pose.
 
-        A rival with as many inliers is met about as often as the best pose. Random draws miss it
-        with probability exp(-meetings) (Fischler and Bolles 1981). That holds for ransac. For
+        A rival with as many inliers is sampled about as often as the best pose. Random draws miss
+        it with probability exp(-meetings) (Fischler and Bolles 1981). This holds for ransac. For
         auto and PROSAC, whose order is not random, it is an assumption.
         """
         return 1.0 - CALIBRATION.search.missed_is_right * math.exp(-self.meetings)
 
     @property
     def genuine(self) -> float:
-        """Return the probability that the place is there, and no picture of it."""
+        """Return the probability that the place is real, not a picture, and unchanged."""
         return 1.0 if self.signs is None else chance_genuine(self.signs, self.motion)
 
     @property
     def certainty(self) -> float:
-        """Return the probability that nothing makes it wrong but the poses found."""
+        """Return the probability that the pose is not wrong for a reason other than its rivals."""
         return math.prod(getattr(self, name) for name in _FACTORS)
 
     @property
@@ -169,9 +169,10 @@ def is_exhaustive(coverage: float, options: RelocalizerOptions) -> bool:
 
 
 def refusal(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
-    """Return why the leading pose is refused; None if it is accepted.
+    """Return the refusal of the leading pose; None if it is accepted.
 
-    What the search of objects lacks does not matter where keyframes alone are sure enough.
+    A search of objects that was too short, or matched too few objects, does not matter if the
+    confidence by keyframes alone is high enough.
     """
     by_points = evidence.by_points >= needed_confidence(evidence, options)
     if evidence.camera_fault and not by_points:
@@ -182,18 +183,17 @@ def refusal(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
     needed = min(CALIBRATION.looks.mean_confidence, options.min_confidence)
     if refused or evidence.mean_confidence >= needed:
         return refused
-    # the looks before this one were too unsure of this pose
     return Refusal(RefusalKind.FRAMES_DISAGREE,
-                   f'mean confidence {_rounded_down(evidence.mean_confidence)} < {needed:g} of '
-                   f'the last {len(evidence.earlier) + 1} frames in this pose; {_LOOK_ABOUT}')
+                   f'mean confidence {_rounded_down(evidence.mean_confidence)} < {needed:g} in '
+                   f'this pose over the last {len(evidence.earlier) + 1} frames; {_LOOK_ABOUT}')
 
 
 def needed_confidence(evidence: Evidence, options: RelocalizerOptions) -> float:
-    """Return the confidence that a pose needs; more while crops are left.
+    """Return the confidence that a pose needs. While crops are left, it is higher.
 
     Each search with more crops is another chance of a false accept, as in the interim analyses of
     clinical trials (Haybittle, "Repeated assessment of results in clinical trials of cancer
-    treatment", 1971). That holds for a search that time ends, too.
+    treatment", 1971). This also holds for a search that ends because time is up.
     """
     if not evidence.crops_left:
         return options.min_confidence
@@ -201,7 +201,7 @@ def needed_confidence(evidence: Evidence, options: RelocalizerOptions) -> float:
 
 
 def _too_little(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
-    """Return the refusal of a search that was too short, or that matched too few objects."""
+    """Return the refusal if the search was too short or matched too few objects; else None."""
     kind, least = RefusalKind.SEARCH_CUT_SHORT, int(CALIBRATION.search.least_samples)
     if evidence.coverage < 1.0 and options.algorithm == 'auto':
         if evidence.tried < least:
@@ -221,23 +221,24 @@ def _too_little(evidence: Evidence, options: RelocalizerOptions) -> Refusal | No
 
 
 def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
-    """Return a refusal that names the evidence which takes most of the missing probability."""
+    """Return the refusal, with the main cause, if the confidence is too low; else None."""
     confidence, needed = evidence.confidence, needed_confidence(evidence, options)
     if confidence >= needed:
         return None
     if confidence >= options.min_confidence:
         digits = 1 + math.ceil(-math.log10(1.0 - needed))
         return Refusal(RefusalKind.NOT_ALL_CROPS,
-                       f'confidence {_rounded_down(confidence, digits)} < {needed:.{digits}f}, as '
-                       f'it takes without {evidence.crops_left} crops; raise timeout_s')
+                       f'confidence {_rounded_down(confidence, digits)} < {needed:.{digits}f}, '
+                       f'required while {evidence.crops_left} crops are not compared; raise '
+                       'timeout_s')
     compared = f'confidence {_rounded_down(confidence)} < {options.min_confidence:g}'
     if evidence.prior < 0.0:
-        compared += '; the prior has the robot elsewhere'
+        compared += '; the prior puts the robot elsewhere'
     likely, rival = max(evidence.likely, evidence.by_points), evidence.rival
     found = max(evidence.likely * evidence.found, evidence.by_points) / max(likely, 1e-9)
     weakest = min(('likely', likely), *((name, getattr(evidence, name)) for name in _FACTORS),
                   ('found', found), key=lambda factor: factor[1])[0]
-    # a rival has most of the missing probability, or nearly that of the pose
+    # a rival has most of the missing probability, or nearly the probability of the pose
     terms = CALIBRATION.refusals
     ambiguous = rival is not None and rival.likely > max(terms.least_rival, min(
         terms.of_leading * evidence.likely, terms.of_missing * (1.0 - evidence.likely)))
@@ -246,29 +247,29 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
             weakest == 'distinct' or (weakest == 'likely' and ambiguous)):
         kind, second = RefusalKind.LOOK_ALIKE, evidence.twin_map and (
             f' (the second in {evidence.twin_map})')
-        said = (f'{_point(evidence.place)} and {_point(evidence.twin)} m look alike{second}; '
+        cause = (f'{_point(evidence.place)} and {_point(evidence.twin)} m look alike{second}; '
                 'turn the camera to objects that differ')
     elif weakest in _ADVICE and (weakest != 'genuine' or evidence.recognized is not None):
         kind, sentence = _ADVICE[weakest]
-        said = sentence.format(evidence)
+        cause = sentence.format(evidence)
     elif rival is None or not (weakest == 'uncontradicted' or ambiguous):
         kind = RefusalKind.UNEXPLAINED
-        said = (f'{evidence.inliers} objects matched, {round(evidence.unexplained)} unexplained'
+        cause = (f'{evidence.inliers} objects matched, {round(evidence.unexplained)} unexplained'
                 f'{_points(evidence)}; {_LOOK_ABOUT}')
     elif rival.is_other_source or weakest == 'uncontradicted':
         apart = float(np.linalg.norm(np.subtract(rival.place, evidence.place)))
         kind = RefusalKind.CONTRADICTION
-        said = f'objects and keyframes lead {apart:.2f} m apart; {_LOOK_ABOUT}'
+        cause = f'objects and keyframes give poses {apart:.2f} m apart; {_LOOK_ABOUT}'
     else:
         where = f' in {rival.map}' if rival.map else ''
-        kind, said = RefusalKind.AMBIGUOUS, (
-            f'ambiguous, another pose has {rival.likely:.2g}{where}; turn the camera to objects '
-            'that differ')
-    return Refusal(kind, f'{compared}; {said}')
+        kind, cause = RefusalKind.AMBIGUOUS, (
+            f'ambiguous: another pose{where} has probability {rival.likely:.2g}; turn the camera '
+            'to objects that differ')
+    return Refusal(kind, f'{compared}; {cause}')
 
 
 def _points(evidence: Evidence) -> str:
-    """Return the keyframes' evidence at the pose, as part of a sentence; empty without any."""
+    """Describe the keyframes that match at the pose, as part of a sentence; empty without any."""
     if evidence.recognized is None:
         return ''
     return (f', {evidence.recognized.inliers} points of keyframes agree in '
@@ -280,5 +281,5 @@ def _point(position: Point) -> str:
 
 
 def _rounded_down(share: float, digits: int = 2) -> str:
-    """Return some decimals, never rounded up: 0.9899 stays below 0.99."""
+    """Format a share, rounded down: 0.9899 stays below 0.99."""
     return f'{math.floor(share * 10**digits + 1e-9) / 10**digits:.{digits}f}'

@@ -3,8 +3,8 @@
 """The systematic errors of a camera and its boxes, fitted together with one pose.
 
 A wrong camera_info, boxes in the pixels of another image, and boxes by another convention displace
-all boxes of a camera by one rule. A box with middle c and half size h on the plane z = 1 is where
-the pose says after
+all boxes of a camera systematically. A box with centre c and half size h on the plane z = 1 is
+corrected to
 
     h' = exp(-size) h / scale,    c' = (c - shift) / scale - 2 corner h',
 
@@ -13,12 +13,14 @@ errors are the seven numbers
 
     focal, aspect, shift x and y, corner x and y, size,
 
-0 for a right camera. Shifts are lengths on the plane z = 1, corners are shares of a box's sides,
-the others are logarithms. A turn about the axis of the camera is a turn of the pose.
+which are 0 for a right camera. Shifts are lengths on the plane z = 1, corners are shares of a
+box's sides, and the other errors are logarithms. A roll error is not among them, because the pose
+absorbs it.
 
-Pose and errors are fitted to the edges of one frame (Levenberg and Marquardt, see refinement).
-Eliminating the pose leaves the information of the errors alone (Schur's complement). A frame of
-eight objects determines its focal length to 15 to 25 %; many frames determine it better.
+Pose and errors are fitted to the edges of the boxes of one frame (Levenberg and Marquardt, see
+refinement). The pose is then eliminated with the Schur complement, which leaves the information
+about the errors alone. A frame of eight objects determines the focal length to 15 to 25 %. Many
+frames determine it better.
 """
 
 from math import exp
@@ -37,30 +39,31 @@ from cliploc_ros.core.fit.refinement import (
 )
 from cliploc_ros.core.kernels.compiled import compiled
 
-#: Number of the errors.
+#: Number of errors of a camera.
 ERRORS = 7
-# Focal length and distance change along a curved valley: a fit takes 15 to 40 steps of 10 us.
+# Focal length and distance are correlated along a curved valley of the cost, so a fit takes 15 to
+# 40 steps of 10 us.
 _STEPS, _TRIALS = 40, 5
 _FIRST_DAMPING, _SETTLED = 1e-3, 1e-5
-# Beyond a step of this length, in metres and radians, the residuals are far from linear.
+# For steps longer than this, in metres and radians, the residuals are far from linear.
 _LONGEST_STEP = 1.0
-# Information of a direction that no box fixes [1 / m^2] [1 / rad^2].
+# Information about a direction that no box determines [1 / m^2] [1 / rad^2].
 _LEAST_INFORMATION = 0.01
-# The most that a residual counts in the mean square.
+# Limit of the residuals in the mean square.
 _MOST_RESIDUAL = 4.0
 
 
 class CameraFit(NamedTuple):
-    """The errors of a camera by one frame, independent of its pose."""
+    """The errors of a camera, estimated from one frame with the pose eliminated."""
 
-    errors: NDArray[np.float64]  #: (7,): the most likely errors, given their deviations
-    information: NDArray[np.float64]  #: (7, 7): of the boxes alone, about these errors
-    square: float  #: Sum of the squared residuals that remain
+    errors: NDArray[np.float64]  #: (7,): the most likely errors, given their prior deviations
+    information: NDArray[np.float64]  #: (7, 7): information of the boxes alone about the errors
+    square: float  #: Sum of the squared residuals after the fit
 
 
 @compiled
 def corrected(pairs, errors):
-    """Return matches (m, 16), see residuals_of, with boxes as of a camera without its errors."""
+    """Return matches (m, 16), see residuals_of, with boxes corrected for errors of the camera."""
     found = pairs.copy()
     for axis in range(2):
         scale = exp(errors[0] + (0.5 - axis) * errors[1])
@@ -76,14 +79,14 @@ def corrected(pairs, errors):
 
 @compiled
 def camera_jacobian(pairs, vertical, errors, rotation, translation, residuals):
-    """Return the derivatives (5 * m + 3, 13) of the residuals by the pose and by the errors.
+    """Return the Jacobian (5 * m + 3, 13) of the residuals with respect to pose and errors.
 
     Parameters
     ----------
     pairs : ndarray (m, 16)
-        Corrected by the errors.
+        Matches with boxes corrected for the errors.
     residuals : ndarray (5 * m + 3,)
-        Theirs, see residuals_of, which explains the other parameters, too.
+        Residuals of these matches. For the other parameters see residuals_of.
     """
     jacobian = np.zeros((5 * len(pairs) + 3, 6 + ERRORS))
     jacobian[:, :6] = jacobian_of(pairs, vertical, rotation, translation)
@@ -105,15 +108,15 @@ def camera_jacobian(pairs, vertical, errors, rotation, translation, residuals):
 
 @compiled
 def fit_camera(pairs, is_edge, vertical, rotation, translation, deviations):
-    """Return the errors of a camera, fitted with its pose to the boxes of one frame: CameraFit.
+    """Fit the errors of a camera together with its pose to the boxes of one frame: CameraFit.
 
     Parameters
     ----------
     pairs, vertical, rotation, translation
-        See residuals_of; a pose near the best one for a camera without errors.
+        See residuals_of. The pose is near the best pose of a camera without errors.
     is_edge : ndarray (m, 4) of bool
-        Whether the left, right, top and bottom edges are those of objects. The border of the image
-        cuts others: it would seem to shift and to shrink all boxes.
+        Whether the left, right, top and bottom edges are edges of the object. Edges that are cut
+        by the border of the image are ignored: they would seem to shift and shrink all boxes.
     deviations : ndarray (7,)
         Standard deviations of the errors before any box is seen.
     """
@@ -165,7 +168,7 @@ def fit_camera(pairs, is_edge, vertical, rotation, translation, deviations):
 
 @compiled
 def _cost(pairs, is_edge, vertical, errors, rotation, translation, deviations):
-    """Return the residuals and the cost; infinite for a landmark behind the camera."""
+    """Return the residuals and the cost, infinite if a landmark is not in front of the camera."""
     residuals = np.zeros(5 * len(pairs) + 3)
     if not residuals_of(corrected(pairs, errors), vertical, rotation, translation, residuals):
         return residuals, np.inf
@@ -178,7 +181,7 @@ def _cost(pairs, is_edge, vertical, errors, rotation, translation, deviations):
 
 @compiled
 def _equations(pairs, is_edge, vertical, errors, rotation, translation, residuals):
-    """Return information (13, 13) and gradient (13,) of pose and errors, by the boxes."""
+    """Return the information (13, 13) and gradient (13,) of the boxes for pose and errors."""
     jacobian = camera_jacobian(corrected(pairs, errors), vertical, errors, rotation, translation,
                                residuals)
     for row in range(len(pairs)):
@@ -193,7 +196,7 @@ def _equations(pairs, is_edge, vertical, errors, rotation, translation, residual
 
 @compiled
 def _moves(information):
-    """Return how the best pose moves (6, 7) with each error."""
+    """Return the Jacobian (6, 7) of the best pose with respect to the errors."""
     moves, column = np.zeros((6, ERRORS)), np.zeros(6)
     for error in range(ERRORS):
         if not solve(information[:6, :6].copy(), -information[:6, 6 + error].copy(), column):

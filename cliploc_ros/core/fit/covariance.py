@@ -1,25 +1,25 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The covariance of a pose: how each source of error moves the pose, and how large it is.
+"""The covariance of a pose, from the size of each source of error and its effect on the pose.
 
-Refinement solves H x = J^T W r. An error e of the residuals moves the pose by H^-1 J^T W e, so the
-covariance is H^-1 M H^-1, and M is a sum over sources of error:
+Refinement solves H x = J^T W r. An error e of the residuals moves the pose by H^-1 J^T W e. The
+covariance is therefore H^-1 M H^-1, where M is a sum over these sources of error:
 
-* the edges of an object. Its shape in the map and its look are wrong in all frames alike, so the
-  errors of one edge are the same in all frames;
-* the position of a landmark, the same in all frames that see it. A landmark that is displaced acts
-  like cameras that are displaced the other way;
-* the position of the map near the camera, the same for all landmarks: as if all cameras were
-  displaced and turned together about the last one;
-* the vertical, the same in all frames: one sensor on one mount;
-* the calibration of a camera, the same in all of its frames: as if all of its boxes were scaled,
-  stretched and shifted together;
-* odometry, a random walk: the error of a step displaces all frames beyond it;
-* the mounts of several cameras, between whose frames of one instant there is no such step.
+* the edges of an object. Its shape in the map and its appearance are wrong in all frames alike, so
+  the error of an edge is the same in all frames;
+* the position of a landmark, with the same error in all frames that see it. A displaced landmark
+  acts like cameras that are displaced in the opposite direction;
+* the position of the map near the camera, with the same error for all landmarks, as if all cameras
+  were displaced together and turned about the last camera;
+* the vertical, with the same error in all frames, because it comes from one sensor on one mount;
+* the calibration of a camera, with the same error in all of its frames, as if all of its boxes
+  were scaled, stretched and shifted together;
+* odometry, as a random walk. The error of a step displaces all frames beyond it;
+* the mounts of several cameras, between whose frames of one instant there is no step of odometry.
 
-Cauchy's weight w of an edge stands for a variance of 1 / w. Each object may also be wrong:
-moved, or matched by mistake. Then the pose without this object is the right one, and how far it is
-away, and how much less certain it is, adds to the covariance.
+Cauchy's weight w of an edge stands for a variance of 1 / w. Each object may also be wrong, that
+is, moved or matched by mistake. Then the pose without this object is right. The shift to this pose
+and its loss of certainty are therefore added to the covariance.
 """
 
 from itertools import pairwise
@@ -43,23 +43,23 @@ from cliploc_ros.core.fit.verification import Rig, verify_rig
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_difference
 
 _TERMS = CALIBRATION.covariance
-#: Variance of a direction that the boxes do not fix: m^2 and rad^2.
+#: (6,): variance in directions that the boxes do not determine [m^2] [rad^2].
 PRIOR_VARIANCES = np.repeat([_TERMS.unfixed_m2, _TERMS.unfixed_rad2], 3)
-# A camera that moves less stands still: rounding [m and rad].
+# A camera that moves less than this stands still; the motion is a rounding error [m] [rad].
 _STANDS_STILL = 1e-9
-# Weights of the first pose that covariance intersection tries: steps of a search for a minimum.
+# Grid of weights of the first pose on which covariance intersection searches for the minimum.
 _WEIGHTS = np.linspace(0.0, 1.0, 11)
-#: Deviations of the errors of a perfect camera.
+#: Standard deviations of the errors of a perfect camera.
 EXACT = np.zeros(ERRORS)
-#: Covariance of a pose that the boxes do not fix.
+#: Covariance of a pose that the boxes do not determine.
 POSE_UNKNOWN = np.diag(PRIOR_VARIANCES)
 
 
 def odometry_deviations(first_from_second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the deviations (6,) of odometry between two frames: 0 if the camera did not move.
+    """Return the standard deviations (6,) of odometry between two frames.
 
-    On each axis, of position [m] and rotation [rad]; first_from_second (4, 4) is the camera's
-    motion.
+    The first three are those of the position [m], the others those of the rotation [rad]. All are
+    0 if the camera did not move. The motion of the camera is first_from_second (4, 4).
     """
     way_m = float(np.linalg.norm(first_from_second[:3, 3]))
     angle = float(Rotation.from_matrix(first_from_second[:3, :3]).magnitude())
@@ -73,17 +73,24 @@ def odometry_deviations(first_from_second: NDArray[np.float64]) -> NDArray[np.fl
 def share_within(radius_m: float, covariance: NDArray[np.float64]) -> float:
     """Return the probability that a position is within a distance of the truth.
 
-    The covariance (6, 6) is as of refined_covariance.
+    The covariance (6, 6) is that of refined_covariance.
     """
     return float(shares_within(radius_m, covariance[None, :3, :3])[0])
 
 
 def shares_within(radius_m: float, covariances: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the probability (k,) of each covariance (k, 3, 3) of a position, see share_within.
+    """Return the probability (k,) that a position is within a distance, for k covariances.
 
-    The squared distance is a sum of squares with different variances. A scaled chi-squared
-    distribution of the same mean and variance stands for it (Box, "Some Theorems on Quadratic
-    Forms Applied in the Study of Analysis of Variance Problems", 1954).
+    The squared distance is a sum of squares with different variances. It is approximated by a
+    scaled chi-squared distribution with the same mean and variance (Box, "Some Theorems on
+    Quadratic Forms Applied in the Study of Analysis of Variance Problems", 1954).
+
+    Parameters
+    ----------
+    radius_m : float
+        The distance [m].
+    covariances : ndarray (k, 3, 3)
+        Covariances of the position [m^2].
     """
     means = np.trace(covariances, axis1=1, axis2=2)
     squares = np.sum(covariances ** 2, axis=(1, 2))
@@ -94,7 +101,7 @@ def normalized_square(map_from_camera: NDArray[np.float64], covariance: NDArray[
                       truth: NDArray[np.float64]) -> float:
     """Return the normalized estimation error squared (NEES) of a pose (4, 4).
 
-    Where covariances (6, 6), as of refined_covariance, are right, it follows the chi-squared
+    If the covariances (6, 6), see refined_covariance, are right, it follows the chi-squared
     distribution with six degrees of freedom (Bar-Shalom, Li and Kirubarajan 2001).
     """
     error = pose_difference(map_from_camera, truth)
@@ -102,7 +109,7 @@ def normalized_square(map_from_camera: NDArray[np.float64], covariance: NDArray[
 
 
 def moved_pose(pose: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a pose (4, 4) after a step (6,) of position and of rotation about fixed axes."""
+    """Move a pose (4, 4) by a step (6,) of position [m] and rotation about fixed axes [rad]."""
     moved = pose.copy()
     moved[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
     moved[:3, 3] += step[:3]
@@ -114,16 +121,16 @@ def fuse(first: NDArray[np.float64], first_covariance: NDArray[np.float64],
          ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the weighted mean of two poses (4, 4) and its covariance (6, 6).
 
-    Both share the errors of the map, to an unknown degree. Covariance intersection is right for
-    any degree (Julier and Uhlmann, "A Non-divergent Estimation Algorithm in the Presence of
-    Unknown Correlations", 1997). The weight gives the least variance of the position, so a pose
-    that is better in every direction stays as it is. The covariances are in the order of
-    core.fit.covariance.
+    Both share the errors of the map to an unknown degree. Covariance intersection is consistent
+    for any correlation (Julier and Uhlmann, "A Non-divergent Estimation Algorithm in the Presence
+    of Unknown Correlations", 1997). The weights minimize the variance of the position, so a pose
+    that is better in every direction is returned unchanged. Covariances are those of position [m]
+    and rotation about the map's axes [rad].
     """
     informations = np.linalg.inv(first_covariance), np.linalg.inv(second_covariance)
     covariances = [np.linalg.inv(weight * informations[0] + (1.0 - weight) * informations[1])
                    for weight in _WEIGHTS]
-    best = int(np.argmin([np.trace(one[:3, :3]) for one in covariances]))
+    best = int(np.argmin([np.trace(fused[:3, :3]) for fused in covariances]))
     covariance = (covariances[best] + covariances[best].T) / 2
     moved = _WEIGHTS[best] * covariance @ informations[0] @ pose_difference(second, first)
     return moved_pose(second, moved), covariance
@@ -132,21 +139,22 @@ def fuse(first: NDArray[np.float64], first_covariance: NDArray[np.float64],
 class _Fit(NamedTuple):
     """A fit, linearized in steps of the reference: F frames, m matches of n objects."""
 
-    #: (m, r, 6): of the four edges of each match and, where any has depth, of that
+    #: (m, r, 6): derivatives of the r residuals of each match: the four edges and, if any match
+    #: has depth, the depth
     jacobian: NDArray[np.float64]
-    #: (m, r), (m, r)
+    #: (m, r), (m, r): residuals in standard deviations, and Cauchy's weights
     residuals: NDArray[np.float64]
     weights: NDArray[np.float64]
-    #: (m, r): share of each deviation apart from that of the landmark's position
+    #: (m, r): share of the standard deviations that is not due to the landmark's position
     own: NDArray[np.float64]
-    #: (m,): of each match
+    #: (m,), (m,): object and frame of each match
     objects: NDArray[np.int64]
     frames: NDArray[np.int64]
-    sigmas: NDArray[np.float64]  #: (n,): of the objects' positions [m]
-    numbers: NDArray[np.int64]  #: (n,): the objects' landmarks
+    sigmas: NDArray[np.float64]  #: (n,): standard deviation of each object's position [m]
+    numbers: NDArray[np.int64]  #: (n,): landmark of each object
     verticals: NDArray[np.float64]  #: (F, 6, 6): information of each frame's vertical
     cameras: NDArray[np.float64]  #: (F, 4, 4): map_from_camera
-    #: (F, 6, 7): gradient of each frame by the errors of its camera, see camera_fit
+    #: (F, 6, 7): change of each frame's gradient with the errors of its camera, see camera_fit
     calibrations: NDArray[np.float64]
 
     @property
@@ -166,17 +174,18 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     Parameters
     ----------
     rotation, translation : ndarray (3, 3), (3,)
-        Rotation and translation of camera_from_map, with information, see refine_rig.
+        Rotation and translation of camera_from_map, a pose with information, see refine_rig.
     instants : ndarray (F,)
-        Number of the instant of each frame, in which odometry joins them: greater for later ones,
-        equal for several cameras.
+        Number of the instant of each frame, in the order of odometry: greater for later instants,
+        equal for several cameras at one instant.
     shared : ndarray (L, 2), optional
-        Common displacement and turn of each landmark and its neighbours [m] [rad].
+        Standard deviations of the common displacement and turn of each landmark and its neighbours
+        [m] [rad].
     wrong_share : float
-        Probability that an object is not where its match says.
+        Probability that an object is not at the place of its landmark.
     mount_deviation : tuple of float
-        Standard deviations of a camera's mount on each axis [m] [deg], against that of the last
-        frame's camera.
+        Standard deviations of a camera's mount on each axis [m] [deg], relative to the mount of
+        the last frame's camera.
     camera_deviations : ndarray (7,)
         Standard deviations of the errors of each camera, see cliploc_ros.core.fit.camera_fit.
     """
@@ -187,12 +196,12 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     of_objects = _sums(of_matches, fit.objects, len(fit.sigmas))
     verticals = fit.verticals.sum(axis=0)
     information = of_objects.sum(axis=0) + verticals + prior
-    # The part of the edges' errors in M, for each object (n, 6, 6).
-    # an edge is as far off as its weight says, in the same direction in all frames
+    # the part of the edges in M, for each object (n, 6, 6): the weight of an edge gives the size
+    # of its error, which has the same direction in all frames
     pulls = _sums(np.sqrt(fit.weights)[:, :, None] * fit.own[:, :, None] * fit.jacobian,
                   fit.objects, len(fit.sigmas))
     edge_noise = np.asarray(_mean_square(fit) * pulls.transpose(0, 2, 1) @ pulls)
-    # that of the landmarks' positions, for each object
+    # the part of the landmarks' positions in M, for each object
     moves = fit.sigmas[:, None, None] * of_objects[:, :, :3]
     noise_of_objects = edge_noise + moves @ moves.transpose(0, 2, 1)
     of_frames = _sums(of_matches, fit.frames, len(fit.cameras)) + fit.verticals
@@ -201,7 +210,7 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
              + _odometry_noise(fit.cameras, of_frames, instants)
              + _mount_noise(fit.cameras, of_frames, instants, mount_deviation))
     matched = _sandwich(information, noise)
-    # of all objects: also without one, the others share them
+    # errors common to all objects, which remain if an object is left out
     common = _calibration_noise(fit.calibrations, instants, camera_deviations)
     if shared is not None:
         deviations = np.repeat(shared[fit.numbers], 3, axis=1)
@@ -215,9 +224,10 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
 
 def moves_with_cameras(rig: Rig, inliers: Inliers, rotation: NDArray[np.float64],
                        translation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how a refined pose moves (F, 6, 7) with the errors of each frame, see camera_fit.
+    """Return the Jacobian (F, 6, 7) of a refined pose for the camera errors of each frame.
 
-    Those of a camera move it by the sum over its frames. See refined_covariance for the others.
+    The Jacobian for the errors of a camera, see camera_fit, is the sum over its frames. For the
+    parameters see refined_covariance.
     """
     fit = _linearize(inliers, rig.sigmas, rotation, translation)
     information = (fit.information.sum(axis=0) + fit.verticals.sum(axis=0)
@@ -228,10 +238,10 @@ def moves_with_cameras(rig: Rig, inliers: Inliers, rotation: NDArray[np.float64]
 def _change_without_each(information: NDArray[np.float64], noise: NDArray[np.float64],
                          gradients: NDArray[np.float64], matched: NDArray[np.float64]
                          ) -> NDArray[np.float64]:
-    """Return the sum of the gains of the covariance with each of n objects left out in turn.
+    """Return by how much the covariance grows if each of n objects is left out, as a sum.
 
-    Without an object, a pose is not surer: only a gain counts. The limit would be a loss where
-    boxes fix next to nothing.
+    A pose does not get more certain without an object, so only growth counts. Otherwise, the prior
+    `limit` would reduce the covariance if the boxes hardly determine the pose.
     """
     limit = np.diag(np.repeat([_TERMS.without_m ** -2, _TERMS.without_rad ** -2], 3))
     inverses = np.linalg.inv(information + limit)
@@ -266,7 +276,7 @@ def _linearize(inliers: Inliers, sigmas: NDArray[np.float64], rotation: NDArray[
         residuals_of(pairs, vertical, own_rotation, own_translation, own)
         steps = camera_jacobian(pairs, vertical, np.zeros(ERRORS), own_rotation, own_translation,
                                 own)
-        # a turn of the reference about itself moves this camera
+        # a rotation of the reference about its own centre moves this camera
         steps[:, 3:6] -= steps[:, :3] @ _cross(cameras[frame, :3, 3] - center)
         weighted = steps / (1.0 + own[:, None] ** 2)
         calibrations[frame] = weighted[:, :6].T @ steps[:, 6:]
@@ -301,9 +311,9 @@ def _sums(rows: NDArray[np.float64], groups: NDArray[np.int64], count: int
 
 
 def _mean_square(fit: _Fit) -> float:
-    """Return the mean square of the residuals, at least that of the deviations assumed.
+    """Return the mean square of the residuals, at least 1, as for the assumed deviations.
 
-    All views of an object count as one. Six residuals are zero by construction.
+    All views of an object count as one view. The fit takes six degrees of freedom.
     """
     views = len(fit.objects) / max(1, len(fit.sigmas))
     squares = np.minimum(np.abs(fit.residuals), _TERMS.most_residual) ** 2
@@ -316,10 +326,10 @@ def _mean_square(fit: _Fit) -> float:
 
 def _odometry_noise(cameras: NDArray[np.float64], information: NDArray[np.float64],
                     instants: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the part of the errors of odometry in M (6, 6)."""
+    """Return the part of M (6, 6) that errors of odometry cause."""
     noise = np.zeros((6, 6))
     numbers, instants = np.unique(instants, return_inverse=True)
-    # the way between two instants is that of the last camera of each
+    # the motion between two instants is that of the last camera of each
     ends = [int(np.nonzero(instants == number)[0][-1]) for number in range(len(numbers))]
     for step, (before, after) in enumerate(pairwise(ends)):
         deviations = odometry_deviations(invert_transform(cameras[before]) @ cameras[after])
@@ -333,9 +343,9 @@ def _odometry_noise(cameras: NDArray[np.float64], information: NDArray[np.float6
 def _mount_noise(cameras: NDArray[np.float64], information: NDArray[np.float64],
                  instants: NDArray[np.int64], mount_deviation: tuple[float, float]
                  ) -> NDArray[np.float64]:
-    """Return the part of the errors of the mounts of several cameras in M (6, 6)."""
+    """Return the part of M (6, 6) that errors of the mounts of several cameras cause."""
     deviations = np.repeat([mount_deviation[0], np.radians(mount_deviation[1])], 3)
-    # the mount of the last camera of an instant is that of the pose
+    # mounts are relative to the last camera of each instant
     others = [row for row in range(len(cameras) - 1) if instants[row] in instants[row + 1:]]
     return np.asarray(sum((_squared(_about(information[row], cameras, row) * deviations)
                            for row in others), np.zeros((6, 6))))
@@ -343,8 +353,8 @@ def _mount_noise(cameras: NDArray[np.float64], information: NDArray[np.float64],
 
 def _calibration_noise(calibrations: NDArray[np.float64], instants: NDArray[np.int64],
                        deviations: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the part of the errors of the cameras' calibrations in M (6, 6)."""
-    # cameras follow each other in one order at each instant
+    """Return the part of M (6, 6) that errors of the cameras' calibrations cause."""
+    # cameras have the same order at each instant
     cameras = np.array([list(instants[row + 1:]).count(number)
                         for row, number in enumerate(instants)])
     return np.asarray(sum((_squared(calibrations[cameras == number].sum(axis=0) * deviations)
@@ -353,7 +363,7 @@ def _calibration_noise(calibrations: NDArray[np.float64], instants: NDArray[np.i
 
 def _about(information: NDArray[np.float64], cameras: NDArray[np.float64], row: int
            ) -> NDArray[np.float64]:
-    """Return what turns about a camera, not about the last one, do to the gradient (6, 6)."""
+    """Return information (6, 6) for rotations about a camera instead of the last camera."""
     moved = information.copy()
     moved[:, 3:] += moved[:, :3] @ _cross(cameras[row, :3, 3] - cameras[-1, :3, 3])
     return moved

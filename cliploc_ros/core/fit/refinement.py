@@ -2,21 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refinement of a pose on all of its inliers, in one frame or several.
 
-The minimal pose fits three box centres; refinement fits the edges of all inliers, which outlines
-should touch. Each match has four residuals, in deviations: a share of the box's size, because the
-errors of detector and shape grow with the object, and the landmark's position_sigma as the camera
-sees it. A fifth one is the depth of its centre, where depth was measured. Cauchy's weights limit
-outliers (Triggs et al., "Bundle Adjustment", 1999).
+A minimal pose fits three box centres. Refinement fits the edges of all inliers, which the outlines
+should touch. Each match has four residuals, in units of their standard deviation. The deviation
+combines a share of the box's size, because the errors of detector and shape grow with the object,
+and the landmark's position_sigma as seen by the camera. A fifth residual is the depth of the
+landmark's centre if depth was measured. Cauchy's weights limit the influence of outliers (Triggs
+et al., "Bundle Adjustment", 1999).
 
-Of the residuals tried on the 258 recorded frames, edges solved most frames with the least error:
-better than Wasserstein's distance of ellipses, the level sets of Zins et al. ("Level Set-Based
-Camera Pose Estimation From Multiple 2D/3D Ellipse-Ellipsoid Correspondences", IROS 2022), and
-logarithms of sizes. Edges cut by the image border count like others: dropping them, or making them
-one-sided, solved no more frames.
+Of the residuals that were tested on the 258 recorded frames, edges solved the most frames with the
+smallest error. The others were the Wasserstein distance of ellipses, the level sets of Zins et al.
+("Level Set-Based Camera Pose Estimation From Multiple 2D/3D Ellipse-Ellipsoid Correspondences",
+IROS 2022), and logarithms of sizes. Edges that the image border cuts are used like the others:
+omitting them, or making them one-sided, did not solve more frames.
 
-The sum of all frames' robust squares is minimized by the method of Levenberg and Marquardt. When
-the reference camera moves by a and turns by w about its centre, a camera at the lever l from it
-moves by a + w x l and turns by w. The camera's information H and gradient g therefore enter as
+The robust cost, summed over all frames, is minimized by the Levenberg-Marquardt method. If the
+reference camera moves by a and turns by w about its centre, a camera at the lever l from it moves
+by a + w x l and turns by w. The information H and gradient g of this camera therefore enter as
 A^T H A and A^T g with A = [1, -[l]; 0, 1].
 """
 
@@ -31,30 +32,31 @@ from cliploc_ros.core.geometry.depth import centre_depth, depth_of
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoid
 from cliploc_ros.core.kernels.compiled import compiled
 
-# Standard deviation of an edge at a landmark of known position: a share of the mean of its box's
-# two sides, plus a constant on the plane z = 1, about a pixel. The share is near the median error
-# of boxes and fitted maps on the recorded frames, which also served for fitting; the constant is a
-# guess.
+# Standard deviation of an edge if the landmark's position is exact: a share of the mean of the
+# box's two sides, plus a constant of about a pixel on the plane z = 1. The share is close to the
+# median error of boxes and fitted maps on the recorded frames, on which the maps were fitted, too.
+# The constant is a guess.
 RELATIVE_DEVIATION = 0.06
 LEAST_DEVIATION = 0.003
 
-# Residuals beyond this many deviations lose influence: some edges of maps and boxes are far off.
+# Residuals beyond this many standard deviations lose influence, because some edges of maps and
+# boxes are far off.
 _CAUCHY = 1.0
-# A round may lower the score to this share of the best so far: a fit of many edges is nearer to
-# the truth than the greatest overlap. A pose that loses its landmarks is dropped.
+# A round may lower the score to this share of the best score, because a fit of many edges is
+# closer to the truth than the greatest overlap. A lower score means that landmarks were lost.
 LEAST_SHARE = 0.9
 _ROUNDS = 4
 _STEPS = 5
 _TRIALS = 4
 _FIRST_DAMPING = 1e-3
 _SETTLED = 1e-5
-# Beyond a step of this length, in metres and radians, the residuals are far from linear.
+# For steps longer than this, in metres and radians, the residuals are far from linear.
 _LONGEST_STEP = 1.0
 
 
 @compiled
 def residuals_of(pairs, vertical, rotation, translation, residuals):
-    """Write by how many deviations outlines miss the edges; False if one is not in front.
+    """Write the residuals of all matches; return False if a landmark is not in front.
 
     Parameters
     ----------
@@ -66,7 +68,8 @@ def residuals_of(pairs, vertical, rotation, translation, residuals):
     rotation, translation : ndarray (3, 3), (3,)
         Rotation and translation of camera_from_map.
     residuals : ndarray (5 * m + 3,)
-        Residuals of left, right, top and bottom edge and depth of each match, and of the vertical.
+        Residuals, in standard deviations, of the left, right, top and bottom edges and the depth
+        of each match, and of the vertical.
     """
     for row in range(len(pairs)):
         box = pairs[row]
@@ -98,8 +101,8 @@ def residuals_of(pairs, vertical, rotation, translation, residuals):
 def edge_deviation(box, center, sigma, rotation, translation):
     """Return the standard deviation of a match's edges on the plane z = 1.
 
-    It is that of the pose at which the match was found. If it followed the pose, a camera that
-    moves away from uncertain landmarks would lower the cost.
+    It is computed at the pose at which the match was found, and then kept. If it followed the
+    pose, moving the camera away from uncertain landmarks would lower the cost.
 
     Parameters
     ----------
@@ -119,7 +122,7 @@ def edge_deviation(box, center, sigma, rotation, translation):
 
 @compiled
 def robust_cost(residuals):
-    """Return the sum of Cauchy's losses."""
+    """Return the sum of Cauchy's losses of the residuals."""
     total = 0.0
     for residual in residuals:
         if residual != 0.0:
@@ -131,7 +134,7 @@ def robust_cost(residuals):
 def jacobian_of(pairs, vertical, rotation, translation):
     """Return the derivatives (5 * m + 3, 6) of the residuals, see residuals_of.
 
-    They are for steps of the camera's position [m] and rotations about the map's axes [rad].
+    Columns are the camera's position [m] and rotations about the map's axes [rad].
     """
     jacobian = np.zeros((5 * len(pairs) + 3, 6))
     for row in range(len(pairs)):
@@ -147,12 +150,12 @@ def jacobian_of(pairs, vertical, rotation, translation):
 
 @compiled
 def _differentiate(center, shape, rotation, translation, deviation, jacobian):
-    """Write the derivatives (4, 6) of the residuals of a landmark in front of the camera.
+    """Write the derivatives (4, 6) of the edges of a landmark in front of the camera.
 
-    In the camera's frame the dual conic is G = M - X X^T, up to sign and scale. A translation of
-    the camera by a changes G by dG = a X^T + X a^T, a rotation by a changes it by dG = B + B^T
-    with B = -[a] G. N is G scaled to a last element of one: cx and cy are its last column, and
-    exx = cx^2 - N00.
+    In the camera's coordinate frame, the dual conic is G = M - X X^T, up to sign and scale. A
+    translation of the camera by a changes G by dG = a X^T + X a^T. A rotation by a changes it by
+    dG = B + B^T with B = -[a] G. N is G scaled so that its last element is 1. Then cx and cy are
+    its last column, and exx = cx^2 - N00.
     """
     _, cx, cy, exx, exy, eyy = project_ellipsoid(rotation, translation, center, shape)
     n00, n01, n11 = cx * cx - exx, cx * cy - exy, cy * cy - eyy
@@ -192,7 +195,7 @@ def _edges(d_middle, d_diagonal, middle, half, deviation):
 
 @compiled
 def _differentiate_depth(center, rotation, translation, deviation, jacobian):
-    """Write the derivatives (6,) of a depth's residual: axis @ (center - camera)."""
+    """Write the derivatives (6,) of the residual of a depth, axis @ (center - camera)."""
     for axis in range(3):
         j, k = (axis + 1) % 3, (axis + 2) % 3
         ray_j, ray_k = center[j], center[k]
@@ -205,7 +208,7 @@ def _differentiate_depth(center, rotation, translation, deviation, jacobian):
 
 @compiled
 def _differentiate_vertical(vertical, rotation, jacobian):
-    """Write the derivatives (3, 6) of the vertical's residuals: a rotation by a adds -a x up."""
+    """Write the derivatives (3, 6) of the vertical's residuals. A rotation by a adds -a x up."""
     up = np.empty(3)
     for i in range(3):
         up[i] = (rotation[i, 0] * vertical[3] + rotation[i, 1] * vertical[4]
@@ -219,7 +222,7 @@ def _differentiate_vertical(vertical, rotation, jacobian):
 
 @compiled
 def normal_equations(jacobian, residuals):
-    """Return information (k, k) and gradient (k,) with Cauchy's weights; jacobian (., k)."""
+    """Return information (k, k) and gradient (k,) with Cauchy's weights; jacobian (r, k)."""
     size = jacobian.shape[1]
     information, gradient = np.zeros((size, size)), np.zeros(size)
     for row in range(len(residuals)):
@@ -238,38 +241,38 @@ def normal_equations(jacobian, residuals):
 
 
 class Refined(NamedTuple):
-    """A pose of the reference after refinement."""
+    """A refined pose of the reference camera."""
 
-    #: (3, 3), (3,): of camera_from_map
+    #: (3, 3), (3,): rotation and translation of camera_from_map
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
-    score: float  #: See verify_rig
-    #: (6, 6): of the reference camera's position [m] and its rotation about the map's axes [rad];
-    #: 0 if the pose has too few inliers
+    score: float  #: Sum of the IoUs, see verify_rig
+    #: (6, 6): information about the reference camera's position [m] and its rotation about the
+    #: map's axes [rad]; 0 if the pose has too few inliers
     information: NDArray[np.float64]
 
 
 class Inliers(NamedTuple):
-    """The matches of F frames, one detection for each landmark of a frame: m of them."""
+    """The m matches of F frames, with one detection for each landmark of a frame."""
 
     pairs: NDArray[np.float64]  #: (m, 16): see residuals_of
-    landmarks: NDArray[np.int64]  #: (m,): their rows in the map
-    starts: NDArray[np.int64]  #: (F + 1,): where each frame's begin
-    #: (F, 3, 4), (F, 7): of the rig
+    landmarks: NDArray[np.int64]  #: (m,): rows of the landmarks in the map
+    starts: NDArray[np.int64]  #: (F + 1,): first match of each frame, then m
+    #: (F, 3, 4), (F, 7): cameras and verticals of the rig, see Rig
     cameras: NDArray[np.float64]
     verticals: NDArray[np.float64]
 
 
 @compiled
 def refine_rig(rig, rotation, translation):
-    """Return a pose of the reference (3, 3), (3,) refined on all frames: Refined.
+    """Refine a pose (3, 3), (3,) of the reference camera on all frames: Refined.
 
-    Each round matches detections with landmarks and fits the pose to them. Rounds end when the
-    score settles or falls.
+    Each round matches detections with landmarks and fits the pose to the matches. The rounds end
+    when the score converges or drops.
     """
     found = verify_rig(rig, rotation, translation)
     best_score = found.score
-    # this many boxes fix a pose
+    # minimum number of boxes that determine a pose
     least = 3
     for vertical in rig.verticals:
         if vertical[6] > 0.0:
@@ -298,7 +301,7 @@ def refine_rig(rig, rotation, translation):
 
 @compiled
 def one_to_one(rig, found, rotation, translation):
-    """Return the inliers of a verified pose; of several detections of a landmark, the best."""
+    """Return the inliers of a verified pose, with the best detection of each landmark."""
     scene, frames = rig.scene, rig.starts.boxes
     pairs, starts = np.empty((len(found.ious), 16)), np.zeros(len(frames), dtype=np.int64)
     landmarks = np.empty(len(pairs), dtype=np.int64)
@@ -329,7 +332,7 @@ def one_to_one(rig, found, rotation, translation):
 
 @compiled
 def _best_detection(found, detection, first, last):
-    """Return the best detection of the same landmark; -1 if an earlier one has this landmark."""
+    """Return the best detection of a detection's landmark; -1 if it is not its first detection."""
     best = detection
     for other in range(first, last):
         if found.landmarks[other] == found.landmarks[detection]:
@@ -342,7 +345,7 @@ def _best_detection(found, detection, first, last):
 
 @compiled
 def residuals_of_rig(inliers, rotation, translation):
-    """Return whether all landmarks are in front of their cameras, and all frames' residuals."""
+    """Return whether all landmarks are in front of their cameras, and all residuals."""
     pairs, _, starts, cameras, verticals = inliers
     residuals = np.empty(5 * len(pairs) + 3 * len(cameras))
     for frame in range(len(cameras)):
@@ -357,7 +360,7 @@ def residuals_of_rig(inliers, rotation, translation):
 
 @compiled
 def linearize_rig(inliers, rotation, translation, residuals):
-    """Return information and gradient of all frames, in steps of the reference."""
+    """Return information (6, 6) and gradient (6,) of all frames for steps of the reference."""
     pairs, _, starts, cameras, verticals = inliers
     information, gradient = np.zeros((6, 6)), np.zeros(6)
     for frame in range(len(cameras)):
@@ -381,8 +384,8 @@ def linearize_rig(inliers, rotation, translation, residuals):
 
 @compiled
 def _move_to_reference(lever, information, gradient):
-    """Change a camera's information and gradient to steps of the reference."""
-    for axis in range(3):  # about this axis the reference turns: w x l = -[l] w
+    """Transform a camera's information and gradient to steps of the reference camera, in place."""
+    for axis in range(3):  # the reference turns about this axis: w x l = -[l] w
         i, j = (axis + 1) % 3, (axis + 2) % 3
         gradient[3 + axis] += lever[i] * gradient[j] - lever[j] * gradient[i]
         for row in range(6):
@@ -397,7 +400,7 @@ def _move_to_reference(lever, information, gradient):
 
 @compiled
 def _minimize(inliers, rotation, translation):
-    """Return the pose of least robust sum of squares (Levenberg-Marquardt)."""
+    """Return the pose with the minimum robust cost (Levenberg-Marquardt)."""
     step, damping = np.zeros(6), _FIRST_DAMPING
     in_front, residuals = residuals_of_rig(inliers, rotation, translation)
     if not in_front:
@@ -436,12 +439,12 @@ def _minimize(inliers, rotation, translation):
 
 @compiled
 def move(rotation, translation, step):
-    """Return camera_from_map after its camera moved by step[:3] and turned by step[3:]."""
+    """Return camera_from_map after the camera moves by step[:3] and turns by step[3:]."""
     new_rotation, new_translation = np.empty((3, 3)), np.zeros(3)
     angle = sqrt(step[3] * step[3] + step[4] * step[4] + step[5] * step[5])
     sine = sin(angle) / angle if angle > 1e-12 else 1.0
     versine = (1.0 - cos(angle)) / (angle * angle) if angle > 1e-6 else 0.5
-    # Each row of the rotation is a camera axis in the map, and turns with the camera (Rodrigues).
+    # Each row of the rotation is a camera axis in the map. It turns with the camera (Rodrigues).
     for row in range(3):
         x, y, z = rotation[row, 0], rotation[row, 1], rotation[row, 2]
         along = (step[3] * x + step[4] * y + step[5] * z) * versine
@@ -460,7 +463,10 @@ def move(rotation, translation, step):
 
 @compiled
 def solve(matrix, right, solution):
-    """Solve a symmetric positive definite system, overwriting its matrix (Cholesky)."""
+    """Solve a symmetric positive definite system by Cholesky's method, and overwrite the matrix.
+
+    Returns False if the matrix is not positive definite.
+    """
     size = len(right)
     for i in range(size):
         for j in range(i + 1):

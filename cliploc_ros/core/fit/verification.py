@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Verification of a pose: its inliers among the detections of one or several frames.
+"""Verification of a pose: find its inliers among the detections of one or several frames.
 
-Every detection takes the potential landmark whose outline overlaps its box's ellipse most, if
-their IoU exceeds the threshold. The score is the sum of these IoUs (Matsuzaki et al. 2024,
-Sec. III-D2). Detections of the minimal sample choose like all others.
+Each detection is matched with the potential landmark whose outline has the largest IoU with the
+ellipse of its box, if the IoU exceeds the threshold. The score is the sum of these IoUs (Matsuzaki
+et al. 2024, Sec. III-D2). Detections of the minimal sample are matched like all others.
 
-Frames of one moving camera are joined by odometry: their cameras form a rigid rig. A pose of the
-rig is the pose of the reference frame's camera. It fixes the poses of all others.
+Odometry joins the frames of one moving camera to a rigid rig of cameras. The pose of the rig is
+the pose of the reference frame's camera, from which the poses of the other cameras follow.
 """
 
 from collections.abc import Sequence
@@ -26,19 +26,20 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.search.scene import Potential, Scene
 from cliploc_ros.errors import OptionsError
 
-#: The most frames that are fused. The leaders of each frame are verified on every frame, so the
-#: time grows with the square; and the tenth view of the same objects adds little.
+#: Maximum number of frames that are fused. The leaders of each frame are verified on every frame,
+#: so the time grows with the square of this number, and a tenth view of the same objects adds
+#: little.
 MAX_FRAMES = 10
 
 
 class FrameStarts(NamedTuple):
-    """Index of the first row of each frame in the arrays of a rig: arrays (F + 1,)."""
+    """The first row of each frame in the arrays of a rig, followed by their length: (F + 1,)."""
 
-    #: (F + 1,): in the box ellipses, and in the landmarks and detections of potential
+    #: (F + 1,): rows in the box ellipses, and in the landmarks and detections of potential
     boxes: NDArray[np.int64]
     landmarks: NDArray[np.int64]
     pairs: NDArray[np.int64]
-    #: (F + 1,): in the groups, and in their detections, members, levels and spheres
+    #: (F + 1,): rows in the groups, and in their detections, members, levels and spheres
     groups: NDArray[np.int64]
     shown: NDArray[np.int64]
     members: NDArray[np.int64]
@@ -47,10 +48,10 @@ class FrameStarts(NamedTuple):
 
 
 class Rig(NamedTuple):
-    """The scenes of F frames, one behind the other, and where their cameras are."""
+    """The concatenated scenes of F frames, and the poses of their cameras."""
 
-    #: All arrays but the map's are concatenated. Numbers in them count within their frame, and
-    #: starts have an end of their own for each frame. It has no pairs.
+    #: All arrays except those of the map are concatenated. Indices in them count within their
+    #: frame, and `starts` arrays have an end for each frame. The scene has no pairs.
     scene: Scene
     starts: FrameStarts
     #: (F, 3, 4): rotation and translation of each camera_from_reference
@@ -61,9 +62,16 @@ class Rig(NamedTuple):
 
 
 def cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64]:
-    """Return each camera from the last (F, 4, 4), by odometry."""
+    """Return camera_from_last (F, 4, 4) of each camera, by odometry.
+
+    Raises
+    ------
+    OptionsError
+        odom_from_camera is missing or not a rigid transform; there are no observations or too
+        many.
+    """
     if not 1 <= len(observations) <= MAX_FRAMES:
-        raise OptionsError(f'1 to {MAX_FRAMES} observations at a time, not {len(observations)}')
+        raise OptionsError(f'{len(observations)} observations, expected 1 to {MAX_FRAMES}')
     cameras = np.tile(np.eye(4), (len(observations), 1, 1))
     if len(observations) == 1:
         return cameras
@@ -71,7 +79,7 @@ def cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64
     for number, observation in enumerate(observations, start=1):
         where = f'odom_from_camera of frame {number} of {len(observations)}'
         if observation.odom_from_camera is None:
-            raise OptionsError(f'{where} is missing: several frames need it')
+            raise OptionsError(f'{where} is missing; it is required for more than one frame')
         if not is_rigid(observation.odom_from_camera):
             raise OptionsError(f'{where} is not a rigid transform')
         linked.append(observation.odom_from_camera)
@@ -82,9 +90,9 @@ def cameras_from_last(observations: Sequence[Observation]) -> NDArray[np.float64
 
 def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64],
              verticals: NDArray[np.float64], sigmas: NDArray[np.float64]) -> Rig:
-    """Return the rig of F scenes of one map, see Rig.
+    """Return the rig of F scenes of one map.
 
-    Cameras are camera_from_reference (F, 4, 4), verticals (F, 7), sigmas (L,).
+    See Rig for camera_from_reference (F, 4, 4), verticals (F, 7) and sigmas (L,).
     """
     first = scenes[0]
     joined = first._replace(
@@ -95,12 +103,13 @@ def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64]
                                                      strict=True))),
         pairs=first.pairs[:0],
         groups=Groups(*map(np.concatenate, zip(*(scene.groups for scene in scenes), strict=True))))
-    # how many rows each frame has in each array, in the order of FrameStarts
+    # number of rows of each frame in each array, in the order of FrameStarts
     sizes = [[0] * len(FrameStarts._fields), *(
-        [len(one.box_ellipses), len(one.potential.landmarks), len(one.potential.detections),
-         len(one.groups.starts) - 1, *(len(rows) for rows in (
-             one.groups.detections, one.groups.members, one.groups.levels, one.groups.spheres))]
-        for one in scenes)]
+        [len(scene.box_ellipses), len(scene.potential.landmarks), len(scene.potential.detections),
+         len(scene.groups.starts) - 1, *(len(rows) for rows in (
+             scene.groups.detections, scene.groups.members, scene.groups.levels,
+             scene.groups.spheres))]
+        for scene in scenes)]
     starts = np.ascontiguousarray(np.cumsum(sizes, axis=0, dtype=np.int64).T)
     return Rig(joined, FrameStarts(*starts), np.ascontiguousarray(camera_from_reference[:, :3]),
                np.ascontiguousarray(verticals), sigmas)
@@ -108,10 +117,10 @@ def make_rig(scenes: Sequence[Scene], camera_from_reference: NDArray[np.float64]
 
 @compiled
 def scene_of(rig, frame):
-    """Return the scene of one frame."""
+    """Return the scene of one frame of a rig."""
     scene, starts, potential, groups = rig.scene, rig.starts, rig.scene.potential, rig.scene.groups
     after = frame + 1
-    # starts and frusta have one row more than their frame has landmarks or groups
+    # for each frame, starts and frusta have one row more than there are landmarks or groups
     landmarks, landmarks_end = starts.landmarks[frame], starts.landmarks[after]
     groups_begin, groups_end = starts.groups[frame] + frame, starts.groups[after] + after
     boxes = scene.box_ellipses[starts.boxes[frame]:starts.boxes[after]]
@@ -134,7 +143,7 @@ def scene_of(rig, frame):
 
 @compiled
 def camera_pose(camera, rotation, translation):
-    """Return camera_from_map (3, 3), (3,) of a camera (3, 4) at a pose of the reference."""
+    """Return camera_from_map (3, 3), (3,) of a camera (3, 4) of a rig, given the rig's pose."""
     own_rotation, own_translation = np.empty((3, 3)), np.empty(3)
     for i in range(3):
         for j in range(3):
@@ -146,16 +155,16 @@ def camera_pose(camera, rotation, translation):
 
 
 class Verified(NamedTuple):
-    """The matches of a pose: n detections, those of several frames one behind the other."""
+    """The matches of a pose, for the n detections of all frames in sequence."""
 
     score: float  #: Sum of the IoUs
-    ious: NDArray[np.float64]  #: (n,): IoU of each detection with its landmark; 0 if it has none
-    landmarks: NDArray[np.int64]  #: (n,): landmark of each detection; -1 if it has none
+    ious: NDArray[np.float64]  #: (n,): IoU of each detection with its landmark; 0 without a match
+    landmarks: NDArray[np.int64]  #: (n,): landmark of each detection; -1 without a match
 
 
 @compiled
 def verify_rig(rig, rotation, translation):
-    """Return the matches of a pose of the reference (3, 3), (3,) in all frames."""
+    """Match the detections of all frames at a pose (3, 3), (3,) of the rig: Verified."""
     starts = rig.starts.boxes
     ious = np.full(starts[-1], rig.scene.iou_threshold)
     landmarks = np.full(starts[-1], -1)
@@ -170,7 +179,7 @@ def verify_rig(rig, rotation, translation):
 
 @compiled
 def _verify(scene, rotation, translation, ious, landmarks):
-    """Write each detection's landmark and its IoU; return the score of the frame."""
+    """Write the landmark and IoU of each detection; return the score of the frame."""
     boxes, potential = scene.box_ellipses, scene.potential
     for u in range(potential.landmarks.shape[0]):
         landmark = potential.landmarks[u]
@@ -190,7 +199,7 @@ def _verify(scene, rotation, translation, ious, landmarks):
 
 @compiled
 def _offer_groups(scene, rotation, translation, ious, landmarks):
-    """Offer detections the landmarks of their class that the pose may see."""
+    """Match detections with the landmarks of their class that may be in view."""
     boxes, groups, numbers = scene.box_ellipses, scene.groups, scene.sorted_landmarks.numbers
     visible = np.empty((2, groups.members.shape[0]), dtype=np.int64)
     pose = Poses(rotation.reshape(1, 3, 3), translation.reshape(1, 3))
@@ -204,7 +213,7 @@ def _offer_groups(scene, rotation, translation, ious, landmarks):
 
 @compiled
 def _offer(boxes, detections, landmark, outline, ious, landmarks):
-    """Offer a landmark to some detections: they take it if it overlaps them more than theirs."""
+    """Match a landmark with each detection that it overlaps more than its present match."""
     in_front, cx, cy, exx, exy, eyy = outline
     if not in_front:
         return
@@ -223,7 +232,7 @@ def _offer(boxes, detections, landmark, outline, ious, landmarks):
 
 @compiled
 def scores_of(rig, rotations, translations):
-    """Return the score (m,) of each pose (m, 3, 3), (m, 3) of the reference."""
+    """Return the score (m,) of each pose (m, 3, 3), (m, 3) of the rig."""
     scores = np.empty(len(rotations))
     for row in range(len(rotations)):
         scores[row] = verify_rig(rig, rotations[row], translations[row]).score

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The camera: intrinsics, distortion, and the projection between pixels and the plane z = 1."""
+"""The camera: intrinsics, distortion, and conversion between pixels and the plane z = 1."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.errors import CameraError
 
-# Coefficients of each distortion model of sensor_msgs/CameraInfo; '' is a pinhole.
+# Valid numbers of coefficients of each distortion model of sensor_msgs/CameraInfo; '': pinhole.
 _COEFFICIENT_COUNTS = {'': (0,), 'plumb_bob': (0, 4, 5), 'rational_polynomial': (0, 8, 12, 14),
                        'equidistant': (4,)}
 _NEWTON_STEPS = 20
@@ -20,11 +20,12 @@ _NEWTON_DIFFERENCE = 1e-6
 _FOLD_STEP_DEG = 0.1
 # A larger error after undistorting and distorting again means that the model has no inverse.
 _MAX_ROUND_TRIP_PX = 0.1
-# Boxes of a lens with distortion that reach further from its axis than 75 degrees have no use: the
-# plane z = 1 stretches them, and its extremes are no longer their midpoints. In simulated fisheye
-# images the overlap with the true box is .93 up to there (median), and .62 at 86 degrees.
+# Boxes of a lens with distortion that extend further than 75 degrees from its axis are not usable:
+# the plane z = 1 stretches them, so that the ellipse no longer touches its box at the midpoints of
+# the edges. In simulated fisheye images, the median overlap with the true box is .93 up to this
+# angle, and .62 at 86 degrees.
 _WIDEST_BOX = np.tan(np.radians(75.0))
-# Corners of the base: right and down, in units of half its size.
+# Corners of the base of a frustum: x right and y down, in units of half its size.
 _CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
@@ -35,7 +36,7 @@ class Camera:
     Raises
     ------
     CameraError
-        For values that no camera can have.
+        A value is impossible; the message states it.
     """
 
     #: Image size [px]
@@ -46,12 +47,12 @@ class Camera:
     fy: float
     cx: float
     cy: float
-    #: 'plumb_bob', 'rational_polynomial' or 'equidistant', a fisheye; '' without distortion
+    #: 'plumb_bob', 'rational_polynomial' or 'equidistant' (fisheye); '' without distortion
     distortion_model: str = ''
-    distortion: tuple[float, ...] = ()  #: The model's coefficients, in OpenCV's order
+    distortion: tuple[float, ...] = ()  #: Coefficients of the model, in OpenCV's order
 
     def __post_init__(self) -> None:
-        """Refuse values that no camera can have."""
+        """Raise CameraError for impossible values."""
         if not (0 < self.width < np.inf and 0 < self.height < np.inf):
             raise CameraError(f'image size {self.width}x{self.height} is not positive and finite')
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
@@ -67,7 +68,7 @@ class Camera:
             raise CameraError(
                 f"distortion model '{model}' is none of {names}: publish one of them (equidistant "
                 "is OpenCV's fisheye, Kannala-Brandt with 4 coefficients), or rectified images")
-        # zeros distort nothing, however many, but for a fisheye
+        # except for a fisheye, any number of zeros is valid, as they do not distort
         if len(self.distortion) not in counts and not self.is_pinhole:
             raise CameraError(f"distortion model '{model}' has "
                               f'{" or ".join(map(str, filter(None, counts)))} coefficients, '
@@ -75,7 +76,7 @@ class Camera:
 
     @property
     def is_pinhole(self) -> bool:
-        """Return whether nothing is distorted; a fisheye always distorts, also with zeros."""
+        """Return whether the camera has no distortion. A fisheye always has, even with zeros."""
         return self.distortion_model != 'equidistant' and not any(self.distortion)
 
     @property
@@ -89,7 +90,7 @@ class Camera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def normalize_points(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return pixels (n, 2) as undistorted points (n, 2) of the plane z = 1.
+        """Convert pixels (n, 2) to undistorted points (n, 2) on the plane z = 1.
 
         Rows where the distortion model has no inverse are NaN.
         """
@@ -98,7 +99,7 @@ class Camera:
         if self.is_pinhole or len(points_px) == 0:
             return normalized
         if self.distortion_model == 'equidistant':
-            # invert an ideal fisheye first: the tangent of the angle, limited below 90 degrees
+            # start with the inverse of an ideal fisheye, with the angle limited below 90 degrees
             angle = np.minimum(np.linalg.norm(normalized, axis=1, keepdims=True), 1.5)
             normalized *= np.tan(angle) / np.maximum(angle, 1e-12)
         with np.errstate(all='ignore'):
@@ -110,7 +111,7 @@ class Camera:
 
     @cached_property
     def _reach(self) -> float:
-        """Return how far from the axis the lens model holds on the plane z = 1: to its fold."""
+        """Return the distance from the axis at which the lens model folds, on the plane z = 1."""
         distances = np.tan(np.radians(np.arange(0.0, 90.0, _FOLD_STEP_DEG)))
         with np.errstate(all='ignore'):
             columns = self._distorted(np.stack([distances, 0.0 * distances], axis=1))[:, 0]
@@ -131,9 +132,10 @@ class Camera:
         return step / determinant[:, None]
 
     def project_normalized(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the (distorted) pixels (n, 2) of points (n, 2) of the plane z = 1.
+        """Project points (n, 2) on the plane z = 1 to distorted pixels (n, 2).
 
-        Rows beyond the fold of the distortion model are NaN: it would put them into the image.
+        Rows beyond the fold of the distortion model are NaN, because the model would project them
+        into the image.
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
         if self.is_pinhole or len(points) == 0:
@@ -143,7 +145,7 @@ class Camera:
         return pixels
 
     def _distorted(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pixels (n, 2) of points (n, 2), beyond the fold as well."""
+        """Project points (n, 2) to distorted pixels (n, 2), without a check of the fold."""
         coefficients, zero = np.array(self.distortion), np.zeros(3)
         if self.distortion_model == 'equidistant':
             pixels = cv2.fisheye.distortPoints(np.ascontiguousarray(points[:, None]),
@@ -154,15 +156,15 @@ class Camera:
         return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
     def normalize_bboxes(self, bboxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return boxes (n, 4) [px] as undistorted boxes (n, 4) of the plane z = 1.
+        """Convert boxes (n, 4) [px] to undistorted boxes (n, 4) on the plane z = 1.
 
-        The midpoint of each edge, where the inscribed ellipse touches, decides where it goes. Rows
-        where the lens has no inverse, or that lie too far from the axis of a lens with distortion,
-        are NaN.
+        Each edge is placed at its undistorted midpoint, where the inscribed ellipse touches it.
+        Boxes are NaN if the distortion model has no inverse there, or if they are too far from the
+        axis of a lens with distortion.
         """
         bboxes_xyxy = np.asarray(bboxes_xyxy, dtype=np.float64).reshape(-1, 4)
         left, top, right, bottom = bboxes_xyxy.T
-        with np.errstate(invalid='ignore', over='ignore'):  # a box may reach from -inf to inf
+        with np.errstate(invalid='ignore', over='ignore'):  # a box may extend from -inf to inf
             middle_x, middle_y = (left + right) / 2, (top + bottom) / 2
         midpoints = np.stack([left, middle_y, middle_x, top, right, middle_y, middle_x, bottom],
                              axis=-1)
@@ -175,13 +177,13 @@ class Camera:
         return edges
 
     def bboxes_in_pixels(self, edges: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return boxes (n, 4) of the plane z = 1 as undistorted boxes (n, 4) [px]."""
+        """Convert boxes (n, 4) on the plane z = 1 to undistorted boxes (n, 4) [px]."""
         return edges * ([self.fx, self.fy] * 2) + [self.cx, self.cy] * 2
 
 
 def frusta(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64], depth_m: float
            ) -> NDArray[np.float64]:
-    """Return the edges (8 f, 2, 3) of the frusta of cameras at some poses [m].
+    """Return the edges (8 f, 2, 3) of the frusta of f cameras [m], as pairs of end points.
 
     Parameters
     ----------
@@ -189,9 +191,10 @@ def frusta(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64], dept
         Camera of each pose.
     map_from_camera : ndarray (f, 4, 4)
     depth_m : float
-        From the tip to the base [m].
+        Distance from the apex to the base [m].
     """
-    half = np.array([(one.width / one.fx, one.height / one.fy) for one in cameras]).reshape(-1, 2)
+    half = np.array([(camera.width / camera.fx, camera.height / camera.fy)
+                     for camera in cameras]).reshape(-1, 2)
     corners = np.full((len(half), 4, 3), depth_m)
     corners[:, :, :2] = _CORNERS * (half[:, None] * 0.5 * depth_m)
     points = np.einsum('fij,fkj->fki', map_from_camera[:, :3, :3], corners) \

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The depth of a landmark's centre, from the depth in its box.
+"""The depth of a landmark's centre, from the measured depth in its box.
 
-The visible surface is nearer than the centre, by a share of half the chord that the ray through
-the centre cuts off the ellipsoid. By how much objects differ from ellipsoids makes this uncertain,
-by another share of it.
+The visible surface is nearer than the centre by a share of half the chord that the ellipsoid cuts
+off the ray through the centre. The standard deviation of this offset is another share of half the
+chord, because objects differ from ellipsoids.
 """
 
 from math import sqrt
@@ -14,26 +14,27 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.kernels.compiled import compiled
 
-# Both of half a chord. Of 892 boxes of a kitchen.
+# Offset of the surface from the centre and its standard deviation, as shares of half a chord.
+# Measured on 892 boxes of a kitchen.
 SURFACE_SHARE, CHORD_DEVIATION = 0.6, 0.4
-# Deviation of a measured depth: a floor, and a share of it. Of the same boxes.
+# Standard deviation of a measured depth: a constant, and a share of the depth (same boxes).
 _FLOOR_M, _SHARE = 0.03, 0.02
-# Share of the right matches whose depth is that of something else, as where they are hidden in
-# part; and the deviation of the depth of wrong matches, as a share of it. In simulated worlds .1
-# tells right from wrong poses better than .15 to .5.
+# Share of the right matches with the depth of another object, for example of an occluding object,
+# and the relative standard deviation of the depth of wrong matches. In simulated worlds, .1
+# separates right from wrong poses better than .15 to .5.
 _ELSEWHERE, _WRONG_SHARE = 0.1, 0.1
 
 
 @compiled
 def depth_of(rotation, translation, point):
-    """Return the depth of a point (3,) of the map, at the camera_from_map (3, 3), (3,)."""
+    """Return the depth of a point (3,) of the map, given camera_from_map (3, 3), (3,)."""
     return (rotation[2, 0] * point[0] + rotation[2, 1] * point[1] + rotation[2, 2] * point[2]
             + translation[2])
 
 
 @compiled
 def centre_depth(measured, center, shape, sigma, rotation, translation):
-    """Return the depth of a landmark's centre by measurement, and its deviation; 0, 0 if none [m].
+    """Return the measured depth of a landmark's centre and its deviation [m]; 0, 0 if unknown.
 
     Parameters
     ----------
@@ -44,7 +45,7 @@ def centre_depth(measured, center, shape, sigma, rotation, translation):
     sigma : float
         Standard deviation of the centre on each axis [m].
     rotation, translation : ndarray (3, 3), (3,)
-        Rotation and translation of camera_from_map. They give the thickness along the ray.
+        Rotation and translation of camera_from_map, which determine the chord.
     """
     if not measured[1] > 0.0:
         return 0.0, 0.0
@@ -56,10 +57,10 @@ def centre_depth(measured, center, shape, sigma, rotation, translation):
 
 @compiled
 def half_chord(center, shape, rotation, translation):
-    """Return half the depth of what the ray through its centre cuts off a landmark [m].
+    """Return half the depth of the chord that a landmark cuts off the ray through its centre [m].
 
-    The ray r to the centre passes through 1 / sqrt(r^T S^-1 r) of its length, with the inverse of
-    the shape S by its cofactors.
+    Half the chord is 1 / sqrt(r^T S^-1 r) of the length of the ray r to the centre. The inverse of
+    the shape S is computed from its cofactors.
     """
     ray = np.empty(3)  # from the camera to the centre
     for axis in range(3):
@@ -80,10 +81,10 @@ def half_chord(center, shape, rotation, translation):
 
 @compiled
 def depth_errors(measured, centers, shapes, sigmas, rotation, translation):
-    """Return by how much m landmarks are deeper than measured, the deviations, and depths (m, 3).
+    """Return depth minus measured depth, standard deviation and depth (m, 3) of m landmarks [m].
 
-    All are in metres; the deviation is 0 where nothing was measured. Parameters are those of
-    centre_depth, with a row for each landmark.
+    The standard deviation is 0 if no depth was measured. The parameters are those of centre_depth,
+    with a row for each landmark.
     """
     errors = np.zeros((len(measured), 3))
     for row in range(len(measured)):
@@ -97,15 +98,15 @@ def depth_errors(measured, centers, shapes, sigmas, rotation, translation):
 
 
 def depth_deviations(depths: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the standard deviations (n,) of the depths of a usual RGB-D camera [m]."""
+    """Return the standard deviations (n,) of depths (n,) of a typical RGB-D camera [m]."""
     return np.hypot(_FLOOR_M, _SHARE * depths)
 
 
 def depth_odds(errors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the log odds (m,) of matches, by their depth_errors (m, 3); 0 where none.
+    """Return the log odds (m,) of matches from their depth_errors (m, 3); 0 if unknown.
 
-    A wrong match has about the right depth, too: its box is as large as that of the landmark, and
-    the pose was fitted to both.
+    The depth of a wrong match is approximately right, too, because its box is as large as that of
+    the landmark, and the pose was fitted to both.
     """
     odds, known = np.zeros(len(errors)), errors[:, 1] > 0.0
     error, deviation, depth = errors[known].T

@@ -2,15 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exact overlap of two ellipses.
 
-A conic pencil reduces it to one cubic. Scale the plane so that the first ellipse is the
-unit circle and turn it so that the second is parallel to the axes: then
+A conic pencil reduces the problem to one cubic. The plane is scaled so that the first ellipse is
+the unit circle, and rotated so that the second ellipse is parallel to the axes:
 
     x^2 + y^2 = 1   and   a (x - h)^2 + b (y - k)^2 = 1,   a <= b.
 
-Among the conics (second) + lambda (first), the conic with the largest root lambda in [-b, -a] of
-its determinant is a pair of real lines through the common points of both outlines, in pairs that
-do not cross. Each line cuts a cap off both ellipses, one cap inside the other. The shared area is
-one whole ellipse minus the difference of the caps.
+Consider the conics (second) + lambda (first). At the largest root lambda in [-b, -a] of the
+determinant, the conic is a pair of real lines, which connect the common points of both outlines in
+pairs and do not cross inside them. Each line cuts a cap off both ellipses, and one cap lies inside
+the other. The shared area is one whole ellipse minus the difference of the caps.
 """
 
 from math import acos, copysign, pi, sqrt
@@ -18,16 +18,16 @@ from math import acos, copysign, pi, sqrt
 from cliploc_ros.core.geometry.minimal_solvers import largest_cubic_root
 from cliploc_ros.core.kernels.compiled import compiled
 
-# The least relative difference of the squared semi-axes: the pencil of two circles has no pair of
-# finite lines. The area changes by less than 1e-9 of itself.
+# Minimum relative difference of the squared semi-axes, because the pencil of two circles has no
+# pair of finite lines. The relative change of the area is less than 1e-9.
 _MIN_ELONGATION = 1e-9
-# An upper bound is raised by this, more than rounding can raise an IoU or a sum of them.
+# Margin of upper bounds, larger than the rounding errors of an IoU or a sum of IoUs.
 _ROUNDING = 1e-9
 
 
 @compiled
 def _cap_area(distance: float) -> float:
-    """Return the area that a line at a signed distance from the centre cuts off the unit disc."""
+    """Return the area that a line with signed distance from the centre cuts off the unit disc."""
     if distance >= 1.0:
         return 0.0
     if distance <= -1.0:
@@ -44,7 +44,7 @@ def unit_circle_overlap(h: float, k: float, p: float, q: float) -> float:
     h, k : float
         Centre of the ellipse.
     p, q : float
-        Its semi-axes along x and y, p >= q > 0.
+        Semi-axes of the ellipse along x and y, p >= q > 0.
     """
     a = 1.0 / (p * p)
     b = max(1.0 / (q * q), a * (1.0 + _MIN_ELONGATION))
@@ -74,12 +74,12 @@ def unit_circle_overlap(h: float, k: float, p: float, q: float) -> float:
     if not (cuts1 or cuts2):
         return _nested_or_apart(h, k, a, b, ellipse_area)
     # Outward means away from the other chord, whose midpoint on a line n.x + e = 0 is -e n. If
-    # both lines coincide (the outlines touch twice), one looks to each side.
+    # both lines coincide because the outlines touch twice, their outward sides are opposite.
     along = r * r - s * s
     side1, side2 = e1 - e2 * along, e2 - e1 * along
     sign1 = 1.0 if not cuts2 or side1 <= 0.0 else -1.0
     sign2 = 1.0 if not cuts1 or side2 < 0.0 or (side2 == 0.0 and along < 0.0) else -1.0
-    # caps of the disc minus those of the ellipse, one inside the other on every line
+    # caps of the disc minus caps of the ellipse, one inside the other on each line
     surplus = 0.0
     width = sqrt(s * s * p * p + r * r * q * q)
     if cuts1:
@@ -109,7 +109,7 @@ def _root_between(a: float, b: float, c: float, ah2: float, bk2: float) -> float
 
 @compiled
 def _nested_or_apart(h: float, k: float, a: float, b: float, ellipse_area: float) -> float:
-    """Return the area shared by the unit disc and an ellipse whose outlines do not meet."""
+    """Return the area shared by the unit disc and an ellipse with outlines that do not meet."""
     if ellipse_area < pi:
         return ellipse_area if h * h + k * k < 1.0 else 0.0
     return pi if a * h * h + b * k * k < 1.0 else 0.0
@@ -118,7 +118,7 @@ def _nested_or_apart(h: float, k: float, a: float, b: float, ellipse_area: float
 @compiled
 def ellipse_iou(u: float, v: float, half_width: float, half_height: float,
                 cx: float, cy: float, exx: float, exy: float, eyy: float) -> float:
-    """Return intersection over union of an ellipse parallel to the axes and any ellipse.
+    """Return the intersection over union of an axis-parallel ellipse and any other ellipse.
 
     Parameters
     ----------
@@ -130,13 +130,13 @@ def ellipse_iou(u: float, v: float, half_width: float, half_height: float,
     Returns
     -------
     float
-        0 to 1, exact to about 1e-9. Precision is lower where the outlines touch in one point and
-        cross in two others to the last digit.
+        0 to 1, exact to about 1e-9. Precision is lower if the outlines touch at one point to the
+        last digit and cross at two others.
     """
     half_x, half_y = sqrt(exx), sqrt(eyy)
     if abs(cx - u) >= half_width + half_x or abs(cy - v) >= half_height + half_y:
         return 0.0
-    # the plane in which the first ellipse is the unit circle
+    # transform to the plane in which the first ellipse is the unit circle
     h, k = (cx - u) / half_width, (cy - v) / half_height
     fxx = exx / (half_width * half_width)
     fxy = exy / (half_width * half_height)
@@ -164,7 +164,7 @@ def ellipse_iou(u: float, v: float, half_width: float, half_height: float,
 @compiled
 def iou_bound(u: float, v: float, half_width: float, half_height: float,
               cx: float, cy: float, half_x: float, half_y: float, axes: float) -> float:
-    """Return an upper bound of ellipse_iou, which is much cheaper.
+    """Return an upper bound of ellipse_iou. It is much cheaper to compute.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def iou_bound(u: float, v: float, half_width: float, half_height: float,
     height = min(v + half_height, cy + half_y) - max(v - half_height, cy - half_y)
     if not (width > 0.0 and height > 0.0):
         return 0.0
-    # Areas in units of pi. The shared area is in both ellipses, and where their boxes overlap.
+    # Areas in units of pi. The shared area lies in both ellipses and in the overlap of both boxes.
     box_axes = half_width * half_height
     shared = min(width * height * (1.0 / pi), min(axes, box_axes))
     return shared / (axes + box_axes - shared) + _ROUNDING

@@ -3,11 +3,11 @@
 """Ellipsoids and their outlines in the image.
 
 The outline of an ellipsoid is an ellipse. With the dual quadric Q* = [S + c c^T, c; c^T, 1] up to
-sign, P Q* P^T is the outline's dual conic (Rubino, Crocco and Del Bue, "3D Object Localisation
-from Multi-view Image Detections", PAMI 2018).
+sign, P Q* P^T is the dual conic of the outline (Rubino, Crocco and Del Bue, "3D Object
+Localisation from Multi-view Image Detections", PAMI 2018).
 
 A shape matrix S = R diag(a^2, b^2, c^2) R^T is stored as its upper triangle
-(xx, xy, xz, yy, yz, zz), an ellipse as its centre c and the upper triangle of E in
+(xx, xy, xz, yy, yz, zz). An ellipse is stored as its centre c and the upper triangle of E in
 (x - c)^T E^-1 (x - c) <= 1.
 """
 
@@ -25,17 +25,18 @@ from cliploc_ros.core.kernels.compiled import compiled
 _UPPER = np.triu_indices(3)
 
 _OUTLINE_POINTS = 64
-#: Ellipsoids whose centres are nearer than this in units of their summed shapes stand in one
-#: another: two that touch are at most 1.41 apart, and a small one whose centre lies on the surface
-#: of a large one is 1 apart.
+#: Two ellipsoids whose centres are nearer than this, in units of their summed shapes, intersect
+#: substantially. The distance is at most 1.41 for ellipsoids that touch, and 1 for a small
+#: ellipsoid whose centre lies on the surface of a large one.
 STANDS_IN = 1.0
 
 
 def shape_matrices(semi_axes: NDArray[np.float64], quats_xyzw: NDArray[np.float64]
                    ) -> NDArray[np.float64]:
-    """Return the shape matrices (n, 6) of ellipsoids as upper triangles.
+    """Return the shape matrices (n, 6) of ellipsoids as upper triangles [m^2].
 
-    From their semi-axes (n, 3) [m] and the rotations (n, 4) from their axes into the map's.
+    The arguments are their semi-axes (n, 3) [m] and the quaternions (n, 4) that rotate their axes
+    to those of the map.
     """
     rotations = Rotation.from_quat(quats_xyzw).as_matrix().reshape(-1, 3, 3)
     shapes = np.einsum('nij,nj,nkj->nik', rotations, np.square(semi_axes), rotations)
@@ -63,7 +64,7 @@ def project_ellipsoid(rotation, translation, center, shape):
     Returns
     -------
     visible : bool
-        Whether the ellipsoid lies wholly in front of the camera; if not, the rest is 0.
+        Whether the ellipsoid lies completely in front of the camera. If not, the ellipse is 0.
     cx, cy, exx, exy, eyy : float
         The ellipse.
     """
@@ -117,7 +118,8 @@ def project_ellipsoids(camera_from_map: NDArray[np.float64], centers: NDArray[np
     camera_from_map : ndarray (4, 4)
         Pose of the map in the camera's optical frame.
     centers, shapes : ndarray (n, 3), (n, 6)
-        Centres and shapes of the ellipsoids in the map. Rows of those not wholly in front are NaN.
+        Centres and shapes of the ellipsoids in the map. Outlines of ellipsoids that are not
+        completely in front of the camera are NaN.
     """
     ellipses = np.empty((len(centers), 5))
     _project_all(np.ascontiguousarray(camera_from_map[:3, :3]),
@@ -133,22 +135,22 @@ def ellipse_bboxes(ellipses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def shared_areas(boxes: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the areas (n, m) that boxes (n, 4) share with others (m, 4)."""
+    """Return the areas (n, m) that boxes (n, 4) share with other boxes (m, 4)."""
     low = np.maximum(boxes[:, None, :2], others[:, :2])
     high = np.minimum(boxes[:, None, 2:], others[:, 2:])
     return np.asarray(np.maximum(high - low, 0.0).prod(axis=2))
 
 
 def box_ious(boxes: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the IoU (n, m) of boxes (n, 4) with others (m, 4); 0 of boxes without an area."""
+    """Return the IoU (n, m) of boxes (n, 4) with other boxes (m, 4); 0 for boxes without area."""
     shared = shared_areas(boxes, others)
-    areas, of_others = (np.maximum(one[:, 2:] - one[:, :2], 0.0).prod(axis=1)
-                        for one in (boxes, others))
+    areas, of_others = (np.maximum(corners[:, 2:] - corners[:, :2], 0.0).prod(axis=1)
+                        for corners in (boxes, others))
     return np.asarray(shared / np.maximum(areas[:, None] + of_others - shared, 1e-12))
 
 
 def ellipses_in_pixels(ellipses: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """Return ellipses (n, 5) of the plane z = 1 as ellipses of the undistorted image [px]."""
+    """Convert ellipses (n, 5) on the plane z = 1 to ellipses in the undistorted image [px]."""
     fx, fy = camera.fx, camera.fy
     scaled = ellipses * (fx, fy, fx * fx, fx * fy, fy * fy)
     scaled[:, :2] += (camera.cx, camera.cy)
@@ -164,32 +166,34 @@ def outline_points(ellipse: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class Poses(NamedTuple):
-    """Poses camera_from_map, as a minimal solver writes them."""
+    """Poses camera_from_map, as written by a minimal solver."""
 
-    #: (p, 3, 3), (p, 3)
+    #: (p, 3, 3), (p, 3): rotations and translations [m]
     rotations: NDArray[np.float64]
     translations: NDArray[np.float64]
 
     @staticmethod
     def allocate() -> 'Poses':
-        """Return memory for the solutions of one minimal sample."""
+        """Allocate memory for the solutions of one minimal sample."""
         return Poses(np.empty((MAX_SOLUTIONS, 3, 3)), np.empty((MAX_SOLUTIONS, 3)))
 
 
 @compiled
 def project(landmarks, first, last, poses, which, outlines, out):
-    """Write the outlines of landmarks first to last at one pose into rows from out on.
+    """Write the outlines of landmarks `first` to `last`, exclusive, into rows from `out` on.
 
-    The numbers are those of project_ellipsoid, in one loop without calls, which is several times
-    faster.
+    The formulas are those of project_ellipsoid, in one loop without function calls, which is
+    several times faster.
 
     Parameters
     ----------
     landmarks : ndarray (u, 9)
-        Centre and shape of each.
+        Centre and shape of each landmark.
+    poses, which : Poses, int
+        The poses, and the index of the pose to use.
     outlines : ndarray (o, 6)
         Centre x and y, half extents x and y, exy, and the product of the semi-axes. The half
-        extents are minus infinity where an ellipsoid is not wholly in front of the camera.
+        extents are minus infinity if an ellipsoid is not completely in front of the camera.
     """
     rotations, translations = poses.rotations, poses.translations
     r00, r01, r02 = rotations[which, 0, 0], rotations[which, 0, 1], rotations[which, 0, 2]

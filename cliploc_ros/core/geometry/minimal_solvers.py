@@ -1,24 +1,24 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The pose of a camera from three points, or from two where the vertical is known.
+"""The pose of a camera from three points, or from two points if the vertical is known.
 
 **Three points (P3P).** The depths d of the three points along their bearings solve three quadratic
-equations ``di^2 + dj^2 - 2 di dj cos_ij = |Xi - Xj|^2``. Two homogeneous combinations of them are
-conics in (d1 : d2 : d3); a degenerate member of their pencil is a pair of lines (Persson and
-Nordberg, "Lambda Twist", ECCV 2018), split as in Ding et al., "Revisiting the P3P Problem", CVPR
-2023. Each line meets a conic in up to two points, so there are up to four poses. The depths found
-are polished by Newton's method on the three equations themselves.
+equations ``di^2 + dj^2 - 2 di dj cos_ij = |Xi - Xj|^2``. Two homogeneous combinations of the
+equations are conics in (d1 : d2 : d3). A degenerate member of their pencil is a pair of lines
+(Persson and Nordberg, "Lambda Twist", ECCV 2018), split as in Ding et al., "Revisiting the P3P
+Problem", CVPR 2023. Each line meets a conic in up to two points, so there are up to four poses.
+The depths are then refined with Newton's method on the three equations.
 
-**Two points.** The vertical leaves a rotation about itself and a translation unknown. In
-coordinate frames whose third axis is up, camera and map differ by a yaw: ``d2 b2 - d1 b1 = Rz(yaw)
-(X2 - X1)``, with depths d along the bearings b. The third row and the length do not depend on the
-yaw:
+**Two points.** If the vertical is known, the rotation about it and the translation are unknown. In
+coordinate frames with the third axis up, camera and map differ by a yaw: ``d2 b2 - d1 b1 = Rz(yaw)
+D`` with ``D = X2 - X1`` and depths d along the bearings b. The third row and the length do not
+depend on the yaw:
 
     d2 b2z - d1 b1z = Dz   and   |d2 b2 - d1 b1|^2 = |D|^2.
 
-These are a line and a conic, which share up to two points; yaw and translation follow (after
-Kukelova, Bujnak and Pajdla, "Closed-form Solutions to Minimal Absolute Pose Problems with Known
-Vertical Direction", ACCV 2010).
+These are a line and a conic, which share up to two points. Yaw and translation follow from the
+depths (after Kukelova, Bujnak and Pajdla, "Closed-form Solutions to Minimal Absolute Pose Problems
+with Known Vertical Direction", ACCV 2010).
 """
 
 from math import acos, copysign, cos, sqrt
@@ -32,10 +32,10 @@ _DOUBLE_ROOT = 1e-12
 _ROUNDING = 4e-16
 MAX_SOLUTIONS = 4
 _NEWTON_STEPS = 3
-# Triangles whose normalized cross product is below this are degenerate; so are baselines that are
-# nearly vertical, and bearings that are nearly level.
+# Triangles are degenerate if their normalized cross product is below this. The same limit applies
+# to baselines that are nearly vertical, and to bearings that are nearly level.
 _MIN_SINE = 1e-9
-# Rounding may make a double root of the quadratic complex.
+# Tolerance for a double root of the quadratic, which rounding may make complex.
 _DOUBLE_ROUNDING = 1e-12
 
 
@@ -43,7 +43,8 @@ _DOUBLE_ROUNDING = 1e-12
 def largest_cubic_root(c2: float, c1: float, c0: float) -> float:
     """Return the largest real root of x^3 + c2 x^2 + c1 x + c0.
 
-    Closed form (Viete for three real roots, Cardano for one), then two Newton steps.
+    It is computed in closed form, by Viete for three real roots and by Cardano for one, and then
+    refined by two Newton steps.
     """
     shift = c2 / 3.0
     p = c1 - c2 * shift
@@ -54,7 +55,7 @@ def largest_cubic_root(c2: float, c1: float, c0: float) -> float:
         cosine = min(1.0, max(-1.0, -0.5 * q / (radius * radius * radius)))
         root = 2.0 * radius * cos(acos(cosine) / 3.0) - shift
     else:
-        # Start with the cube root of larger magnitude: the other follows without cancellation.
+        # Compute the cube root of larger magnitude; the other one follows without cancellation.
         u = np.cbrt(-0.5 * q - copysign(sqrt(discriminant), q))
         depressed = u - p / (3.0 * u) if u != 0.0 else 0.0
         if depressed < 0.0 and discriminant <= _DOUBLE_ROOT * q * q:
@@ -71,21 +72,21 @@ def largest_cubic_root(c2: float, c1: float, c0: float) -> float:
 
 def solve_p3p(bearings: NDArray[np.float64], points: NDArray[np.float64]
               ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the poses from which three points are seen along three bearings.
+    """Return the poses at which three points have the given bearings.
 
     Parameters
     ----------
     bearings : ndarray (3, 3)
-        Unit vectors in the camera's optical frame, one a row.
+        Unit vectors in the camera's optical frame, one per row.
     points : ndarray (3, 3)
-        The points in the map frame [m], one a row.
+        The points in the map frame [m], one per row.
 
     Returns
     -------
     rotations : ndarray (s, 3, 3)
-        Rotation of ``camera_from_map`` of each of the s = 0 to 4 solutions.
+        Rotations of ``camera_from_map`` for the s = 0 to 4 solutions.
     translations : ndarray (s, 3)
-        Its translation [m]. All points lie in front of the camera along their bearings.
+        Translations of ``camera_from_map`` [m]. All points lie in front of the camera.
     """
     rotations = np.empty((MAX_SOLUTIONS, 3, 3))
     translations = np.empty((MAX_SOLUTIONS, 3))
@@ -103,7 +104,7 @@ def p3p(bearings, points, rotations, translations):
     longest = max(a12, a13, a23)
     if not min(a12, a13, a23) > _MIN_SINE * _MIN_SINE * longest:
         return 0
-    # lengths in units of the longest side, so that every threshold below is relative
+    # lengths in units of the longest side, so that all thresholds below are relative
     scale = sqrt(longest)
     a12, a13, a23 = a12 / longest, a13 / longest, a23 / longest
 
@@ -150,7 +151,7 @@ def _squared_distance(points, i, j):
 
 @compiled
 def _cofactors(c):
-    """Return the adjugate of a symmetric matrix, both as upper triangles."""
+    """Return the adjugate of a symmetric matrix; both are given as upper triangles."""
     xx, xy, xz, yy, yz, zz = c
     return (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy,
             xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy)
@@ -158,8 +159,8 @@ def _cofactors(c):
 
 @compiled
 def _degenerate_lines(first, second):
-    """Split a degenerate conic of the pencil into two lines; False if they are not real."""
-    # det(first + g second) is a cubic in g with these coefficients (mixed determinants)
+    """Split a degenerate conic of the pencil into two lines, and return whether they are real."""
+    # these are the coefficients of the cubic det(first + g second) in g (mixed determinants)
     adj1, adj2 = _cofactors(first), _cofactors(second)
     det1 = first[0] * adj1[0] + first[1] * adj1[1] + first[2] * adj1[2]
     det2 = second[0] * adj2[0] + second[1] * adj2[1] + second[2] * adj2[2]
@@ -168,7 +169,7 @@ def _degenerate_lines(first, second):
     mixed2 = (adj2[0] * first[0] + adj2[3] * first[3] + adj2[5] * first[5]
               + 2.0 * (adj2[1] * first[1] + adj2[2] * first[2] + adj2[4] * first[4]))
     nowhere = (0.0, 0.0, 0.0)
-    # Divide by the larger of both end coefficients, so that the root, g or 1 / g, is finite.
+    # Divide by the larger of the two end coefficients, so that the root, g or 1 / g, is finite.
     if abs(det2) >= abs(det1):
         if det2 == 0.0:
             return nowhere, nowhere, False
@@ -183,7 +184,10 @@ def _degenerate_lines(first, second):
 
 @compiled
 def _split_lines(c):
-    """Return the two lines of a rank-two conic: (p x) + conic has rank one for their point p."""
+    """Return the two lines of a rank-two conic, and whether they are real.
+
+    If p is the common point of the lines, [p]x + conic is the rank-one matrix l m^T of the lines.
+    """
     adj = _cofactors(c)
     if adj[0] <= adj[3] and adj[0] <= adj[5]:
         px, py, pz = adj[0], adj[1], adj[2]
@@ -219,7 +223,7 @@ def _longest(a, b, c):
 
 @compiled
 def _meet_line_and_conic(line, c):
-    """Return the number of points (0 or 2) that a line and a conic share, and the points."""
+    """Return the number (0 or 2) of common points of a line and a conic, and the points."""
     lx, ly, lz = line
     # two points that span the line, far from parallel
     if abs(lx) >= abs(ly) and abs(lx) >= abs(lz):
@@ -231,7 +235,7 @@ def _meet_line_and_conic(line, c):
     quadratic, half, constant = _bilinear(c, u, u), _bilinear(c, u, v), _bilinear(c, v, v)
     discriminant = half * half - quadratic * constant
     if discriminant < 0.0:
-        # Rounding may make a double root complex; it still is one pose.
+        # A double root that rounding made complex is still a solution.
         if discriminant < -1e-12 * (half * half + abs(quadratic * constant)):
             return 0, u, v
         discriminant = 0.0
@@ -251,7 +255,7 @@ def _bilinear(c, u, v):
 
 @compiled
 def _combine(s, u, t, v):
-    """Return s u + t v with the sign that makes the sum of its components positive."""
+    """Return s u + t v, with its sign chosen so that the sum of its components is positive."""
     x, y, z = s * u[0] + t * v[0], s * u[1] + t * v[1], s * u[2] + t * v[2]
     if x + y + z < 0.0:
         return -x, -y, -z
@@ -260,7 +264,7 @@ def _combine(s, u, t, v):
 
 @compiled
 def _polish(d1, d2, d3, m12, m13, m23, a12, a13, a23):
-    """Return the depths after Newton steps on the three distance equations."""
+    """Refine the depths by Newton steps on the three distance equations."""
     for _ in range(_NEWTON_STEPS):
         r1 = d1 * d1 + d2 * d2 - 2.0 * d1 * d2 * m12 - a12
         r2 = d1 * d1 + d3 * d3 - 2.0 * d1 * d3 * m13 - a13
@@ -281,9 +285,9 @@ def _polish(d1, d2, d3, m12, m13, m23, a12, a13, a23):
 
 @compiled
 def _inverse_triangle_frame(points):
-    """Return the rows of the inverse of [X1-X2, X1-X3, their cross product], and True.
+    """Return the rows of the inverse of [X1-X2, X1-X3, their cross product].
 
-    False for points on a line.
+    Also returns whether the inverse exists: it does not if the points lie on a line.
     """
     u0, u1, u2 = (points[0, 0] - points[1, 0], points[0, 1] - points[1, 1],
                   points[0, 2] - points[1, 2])
@@ -303,7 +307,7 @@ def _inverse_triangle_frame(points):
 
 @compiled
 def _pose_from_depths(d1, d2, d3, bearings, points, inverse, rotations, translations, which):
-    """Write camera_from_map: its rotation maps the map's triangle to the camera's."""
+    """Write camera_from_map, whose rotation maps the triangle in the map to that in the camera."""
     y0, y1, y2 = d1 * bearings[0, 0], d1 * bearings[0, 1], d1 * bearings[0, 2]
     u0, u1, u2 = (y0 - d2 * bearings[1, 0], y1 - d2 * bearings[1, 1], y2 - d2 * bearings[1, 2])
     v0, v1, v2 = (y0 - d3 * bearings[2, 0], y1 - d3 * bearings[2, 1], y2 - d3 * bearings[2, 2])
@@ -326,17 +330,16 @@ def _pose_from_depths(d1, d2, d3, bearings, points, inverse, rotations, translat
 
 @compiled
 def two_point(bearings, points, verticals, rotations, translations):
-    """Write the poses with a known vertical from which two points are seen along two bearings.
+    """Write the poses with a known vertical at which two points have the given bearings.
 
     Parameters
     ----------
     bearings, points : ndarray (2, 3)
-        Unit vectors in the camera's optical frame, and points in the map frame [m], one a row.
+        Unit vectors in the camera's optical frame, and points in the map frame [m], one per row.
     verticals : ndarray (6,) or more
-        Up in the camera and up in the map, unit vectors.
+        Unit vectors up, in the camera's optical frame and in the map frame.
     rotations, translations : ndarray (2, 3, 3), (2, 3)
-        Rotations and translations of camera_from_map [m]. Both points lie in front of
-        the camera along their bearings.
+        Rotations and translations of camera_from_map [m]. Both points lie in front of the camera.
 
     Returns
     -------
@@ -353,21 +356,21 @@ def two_point(bearings, points, verticals, rotations, translations):
     height = e0 * w0 + e1 * w1 + e2 * w2
     level_square = square - height * height
     if not level_square > _MIN_SINE * square:
-        return 0  # one point is above the other: the yaw is free
+        return 0  # one point is above the other, so the yaw is undetermined
     rise1 = b10 * u0 + b11 * u1 + b12 * u2
     rise2 = b20 * u0 + b21 * u1 + b22 * u2
     cosine = b10 * b20 + b11 * b21 + b12 * b22
-    # The line d2 rise2 - d1 rise1 = height as d = base + s direction, with base its point nearest
-    # to zero. The conic d1^2 + d2^2 - 2 d1 d2 cosine = square is a quadratic in s.
+    # The line d2 rise2 - d1 rise1 = height is written as d = base + s direction, where base is its
+    # point nearest to zero. The conic d1^2 + d2^2 - 2 d1 d2 cosine = square is quadratic in s.
     steepness = rise1 * rise1 + rise2 * rise2
     if not steepness > _MIN_SINE * _MIN_SINE:
-        return 0  # both points are level with the camera: the depths are free
+        return 0  # both points are level with the camera, so the depths are undetermined
     base1, base2 = -rise1 * height / steepness, rise2 * height / steepness
     quadratic = steepness - 2.0 * rise1 * rise2 * cosine
     half = base1 * rise2 + base2 * rise1 - cosine * (base1 * rise1 + base2 * rise2)
     constant = base1 * base1 + base2 * base2 - 2.0 * base1 * base2 * cosine - square
     discriminant = half * half - quadratic * constant
-    # Rounding may make a double root complex; it still is one pose.
+    # A double root that rounding made complex is still a solution.
     if not (discriminant >= -_DOUBLE_ROUNDING * (half * half + abs(quadratic * constant))
             and quadratic > 0.0):
         return 0
@@ -394,12 +397,16 @@ def two_point(bearings, points, verticals, rotations, translations):
 
 @compiled
 def _upright_rotation(e, f, u, w, rotations, which):
-    """Write the rotation that maps the vertical w to u, and e to f, which have equal heights."""
+    """Write the rotation that maps w to u, and e to f; False if f is parallel to u.
+
+    The unit vectors w and u point up in the map and in the camera. The components of e along w and
+    of f along u are equal.
+    """
     e0, e1, e2 = e
     f0, f1, f2 = f
     u0, u1, u2 = u
     w0, w1, w2 = w
-    # a and g are the level parts of e and f; c and h are up x level part
+    # a and g are the horizontal directions of e and f; c and h are up x a and up x g
     height = e0 * w0 + e1 * w1 + e2 * w2
     a0, a1, a2 = e0 - height * w0, e1 - height * w1, e2 - height * w2
     length = sqrt(a0 * a0 + a1 * a1 + a2 * a2)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rigid transforms as 4x4 matrices, named ``a_from_b``: ``x_a = a_from_b @ x_b``.
 
-Every tolerance by which two poses agree has a name here.
+All tolerances within which two poses agree are defined here.
 """
 
 from typing import NamedTuple
@@ -28,14 +28,14 @@ def invert_transform(a_from_b: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def is_rigid(transform: NDArray[np.float64], tolerance: float = 1e-4) -> bool:
-    """Return whether an array is a finite rigid transform (4, 4)."""
+    """Return whether an array is a rigid transform (4, 4) with finite elements."""
     return transform.shape == (4, 4) and bool(are_rigid(transform[None], tolerance)[0])
 
 
 def are_rigid(transforms: NDArray[np.float64], tolerance: float = 1e-3) -> NDArray[np.bool_]:
-    """Return which arrays (k, 4, 4) are finite rigid transforms."""
+    """Return which arrays (k, 4, 4) are rigid transforms with finite elements."""
     finite = np.isfinite(transforms).all(axis=(1, 2))
-    # no element of a rotation exceeds 1, and squares of huge numbers overflow
+    # clip to avoid overflow: no element of a rotation exceeds 1
     rotations = np.clip(np.where(finite[:, None, None], transforms[:, :3, :3], 0.0), -2.0, 2.0)
     errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     return np.asarray((errors <= tolerance) & (np.linalg.det(rotations) > 0.0)
@@ -56,7 +56,7 @@ def quaternion_from_transform(a_from_b: NDArray[np.float64]) -> NDArray[np.float
 
 def move_poses(poses: NDArray[np.float64], scale: float, rotation: NDArray[np.float64]
                ) -> NDArray[np.float64]:
-    """Return poses (n, 4, 4) with positions times a scale, then turned by a rotation (3, 3)."""
+    """Scale the positions of poses (n, 4, 4), then rotate the poses by a rotation (3, 3)."""
     moved = poses.copy()
     moved[:, :3, 3] *= scale
     moved[:, :3] = rotation @ moved[:, :3]
@@ -64,7 +64,7 @@ def move_poses(poses: NDArray[np.float64], scale: float, rotation: NDArray[np.fl
 
 
 def rotation_angle_deg(rotation: NDArray[np.float64]) -> float:
-    """Return the angle [deg] by which a rotation (3, 3) turns."""
+    """Return the angle [deg] of a rotation (3, 3)."""
     return float(np.degrees(Rotation.from_matrix(rotation).magnitude()))
 
 
@@ -75,21 +75,21 @@ def pose_error(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> tup
 
 
 def pose_difference(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the step (6,) from one pose to another: position [m], rotation about fixed axes."""
+    """Return the step (6,) between two poses: position [m], rotation about fixed axes [rad]."""
     turn = Rotation.from_matrix(other[:3, :3] @ one[:3, :3].T).as_rotvec()
     return np.concatenate([other[:3, 3] - one[:3, 3], turn])
 
 
 def move_covariance(covariance: NDArray[np.float64], lever: NDArray[np.float64]
                     ) -> NDArray[np.float64]:
-    """Return a pose's covariance after its origin moved rigidly by a lever.
+    """Return the covariance of a pose after its origin is moved by a rigid lever.
 
     Parameters
     ----------
     covariance : ndarray (6, 6)
         Covariance of x, y, z [m] and the rotations about the fixed X, Y, Z axes [rad] (ROS order).
     lever : ndarray (3,)
-        From the old origin to the new one, in the fixed frame [m].
+        Vector from the old origin to the new origin, in the fixed coordinate frame [m].
     """
     x, y, z = lever
     jacobian = np.eye(6)
@@ -98,7 +98,10 @@ def move_covariance(covariance: NDArray[np.float64], lever: NDArray[np.float64]
 
 
 def first_of_each(same: NDArray[np.bool_], most: int | None = None) -> list[int]:
-    """Return the first of m rows that are not the same (m, m) as one before, up to a number."""
+    """Return the first row of each group of equal rows, in order, and `most` rows at most.
+
+    same (m, m) states which rows are equal. A row is skipped if it equals a row returned before.
+    """
     rows = list[int]()
     for row in range(len(same)):
         if len(rows) == most:
@@ -109,14 +112,14 @@ def first_of_each(same: NDArray[np.bool_], most: int | None = None) -> list[int]
 
 
 class Tolerance(NamedTuple):
-    """Two poses agree if they are nearer than this to each other, in both [m] [deg]."""
+    """Two poses agree if both their distance [m] and their angle [deg] are smaller than this."""
 
     distance_m: float
     angle_deg: float
 
     @property
     def least_trace(self) -> float:
-        """Return the trace of a rotation by the angle; a smaller turn has a greater trace."""
+        """Return the trace of a rotation by the angle. Smaller rotations have a greater trace."""
         return float(1.0 + 2.0 * np.cos(np.radians(self.angle_deg)))
 
     def agree(self, one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
@@ -125,43 +128,46 @@ class Tolerance(NamedTuple):
 
     def agreeing(self, poses: NDArray[np.float64], others: NDArray[np.float64] | None = None
                  ) -> NDArray[np.bool_]:
-        """Return which poses (m, 4, 4) agree with which others (k, 4, 4), or with each other."""
+        """Return which poses (m, 4, 4) agree with which other poses (k, 4, 4), as (m, k).
+
+        By default, the poses are compared with each other.
+        """
         others = poses if others is None else others
         near = np.linalg.norm(poses[:, None, :3, 3] - others[:, :3, 3], axis=2) < self.distance_m
         traces = np.einsum('iab,jab->ij', poses[:, :3, :3], others[:, :3, :3])
         return np.asarray(near & (traces > self.least_trace))
 
     def distinct(self, poses: NDArray[np.float64], most: int | None = None) -> list[int]:
-        """Return the row of the first of m poses (m, 4, 4) at each place, up to a number."""
+        """Return the row of the first pose (m, 4, 4) at each place, and `most` rows at most."""
         return first_of_each(self.agreeing(poses), most)
 
     def wider(self, distance_m: float, angle_deg: float) -> 'Tolerance':
-        """Return a tolerance that allows more by these amounts."""
+        """Return a tolerance that is wider by these amounts."""
         return Tolerance(self.distance_m + distance_m, min(180.0, self.angle_deg + angle_deg))
 
 
-#: Two poses count as the same answer, and a pose this near to the truth as right.
+#: Within this, two poses count as the same answer, and a pose near the truth counts as right.
 SAME_ANSWER = Tolerance(1.0, 45.0)
 #: A pose further from the truth than this is wrong [m].
 RIGHT_M = SAME_ANSWER.distance_m
-#: Two hypotheses of a search are at one place: the better one stands for both.
+#: Within this, two hypotheses of a search are at one place, and only the better one is kept.
 SAME_PLACE = Tolerance(0.5, 20.0)
-#: Two looks, linked by odometry, lead to the same pose.
+#: Within this, two looks that odometry links lead to the same pose.
 SAME_LOOK = Tolerance(0.5, 20.0)
-#: A localizer drifts by less, and the mount of a camera is off by less.
+#: The drift of a localizer and the error of a camera's mount are smaller than this.
 SAME_NEIGHBOURHOOD = Tolerance(0.7, 20.0)
-#: Two refined poses are the same minimum of the cost.
+#: Within this, two refined poses are the same minimum of the cost.
 SAME_MINIMUM = Tolerance(0.05, 2.0)
-#: A camera that moved less sees the same again.
+#: A camera that moves less than this has the same view.
 SAME_VIEW = Tolerance(0.05, 3.0)
-#: Boxes of an object share their errors between poses this near to each other.
+#: Within this, the boxes of an object at two poses have the same errors.
 SAME_BOXES = Tolerance(0.25, 10.0)
-#: A keyframe sees what a camera sees; the shares of both tolerances add up.
+#: Within this, a keyframe has the view of a camera; the shares of both tolerances are added.
 SAME_SIGHT = Tolerance(2.0, 40.0)
-#: A robot that moved less since its image is still where its pose says.
+#: If a robot has moved less than this since its image, its pose is still valid.
 SAME_SPOT = Tolerance(0.1, 5.0)
-#: A localizer that shows a pose this near to the given pose has taken it. Its particles scatter by
-#: the given covariance, so the tolerance is wider by three standard deviations.
+#: A localizer has accepted a given pose if it shows a pose within this. Its particles scatter by
+#: the given covariance, so the tolerance is increased by three standard deviations.
 TAKEN = Tolerance(0.3, 10.0)
-#: Two moves of a place onto another place that differ by less are the same move.
+#: Within this, two moves of a place onto another place are the same move.
 SAME_MOVE = Tolerance(1.0, 30.0)

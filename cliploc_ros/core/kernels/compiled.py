@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Compile numerical kernels, and keep the compiled code on disk.
+"""Compile numerical kernels, and keep the machine code on disk.
 
-numba's own cache misses a change of a kernel that another one calls, compiles again after a copy,
-and fails on a damaged file. Here the name of a file holds a digest of all that decides the machine
-code: the source of the kernel's module and of all modules that it imports, the types of the
-arguments, the processor, and the versions of Python, numba and NumPy. So a file is never outdated,
-and machines, users and versions may share a folder.
+numba's cache does not notice a change of a kernel that another kernel calls, compiles again after
+the package is copied, and fails on a damaged file. Here, the name of a file contains a digest of
+everything that affects the machine code: the source of the kernel's module and of all modules that
+it imports, the types of the arguments, the processor, and the versions of Python, numba and NumPy.
+A file is therefore never outdated, and machines, users and versions can share a folder.
 """
 
 import hashlib
@@ -46,7 +46,7 @@ _ROOT = _PACKAGE.name
 _IMPORTED = re.compile(rb'^(?:from|import) (%s[\w.]*)(?: import (\w+)$)?' % _ROOT.encode(), re.M)
 _VERSIONS = (sys.version_info[:2], numba.__version__, llvmlite.__version__, np.__version__)
 _DIGEST_BYTES = 32
-#: A literal 0 as an argument compiles a further specialization of a kernel; this one does not.
+#: Zero as an argument of a kernel; a literal 0 would compile a further specialization.
 ZERO = np.int64(0)
 
 logger = logging.getLogger(__name__)
@@ -55,14 +55,14 @@ logger = logging.getLogger(__name__)
 class KernelFolders:
     """The folders of compiled kernels, in the order of preference.
 
-    NUMBA_CACHE_DIR replaces all others.
+    If the environment variable NUMBA_CACHE_DIR is set, only this folder is used.
 
     Attributes
     ----------
     found, missing : int
-        How many kernels were read, and how many were looked for in vain.
+        Number of kernels that were read, and of kernels that were not found.
     kept_in : Path or None
-        Where the last new kernel was stored; None if no folder takes them.
+        Folder in which the last new kernel was stored; None if no folder is writable.
     """
 
     def __init__(self) -> None:
@@ -72,11 +72,11 @@ class KernelFolders:
         self._is_warned = False
 
     def prefer(self, folder: Path) -> None:
-        """Look for kernels in a folder first, and keep them there."""
+        """Use a folder before the others, for reading and for storing kernels."""
         self._preferred = folder
 
     def read(self, name: str) -> bytes | None:
-        """Return the content stored under a name, or None."""
+        """Return the content stored under a name; None if there is none."""
         for number, folder in enumerate(self._all()):
             content = _read(folder / name)
             if content is not None:
@@ -91,7 +91,7 @@ class KernelFolders:
         return None
 
     def store(self, name: str, content: bytes, outdated: str) -> None:
-        """Store content in the first folder that takes it, and remove what the pattern matches."""
+        """Store content in the first writable folder, and delete files that match `outdated`."""
         failures = []
         for folder in self._all():
             old = [file for file in folder.glob(outdated) if file.name != name]
@@ -120,14 +120,14 @@ class KernelFolders:
             yield resolve_cache_dir('') / 'kernels'
 
     def _write(self, file: Path, content: bytes) -> str:
-        """Write a file in one step; return what failed, or ''."""
+        """Write a file atomically; return a description of the failure, or ''."""
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
             with replace_file(file) as partial:
                 partial.write_bytes(hashlib.sha256(content).digest() + content)
         except OSError as error:
             failure = f'{file.parent}: {error.strerror}'
-            if file.parent == self._preferred:  # this machine may have them elsewhere
+            if file.parent == self._preferred:  # another folder of this machine may be writable
                 NOT_KEPT.append(f'compiled kernels are not kept in {failure}; {MAKE_ROOM}')
             return failure
         return ''
@@ -137,9 +137,9 @@ KERNEL_FOLDERS = KernelFolders()
 
 
 class KernelCache(NullCache):
-    """The compiled versions of one kernel on disk, in the place of numba's cache.
+    """The compiled versions of one kernel on disk, which replaces numba's cache.
 
-    A damaged file, or a folder that cannot be written to, costs the time to compile and no more.
+    If a file is damaged or no folder is writable, the kernel is compiled again.
     """
 
     def __init__(self, kernel: Dispatcher) -> None:
@@ -148,7 +148,7 @@ class KernelCache(NullCache):
         self._name = f'{function.__module__.removeprefix(f"{_ROOT}.")}.{function.__qualname__}'
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the machine code for the types of arguments, or None."""
+        """Return the machine code for the types of arguments; None if it is not on disk."""
         target_context.refresh()
         name, _ = self._file_names(sig, target_context.codegen())
         content = KERNEL_FOLDERS.read(name)
@@ -156,25 +156,25 @@ class KernelCache(NullCache):
             return None
         try:
             return CompileResult._rebuild(target_context, *pickle.loads(content))
-        except Exception as error:  # pickle and LLVM raise many kinds
+        except Exception as error:  # pickle and LLVM raise many kinds of errors
             logger.warning('a compiled kernel cannot be used (%r): compiling %s again', error,
                            self._name)
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep machine code for the types of arguments."""
+        """Store the machine code for the types of arguments."""
         if data.library.has_dynamic_globals:
             return
         name, outdated = self._file_names(sig, data.codegen)
         try:
             content = dumps(data._reduce())
         except RuntimeError as error:
-            # there is no code: llvmlite lost an interruption that came in its callback
+            # no code was compiled, because Ctrl-C arrived in a callback of llvmlite, which lost it
             raise KeyboardInterrupt from error
         KERNEL_FOLDERS.store(name, content, outdated)
 
     def _file_names(self, sig: Any, codegen: Any) -> tuple[str, str]:
-        """Return the name of the file, and a pattern of the names it had with other sources."""
+        """Return the name of the file, and a pattern of its names with other sources."""
         place = _hash((_VERSIONS, codegen.magic_tuple(), [_describe(each) for each in sig]))
         stamp = _hash((source_stamp(self._kernel.py_func.__module__),
                        sorted(self._kernel.targetoptions.items())))
@@ -184,7 +184,7 @@ class KernelCache(NullCache):
 
 @cache
 def source_stamp(module: str) -> str:
-    """Return a digest of a module's source and of those of this package that it imports."""
+    """Return a digest of the sources of a module and of all modules of this package it imports."""
     sources: dict[str, bytes] = {}
     waiting = [module]
     while waiting:
@@ -206,7 +206,7 @@ def _read_source(module: str) -> tuple[bytes, list[str]]:
 
 
 def _describe(kind: Type) -> object:
-    """Return the identity of an argument's type; it includes the fields of a named tuple."""
+    """Return the identity of an argument's type, including the fields of a named tuple."""
     if isinstance(kind, BaseTuple):
         named = getattr(kind, 'instance_class', None)
         identity = named and (named.__module__, named.__qualname__, named._fields)
@@ -219,7 +219,7 @@ def _hash(value: object) -> str:
 
 
 def _read(file: Path) -> bytes | None:
-    """Return the content of a file if it is whole, and only trusted users can write to it."""
+    """Return the content of a file; None if it is damaged or untrusted users can write to it."""
     try:
         content = read_file(file)
     except OSError:
@@ -235,9 +235,9 @@ def _read(file: Path) -> bytes | None:
 
 
 def _is_foreign(file: Path) -> bool:
-    """Return whether a user could have written it who owns neither this package nor the process.
+    """Return whether users other than the owners of this package and process may have written it.
 
-    A forged kernel runs code. Who owns the package can run code anyway.
+    A forged kernel would run arbitrary code. The owner of the package can do that anyway.
     """
     trusted = {os.getuid(), 0, Path(__file__).stat().st_uid}
     return any(is_foreign(each.stat(), trusted) for each in (file, file.parent))
@@ -246,17 +246,17 @@ def _is_foreign(file: Path) -> bool:
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a kernel to machine code at its first call, and cache the code on disk.
 
-    The kernel releases the GIL, so that a node answers during a search. Divisions by zero give
-    inf and NaN, as in NumPy.
+    The kernel releases the GIL, so that a node stays responsive during a search. Divisions by zero
+    give inf and NaN, as in NumPy.
     """
-    # Nothing calls a kernel through a C pointer: without that wrapper it compiles faster.
+    # Kernels are not called through C pointers; without the wrapper for that, they compile faster.
     kernel = njit(nogil=True, error_model='numpy', no_cfunc_wrapper=True)(function)
     kernel._cache = KernelCache(kernel)
     return kernel
 
 
 def warm_up(run: Callable[[], object]) -> None:
-    """Run the kernels once. Where they must be compiled, say so and how long it takes."""
+    """Call a function that runs the kernels, and log the number and time of those compiled."""
     start, missing = time.monotonic(), KERNEL_FOLDERS.missing
     run()
     compiled_now = KERNEL_FOLDERS.missing - missing
