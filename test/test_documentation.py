@@ -6,6 +6,7 @@ import ast
 import importlib.machinery
 import importlib.util
 import json
+import math
 import re
 import subprocess
 import sys
@@ -15,7 +16,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.calibration import CALIBRATION
+from cliploc_ros.core.geometry.transforms import SAME_ANSWER
+from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
+from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.offline.mapping import building, triangulation
+from cliploc_ros.offline.mapping.update import judging, updating
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -170,3 +176,32 @@ def test_foxglove_shows_what_is_published_and_calls_what_is_served():
     def names(node):
         return {node} if isinstance(node, str) else names(node['first']) | names(node['second'])
     assert names(tree['layout']) == set(panels)
+
+
+# Numbers that pages name, in the order of the pattern's groups, and where the code has them.
+CONSTANTS = [
+    ('trust.md', r'reaches `min_confidence` \(([.\d]+)\)', [RelocalizerOptions.min_confidence]),
+    ('trust.md', r'give it a confidence of ([.\d]+) on average',
+     [CALIBRATION.looks.mean_confidence]),
+    ('trust.md', r'At odds of (\d+) to 1', [round(math.exp(CALIBRATION.camera.sure), -2)]),
+    ('trust.md', r'probability is below ([.\d]+) and two or three', [CALIBRATION.watch.lost]),
+    ('trust.md', r'`position_sigma` \(([.\d]+) m without it\)', [DEFAULT_SIGMA_M]),
+    ('trust.md', r'Poses within (\d+) m and (\d+) degrees count', [SAME_ANSWER.distance_m, SAME_ANSWER.angle_deg]),
+    ('mapping.md', r'less than ([.\d]+) of the boxes of its classes',
+     [building.LEAST_EXPLAINED]),
+    ('mapping.md', r'a factor above ([.\d]+) is refused', [triangulation._UNIT_FACTOR]),
+    ('mapping.md', r'in view from at least (\d+) viewpoints', [judging.LEAST_VIEWS]),
+    ('mapping.md', r'fewer than (\d+) landmarks or less than ([.\d]+) .* less than ([.\d]+) of',
+     [updating.MIN_CONFIRMED, updating._MIN_CONFIRMED_SHARE, updating._MIN_WELL_SHARE]),
+    ('interface.md', r'The last images \(at most (\d+)\) .* confidence of ([.\d]+) on average',
+     [CALIBRATION.looks.most, CALIBRATION.looks.mean_confidence]),
+    ('interface.md', r'off by more than (\d+) %', [100 * (CALIBRATION.depth.most_ratio - 1)]),
+    ('interface.md', r'\((6\.9) refuses\)', [CALIBRATION.camera.sure])]
+
+
+@pytest.mark.parametrize(('page', 'pattern', 'values'), CONSTANTS,
+                         ids=[pattern for _, pattern, _ in CONSTANTS])
+def test_the_numbers_of_the_pages_are_those_of_the_code(page, pattern, values):
+    text = ' '.join((PROJECT / 'doc' / page).read_text().split())
+    (found,) = (match.groups() for match in re.finditer(pattern, text))
+    assert [*map(float, found)] == pytest.approx(values)
