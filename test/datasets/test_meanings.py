@@ -130,7 +130,7 @@ def test_depth_of_transforms_json_is_in_the_unit_of_its_poses(shots, tmp_path):
             'depth_unit_scale_factor', 'integer_depth_scale')])
     (folder / f'depth/{shots[0].path.stem}.png').unlink()
     notes = read_folder(folder, METRES).notes
-    assert any('depth images that are listed are missing' in note for note in notes)
+    assert any('listed depth images are missing' in note for note in notes)
 
 
 @pytest.mark.parametrize(('text', 'red_first'), [
@@ -345,7 +345,7 @@ def test_messages_of_two_cameras_or_bodies_on_one_topic(room, tmp_path):
             ('images', '/image', bag_messages.IMAGE,
              lambda at: bag_messages.image_message(at, '/right', few[0][1]))):
         more = [(at, topic, kind, message(at)) for at, *_ in few]
-        refuses(f'{topic} is of several coordinate frames, camera, right',
+        refuses(f'{topic} has messages of several coordinate frames, camera, right',
                 write_bag(tmp_path / name, few, more=more))
     odometry = [(at, '/ground_truth', ODOMETRY, odometry_message(at, child, pose))
                 for at, _, pose, _ in few for child in ('camera', 'gripper')]
@@ -405,7 +405,7 @@ def test_stamps_that_begin_again(room, tmp_path):
 def test_what_a_list_names_is_counted(shots, tmp_path):
     folder = write_nerf(tmp_path / 'nerf', shots)
     (folder / 'images' / shots[2].path.name).unlink()
-    assert any(f'1 of {len(shots)} images that are listed are missing, such as' in note
+    assert any(f'1 of {len(shots)} listed images are missing, such as' in note
                for note in read_folder(folder, METRES).notes)
 
 
