@@ -188,8 +188,8 @@ def _load_text_tower(weights: ClipWeights, options: ClipOptions
 def _as_onnx(weights: ClipWeights, options: ClipOptions) -> ClipWeights | None:
     """Return weights in ONNX files, exported once; None if PyTorch is to run them.
 
-    With inference 'auto', PyTorch runs a CLIP that cannot be exported. ExportError: the export
-    failed, with 'openvino'. OptionsError: a GPU or PyTorch is requested for ONNX files.
+    With inference 'auto', PyTorch runs a CLIP that cannot be exported; with 'openvino', an
+    ExportError is raised. OptionsError: a GPU or PyTorch is requested for ONNX files.
     """
     if not runs_in_openvino(options):
         if weights.is_onnx and not (options.device == 'auto' and options.inference == 'auto'):
@@ -198,7 +198,7 @@ def _as_onnx(weights: ClipWeights, options: ClipOptions) -> ClipWeights | None:
         return weights if weights.is_onnx else None
     if weights.is_onnx:
         return weights
-    with needs_pytorch(f'CLIP {weights.model}, which is no ONNX network,', WITHOUT_CLIP):
+    with needs_pytorch(f'CLIP {weights.model}, which is not an ONNX network,', WITHOUT_CLIP):
         from cliploc_ros.models.export import export_clip
 
         try:

@@ -50,8 +50,8 @@ class TorchTower:
                     self._device, dtype=self._dtype), normalize=False)
                 return np.asarray(features.float().cpu().numpy())
         except torch.cuda.OutOfMemoryError as error:
-            raise ModelError(f'the GPU has not enough memory for {len(batch)} crops at once: '
-                             'lower max_batch or choose a smaller model') from error
+            raise ModelError(f'the GPU does not have enough memory for {len(batch)} crops at '
+                             'once: lower max_batch or choose a smaller model') from error
 
 
 class TorchTextTower:

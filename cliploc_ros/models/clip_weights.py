@@ -106,7 +106,7 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
         folder = find_export(options.cache_dir, identity[1], identity)
         if folder is not None:
             return _of_onnx(folder, identity[1])
-    with needs_pytorch(f'CLIP {identity[1]}, which is no ONNX network,', WITHOUT_CLIP):
+    with needs_pytorch(f'CLIP {identity[1]}, which is not an ONNX network,', WITHOUT_CLIP):
         return _resolve_by_open_clip(options, identity)
 
 
@@ -161,7 +161,7 @@ def _resolve_by_open_clip(options: ClipOptions, identity: tuple[str, ...]) -> Cl
     if config is None:
         raise ModelError(f"unknown CLIP model '{options.model}'"
                          f'{did_you_mean(model, open_clip.list_models(), 4, 0.5)} '
-                         '(open_clip.list_models() names all)')
+                         '(open_clip.list_models() lists all)')
     if {'hf_model_name', 'hf_tokenizer_name'} & config['text_cfg'].keys():
         raise ModelError(f"CLIP model '{options.model}' takes its tokenizer from the transformers "
                          "library, which is not supported: choose one like ViT-L-14 or RN50")

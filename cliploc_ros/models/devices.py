@@ -30,7 +30,7 @@ def check_run(precision: str, inference: str) -> None:
     for name, value, known in (('precision', precision, PRECISIONS),
                                ('inference', inference, INFERENCES)):
         if value not in known:
-            raise OptionsError(f"{name} '{value}' is none of {', '.join(known)}")
+            raise OptionsError(f"{name} '{value}' is not one of {', '.join(known)}")
 
 
 def has_gpu() -> bool:
@@ -45,7 +45,7 @@ def resolve_device(device: str) -> str:
     invalid, or PyTorch does not find the GPU. ModelError: a GPU is requested without PyTorch.
     """
     if not re.fullmatch(r'auto|cpu|cuda(:\d+)?', device):
-        raise OptionsError(f"device '{device}' is none of auto, cpu, cuda, cuda:0, cuda:1 ...")
+        raise OptionsError(f"device '{device}' is not one of auto, cpu, cuda, cuda:0, cuda:1 ...")
     if device == 'cpu' or (device == 'auto' and not (has_gpu() and find_spec('torch'))):
         return 'cpu'
     with needs_pytorch(f"device '{device}'"):
@@ -126,7 +126,7 @@ def resolve_inference(inference: str, device: str, precision: str) -> str:
 @cache
 def import_openvino() -> Any:
     """Import OpenVINO without its telemetry; return None if it is not installed."""
-    # With this package, OpenVINO reports its import and all conversions to Google.
+    # If this package can be imported, OpenVINO reports its import and all conversions to Google.
     sys.modules.setdefault('openvino_telemetry', None)  # type: ignore[arg-type]
     try:
         import openvino

@@ -87,8 +87,8 @@ def _tokenizer_of(tokenizer: Any) -> str:
     start, end = '<start_of_text>', '<end_of_text>'
     lines = gzip.decompress(Path(open_clip.tokenizer.default_bpe()).read_bytes()).decode()
     vocabulary = dict(getattr(tokenizer, 'encoder', {}))
-    # The first line describes the table. The vocabulary has 49,152 entries without the two special
-    # tokens: one for each merge, and two for each of 256 bytes (alone, or at the end of a word).
+    # The first line describes the table. The 49,408 tokens are 256 bytes within a word, 256 bytes
+    # at its end, the merges, and two special tokens.
     merges = [(line.split()[0], line.split()[1])
               for line in lines.split('\n')[1:49_152 - 256 - 2 + 1]]
     found = Tokenizer(models.BPE(vocabulary, merges, end_of_word_suffix='</w>',

@@ -109,7 +109,7 @@ def keep_export(cache_dir: str, name: str, identity: Sequence[str],
                       'writable cache_dir')
         _unkept[folder], folder = desk, written
     free_memory()
-    logger.info('%s is exported after %.0f s', name, time.monotonic() - started)
+    logger.info('exported %s in %.0f s', name, time.monotonic() - started)
     return folder
 
 

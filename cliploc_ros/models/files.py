@@ -91,7 +91,7 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
 
     ``fetch`` returns the path of the file, and must not leave a partial file there. The folder is
     made if it does not exist. The error names the file (``what``), and a ``remedy`` without a
-    network. ``setting`` is the option that chooses the folder.
+    network. ``setting`` is the option that sets the folder.
     """
     logger.info('downloading %s into %s', what, folder)
     try:

@@ -56,7 +56,8 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
     wanted = [[file], *networks[1:]] if file else list(networks)
     own = resolve_cache_dir(cache_dir) / 'weights'
     request = json.dumps([repository, revision, [*map(list, wanted)], list(beside)])
-    marker = own / f'{repository.replace("/", "--")}-{_digest(request.encode())[:16]}.json'
+    digest = hashlib.sha256(request.encode()).hexdigest()
+    marker = own / f'{repository.replace("/", "--")}-{digest[:16]}.json'
     try:
         found = own / str(json.loads(read_file(marker)))
     except (OSError, ValueError):
@@ -121,7 +122,3 @@ def _check_content(file: Path) -> None:
     if len(blob.name) in (40, 64) and digest.hexdigest() != blob.name:
         blob.unlink()
         raise ValueError(f'the digest of {file.name} differs from that on the hub')
-
-
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()

@@ -22,8 +22,8 @@ _MOVED_PX = 2.0
 # Side of the thumbnail of a crop [px]. Its cells average out the noise of the sensor.
 _SIDE = 8
 # A crop is unchanged if its thumbnail changed by less than this on average, and in its worst cell
-# [grey levels]. Not measured on robots: the demo's images with noise of 3 levels stay below, those
-# of an object that is covered by a third do not.
+# [grey levels]. Images of the demo with noise of 3 levels stay below these limits; those of an
+# object a third of which is covered exceed them. Not measured on robots.
 _CHANGED, _CELL_CHANGED = 4.0, 32.0
 # Each crop takes 3.5 KB with an embedding of 768 numbers.
 _LIMIT = 256

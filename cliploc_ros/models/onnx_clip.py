@@ -204,8 +204,8 @@ def _read_tokenizer(folder: Path) -> tuple[Any, int]:
     files = [file for file in (folder / TOKENIZER, folder / 'textual' / TOKENIZER)
              if file.exists()]
     if not files:
-        raise ModelError(f'{folder / TOKENIZER} is missing, but it splits labels into tokens: put '
-                         'that of the published network there')
+        raise ModelError(f'{folder / TOKENIZER} is missing; it splits labels into tokens: put the '
+                         'file of the published network there')
     try:
         tokenizer = tokenizers.Tokenizer.from_str(read_file(files[0]).decode())
         if len(tokenizer.encode('a cup').ids) < 3:

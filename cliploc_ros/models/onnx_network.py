@@ -133,7 +133,7 @@ def read_config(file: Path, purpose: str) -> dict[str, Any]:
     try:
         found = parse_json(read_file(file))
     except FileNotFoundError:
-        raise ModelError(f'{file} is missing, but {purpose}: put that of the published network '
+        raise ModelError(f'{file} is missing; {purpose}: put the file of the published network '
                          'there') from None
     except (OSError, ValueError, RecursionError) as error:
         raise ModelError(f'{file} cannot be read: {first_line(error)}') from error
@@ -171,7 +171,7 @@ def _stored(folder: Path, precision: str | None) -> tuple[Any, dict[str, str]]:
     """
     about = parse_json(read_file(folder / _ABOUT))
     openvino = import_openvino()
-    # A copy of the file: OpenVINO reads it later, too, and a mapped file may be cut short.
+    # Tensor copies the mapped file: OpenVINO also reads it later, when it may be truncated.
     blob = openvino.Tensor(np.memmap(folder / _BLOB, dtype=np.uint8, mode='r'))
     if hashlib.sha256(blob.data).hexdigest() != about['sha256']:
         raise ValueError(f'{_BLOB} is damaged')

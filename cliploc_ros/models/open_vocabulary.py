@@ -115,8 +115,7 @@ def set_prompts(model: Any, options: DetectorOptions) -> str:
 
 def _tower(name: str, options: DetectorOptions
            ) -> tuple[str, Callable[[Sequence[str]], NDArray[np.float32]]]:
-    """Return the key of a text tower, and a function that embeds texts; errors: see set_prompts.
-    """
+    """Return the key of a text tower, and a function that embeds texts; see set_prompts."""
     if name == 'clip' and not options.text_model.endswith('.ts'):
         try:
             clip = ClipOptions('ViT-B-32', 'openai', checkpoint_path=options.text_model,

@@ -49,7 +49,7 @@ def resolve_profile(profile: str, device: str) -> Profile:
     OptionsError: the name is unknown, or the device is missing.
     """
     if profile not in PROFILE_NAMES:
-        raise OptionsError(f"profile '{profile}' is none of {', '.join(PROFILE_NAMES)}")
+        raise OptionsError(f"profile '{profile}' is not one of {', '.join(PROFILE_NAMES)}")
     if profile == 'auto':
         profile = 'balanced' if resolve_device(device) == 'cpu' else 'accurate'
     return PROFILES[profile]
@@ -101,7 +101,7 @@ def load_detector(options: 'DetectorOptions') -> 'ObjectDetector':
         exported = _exported(file, options)
         if exported is not None:
             return OnnxDetector(exported)
-    with needs_pytorch(f'{file}, which is no ONNX network,'):
+    with needs_pytorch(f'{file}, which is not an ONNX network,'):
         from cliploc_ros.models.yolo_detector import YoloDetector
 
         return YoloDetector(file, options)
@@ -124,7 +124,7 @@ def _exported(file: Path, options: 'DetectorOptions') -> 'DetectorOptions | None
     identity = detector_identity(file, options)
     folder = find_export(options.cache_dir, 'YOLO', identity)
     if folder is None:
-        with needs_pytorch(f'{file}, which is no ONNX network,'):
+        with needs_pytorch(f'{file}, which is not an ONNX network,'):
             from cliploc_ros.models.yolo_detector import export_detector
 
             try:

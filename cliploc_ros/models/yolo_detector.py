@@ -52,7 +52,7 @@ class YoloDetector:
         self.class_names = tuple(dict.fromkeys(self._class_of.values()))
         self.configure(options)
         # The first pass sets up predictor, kernels and memory; run it before the first image. On a
-        # CPU, it reduces the number of threads by one, which is undone.
+        # CPU, ultralytics also sets the threads of the process to leave a core free: undo that.
         self.detect(np.zeros((self._stride, self._stride, 3), dtype=np.uint8))
         torch.set_num_threads(threads)
 

@@ -59,7 +59,7 @@ def import_ultralytics() -> Any:
 
 
 def _is_restricted(ultralytics: Any) -> bool:
-    """Return whether ultralytics reads weights only and refuses code in their files."""
+    """Return whether ultralytics reads only weights, and refuses code in their files."""
     import torch
 
     return (getattr(ultralytics.utils, 'SAFE_LOAD', False)

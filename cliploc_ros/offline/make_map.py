@@ -40,7 +40,8 @@ from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_lay
 from cliploc_ros.offline.vocabulary.phrase_embeddings import phrases_of_classes
 from cliploc_ros.offline.vocabulary.vocabulary import Vocabulary, load_vocabulary, shipped_phrases
 
-# Most trial maps to find a scale by objects of known size, and the relative change to stop at.
+# A scale by objects of known size: greatest number of trial maps, and the relative change of the
+# scale below which they end.
 _TRIALS, _SAME_SIZE = 4, 0.01
 
 
@@ -210,8 +211,8 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
                options: MappingOptions) -> MadeMap:
     """Update the map in a file with a recording; the file is not written.
 
-    Poses are refined against the map if ``pose_errors`` is given or the boxes show that they are
-    inaccurate.
+    Poses are refined against the map by the errors in ``pose_errors``; without these, if the boxes
+    show that the poses are inaccurate.
 
     Raises
     ------

@@ -87,7 +87,7 @@ def verdict(text: str, is_good: bool) -> str:
 
 
 def tiles(numbers: Iterable[tuple[str, str, bool]]) -> str:
-    """Return numbers in large type; each has a caption and a flag: it is good."""
+    """Return numbers in large type, each with a caption, and whether it is good."""
     return '<div class="tiles">' + ''.join(
         f'<div class="{"good" if is_good else "bad"}"><b>{escape(number)}</b>{escape(words)}</div>'
         for number, words, is_good in numbers) + '</div>'
@@ -114,7 +114,7 @@ def card(text: str, image: bytes | None = None, caption: str = '') -> str:
 
 
 def fold(heading: str, *parts: str, is_open: bool = False) -> str:
-    """Return parts that are shown by a click on their heading."""
+    """Return parts that fold out at a click on their heading."""
     return (f'<details{" open" if is_open else ""}><summary>{escape(heading)}</summary>'
             f'{"".join(parts)}</details>')
 
@@ -146,8 +146,7 @@ def note(text: str) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str | tuple[str, str]]]) -> str:
-    """Return a table; a cell may have a CSS class, and # before a heading right-aligns a column.
-    """
+    """Return a table; a cell may have a CSS class, and # in a heading right-aligns its column."""
     kinds = ['number' if title.startswith('#') else '' for title in head]
     lines = [(('th', title.lstrip('#'), kind) for title, kind in zip(head, kinds, strict=True))
              ] if any(head) else []

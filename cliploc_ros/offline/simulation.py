@@ -27,7 +27,7 @@ from cliploc_ros.core.observation import Detections
 #: Standard deviations of a box's edge: [px], and as a share of the box's extent; their variances
 #: are added.
 EDGE_SIGMA_PX, EDGE_SIGMA_SHARE = 2.0, 0.04
-# Frames count for a pose if their viewing direction of the landmark is within this angle.
+# Frames count for a pose if their direction to the landmark differs by less than this angle.
 _NEAR_COSINE = np.cos(np.radians(30.0))
 # Weight of the landmark's overall ratio, in frames; it matters where few frames count.
 _PRIOR_FRAMES = 3.0
@@ -63,8 +63,8 @@ class DetectorModel:
     landmark_map: LandmarkMap  #: The landmarks to detect
     camera: Camera
     sightings: tuple[Sightings, ...]  #: Sightings of each landmark; empty without a recording
-    #: (L,): share of the frames with each landmark in view in which it was detected, and the
-    #: greatest distance at which it can be detected [m]
+    #: (L,): detection ratio of each landmark in the frames that have it in view, and the greatest
+    #: distance at which it can be detected [m]
     ratios: NDArray[np.float64]
     reach_m: NDArray[np.float64]
     edge_scale: float  #: Scale of the standard deviations of edges

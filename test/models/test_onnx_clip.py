@@ -176,7 +176,7 @@ def other_words(file: Path) -> None:
     (lambda folder: (folder / 'onnx/vision_model.onnx').unlink(), 'vision_model.onnx'),
     (lambda folder: (folder / 'onnx/text_model.onnx').unlink(), 'text_model.onnx'),
     (lambda folder: (folder / 'tokenizer.json').unlink(), 'tokenizer.json is missing'),
-    (lambda folder: (folder / 'tokenizer.json').write_text('{}'), 'no tokenizer of a CLIP'),
+    (lambda folder: (folder / 'tokenizer.json').write_text('{}'), 'not a tokenizer of a CLIP'),
     (lambda folder: other_words(folder / 'tokenizer.json'), 'it has 30 tokens, the text'),
     (lambda folder: shutil.copy(ASSETS / 'yolo.onnx', folder / 'onnx/vision_model.onnx'),
      'expected one output'),

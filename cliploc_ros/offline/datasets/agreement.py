@@ -109,8 +109,8 @@ def check_agreement(views: Sequence[View], readings: Mapping[str, Reading], wher
     if errors[given] > reading.least_px and errors[best] < min(_GOOD_PX,
                                                                reading.better * errors[given]):
         raise DatasetError(f'{where}: the images do not fit the poses as {given} (median epipolar '
-                           f'error {errors[given]:.1f} px), but do as {best} ({errors[best]:.1f} '
-                           f'px): {reading.remedy}')
+                           f'error {errors[given]:.1f} px), but they fit as {best} '
+                           f'({errors[best]:.1f} px): {reading.remedy}')
     if errors[given] < _WRONG_PX:
         return ''
     return (f'the images do not fit the poses: median epipolar error {errors[given]:.1f} px, '

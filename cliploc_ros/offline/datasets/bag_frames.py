@@ -85,7 +85,7 @@ def topic_of(camera: str, topic: str) -> str:
 
 
 def find_topics(bag: Path, image: str | None, camera_info: str | None) -> tuple[str, str]:
-    """Return the topics of image and camera_info; a missing one must have a single candidate.
+    """Return the topics of image and camera_info; where one is None, find the only candidate.
 
     Depth and debug images are not candidates. Raw images are preferred to compressed images of the
     same camera. DatasetError: there are no candidates, or several; the message lists them and

@@ -71,14 +71,14 @@ def deserialize(data: bytes, msgtype: str, where: str) -> Any:
     try:
         return typestore().deserialize_cdr(data, msgtype)
     except Exception as error:  # the library raises whatever exception the bytes cause
-        raise DatasetError(f'{where}: a message is no {msgtype}: {error}') from error
+        raise DatasetError(f'{where}: a message is not a valid {msgtype}: {error}') from error
 
 
 @dataclass(frozen=True)
 class BagTopic:
-    """One topic of a recording."""
+    """A topic of a recording."""
 
-    #: As ``/image`` and ``sensor_msgs/msg/Image``
+    #: Name and type, such as ``/image`` and ``sensor_msgs/msg/Image``
     name: str
     msgtype: str
     message_count: int  #: Number of messages according to the metadata
@@ -89,9 +89,9 @@ class BagTopic:
 
 @dataclass(frozen=True)
 class BagMessage:
-    """One recorded message, still serialized."""
+    """A serialized message of a recording."""
 
-    topic: str  #: Name of its topic
+    topic: str  #: Name of the topic
     stamp_ns: int  #: Time of recording [ns]
     data: bytes  #: CDR, with the four-byte header
 
@@ -177,7 +177,7 @@ class BagReader:
                  stop_ns: int | None = None) -> Iterator[BagMessage]:
         """Yield messages in the order of their stamps.
 
-        DatasetError: a topic is unknown, or the recording is damaged here.
+        DatasetError: a topic is unknown, or the recording is damaged.
 
         Parameters
         ----------
@@ -307,7 +307,7 @@ class BagWriter:
     def __init__(self, path: str | Path, storage: str = 'sqlite3') -> None:
         self.path = Path(path)
         if storage not in STORAGES:
-            raise DatasetError(f'storage {storage!r} is none of {", ".join(STORAGES)}')
+            raise DatasetError(f'storage {storage!r} is not one of {", ".join(STORAGES)}')
         self._storage = STORAGES[storage]
         self._staging: Path | None = None
         self._writer: Writer | None = None
@@ -354,7 +354,7 @@ class BagWriter:
         Parameters
         ----------
         name, msgtype : str
-            As ``/image`` and ``sensor_msgs/msg/Image``.
+            Such as ``/image`` and ``sensor_msgs/msg/Image``.
         qos : Qos
             The QoS that the topic's publisher would offer.
         """

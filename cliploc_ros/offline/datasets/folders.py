@@ -82,7 +82,7 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
                   else 'unpack it' if folder.suffix in ('.r3d', '.zip') else _unread(folder)
                   or 'images without poses need a pose estimator, such as COLMAP')
         known = ', '.join(sorted({layout.name for layout in LAYOUTS}))
-        raise DatasetError(f'{folder}: has the files of no known layout: {known}; {remedy}')
+        raise DatasetError(f'{folder}: has none of the known layouts ({known}); {remedy}')
     given = {'intrinsics': options.intrinsics, 'trajectory': options.trajectory,
              'mount': options.body_from_camera, 'images': options.images}
     for name, value in given.items():
@@ -101,8 +101,8 @@ def _unread(folder: Path) -> str:
             return f'it has {mark} as {name} does, but lacks {lacking}'
     other = next((name for name, marks in _OTHERS.items()
                   if all(any(folder.glob(mark)) for mark in marks)), '')
-    return other and (f'it is of {other}: write rgb.txt, groundtruth.txt and camera.json next to '
-                      'its images, as in TUM RGB-D, or a transforms.json')
+    return other and (f'its layout is that of {other}: write rgb.txt, groundtruth.txt and '
+                      'camera.json next to its images, as in TUM RGB-D, or a transforms.json')
 
 
 def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Camera, str]:
@@ -152,7 +152,7 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
              placing.check_axes(capture.files, axes, folder)]
     if options.known_distance is not None:
         scale = placing.find_scale(files, *options.known_distance, folder)
-        notes.append(f'a unit is {scale:.5g} m, by the known distance')
+        notes.append(f'a unit is {scale:.5g} m by the known distance')
     if scale is None and not capture.is_metric and not options.any_unit:
         raise DatasetError(f'{folder}: the unit of {layout.name} is unknown: give `scale`, the '
                            'metres of a unit (1 for metres), a `known_distance` or an '
@@ -297,7 +297,7 @@ LAYOUTS = (
            devices.read_record3d),
     Layout('arkitscenes', 'ARKitScenes', lambda folder: (folder / 'lowres_wide.traj').is_file(),
            devices.read_arkitscenes),
-    # of HoloLens2ForCV's StreamRecorder
+    # the output of StreamRecorder, a sample of HoloLens2ForCV
     Layout('hololens', 'HoloLens 2', lambda folder: any(folder.glob('*_pv.txt')),
            devices.read_hololens),
     Layout('nerf', 'transforms.json', lambda folder: folder.name.endswith('.json') or

@@ -25,7 +25,7 @@ from cliploc_ros.core.geometry.transforms import move_poses
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.units import NS_PER_S
 
-_MOST_NOTES = 5  # on cameras; each image may have another camera
+_MOST_NOTES = 5  # on cameras; each image may have a different camera
 # Greatest number of pixels to compute for an undistorted image; each takes 0.6 kB.
 _MOST_PLACES = 1_000_000
 
@@ -101,7 +101,7 @@ class Frames:
             yield raw.decode()
 
     def select(self, places: Iterable[int]) -> 'Frames':
-        """Return the frames of some indices; 0 is the first frame."""
+        """Select frames by index; 0 is the first frame."""
         chosen = frozenset(places)
 
         def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:

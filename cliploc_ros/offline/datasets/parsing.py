@@ -131,7 +131,7 @@ def parse_stamp_ns(text: str, where: str, unit_s: Decimal = Decimal(1)) -> int:
 
 def unit_quaternion(quat: Sequence[float], where: str, tolerance: float
                     ) -> NDArray[np.float64]:
-    """Normalize a quaternion (4,); DatasetError: its norm differs from 1 by over a tolerance."""
+    """Normalize a quaternion (4,); DatasetError: its norm is not 1 within the tolerance."""
     norm = math.hypot(*quat)
     if not abs(norm - 1.0) <= tolerance:
         raise DatasetError(f'{where}: quaternion {list(quat)} has norm {norm:.3g}, not 1')

@@ -81,8 +81,8 @@ class TimedPoses:
     def pose_at(self, stamp_ns: int) -> NDArray[np.float64] | None:
         """Return ``map_from_camera`` (4, 4) at a stamp; None if no sample is near enough.
 
-        Positions are interpolated linearly, rotations by slerp. Before the first and after the
-        last sample, within the tolerance, that sample is returned: there is no extrapolation.
+        Positions are interpolated linearly, rotations by slerp. There is no extrapolation: before
+        the first or after the last sample, the pose of that sample is returned.
         """
         if len(self) == 0:
             return None
@@ -140,7 +140,7 @@ def check_forward(stamps_ns: Sequence[int], where: str) -> None:
     again = np.nonzero(latest - stamps > _BACK_S * NS_PER_S)[0]
     if len(again):
         raise DatasetError(
-            f'{where}: the stamps begin again: {stamps[again[0]] / NS_PER_S:.3f} s comes after '
+            f'{where}: the stamps jump back: {stamps[again[0]] / NS_PER_S:.3f} s comes after '
             f'{latest[again[0]] / NS_PER_S:.3f} s; poses of two runs would be mixed: record each '
             'run separately, or split them with `ros2 bag convert`')
 

@@ -48,7 +48,7 @@ class TumSequence:
         DatasetError: the step is less than 1.
         """
         if step < 1:
-            raise DatasetError(f'every {step}th image is not a selection: give 1 or more')
+            raise DatasetError(f'every {step}th image cannot be selected: give 1 or more')
         return replace(
             self, stamps_ns=self.stamps_ns[::step], image_paths=self.image_paths[::step])
 
@@ -69,7 +69,7 @@ def read_tum(folder: str | Path) -> TumSequence:
 
 
 def read_tum_trajectory(path: str | Path) -> TimedPoses:
-    """Read a trajectory in TUM format: ``timestamp tx ty tz qx qy qz qw`` a line.
+    """Read a trajectory in TUM format, with lines ``timestamp tx ty tz qx qy qz qw``.
 
     A first line with the names of the columns, as in EuRoC, may define another order and other
     units; columns that are not part of a pose are ignored. Without names, a line may also hold a

@@ -38,7 +38,7 @@ class ConversionOptions:
     prefix: str = ''  #: Namespace of all topics: ``camera`` gives ``/camera/image``
     #: Coordinate frame of images, camera_info and detections (optical axes)
     camera_frame: str = 'camera_optical_frame'
-    world_frame: str = 'world'  #: Coordinate frame of the ground-truth poses: the map's
+    world_frame: str = 'world'  #: Coordinate frame of the ground-truth poses, and of the map
     imu_frame: str = 'imu'  #: Coordinate frame of the accelerometer; TUM does not give its mount
 
     def topic(self, name: str) -> str:

@@ -34,7 +34,7 @@ _LONGEST_PX = 800
 _LEAST_POINTS = 20
 # Stored images are for visual inspection; each takes 7 to 9 kB.
 _IMAGE_PX, _JPEG_QUALITY = 256, 60
-# Rays that cross at a smaller angle give too inaccurate a point.
+# Rays that cross at a smaller angle do not locate a point accurately enough.
 _LEAST_PARALLAX = np.radians(1.5)
 # Greatest distance of a ray from its point: 2 px at f = 525 px.
 _MOST_ERROR = 2.0 / 525.0

@@ -25,7 +25,7 @@ from cliploc_ros.offline.datasets.frames import RawFrame
 from cliploc_ros.offline.datasets.observations import camera_from_numbers
 from cliploc_ros.offline.mapping.views import at_border
 
-#: Greatest number of detections used of an image, as in the relocalizer node.
+#: Greatest number of detections per image, as in the relocalizer node.
 MAX_DETECTIONS = 50
 
 

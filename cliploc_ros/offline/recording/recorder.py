@@ -121,7 +121,7 @@ class RecordingOptions:
 
 
 def observation_file(frames: Frames, options: RecordingOptions) -> Path:
-    """Return the path of the observation file next to a source, named after `describe`."""
+    """Return the path of the observation file next to a source; see `describe`."""
     source = frames.source.resolve()
     digest = hashlib.sha256(describe(frames, options).encode()).hexdigest()[:12]
     return source.with_name(f'{source.name}{_BESIDE}{digest}.npz')
@@ -437,7 +437,7 @@ def _settings(options: DetectorOptions | ClipOptions) -> dict[str, Any]:
     """Return the options that change the output of a network."""
     return {name: value for name, value in asdict(options).items()
             if name not in ('cache_dir', 'max_batch', 'inference')
-            and (value or name not in ('prompts', 'text_model'))}  # older files lack the latter
+            and (value or name not in ('prompts', 'text_model'))}  # as in files of older versions
 
 
 def _state(path: Path) -> tuple[int, int] | None:

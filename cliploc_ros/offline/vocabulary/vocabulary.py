@@ -178,7 +178,7 @@ def _grammar(name: Any, where: str) -> dict[str, list[str]]:
     """Return the rules of a grammar; missing rules are those of the general grammar."""
     grammars = _shipped('grammars.yaml')
     if not isinstance(name, str) or name not in grammars:
-        raise OptionsError(f'{where}: grammar: {name!r:.60} is none of {", ".join(grammars)}')
+        raise OptionsError(f'{where}: grammar: {name!r:.60} is not one of {", ".join(grammars)}')
     return {**grammars[_GENERAL], **grammars[name]}
 
 

@@ -145,7 +145,7 @@ def _sound(pose: NDArray[np.float64] | None, where: str) -> NDArray[np.float64] 
 
 
 def first_image(folder: Path, stem: str) -> Path | None:
-    """Find the image with a stem, of any ending in IMAGES; None if there is none."""
+    """Find the image file with a stem and an ending in IMAGES; None if there is none."""
     return next((found for end in IMAGES if (found := beside(folder / f'{stem}{end}'))), None)
 
 

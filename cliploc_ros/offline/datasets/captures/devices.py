@@ -57,7 +57,7 @@ def read_polycam(folder: Path, options: capture.FolderOptions) -> capture.Captur
 
 
 def _with_depth(image: ImageFile, depths: Path, confidences: Path, stem: str) -> ImageFile:
-    """Add the depth image and the confidence image with a name's stem to an image, if any."""
+    """Add the depth and confidence images of a stem to an image, if they exist."""
     depth = capture.beside(depths / f'{stem}.png')
     return image._replace(depth=depth,
                           confidence=depth and capture.beside(confidences / f'{stem}.png'))
@@ -88,7 +88,7 @@ def read_record3d(folder: Path, options: capture.FolderOptions) -> capture.Captu
             parsing.camera_of(where, *size, *intrinsics.tolist()),
             parsing.pose_of(pose[4:], pose[:4], where)))
     return capture.Capture.of(files, path, 'opengl', up='y', notes=(
-        'the depth of Record3D is not read: it is compressed by LZFSE or EXR',))
+        'the depth of Record3D is not read: it is compressed with LZFSE or EXR',))
 
 
 def metadata_of_record3d(folder: Path) -> Path | None:
@@ -125,7 +125,7 @@ def read_stray(folder: Path, options: capture.FolderOptions) -> capture.Capture:
 
 
 def _size_of(folder: Path, video: Path | None) -> tuple[int, int]:
-    """Return width and height of Stray Scanner's images, from the first; no file stores them."""
+    """Read width and height of Stray Scanner's images from the first image: no file has them."""
     first = next((file for file in sorted((folder / 'rgb').glob('*.*'))
                   if file.suffix in capture.IMAGES), None)
     size = None
@@ -220,7 +220,7 @@ def _stamp_ns(time_s: float) -> int:
 
 
 TRANSFORMS = 'transforms.json'
-_SAME_FOCAL = 1.02  # two rounded fields give the focal length; greatest ratio of them
+_SAME_FOCAL = 1.02  # greatest ratio of the focal lengths in two fields, which are rounded
 _PERSPECTIVE = ('PINHOLE', 'SIMPLE_PINHOLE', 'SIMPLE_RADIAL', 'RADIAL', 'OPENCV', 'PERSPECTIVE')
 _FISHEYE = ('OPENCV_FISHEYE', 'FISHEYE')
 _INTRINSICS = ('w', 'h', 'fl_x', 'fl_y', 'cx', 'cy', 'camera_angle_x', 'k1', 'k2', 'k3', 'k4',

@@ -23,7 +23,7 @@ from cliploc_ros.offline.datasets.agreement import (
 from cliploc_ros.offline.datasets.frames import ImageFile, read_color
 
 _Pose = NDArray[np.float64]
-#: Rotations from coordinates in which an axis points up to coordinates in which z points up.
+#: Rotations into a coordinate frame with z up, by the axis that points up.
 UP: Mapping[str, _Pose] = {
     'z': np.eye(3), 'y': np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
 
@@ -62,8 +62,8 @@ def find_scale(files: Sequence[ImageFile], first: str, second: str, metres: floa
                ) -> float:
     """Compute the metres per unit of the poses from the distance between two cameras [m].
 
-    `first` and `second` name an image of each camera. DatasetError: an image is unknown, or both
-    were taken at the same place.
+    `first` and `second` are the names of the two images. DatasetError: an image is unknown, or
+    both were taken at the same place.
     """
     places = []
     for name in (first, second):

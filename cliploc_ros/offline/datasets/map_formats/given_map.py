@@ -209,8 +209,8 @@ def read_class_names(path: Path) -> tuple[str, ...]:
 def class_name(names: Sequence[str], index: int) -> str:
     """Return the name of a class; DatasetError: the list of names has no such index."""
     if not 0 <= index < len(names):
-        raise DatasetError(f'class index {index} is not among {len(names)} names; name the '
-                           'classes that the map was made with: `class_names`')
+        raise DatasetError(f'class index {index} is not among {len(names)} names; give the names '
+                           'of the classes that the map was made with: `class_names`')
     return names[index]
 
 
@@ -344,7 +344,7 @@ def read_table(path: Path) -> GivenMap:
     DatasetError: the message names the file, the line and the column to correct.
     """
     content = read_bytes(path)
-    is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # of a spreadsheet
+    is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # spreadsheets
     try:
         text = content.decode('utf-16' if is_utf16 else 'utf-8-sig').lstrip()
     except UnicodeDecodeError as error:
