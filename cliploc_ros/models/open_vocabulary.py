@@ -52,8 +52,8 @@ def prompts_of_names(names: str) -> Prompts:
 def prompts_of_map(landmark_map: LandmarkMap, source: str) -> Prompts:
     """Return the prompts of a map: its classes, and its labels with the class of their landmarks.
 
-    A label of landmarks of several classes gets the most frequent class. If there are too many
-    labels, the prompts are only the classes. OptionsError: there are no classes, or too many.
+    A label shared by landmarks of several classes gets the most frequent class. If there are too
+    many labels, the prompts are only the classes. OptionsError: there are no classes, or too many.
     """
     found = [(name, name) for name in dict.fromkeys(landmark_map.class_ids) if name.strip()]
     classes = {name for name, _ in found}

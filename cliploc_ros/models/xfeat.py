@@ -69,7 +69,7 @@ def load_xfeat(cache_dir: str = '') -> FeatureKind:
         from urllib.request import urlopen
 
         with urlopen(_URL, timeout=_PATIENCE_S) as answer:
-            content = answer.read(2**26)  # limited: a server may send without end
+            content = answer.read(2**26)  # a limit, in case the server does not stop sending
         if not _is_published(content):
             raise ValueError('the server sent another file')
         with replace_file(file) as partial_file:

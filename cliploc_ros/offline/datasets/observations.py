@@ -75,7 +75,7 @@ _QUERIES = npz.Schema('query file', {
         npz.UNIQUE, npz.Check('is empty', lambda ids: ids == ''))),
     **FRAME_FIELDS,
     'intrinsics_fx_fy_cx_cy': npz.Field('numbers', (4,), (npz.FINITE, npz.Check(
-        'is a focal length that is not above 0',
+        'has a focal length that is not above 0',
         lambda numbers: (numbers <= 0) & (np.arange(4) < 2)))),
     # half precision rounds some cosines to just above 1
     'similarities': npz.Field('numbers', ('n', 'L'), (npz.FINITE, npz.Check(
