@@ -201,12 +201,12 @@ def test_rectified_images_beside_a_distortion(room, tmp_path):
         made.p[:] = message.p
         return made
     bag = write_bag(tmp_path / 'bag', room, info=info)
-    refuses('do as rectified .*`rectified`', bag)
+    refuses('fit as rectified .*`rectified`', bag)
     assert not [note for note in reads(bag, BagTopics(rectified=True)).notes if 'fit' in note]
     raw = [(at, distorted(pixels, camera, lens), pose, camera) for at, pixels, pose, _ in room]
     bag = write_bag(tmp_path / 'raw', raw, info=info)
     assert not [note for note in reads(bag).notes if 'fit' in note]
-    refuses('do as raw .*leave `rectified`', bag, BagTopics(rectified=True))
+    refuses('fit as raw .*leave `rectified`', bag, BagTopics(rectified=True))
 
 
 def distorted(pixels, pinhole, lens):
@@ -232,7 +232,7 @@ def test_whose_poses_they_are_and_in_which_frame_depth_is(room, tmp_path):
     # the frame of the images is the camera's body: x forward
     body = make_transform(Rotation.from_euler('xyz', [-90, 0, -90], degrees=True).as_matrix(),
                           np.zeros(3))
-    refuses('do as ros .*`mount` 0 0 0 -0.5 0.5 -0.5 0.5', write_bag(
+    refuses('fit as ros .*`mount` 0 0 0 -0.5 0.5 -0.5 0.5', write_bag(
         tmp_path / 'c', room, pose=lambda pose: pose @ invert_transform(body)))
     # depth of another camera: by its camera_info and tf, or not at all
     depth_from = make_transform(np.eye(3), np.array([0.05, 0.0, 0.0]))

@@ -238,7 +238,7 @@ def test_files_that_are_no_detector(load, tmp_path, outputs, metadata, changes, 
 def test_configurations_that_do_not_fit(load, tmp_path):
     write_network(tmp_path / 'model.onnx', DETR)
     write_configs(tmp_path, ('mug',) * 4)
-    assert 'has 2 classes, config.json names 4' in refusal(load, tmp_path)
+    assert 'has 2 classes, but config.json has 4' in refusal(load, tmp_path)
     write_configs(tmp_path, ('mug', 'box'), size={'height': 32, 'width': 32})
     assert 'not from the same network' in refusal(load, tmp_path)
     write_configs(tmp_path, ('mug', 'box'), size=64)
