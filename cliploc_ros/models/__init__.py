@@ -2,6 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Neural networks: a detector and an image-text encoder behind two protocols, and XFeat.
 
-Importing this package imports neither torch nor open_clip nor ultralytics; making an encoder or a
-detector does.
+Importing this package does not import torch, open_clip or ultralytics; constructing an encoder or
+a detector does.
 """

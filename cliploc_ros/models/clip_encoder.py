@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""CLIP: crops and labels in, unit embeddings out."""
+"""Encode crops and labels with CLIP as embeddings of unit length."""
 
 import logging
 import time
@@ -45,7 +45,7 @@ logger = logging.getLogger(__name__)
 
 
 class LoadedEncoder(NamedTuple):
-    """An encoder ready for crops, and the embeddings (L, d) of the labels it was loaded for."""
+    """An encoder for crops, and the embeddings (L, d) of a map's labels."""
 
     encoder: 'ClipEncoder'
     label_embeddings: LabelEmbeddings
@@ -54,12 +54,11 @@ class LoadedEncoder(NamedTuple):
 def load_encoder(options: ClipOptions, labels: Sequence[Label]) -> LoadedEncoder:
     """Load CLIP for a map: encode its labels and keep only the image tower.
 
-    The labels' embeddings come from the cache if it knows model, weights and labels; then the text
-    tower is never loaded. Otherwise the text tower is loaded first, alone, and freed before the
-    image tower is loaded. Labels may repeat.
+    If the cache has the embeddings for model, weights and labels, the text tower is not loaded.
+    Otherwise the text tower is loaded first, and freed before the image tower is loaded. Labels
+    may be repeated.
 
-    ModelError: when the weights cannot be found or loaded. OptionsError: when the device is not
-    there.
+    ModelError: the weights cannot be found or loaded. OptionsError: the device is missing.
     """
     started = time.monotonic()
     weights = resolve_clip_weights(options)
@@ -72,18 +71,19 @@ def load_encoder(options: ClipOptions, labels: Sequence[Label]) -> LoadedEncoder
 
 def embed_labels(weights: ClipWeights, options: ClipOptions, labels: Sequence[Label]
                  ) -> LabelEmbeddings:
-    """Return the embeddings of labels, see `load_encoder`; they need no encoder of crops."""
+    """Return the embeddings of labels, without an encoder for crops; see `load_encoder`."""
     described = [((label, 1.0),) if isinstance(label, str) else label for label in labels]
-    # Once each and sorted: moving or reordering landmarks needs no new embeddings.
+    # Unique and sorted, so that moving or reordering landmarks needs no new embeddings.
     unique = sorted(set(described))
     embeddings = mixed_rows(unique, partial(_encoded_once, weights, options), weights.embed_dim)
-    rows = {one: row for row, one in enumerate(unique)}
-    return LabelEmbeddings(embeddings, np.array([rows[one] for one in described], dtype=np.int64))
+    rows = {description: row for row, description in enumerate(unique)}
+    return LabelEmbeddings(embeddings, np.array([rows[description] for description in described],
+                                                dtype=np.int64))
 
 
 def _encoded_once(weights: ClipWeights, options: ClipOptions, labels: Sequence[str]
                   ) -> NDArray[np.float32]:
-    """Return the embeddings of labels: those in the cache, or new ones, which it then holds."""
+    """Return the embeddings of labels from the cache, or encode and cache them."""
     cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'labels')
     embeddings = cache.load(weights.key, labels, weights.embed_dim)
     source = 'cached'
@@ -96,10 +96,10 @@ def _encoded_once(weights: ClipWeights, options: ClipOptions, labels: Sequence[s
 
 
 class ClipEncoder:
-    """An `ImageTextEncoder` that keeps the image tower alone in memory.
+    """An `ImageTextEncoder` that keeps only the image tower in memory.
 
-    ModelError: when the file does not hold the weights of the model, or they give no finite
-    numbers. OptionsError: when the device or the inference engine is not there.
+    ModelError: the file does not hold the weights of the model, or embeddings are not finite.
+    OptionsError: the device or the inference engine is missing.
     """
 
     def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
@@ -111,20 +111,20 @@ class ClipEncoder:
         self.key = weights.key
         self.inference = self._tower.inference  #: 'pytorch' or 'openvino'
         self.embed_dim = weights.embed_dim  #: The length d of an embedding
-        # The first pass sets up kernels and memory: do it before the first request.
+        # The first pass sets up kernels and memory; run it before the first request.
         self.encode_crops(np.zeros((32, 32, 3), dtype=np.uint8), np.array([[0.0, 0, 32, 32]]))
 
     def encode_crops(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
                      ) -> NDArray[np.float32]:
-        """Return one embedding (n, d), of unit length, for each box of an image (h, w, 3).
+        """Return embeddings (n, d) of unit length for the boxes of an image (h, w, 3).
 
         The boxes (n, 4) are left, top, right, bottom [px]; `visible_boxes` finds those that can be
-        cropped. A crop holds every pixel that its box touches. The tower takes at most
-        ``max_batch`` of them at once.
+        cropped. A crop contains all pixels that its box touches. A batch has at most ``max_batch``
+        crops.
 
-        ImageError: for an image of another shape or type, or without pixels. CliplocError: for
-        boxes that are not finite, are empty, or lie outside the image. ModelError: when memory
-        runs out, or the tower gives no finite numbers.
+        ImageError: the image has another shape or type, or no pixels. CliplocError: a box is not
+        finite, empty or outside the image. ModelError: memory runs out, or embeddings are not
+        finite.
         """
         check_image_rgb(image_rgb)
         bounds = crop_bounds(bboxes_xyxy, image_rgb.shape[1], image_rgb.shape[0])
@@ -137,17 +137,17 @@ class ClipEncoder:
         return _unit_rows(features, self._weights)
 
     def encode_labels(self, labels: Sequence[str]) -> NDArray[np.float32]:
-        """Return the embeddings (L, d) of labels; loads the text tower and frees it again."""
+        """Return the embeddings (L, d) of labels; loads and frees the text tower."""
         return encode_labels(self._weights, labels, self._options)
 
 
 def encode_labels(weights: ClipWeights, labels: Sequence[str], options: ClipOptions
                   ) -> NDArray[np.float32]:
-    """Return one embedding (L, d) for each label, float32 rows of unit length.
+    """Return the embeddings (L, d) of labels, float32 rows of unit length.
 
     This loads the text tower and frees it afterwards. The tower runs in fp32 on any device, so
-    that a cache made on one machine serves another. A label longer than the model's context is
-    cut, with a warning.
+    that a cache made on one machine can be used on another. A label longer than the model's
+    context is truncated, with a warning.
     """
     features = [_run_text_tower(weights, labels, options)] if labels else []
     free_memory()
@@ -186,10 +186,10 @@ def _load_text_tower(weights: ClipWeights, options: ClipOptions
 
 
 def _as_onnx(weights: ClipWeights, options: ClipOptions) -> ClipWeights | None:
-    """Return weights in ONNX files, exported once; None where PyTorch is to run them.
+    """Return weights in ONNX files, exported once; None if PyTorch is to run them.
 
-    With 'auto', PyTorch runs a CLIP that cannot be exported. ExportError: with 'openvino'.
-    OptionsError: a GPU or PyTorch is asked for where there are ONNX files alone.
+    With inference 'auto', PyTorch runs a CLIP that cannot be exported; with 'openvino', an
+    ExportError is raised. OptionsError: a GPU or PyTorch is requested for ONNX files.
     """
     if not runs_in_openvino(options):
         if weights.is_onnx and not (options.device == 'auto' and options.inference == 'auto'):
@@ -198,7 +198,7 @@ def _as_onnx(weights: ClipWeights, options: ClipOptions) -> ClipWeights | None:
         return weights if weights.is_onnx else None
     if weights.is_onnx:
         return weights
-    with needs_pytorch(f'CLIP {weights.model}, which is no ONNX network,', WITHOUT_CLIP):
+    with needs_pytorch(f'CLIP {weights.model}, which is not an ONNX network,', WITHOUT_CLIP):
         from cliploc_ros.models.export import export_clip
 
         try:
@@ -207,16 +207,17 @@ def _as_onnx(weights: ClipWeights, options: ClipOptions) -> ClipWeights | None:
         except ExportError as error:
             if options.inference == 'openvino':
                 raise
-            logger.warning('%s; PyTorch runs it (inference: pytorch saves the attempt)', error)
+            logger.warning('%s; PyTorch runs it (set inference to pytorch to skip the attempt)',
+                           error)
             return None
     return replace(weights, file=folder, is_onnx=True)
 
 
 def _unit_rows(features: Sequence[NDArray[np.float32]], weights: ClipWeights
                ) -> NDArray[np.float32]:
-    """Return features in rows of unit length, in fp32: fp16 would round their length to 1e-3."""
+    """Scale features to rows of unit length, in fp32: fp16 would round their length to 1e-3."""
     rows = np.concatenate([np.empty((0, weights.embed_dim), dtype=np.float32), *features])
     if not np.isfinite(rows).all():
-        raise ModelError(f'{weights.file} gives embeddings that are not finite: the weights are '
+        raise ModelError(f'the embeddings of {weights.file} are not finite: the weights are '
                          'corrupt, or overflow in fp16 (set the precision to fp32)')
     return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)

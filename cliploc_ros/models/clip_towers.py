@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The image tower or the text tower of CLIP alone, in PyTorch."""
+"""Load and run only the image tower or only the text tower of CLIP, in PyTorch."""
 
 import contextlib
 import logging
@@ -22,7 +22,7 @@ from cliploc_ros.models.files import check_weights_file, damaged, first_line
 if TYPE_CHECKING:
     import torch
 
-# Apple's MobileCLIP and Google's big_vision: open_clip converts these into the model it fills.
+# Checkpoints of Apple's MobileCLIP and Google's big_vision, which open_clip converts on loading.
 _FOREIGN_PREFIX = 'image_encoder.'
 _FOREIGN_SUFFIXES = ('.npz', '.npy')
 
@@ -41,7 +41,7 @@ class TorchTower:
         self.prepare = CropPreparation(crops)
 
     def __call__(self, batch: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the features (n, d) of prepared crops (n, 3, s, s); ModelError: no memory."""
+        """Return the features (n, d) of prepared crops (n, 3, s, s); ModelError: out of memory."""
         import torch
 
         try:
@@ -50,8 +50,8 @@ class TorchTower:
                     self._device, dtype=self._dtype), normalize=False)
                 return np.asarray(features.float().cpu().numpy())
         except torch.cuda.OutOfMemoryError as error:
-            raise ModelError(f'the GPU has no memory left for {len(batch)} crops at once: '
-                             'lower max_batch or choose a smaller model') from error
+            raise ModelError(f'the GPU does not have enough memory for {len(batch)} crops at '
+                             'once: lower max_batch or choose a smaller model') from error
 
 
 class TorchTextTower:
@@ -62,15 +62,15 @@ class TorchTextTower:
 
         with quiet_root_logger():
             self._tokenizer = open_clip.get_tokenizer(weights.model)
-        self.context = int(self._tokenizer.context_length)  #: The most tokens of a label
+        self.context = int(self._tokenizer.context_length)  #: Greatest number of tokens of a label
         self._device, self._model = device, load_one_tower(weights, 'text', device, 'fp32')[0]
 
     def count(self, label: str) -> int:
-        """Return the number of tokens of a label, with start and end."""
+        """Return the number of tokens of a label, including start and end."""
         return len(self._tokenizer.encode(label)) + 2
 
     def __call__(self, labels: Sequence[str], batch: int) -> NDArray[np.float32]:
-        """Return the features (L, d) of labels, some of them at once."""
+        """Return the features (L, d) of labels, encoded in batches."""
         import torch
 
         tokens = cut_padding(self._model, self._tokenizer(list(labels)))
@@ -80,11 +80,11 @@ class TorchTextTower:
                 for part in tokens.split(batch)])
 
 
-# ---- one tower in PyTorch -----------------------------------------------------------------------
+# ---- loading a single tower ---------------------------------------------------------------------
 
 def load_one_tower(weights: ClipWeights, tower: str, device: str, precision: str
                    ) -> tuple[Any, dict[str, Any]]:
-    """Return a CLIP with one tower, 'visual' or 'text', and how it takes crops.
+    """Load a CLIP with one tower, 'visual' or 'text'; also return its preparation of crops.
 
     ModelError: the file does not hold the weights of the model.
     """
@@ -95,7 +95,7 @@ def load_one_tower(weights: ClipWeights, tower: str, device: str, precision: str
     state = {} if weights.file.suffix in _FOREIGN_SUFFIXES else read_state_dict(weights.file)
     is_foreign = not state or any(name.startswith(_FOREIGN_PREFIX) for name in state)
     module = getattr(model, tower)
-    # tensors that the tower computes at construction, and no checkpoint holds
+    # tensors that the tower computes at construction, and that checkpoints lack
     unsaved = {name for name, _ in module.named_buffers()} - module.state_dict().keys()
     if isinstance(module, TextTransformer):
         unsaved -= {'attn_mask'}
@@ -110,9 +110,9 @@ def load_one_tower(weights: ClipWeights, tower: str, device: str, precision: str
 
 
 def _build_without_memory(weights: ClipWeights, precision: str) -> Any:
-    """Return the model on torch's meta device: shapes and types alone.
+    """Build the model on torch's meta device, which has shapes and types but no memory.
 
-    Drawing random weights only to overwrite them takes seconds and the memory of both towers.
+    Random weights, which are overwritten later, take seconds and the memory of both towers.
     """
     import open_clip
     import torch
@@ -125,7 +125,7 @@ def _build_without_memory(weights: ClipWeights, precision: str) -> Any:
 
 
 def _load_by_open_clip(weights: ClipWeights, device: str, precision: str) -> Any:
-    """Return the model as open_clip itself loads it: slower, with twice the memory."""
+    """Load the model with open_clip, which is slower and takes twice the memory."""
     import open_clip
 
     try:
@@ -133,17 +133,17 @@ def _load_by_open_clip(weights: ClipWeights, device: str, precision: str) -> Any
             return open_clip.create_model(
                 weights.model, pretrained=str(weights.file), precision=precision, device=device,
                 force_quick_gelu=weights.quick_gelu, force_custom_text=True)
-    except Exception as error:  # open_clip has no exceptions of its own
+    except Exception as error:  # open_clip has no exception classes
         raise ModelError(f'{weights.file} does not hold the weights of CLIP model '
                          f"'{weights.model}': {str(error)[:300]}") from error
 
 
 def _fill(module: 'torch.nn.Module', tower: str, state: 'dict[str, torch.Tensor]',
           weights: ClipWeights, device: str) -> None:
-    """Fill a tower on the meta device with all of its weights.
+    """Fill a tower on the meta device with its weights.
 
-    The tower gets copies, not the mapped tensors: a process dies when a file that it has mapped is
-    cut short, as a copy over the old weights does.
+    The tower gets copies of the mapped tensors. If the old weights are overwritten, the mapped
+    file is truncated for a moment, and a process that reads it then is killed.
     """
     found = {name.removeprefix(f'{tower}.'): tensor for name, tensor in state.items()
              if name.startswith(f'{tower}.')}
@@ -163,11 +163,12 @@ def _fill(module: 'torch.nn.Module', tower: str, state: 'dict[str, torch.Tensor]
 
 
 def cut_padding(model: Any, tokens: 'torch.Tensor') -> 'torch.Tensor':
-    """Return the tokens (L, context) of texts without the padding, which is 0.
+    """Return the tokens (L, context) of texts without the common padding, which is 0.
 
-    In a causal tower that is read at a text's end, nothing depends on the padding after it. Twelve
-    tokens instead of 77 take a quarter of the time. The text tower of the model is for these texts
-    only afterwards. The tokens of any other tower stay as they are.
+    A causal tower that takes its features at the end of a text does not depend on the padding
+    after it. Twelve tokens instead of 77 take a quarter of the time. The attention mask of the
+    text tower is cut too: afterwards, the tower can only encode these texts. The tokens of other
+    towers are unchanged.
     """
     text = model.text
     if (getattr(text, 'pool_type', '') != 'argmax' or getattr(text, 'attn_mask', None) is None
@@ -178,16 +179,16 @@ def cut_padding(model: Any, tokens: 'torch.Tensor') -> 'torch.Tensor':
     return tokens[:, :longest]
 
 
-# ---- a checkpoint -------------------------------------------------------------------------------
+# ---- reading a checkpoint -----------------------------------------------------------------------
 
 def read_state_dict(file: Path) -> 'dict[str, torch.Tensor]':
-    """Return the tensors of a checkpoint, mapped from the file where its format allows.
+    """Read the tensors of a checkpoint, mapped from the file if its format allows.
 
-    The names are those of open_clip's ``CustomTextCLIP``, 'visual.*' and 'text.*', for every
-    form of checkpoint. TorchScript archives (OpenAI's own files) and pickles of PyTorch before
-    1.6 cannot be mapped and are read whole.
+    The names are those of open_clip's ``CustomTextCLIP``, 'visual.*' and 'text.*', for all formats
+    of checkpoints. TorchScript archives (the files of OpenAI) and pickles of PyTorch before 1.6
+    cannot be mapped, and are read into memory.
 
-    ModelError: for a file that is missing, damaged, or holds something other than tensors.
+    ModelError: the file is missing or damaged, or holds something other than tensors.
     """
     import torch
     from open_clip.model import convert_to_custom_text_state_dict
@@ -196,13 +197,13 @@ def read_state_dict(file: Path) -> 'dict[str, torch.Tensor]':
     try:
         state = _read(file)
     except pickle.UnpicklingError as error:
-        # one line of torch's long message names the refused class
+        # a line of torch's long message names the refused class
         lines = str(error).splitlines() or ['']
         cause = next((line.strip() for line in lines if 'Unsupported' in line), lines[0])
-        raise ModelError(f'{file} is no checkpoint of CLIP: {cause}') from error
+        raise ModelError(f'{file} is not a checkpoint of CLIP: {cause}') from error
     except OSError as error:
         raise ModelError(f'{file} cannot be read: {error.strerror}') from error
-    except Exception as error:  # each format and version has exceptions of its own
+    except Exception as error:  # each format and version has different exceptions
         raise damaged(file, first_line(error)) from error
     tensors = state
     if isinstance(tensors, dict) and isinstance(tensors.get('state_dict'), dict):
@@ -210,11 +211,12 @@ def read_state_dict(file: Path) -> 'dict[str, torch.Tensor]':
     tensors = {str(name).removeprefix('module.'): tensor for name, tensor in tensors.items()
                if isinstance(tensor, torch.Tensor)} if isinstance(tensors, dict) else {}
     if not tensors:
-        # Once ultralytics has loaded a detector, PyTorch's check of pickles passes its classes
-        # until the process ends, and then reads a whole detector.
+        # After ultralytics has loaded a detector, PyTorch's check of pickles accepts the classes
+        # of ultralytics until the process ends, so that a detector's file gets here.
         values = state.values() if isinstance(state, dict) else [state]
-        types = sorted({f'{type(one).__module__}.{type(one).__qualname__}' for one in values})
-        raise ModelError(f'{file} is no checkpoint of CLIP: it holds no named tensors, but '
+        types = sorted({f'{type(value).__module__}.{type(value).__qualname__}'
+                        for value in values})
+        raise ModelError(f'{file} is not a checkpoint of CLIP: it holds no named tensors, but '
                          f'{", ".join(types[:8]) or "nothing"}')
     return convert_to_custom_text_state_dict(tensors)
 
@@ -229,15 +231,15 @@ def _read(file: Path) -> object:
         with warnings.catch_warnings():
             warnings.simplefilter('ignore', FutureWarning)  # TorchScript is deprecated
             return torch.jit.load(file, map_location='cpu').state_dict()
-    # PyTorch maps the zip archives that it writes since 1.6.
+    # PyTorch can map the zip archives that it has written since 1.6.
     return torch.load(file, map_location='cpu', weights_only=True, mmap=zipfile.is_zipfile(file))
 
 
 @contextlib.contextmanager
 def quiet_root_logger() -> Iterator[None]:
-    """Suppress open_clip's warnings of random weights and its handler on the root logger.
+    """Suppress open_clip's warnings of random weights, and its handler on the root logger.
 
-    It logs through ``logging.warning``, which adds a handler to a root logger without one.
+    open_clip logs through ``logging.warning``, which adds a handler to a root logger without one.
     """
     root = logging.getLogger()
     handler = logging.NullHandler()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What an image tower of CLIP sees of a crop, as open_clip prepares it, without PyTorch."""
+"""Preparation of crops for an image tower of CLIP, as in open_clip, without PyTorch."""
 
 import sys
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-# CLIP sees only the middle square of a long crop; beyond this ratio the rest has no influence.
+# Crops with a greater ratio of sides are cut first: CLIP sees only the central square.
 _MAX_ASPECT = 16
 
 
@@ -33,7 +33,7 @@ class CropPreparation:
         self._max_aspect = _MAX_ASPECT if self._mode == 'shortest' else sys.maxsize
 
     def __call__(self, crop_rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Return the input (3, H, W) of a crop (h, w, 3)."""
+        """Convert a crop (h, w, 3) to the input (3, H, W) of the tower."""
         image = Image.fromarray(np.ascontiguousarray(self._cut(crop_rgb)))
         image = image.resize(self._scaled(*image.size), self._filter)
         left, top = (round((has - wants) / 2.0) for has, wants in
@@ -60,10 +60,10 @@ class CropPreparation:
         return round(width / ratio), round(height / ratio)
 
     def _cut(self, crop_rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return a crop; cut a very long one to its middle.
+        """Cut a very long crop to its middle.
 
-        The short side is scaled up to the tower's input before a square is cut from the middle: a
-        crop of 1 x 2000 pixels would first become an image of 224 x 448,000.
+        The short side is scaled to the tower's input before the central square is cut out. A crop
+        of 1 x 2000 pixels would first become an image of 224 x 448,000.
         """
         height, width = crop_rgb.shape[:2]
         longest = self._max_aspect * min(height, width)

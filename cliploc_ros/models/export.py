@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Export a CLIP of open_clip to ONNX, and what exports of all networks share. Needs PyTorch."""
+"""Export a CLIP of open_clip to ONNX, and helpers for all exports. Needs PyTorch."""
 
 import contextlib
 import gzip
@@ -29,9 +29,9 @@ from cliploc_ros.models.onnx_network import CompiledNetwork
 if TYPE_CHECKING:
     import torch
 
-#: The newest that OpenVINO and exporters agree on.
+#: The newest version that OpenVINO and the exporters support.
 OPSET = 17
-# How far an output may be off, as a share of its length; measured: 1e-5.
+# Greatest error of an output, relative to its norm; measured: 1e-5.
 _TOLERANCE = 1e-3
 # Smaller tensors stay in fp32.
 _LEAST_HALVED = 1024
@@ -39,12 +39,12 @@ _TEXTS = ['a photo of a red mug', "the dog's 2 bowls!", '']
 
 
 def export_clip(weights: ClipWeights, folder: Path, half: bool = False) -> None:
-    """Write both towers of a CLIP of open_clip into a folder, with all that the towers need.
+    """Export both towers of a CLIP of open_clip, with tokenizer and configuration, into a folder.
 
-    With ``half``, weights are stored in half precision, and run in fp32 nevertheless.
+    With ``half``, weights are stored in half precision, but the towers run in fp32.
 
-    ExportError: a tower gives other results than in PyTorch, or the tokenizer is not CLIP's own.
-    ModelError: the file does not hold the weights of the model.
+    ExportError: the results of a tower differ from those in PyTorch, or the tokenizer is not that
+    of CLIP. ModelError: the file does not hold the weights of the model.
     """
     import open_clip
     import torch
@@ -80,14 +80,15 @@ def export_clip(weights: ClipWeights, folder: Path, half: bool = False) -> None:
 
 
 def _tokenizer_of(tokenizer: Any) -> str:
-    """Return CLIP's byte-pair tokenizer (Sennrich et al., 2016) as tokenizer.json."""
+    """Convert CLIP's byte-pair tokenizer (Sennrich et al., 2016) to a tokenizer.json."""
     import open_clip
     from tokenizers import Regex, Tokenizer, models, normalizers, pre_tokenizers, processors
 
     start, end = '<start_of_text>', '<end_of_text>'
     lines = gzip.decompress(Path(open_clip.tokenizer.default_bpe()).read_bytes()).decode()
     vocabulary = dict(getattr(tokenizer, 'encoder', {}))
-    # A first line is about the table; 256 bytes stand alone or end a word.
+    # The first line describes the table. The 49,408 tokens are 256 bytes within a word, 256 bytes
+    # at its end, the merges, and two special tokens.
     merges = [(line.split()[0], line.split()[1])
               for line in lines.split('\n')[1:49_152 - 256 - 2 + 1]]
     found = Tokenizer(models.BPE(vocabulary, merges, end_of_word_suffix='</w>',
@@ -104,15 +105,15 @@ def _tokenizer_of(tokenizer: Any) -> str:
     for text, row in zip(_TEXTS, tokenizer(_TEXTS).tolist(), strict=True):
         ids = found.encode(text).ids
         if row != ids + [0] * (len(row) - len(ids)):
-            raise ExportError('its tokenizer is not that of CLIP: PyTorch runs it')
+            raise ExportError('its tokenizer is not that of CLIP')
     return str(found.to_str())
 
 
-# ---- of all networks ----------------------------------------------------------------------------
+# ---- helpers for all networks -------------------------------------------------------------------
 
 @contextlib.contextmanager
 def quiet_export() -> Iterator[None]:
-    """Export without the warnings of constants in a trace: a probe tests them."""
+    """Suppress warnings of constants in a trace; `compare` tests the export instead."""
     import torch
 
     fast, threads = torch.backends.mha.get_fastpath_enabled(), torch.get_num_threads()
@@ -123,11 +124,11 @@ def quiet_export() -> Iterator[None]:
             yield
     finally:
         torch.backends.mha.set_fastpath_enabled(fast)
-        torch.set_num_threads(threads)  # ultralytics takes one for an export
+        torch.set_num_threads(threads)  # ultralytics sets it to 1 for an export
 
 
 def halve(file: Path) -> None:
-    """Store large tensors of an ONNX file in half precision, and cast them where they are used."""
+    """Store large tensors of an ONNX file in half precision, and add casts to fp32."""
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
@@ -147,16 +148,16 @@ def halve(file: Path) -> None:
 
 
 def compare(file: Path, probe: NDArray[Any], expected: 'torch.Tensor', half: bool) -> None:
-    """Raise an ExportError where OpenVINO gives another first output for a probe than PyTorch."""
+    """Raise an ExportError if OpenVINO's first output for a probe differs from PyTorch's."""
     wanted = expected.numpy()
     try:
         found = CompiledNetwork.of(import_openvino().Core().read_model(file))(probe)[0]
-    except Exception as error:  # OpenVINO has no exceptions of its own
-        raise ExportError(f'OpenVINO does not run its export: {error}') from error
+    except Exception as error:  # OpenVINO has no exception classes
+        raise ExportError(f'OpenVINO cannot run its export: {error}') from error
     if found.shape != wanted.shape:
         raise ExportError(f'its export gives the shape {found.shape}, PyTorch {wanted.shape}')
     rows = len(wanted)
     off = float(np.max(np.linalg.norm((found - wanted).reshape(rows, -1), axis=1)
                        / np.linalg.norm(wanted.reshape(rows, -1), axis=1)))
-    if not off <= _TOLERANCE * (10 if half else 1):  # true of NaN
-        raise ExportError(f'its export is off by {off:.2g} of the length of an output')
+    if not off <= _TOLERANCE * (10 if half else 1):  # also for NaN
+        raise ExportError(f'its export has a relative error of {off:.2g}')

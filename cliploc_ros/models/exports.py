@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Folders of networks that were exported to ONNX: written once, and checked before their use."""
+"""Cache of networks exported to ONNX: folders that are written once and checked before use."""
 
 import contextlib
 import hashlib
@@ -21,7 +21,7 @@ from cliploc_ros.models.devices import free_memory
 from cliploc_ros.models.files import fingerprint_file, first_line, keep_folder
 from cliploc_ros.models.protocols import DetectorOptions
 
-# Of such a folder, and of how networks are exported.
+# Version of these folders and of the export; a change makes new folders.
 _FORMAT = 1
 _MOST_EXPORTS = 8
 _ABOUT = 'export.json'
@@ -29,16 +29,16 @@ _ABOUT = 'export.json'
 DETECTOR = 'model.onnx'
 
 logger = logging.getLogger(__name__)
-# Exports that no disk takes, removed when the process ends.
+# Exports that could not be written to the cache, removed when the process ends.
 _unkept: dict[Path, tempfile.TemporaryDirectory[str]] = {}
 
 
 class ExportError(ModelError):
-    """A network cannot be exported, or gives other results than in PyTorch."""
+    """A network cannot be exported, or its results differ from those in PyTorch."""
 
 
 def detector_identity(file: Path, options: DetectorOptions) -> list[str]:
-    """Return what an exported detector depends on: its weights, and the texts it looks for."""
+    """Return the inputs of a detector's export: its weights and its prompts."""
     identity = [fingerprint_file(file)]
     if options.prompts:
         tower = Path(options.text_model).expanduser()
@@ -48,14 +48,14 @@ def detector_identity(file: Path, options: DetectorOptions) -> list[str]:
 
 
 def describe_export(folder: Path, key: str) -> None:
-    """Complete a folder: write the fingerprints of its files, and what the weights are called."""
+    """Complete a folder: write the fingerprints of its files, and the key of the weights."""
     files = sorted(file for file in folder.rglob('*') if file.is_file())
     (folder / _ABOUT).write_text(json.dumps({'key': key, 'files': {
         str(file.relative_to(folder)): fingerprint_file(file) for file in files}}))
 
 
 def export_key(folder: Path) -> str:
-    """Return the key of the weights in a folder of ours; '' for others and changed ones."""
+    """Return the key of the weights in an export; '' for other folders and changed exports."""
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError,
                              RecursionError):
         about: dict[str, Any] = parse_json(read_file(folder / _ABOUT))
@@ -66,7 +66,7 @@ def export_key(folder: Path) -> str:
 
 
 def find_export(cache_dir: str, name: str, identity: Sequence[str]) -> Path | None:
-    """Return the folder of an export in the cache, if it is there and sound."""
+    """Return the folder of an export in the cache; None if it is missing or damaged."""
     folder = _folder(cache_dir, name, identity)
     if folder in _unkept:
         return Path(_unkept[folder].name) / folder.name
@@ -82,13 +82,13 @@ def find_export(cache_dir: str, name: str, identity: Sequence[str]) -> Path | No
 
 def keep_export(cache_dir: str, name: str, identity: Sequence[str],
                 export: Callable[[Path], None]) -> Path:
-    """Return the folder of an export; export the network where the cache does not have it.
+    """Return the folder of an export; export the network if the cache does not have it.
 
-    The name of the folder is the hash of all that the network depends on. It is written under
-    another name and renamed: any number of processes may share the cache. The export is to write
-    into the folder that it gets, and end with `describe_export`.
+    The name of the folder contains a hash of all inputs of the export. The folder is written under
+    another name and renamed, so that any number of processes can share the cache. ``export`` must
+    write into the folder that it is given, and end with `describe_export`.
 
-    ExportError: it failed. ModelError, ModuleNotFoundError: from ``export``.
+    ExportError: the export failed. ModelError, ModuleNotFoundError: from ``export``.
     """
     folder, started = _folder(cache_dir, name, identity), time.monotonic()
     if folder in _unkept:
@@ -96,8 +96,8 @@ def keep_export(cache_dir: str, name: str, identity: Sequence[str],
     if export_key(folder):
         return folder
     logger.info('exporting %s to ONNX: once, into %s', name, folder)
-    # A library that meets a full disk raises the errors of a network that it cannot export, so it
-    # writes elsewhere.
+    # On a full disk, the libraries raise the same errors as for networks that cannot be exported.
+    # To distinguish the two, the export is written to a temporary folder first.
     desk = tempfile.TemporaryDirectory(prefix='cliploc_ros_export_')
     written = Path(desk.name) / folder.name
     run_export(name, export, written)
@@ -109,13 +109,13 @@ def keep_export(cache_dir: str, name: str, identity: Sequence[str],
                       'writable cache_dir')
         _unkept[folder], folder = desk, written
     free_memory()
-    logger.info('%s is exported after %.0f s', name, time.monotonic() - started)
+    logger.info('exported %s in %.0f s', name, time.monotonic() - started)
     return folder
 
 
 def run_export(name: str, export: Callable[[Path], None], folder: Path) -> None:
-    """Export a network into a new folder; errors as of keep_export, which name the network."""
-    folder.mkdir()  # others may read it, unlike a temporary folder
+    """Export a network into a new folder; errors as in keep_export, with the network's name."""
+    folder.mkdir()  # readable by other users, unlike a temporary folder
     try:
         export(folder)
     except ExportError as error:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of weights: whether they are intact, their fingerprint; folders of a cache."""
+"""Files of weights: checks, fingerprints and downloads; folders of a cache."""
 
 import errno
 import hashlib
@@ -23,18 +23,18 @@ _BLOCK_COUNT = 66
 _HEADS = (b'PK', b'\x80', b'\x93NUMPY')
 # The first field of an ONNX file: the version of the format.
 _ONNX_HEAD = b'\x08'
-# A writer that takes longer than this was killed [s].
+# Partial files older than this are from killed writers [s].
 _STALE_S = 24 * 3600.0
 
 logger = logging.getLogger(__name__)
 
 
 def fingerprint_file(path: Path) -> str:
-    """Return a hash that distinguishes files of weights, within milliseconds.
+    """Return a hash that distinguishes files of weights; it takes milliseconds.
 
-    It is the SHA-256 of the size and of 66 blocks of 64 KiB: head, tail and 64 evenly spaced
-    between them. Training changes every tensor and so the blocks. The hash misses an edit of a few
-    bytes between the blocks.
+    It is the SHA-256 of the size and of 66 evenly spaced blocks of 64 KiB, including head and
+    tail. Training changes all tensors, and thus the blocks. The hash misses an edit of a few bytes
+    between the blocks.
     """
     size = path.stat().st_size
     last = max(size - _BLOCK_BYTES, 0)
@@ -48,9 +48,9 @@ def fingerprint_file(path: Path) -> str:
 
 
 def check_weights_file(path: Path) -> None:
-    """Raise a ModelError for a file that is missing, unreadable, cut off or no weights at all.
+    """Raise a ModelError for a file that is missing, unreadable or truncated, or not weights.
 
-    This looks at head and end of the file only; the loader checks the content.
+    Only the head and the end of the file are read; the loader checks the content.
     """
     if path.is_dir():
         raise ModelError(f'{path} is a folder: name the file with the weights')
@@ -72,8 +72,8 @@ def check_weights_file(path: Path) -> None:
         raise damaged(path, 'the end of the archive is missing')
     heads = _ONNX_HEAD if path.suffix == '.onnx' else _HEADS
     if path.suffix != '.safetensors' and not head.startswith(heads):
-        raise ModelError(f'{path} holds no weights: it is neither a file of PyTorch nor, by its '
-                         'name, of ONNX or safetensors')
+        raise ModelError(f'{path} holds no weights: it is not a file of PyTorch, and its name is '
+                         'not that of an ONNX or safetensors file')
     # The format: eight bytes with the length of a JSON header, the header, the tensors.
     if path.suffix == '.safetensors' and (
             len(head) < 8 or struct.unpack('<Q', head[:8])[0] + 8 > size):
@@ -87,11 +87,11 @@ def damaged(path: Path, reason: object) -> ModelError:
 
 def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Path],
              setting: str = 'cache_dir') -> Path:
-    """Download a file with a library's own function; ModelError: that fails.
+    """Download a file with a function of a library; ModelError: that fails.
 
-    ``fetch`` returns the file's path and must leave no partial file under that name. The folder is
-    made if it does not exist. The error names ``what`` was to be downloaded, and as a remedy what
-    the user can do without a network. ``setting`` names what chooses the folder.
+    ``fetch`` returns the path of the file, and must not leave a partial file there. The folder is
+    made if it does not exist. The error names the file (``what``), and a ``remedy`` without a
+    network. ``setting`` is the option that sets the folder.
     """
     logger.info('downloading %s into %s', what, folder)
     try:
@@ -99,7 +99,7 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
         return Path(fetch())
     except ModelError:
         raise
-    except Exception as error:  # each library raises exceptions of its own
+    except Exception as error:  # each library has different exceptions
         reason = f'{type(error).__name__}: {first_line(error).rstrip(".")}'
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             reason = f'the disk of {folder} is full: make room, or set {setting} to another disk'
@@ -110,9 +110,9 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
 
 
 def download_file(url: str, file: Path, remedy: str, setting: str) -> Path:
-    """Download a file from its address; the rest of it, where a part is there.
+    """Download a file from its address, or continue an interrupted download.
 
-    The part is NAME.partial, until it is whole. ModelError, remedy and setting: see download.
+    A partial file has the name NAME.partial. ModelError, remedy and setting: see download.
     """
     partial = file.with_name(f'{file.name}.partial')
 
@@ -125,7 +125,7 @@ def download_file(url: str, file: Path, remedy: str, setting: str) -> Path:
             with partial.open('ab') as opened:
                 http_get(url, opened, resume_size=opened.tell(), displayed_filename=file.name)
         except HfHubHTTPError as error:
-            if error.response.status_code == 416:  # the part is longer than the file
+            if error.response.status_code == 416:  # the partial file is longer than the file
                 partial.unlink()
             raise
         return partial.replace(file)
@@ -134,14 +134,14 @@ def download_file(url: str, file: Path, remedy: str, setting: str) -> Path:
 
 
 def remove_unused(entries: Iterable[Path], partial: Iterable[Path], most: int) -> None:
-    """Keep the entries of a cache that were used last; remove what killed writers left, too."""
+    """Remove the least recently used entries of a cache, and partial files of killed writers."""
     def modified(entry: Path) -> float:
         try:
             return entry.stat().st_mtime
         except OSError:  # another process has removed it
             return -1.0
 
-    stale = [one for one in partial if 0.0 <= modified(one) < time.time() - _STALE_S]
+    stale = [path for path in partial if 0.0 <= modified(path) < time.time() - _STALE_S]
     for entry in sorted(entries, key=modified, reverse=True)[most:] + stale:
         if entry.is_dir():
             shutil.rmtree(entry, ignore_errors=True)
@@ -150,23 +150,23 @@ def remove_unused(entries: Iterable[Path], partial: Iterable[Path], most: int) -
 
 
 def keep_folder(folder: Path, most: int, write: Callable[[Path], object]) -> None:
-    """Write a folder of a cache, which appears as a whole; keep so many that were used last.
+    """Write a folder of a cache atomically; keep only the `most` recently used folders.
 
-    ``write`` gets the path of a folder to make. Any number of processes may share the cache.
+    ``write`` gets the path of a folder to make. Any number of processes can share the cache.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
-    remove_unused([each for each in folder.parent.iterdir() if not each.name.startswith('.')],
+    remove_unused([entry for entry in folder.parent.iterdir() if not entry.name.startswith('.')],
                   folder.parent.glob('.*.tmp'), most - 1)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix='.', suffix='.tmp',
                                      ignore_cleanup_errors=True) as desk:
         whole = Path(desk) / folder.name
         write(whole)
-        if folder.exists():  # damaged, or of another process
+        if folder.exists():  # damaged, or from another process
             folder.rename(Path(desk) / 'old')
         whole.rename(folder)
 
 
 def first_line(error: Exception) -> str:
-    """Return the first line of a library's message in ASCII; some hold emojis and colours."""
+    """Return the first line of an error in ASCII, without emojis and colours."""
     lines = str(error).encode('ascii', 'ignore').decode().strip().splitlines()
     return lines[0].strip() if lines else type(error).__name__

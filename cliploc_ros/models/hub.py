@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Networks that are named as OWNER/NAME of the Hugging Face hub, downloaded once."""
+"""Networks named OWNER/NAME on the Hugging Face hub, downloaded once."""
 
 import hashlib
 import json
@@ -14,35 +14,35 @@ from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import read_file, replace_file, resolve_cache_dir
 from cliploc_ros.models.files import download
 
-# OWNER/NAME, @REVISION (a branch, tag or commit) and :FILE, the last two as wanted.
+# OWNER/NAME[@REVISION][:FILE]; the revision is a branch, tag or commit.
 _NAME = re.compile(r'([\w-][\w.-]*/[\w-][\w.-]*)(?:@([\w][\w.-]*))?(?::([\w][\w./-]*\.onnx))?')
-# Where packets are dropped, this gives up [s].
+# Time-out of the first request, in case a firewall drops its packets [s].
 _PATIENCE_S = 10.0
 
 
 def is_hub_name(name: str) -> bool:
-    """Return whether a name is OWNER/NAME[@REVISION][:FILE], and no file or folder here."""
+    """Return whether a name is OWNER/NAME[@REVISION][:FILE], and not a local file or folder."""
     return (not Path(name).expanduser().exists() and _NAME.fullmatch(name) is not None
             and Path(name).suffix not in ('.pt', '.ts', '.safetensors', '.bin', '.json'))
 
 
 def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequence[str],
                    cache_dir: str) -> Path:
-    """Return a folder with networks and the files beside them; download it if necessary.
+    """Return a folder with networks and the files next to them; download it if necessary.
 
-    A download is made once: with a marker of it, no request is sent. Content is compared with the
-    digest that the hub names, and what was interrupted goes on. Proxy, mirror and offline mode are
-    those of huggingface_hub: HTTPS_PROXY, HF_ENDPOINT, HF_HUB_OFFLINE.
+    A complete download is marked, and no further request is sent. Each file is compared with the
+    digest given by the hub, and interrupted downloads are continued. Proxy, mirror and offline
+    mode are those of huggingface_hub: HTTPS_PROXY, HF_ENDPOINT, HF_HUB_OFFLINE.
 
-    ModelError: the name is no folder and none of the hub, or the download fails.
+    ModelError: the name is neither a folder nor a name on the hub, or the download fails.
 
     Parameters
     ----------
     name : str
         A folder, or OWNER/NAME[@REVISION][:FILE].
     networks : sequence of sequences of str
-        For each network the patterns of its ONNX file; the first that exists is taken, with its
-        file of weights. A FILE in the name takes the place of the first network.
+        For each network, the patterns of its ONNX file. The first file that exists is used, with
+        its file of weights. A FILE in the name replaces the patterns of the first network.
     beside : sequence of str
         Patterns of all other files.
     """
@@ -56,7 +56,8 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
     wanted = [[file], *networks[1:]] if file else list(networks)
     own = resolve_cache_dir(cache_dir) / 'weights'
     request = json.dumps([repository, revision, [*map(list, wanted)], list(beside)])
-    marker = own / f'{repository.replace("/", "--")}-{_digest(request.encode())[:16]}.json'
+    digest = hashlib.sha256(request.encode()).hexdigest()
+    marker = own / f'{repository.replace("/", "--")}-{digest[:16]}.json'
     try:
         found = own / str(json.loads(read_file(marker)))
     except (OSError, ValueError):
@@ -68,22 +69,22 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
         os.environ.setdefault('HF_HUB_DISABLE_TELEMETRY', '1')
         import huggingface_hub
 
-        told = huggingface_hub.HfApi().model_info(repository, revision=revision,
+        info = huggingface_hub.HfApi().model_info(repository, revision=revision,
                                                   timeout=_PATIENCE_S)
-        files = [each.rfilename for each in told.siblings or ()]
-        chosen = [each for each in files if any(fnmatch(each, pattern) for pattern in beside)]
+        files = [sibling.rfilename for sibling in info.siblings or ()]
+        chosen = [file for file in files if any(fnmatch(file, pattern) for pattern in beside)]
         for patterns in wanted:
-            main = next((each for pattern in patterns for each in files
-                         if fnmatch(each, pattern)), None)
+            main = next((file for pattern in patterns for file in files
+                         if fnmatch(file, pattern)), None)
             if main is None:
                 raise ModelError(f'{name} has none of {", ".join(patterns)}: it has '
                                  f'{", ".join(files)}')
-            chosen += [each for each in files if each.startswith(main)]
-        for each in chosen:
+            chosen += [file for file in files if file.startswith(main)]
+        for file in chosen:
             path = Path(huggingface_hub.hf_hub_download(
-                repository, each, revision=told.sha, cache_dir=own))
+                repository, file, revision=info.sha, cache_dir=own))
             _check_content(path)
-        snapshot = Path(str(path)[:-len(each)])
+        snapshot = Path(str(path)[:-len(file)])
         with replace_file(marker) as partial:
             partial.write_text(json.dumps(str(snapshot.relative_to(own))))
         return snapshot
@@ -91,7 +92,7 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
     listed = ', '.join([*(patterns[0] for patterns in wanted), *beside])
     return download(f"the network '{name}'", own, (
         f'Without a network: download {listed} from https://huggingface.co/{repository} on '
-        'another machine into a folder, and name the path of that folder'), fetch)
+        'another machine into a folder, and give the path of that folder'), fetch)
 
 
 def find_network(folder: Path, name: str, networks: Sequence[str]) -> Path:
@@ -106,9 +107,10 @@ def find_network(folder: Path, name: str, networks: Sequence[str]) -> Path:
 
 
 def _check_content(file: Path) -> None:
-    """Remove a file whose content is not what the hub named; raise ValueError.
+    """Compare a file with its digest on the hub; ValueError: it differs, and was removed.
 
-    The hub's cache names each file after its digest: SHA-256 of large ones, else git's SHA-1.
+    The hub's cache names each file after its digest: SHA-256 for large files, otherwise git's
+    SHA-1.
     """
     blob = file.resolve()
     content = hashlib.sha256 if len(blob.name) == 64 else hashlib.sha1
@@ -119,8 +121,4 @@ def _check_content(file: Path) -> None:
             digest.update(block)
     if len(blob.name) in (40, 64) and digest.hexdigest() != blob.name:
         blob.unlink()
-        raise ValueError(f'{file.name} is not the file that the hub named, by its digest')
-
-
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
+        raise ValueError(f'the digest of {file.name} differs from that on the hub')

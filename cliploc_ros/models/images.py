@@ -21,9 +21,9 @@ def check_image_rgb(image_rgb: NDArray[np.uint8]) -> None:
 
 def visible_boxes(bboxes_xyxy: NDArray[np.float64], width: int, height: int
                   ) -> NDArray[np.bool_]:
-    """Return which boxes (n, 4) can be cropped from an image, of left, top, right, bottom [px].
+    """Return a mask (n,): the boxes (n, 4) left, top, right, bottom [px] that can be cropped.
 
-    The others are not finite, are empty or inverted, or do not overlap the image.
+    The other boxes are not finite, empty or inverted, or do not overlap the image.
     """
     bboxes_xyxy = _as_boxes(bboxes_xyxy)
     left, top, right, bottom = bboxes_xyxy.T
@@ -35,10 +35,10 @@ def visible_boxes(bboxes_xyxy: NDArray[np.float64], width: int, height: int
 
 def crop_bounds(bboxes_xyxy: NDArray[np.float64], width: int, height: int
                 ) -> NDArray[np.int64]:
-    """Return the pixels (n, 4) that each box touches: left, top and, exclusive, right, bottom.
+    """Return the pixels (n, 4) that boxes touch: left, top, and right, bottom (exclusive).
 
-    They are clamped to the image; every crop holds at least one pixel. CliplocError: for a box
-    that `visible_boxes` would drop.
+    The bounds are clipped to the image. Each crop has at least one pixel. CliplocError: a box
+    cannot be cropped, see `visible_boxes`.
     """
     bboxes_xyxy = _as_boxes(bboxes_xyxy)
     hidden = np.flatnonzero(~visible_boxes(bboxes_xyxy, width, height))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Label embeddings on disk: with them CLIP starts without its text tower."""
+"""Cache of label embeddings, so that CLIP starts without its text tower."""
 
 import contextlib
 import hashlib
@@ -25,11 +25,11 @@ _FORMAT = 1
 _MOST_FILES = 32
 
 logger = logging.getLogger(__name__)
-#: The most labels that are encoded, cached and held at once: 134 MB of 512 numbers each.
+#: Greatest number of labels encoded, cached and held at once: 134 MB with 512 numbers each.
 PART = 65_536
-# Descriptions that are mixed at once.
+# Number of descriptions mixed at once.
 _BLOCK = 8_192
-# L labels, d numbers, t bytes that say which labels and encoder.
+# L labels, d numbers, t bytes that identify labels and encoder.
 _SCHEMA = Schema('file of label embeddings', {
     'identity': Field('uint8', ('t',)),
     'embeddings': Field('float32', ('L', 'd'), (Check('is not of unit length', lambda rows: ~(
@@ -41,11 +41,12 @@ class LabelCache:
     """A folder of label embeddings, one ``.npz`` for each model and set of labels.
 
     The name of a file is the hash of the encoder's key (model, activation, fingerprint of the
-    weights) and of the labels. The file holds both, which reveals a foreign or damaged one. One
-    file holds the whole set, not one label: embeddings then never depend on earlier batches, and
-    an edit of the map costs one cold start. Files are written under another name and renamed, so
-    that any number of processes may share the folder. A hit marks its file as used; beyond
-    ``most_files``, the least recently used ones are removed. The first write makes the folder.
+    weights) and of the labels. The file also contains both, to detect foreign and damaged files. A
+    file holds a whole set of labels, not a single label, so that embeddings never depend on
+    earlier batches; a changed map costs one slow start. Files are written under another name and
+    renamed, so that any number of processes can share the folder. Reading a file marks it as used.
+    Beyond ``most_files``, the least recently used files are removed. The first write makes the
+    folder.
     """
 
     def __init__(self, folder: Path, most_files: int = _MOST_FILES) -> None:
@@ -53,7 +54,7 @@ class LabelCache:
         self._most_files = most_files
 
     def load(self, key: str, labels: Sequence[str], embed_dim: int) -> NDArray[np.float32] | None:
-        """Return the embeddings (L, embed_dim) of L labels, or None if the cache lacks them."""
+        """Return the embeddings (L, embed_dim) of L labels; None if they are not in the cache."""
         file = self._file(key, labels)
         if not file.exists():
             return None
@@ -63,7 +64,7 @@ class LabelCache:
             return self._ignore(file, error)
         embeddings = arrays['embeddings']
         if bytes(arrays['identity']) != _identity(key, labels):
-            return self._ignore(file, 'it belongs to other weights or labels')
+            return self._ignore(file, 'it is for other weights or labels')
         if embeddings.shape != (len(labels), embed_dim):
             return self._ignore(file, 'its embeddings are not of the expected shape')
         with contextlib.suppress(OSError):  # a read-only cache works too
@@ -71,7 +72,7 @@ class LabelCache:
         return embeddings
 
     def store(self, key: str, labels: Sequence[str], embeddings: NDArray[np.float32]) -> None:
-        """Write the embeddings of labels; on failure only warn."""
+        """Write the embeddings of labels; a failure causes only a warning."""
         file = self._file(key, labels)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -102,22 +103,23 @@ def _identity(key: str, labels: Sequence[str]) -> bytes:
 def mixed_rows(descriptions: Sequence[WeightedLabels],
                encode: Callable[[Sequence[str]], NDArray[np.float32]], embed_dim: int
                ) -> NDArray[np.float32]:
-    """Return one embedding (R, embed_dim) for each description.
+    """Return the embeddings (R, embed_dim) of R descriptions.
 
-    It is the weighted mean of the embeddings of the labels, scaled to unit length. A single label
-    keeps its embedding. ``encode`` returns the embeddings (m, embed_dim) of m labels, unit rows.
-    It is called with sorted labels, at most PART at once.
+    The embedding of a description is the weighted mean of the embeddings of its labels, scaled to
+    unit length. That of a single label is unchanged. ``encode`` returns the embeddings (m,
+    embed_dim) of m labels, as unit rows. It is called with sorted labels, at most PART at once.
     """
     labels = sorted({label for description in descriptions for label, _ in description})
     # the share of each label in each description, a sparse matrix (R, U)
     columns = {label: column for column, label in enumerate(labels)}
     ends = np.cumsum([0, *map(len, descriptions)])
-    shares = np.array([weight for one in descriptions for _, weight in one], dtype=np.float32)
+    shares = np.array([weight for description in descriptions for _, weight in description],
+                      dtype=np.float32)
     owners = np.repeat(np.arange(len(descriptions)), np.diff(ends))
     shares /= np.bincount(owners, shares, len(descriptions)).astype(np.float32)[owners]
     weights = csr_matrix(
-        (shares, [columns[label] for one in descriptions for label, _ in one], ends),
-        shape=(len(descriptions), len(labels)))
+        (shares, [columns[label] for description in descriptions for label, _ in description],
+         ends), shape=(len(descriptions), len(labels)))
     rows = np.zeros((len(descriptions), embed_dim), dtype=np.float32)
     blocks = [slice(start, start + _BLOCK) for start in range(0, len(rows), _BLOCK)]
     for start in range(0, len(labels), PART):

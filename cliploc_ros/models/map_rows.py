@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What crops are compared with: the labels of a map, its images, or both."""
+"""Embeddings that crops are compared with: those of a map's labels, its images, or both."""
 
 import logging
 from collections.abc import Sequence
@@ -24,11 +24,12 @@ logger = logging.getLogger(__name__)
 
 def load_encoder_for_map(options: ClipOptions, landmark_map: LandmarkMap,
                          map_files: Sequence[str], compare: str) -> LoadedEncoder:
-    """Load CLIP and the embeddings that it compares crops with; errors as of load_encoder.
+    """Load CLIP and the embeddings that crops are compared with; errors as in load_encoder.
 
-    The file of each map has its image embeddings next to it; no files for none. ``compare`` is one
-    of COMPARED. Where one of the maps has no images of this encoder, labels alone are compared:
-    images and labels of different maps would not be rivals on equal terms.
+    ``map_files`` are the files of the maps, with image embeddings next to them; empty: no image
+    embeddings. ``compare`` is one of COMPARED. If a map has no image embeddings of this encoder,
+    only labels are compared, because similarities to images and to labels are not comparable
+    between maps.
     """
     loaded = load_encoder(options, landmark_map.weighted_labels)
     return loaded._replace(label_embeddings=_compared(
@@ -37,7 +38,7 @@ def load_encoder_for_map(options: ClipOptions, landmark_map: LandmarkMap,
 
 def embed_map(options: ClipOptions, landmark_map: LandmarkMap, map_files: Sequence[str],
               compare: str) -> LabelEmbeddings:
-    """Return the embeddings of another map for an encoder that stays, see load_encoder_for_map."""
+    """Return the embeddings of a map for an encoder already loaded; see load_encoder_for_map."""
     weights = resolve_clip_weights(options)
     return _compared(embed_labels(weights, options, landmark_map.weighted_labels), weights.key,
                      landmark_map, map_files, compare)
@@ -56,7 +57,7 @@ def _compared(labels: LabelEmbeddings, key: str, landmark_map: LandmarkMap,
 
 def _images_of_all(key: str, embed_dim: int, landmark_map: LandmarkMap, map_files: Sequence[str]
                    ) -> LandmarkEmbeddings | None:
-    """Return the image embeddings of all maps, if each has some of this encoder."""
+    """Return the image embeddings of all maps; None unless each map has some of this encoder."""
     parts = parts_of(landmark_map)
     if len(map_files) != len(parts):
         return None
@@ -66,8 +67,8 @@ def _images_of_all(key: str, embed_dim: int, landmark_map: LandmarkMap, map_file
     if len(known) < len(parts):
         if known:
             without = next(file for file, images in found.items() if images is None)
-            logger.warning('only labels are compared: %s has no images of this encoder, other '
-                           'maps have; build it again with its images', without)
+            logger.warning('only labels are compared: %s has no image embeddings of this encoder, '
+                           'unlike other maps; build it again with its images', without)
         return None
     for file, images in zip(map_files, known, strict=True):
         logger.info('%s: images of %d of %d landmarks', embeddings_path(file),
@@ -77,7 +78,7 @@ def _images_of_all(key: str, embed_dim: int, landmark_map: LandmarkMap, map_file
 
 def _images(key: str, embed_dim: int, landmark_map: LandmarkMap, map_file: str
             ) -> LandmarkEmbeddings | None:
-    """Return the image embeddings of a map, if there are some of this encoder."""
+    """Return the image embeddings of a map by this encoder; None if there are none."""
     try:
         images = load_embeddings_of_map(map_file, landmark_map.landmark_ids,
                                         landmark_map.map_set)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Make an observation of an image and its detections: compare crops with labels."""
+"""Make an observation from an image and its detections: compare crops with labels."""
 
 import time
 from collections import deque
@@ -17,26 +17,27 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.models.images import crop_bounds
 from cliploc_ros.models.protocols import ImageTextEncoder
 
-# A box is the same if no edge has moved by more [px].
+# A box is unchanged if no edge has moved by more [px].
 _MOVED_PX = 2.0
-# Side of the small picture of a crop [px]. Its cells average out the noise of the sensor.
+# Side of the thumbnail of a crop [px]. Its cells average out the noise of the sensor.
 _SIDE = 8
-# A crop is the same if its picture changed by less than this on average, and in its worst cell
-# [grey levels]. Guesses: the demo's images with noise of 3 levels stay below, those of an object
-# that is covered by a third do not.
+# A crop is unchanged if its thumbnail changed by less than this on average, and in its worst cell
+# [grey levels]. Images of the demo with noise of 3 levels stay below these limits; those of an
+# object a third of which is covered exceed them. Not measured on robots.
 _CHANGED, _CELL_CHANGED = 4.0, 32.0
-# A crop costs 3.5 KB with an embedding of 768 numbers.
+# Each crop takes 3.5 KB with an embedding of 768 numbers.
 _LIMIT = 256
-# A busy moment must not rule out CLIP for good: a time for which no crop fitted fades. A guess.
+# If no crop fits the time left, the estimated time of a crop decays by this factor, so that CLIP
+# is tried again after a moment of high load. Not measured.
 _FADING = 0.9
-# The next batch may take this much longer than the newest one. A guess.
+# The next batch may take this much longer than the newest one. Not measured.
 _SLOWER = 1.3
-# The most crops between two looks at the clock.
+# Greatest number of crops between two checks of the clock.
 _MOST_CROPS = 64
 
 
 class _Known(NamedTuple):
-    """A box (4,) [px], its small picture, and the embedding (d,) of its crop."""
+    """A box (4,) [px], its thumbnail, and the embedding (d,) of its crop."""
 
     bbox_xyxy: NDArray[np.float64]
     picture: NDArray[np.int16]
@@ -44,7 +45,7 @@ class _Known(NamedTuple):
 
 
 class CropMemory:
-    """The newest embeddings of one encoder, at most 256 of them."""
+    """The newest embeddings of an encoder, at most 256."""
 
     def __init__(self) -> None:
         self._known: deque[_Known] = deque(maxlen=_LIMIT)
@@ -55,15 +56,15 @@ class CropMemory:
 
     def recall(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
                ) -> dict[int, NDArray[np.float32]]:
-        """Return the embeddings of the boxes whose crops have not changed, by their rows.
+        """Return the embeddings of unchanged crops, by the rows of their boxes.
 
-        Each crop is compared with the embedded crop, so slow changes do not add up. Each box
-        (n, 4) overlaps the image (h, w, 3) uint8.
+        Each crop is compared with the crop that was embedded, so that slow changes are noticed.
+        Each box (n, 4) must overlap the image (h, w, 3) uint8.
         """
         if not self._known:
             return {}
         pictures = _pictures(image_rgb, bboxes_xyxy)
-        boxes = np.array([one.bbox_xyxy for one in self._known])
+        boxes = np.array([known.bbox_xyxy for known in self._known])
         found = {}
         for row, (bbox, picture) in enumerate(zip(bboxes_xyxy, pictures, strict=True)):
             near = np.nonzero(np.abs(boxes - bbox).max(axis=1) <= _MOVED_PX)[0]
@@ -76,14 +77,14 @@ class CropMemory:
 
     def keep(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64],
              embeddings: NDArray[np.float32]) -> None:
-        """Remember the embeddings (n, d) of boxes (n, 4); the oldest ones are dropped."""
+        """Store the embeddings (n, d) of boxes (n, 4); the oldest embeddings are dropped."""
         self._known.extend(map(_Known, bboxes_xyxy, _pictures(image_rgb, bboxes_xyxy),
                                embeddings))
 
 
 def _pictures(image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
               ) -> list[NDArray[np.int16]]:
-    """Return a small picture of each crop."""
+    """Return a thumbnail of each crop."""
     height, width = image_rgb.shape[:2]
     return [cv2.resize(image_rgb[top:bottom, left:right], (_SIDE, _SIDE),
                        interpolation=cv2.INTER_AREA).astype(np.int16)
@@ -111,7 +112,7 @@ class Observer:
         self._encode(np.zeros((32, 32, 3), dtype=np.uint8), np.array([[0.0, 0.0, 32.0, 32.0]]))
 
     def crops_within(self, left_s: float) -> int:
-        """Return how many crops there is time for [s], from the time of the newest batch."""
+        """Estimate the number of crops that fit a time [s], from the time of the newest batch."""
         if self._crop_s is None:
             return 1
         count = int(np.clip(left_s / max(_SLOWER * self._crop_s, 1e-6), 0, _MOST_CROPS))
@@ -121,7 +122,7 @@ class Observer:
 
     def observe(self, image_rgb: NDArray[np.uint8], camera: Camera, detections: Detections,
                 stamp_ns: int) -> Observation:
-        """Return an observation: each usable detection with its similarity to every label."""
+        """Make an observation: all detections with their similarities to all labels."""
         crops = self._encoder.encode_crops(image_rgb, detections.bboxes_xyxy)
         return Observation(camera, detections, CropSimilarities(crops, self._labels), stamp_ns)
 
@@ -129,7 +130,7 @@ class Observer:
               known: Mapping[int, NDArray[np.float32]] | None = None) -> 'ObservedCrops':
         """Return the crops of an image (h, w, 3) uint8 at boxes (n, 4) [px].
 
-        `known` has embeddings (d,) by their row; by default those of crops that have not changed
+        `known` has known embeddings (d,) by row; default: those of crops that have not changed
         since an earlier image.
         """
         return ObservedCrops(self, image_rgb, bboxes_xyxy, self._memory.recall(
@@ -137,7 +138,7 @@ class Observer:
 
     def encode(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
                ) -> NDArray[np.float32]:
-        """Return the embeddings (n, d) of crops, one at least, and remember them."""
+        """Encode and store the embeddings (n, d) of at least one crop."""
         embeddings = self._encode(image_rgb, bboxes_xyxy)
         self._memory.keep(image_rgb, bboxes_xyxy, embeddings)
         return embeddings
@@ -150,14 +151,14 @@ class Observer:
         return embeddings
 
     def similarities(self, embeddings: NDArray[np.float32]) -> CropSimilarities:
-        """Return the similarities of crops, given their embeddings (n, d), and the labels."""
+        """Return the similarities of crops, given by embeddings (n, d), to the labels."""
         return CropSimilarities(embeddings.reshape(-1, self._labels.shape[1]), self._labels)
 
 
 class ObservedCrops:
-    """The crops of one image, each encoded once at most, when it is compared.
+    """The crops of an image; a crop is encoded when it is compared for the first time.
 
-    ``known`` has embeddings (d,) of crops by their row.
+    ``known`` has known embeddings (d,) of crops by row.
     """
 
     def __init__(self, observer: Observer, image_rgb: NDArray[np.uint8],
@@ -172,7 +173,7 @@ class ObservedCrops:
         return np.array(sorted(self._known), dtype=np.int64)
 
     def compare(self, rows: NDArray[np.int64]) -> CropSimilarities:
-        """Return the similarities (m, L) of some crops (m,) and the labels."""
+        """Return the similarities (m, L) of crops, given by rows (m,), to the labels."""
         new = np.array([row for row in rows.tolist() if row not in self._known], dtype=np.int64)
         if len(new):
             self._known.update(zip(new.tolist(), self._observer.encode(

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The towers of a CLIP in ONNX files, with the tokenizer and the preparation of crops.
 
-What inputs and outputs mean is read from the files and from the configurations beside them.
+The meaning of inputs and outputs is read from the files and the configurations next to them.
 """
 
 import contextlib
@@ -31,13 +31,13 @@ from cliploc_ros.models.files import first_line
 from cliploc_ros.models.hub import find_network
 from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, read_config
 
-# Pillow's numbers of filters, which transformers writes.
+# Pillow's numbers of filters, as written by transformers.
 _FILTERS = {2: 'bilinear', 3: 'bicubic'}
-# Of a CLIP.
+# Defaults of CLIP's configuration.
 _DEFAULTS = {'max_position_embeddings': 77, 'vocab_size': 49_408}
-# Longest side of what a tower sees; the largest published towers take 1024 px.
+# Greatest side of an input; the largest published towers take 1024 px.
 _MOST_PX = 2048
-# A tokenizer uses nearly all of the tokens that its text tower knows.
+# Least size of a tokenizer's vocabulary, as a share of the text tower's.
 _LEAST_SHARE = 0.9
 _EMBEDDINGS = ('image_embeds', 'text_embeds', 'embedding')
 
@@ -45,7 +45,7 @@ _EMBEDDINGS = ('image_embeds', 'text_embeds', 'embedding')
 class OnnxTower:
     """An image tower in OpenVINO on a CPU, for batches of any size.
 
-    ModelError: the files hold no image tower of these weights.
+    ModelError: the files do not hold an image tower of these weights.
     """
 
     inference = 'openvino'
@@ -69,15 +69,15 @@ class OnnxTower:
 
 
 def read_preparation(folder: Path, fixed: Sequence[int]) -> dict[str, Any]:
-    """Return how crops are prepared, as `CropPreparation` takes it.
+    """Read the preparation of crops, in the format of `CropPreparation`.
 
     ``fixed`` has height and width of the network's input, ANY where they vary. ModelError: the
-    configuration is missing, incomplete, or of another network.
+    configuration is missing, incomplete, or from another network.
     """
     file = folder / PREPROCESSOR
-    if (folder / PREPROCESS).exists():  # open_clip's own
+    if (folder / PREPROCESS).exists():  # the format of open_clip
         file = folder / PREPROCESS
-    about = read_config(file, 'nothing else says how images are prepared')
+    about = read_config(file, 'it defines the preparation of images')
     size = about.get('size')
     squashes = not about.get('do_center_crop', isinstance(size, dict) and 'shortest_edge' in size)
     found = {'size': about.get('crop_size') if not squashes else size,
@@ -98,45 +98,45 @@ def read_preparation(folder: Path, fixed: Sequence[int]) -> dict[str, Any]:
                 and np.isfinite(std).all() and (std > 0.0).all()):
             raise ValueError('a number is out of range')
     except (LookupError, ValueError, TypeError, OverflowError) as error:
-        raise ModelError(f'{file} does not say how images are prepared: it needs their size, at '
-                         f'most {_MOST_PX} x {_MOST_PX}, and a mean and a standard deviation of '
-                         'three numbers') from error
+        raise ModelError(f'{file} does not define the preparation of images: expected a size up '
+                         f'to {_MOST_PX} x {_MOST_PX}, and a mean and a standard deviation of '
+                         'three numbers each') from error
     if (height, width) != tuple(want if want != ANY else has for want, has in
                                 zip(fixed, (height, width), strict=True)):
-        raise ModelError(f'{file} says that images have {height} x {width} pixels, the network '
-                         f'takes {fixed[0]} x {fixed[1]}: they are not of the same CLIP')
+        raise ModelError(f'{file} has an image size of {height} x {width}, but the network takes '
+                         f'{fixed[0]} x {fixed[1]}: they are not from the same CLIP')
     return found | {'size': (height, width), 'mean': mean.tolist(), 'std': std.tolist()}
 
 
 class OnnxTextTower:
     """A text tower with its tokenizer, in OpenVINO on a CPU.
 
-    ModelError: the files hold no text tower of these weights.
+    ModelError: the files do not hold a text tower of these weights.
     """
 
     def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
         network = OnnxNetwork(find_network(weights.file, '', TEXT_TOWERS), options.cache_dir)
         self._network, self._weights = network, weights
-        masks = [each for each in network.inputs if 'mask' in each.name]
-        texts = [each for each in network.inputs if 'mask' not in each.name]
+        masks = [port for port in network.inputs if 'mask' in port.name]
+        texts = [port for port in network.inputs if 'mask' not in port.name]
         if len(texts) != 1 or len(masks) > 1 or any(
-                len(each.shape) != 2 or each.type not in (np.int32, np.int64)
-                or each.shape[1] in (0, 1, 2) for each in network.inputs):
+                len(port.shape) != 2 or port.type not in (np.int32, np.int64)
+                or port.shape[1] in (0, 1, 2) for port in network.inputs):
             raise ModelError(f'{network.file} takes no tokens: its inputs are '
                              f'{network.described_inputs()}, expected (texts, tokens)')
         self._text, self._masks = texts[0], masks
-        #: The most tokens of a label
+        #: Greatest number of tokens of a label
         self.context = (self._text.shape[1] if self._text.shape[1] != ANY
                         else _of_text(weights.file, 'max_position_embeddings', 'context_length'))
         self._tokenizer, self._padding = _read_tokenizer(weights.file)
 
     def count(self, label: str) -> int:
-        """Return the number of tokens of a label, with start and end."""
+        """Return the number of tokens of a label, including start and end."""
         self._tokenizer.no_truncation()
         return len(self._tokenizer.encode(clean(label)).ids)
 
     def tokens(self, labels: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the tokens (L, context) of labels, and a mask that is 0 behind their ends."""
+        """Return the tokens (L, context) of labels, and a mask that is 0 for padding."""
         self._tokenizer.enable_truncation(self.context)
         found = np.full((len(labels), self.context), self._padding, dtype=np.int64)
         mask = np.zeros_like(found)
@@ -145,7 +145,7 @@ class OnnxTextTower:
         return found, mask
 
     def __call__(self, labels: Sequence[str], batch: int) -> NDArray[np.float32]:
-        """Return the features (L, d) of labels, some of them at once."""
+        """Return the features (L, d) of labels, encoded in batches."""
         at_once = batch if self._text.shape[0] == ANY else 1
         tokens, mask = self.tokens(labels)
         found = []
@@ -153,13 +153,13 @@ class OnnxTextTower:
             rows = slice(start, start + at_once)
             outputs = self._network(
                 **{self._text.name: tokens[rows].astype(self._text.type)},
-                **{each.name: mask[rows].astype(each.type) for each in self._masks})
+                **{port.name: mask[rows].astype(port.type) for port in self._masks})
             found.append(outputs[_embedding(self._network, outputs, self._weights)])
         return np.concatenate(found)
 
 
 def clean(label: str) -> str:
-    """Return a label as CLIP was trained with it: HTML, wide letters and the like are mended."""
+    """Clean a label as in CLIP's training: repair HTML entities, full-width letters and others."""
     import ftfy
 
     return ' '.join(html.unescape(html.unescape(ftfy.fix_text(label))).split())
@@ -167,55 +167,55 @@ def clean(label: str) -> str:
 
 def _embedding(network: OnnxNetwork, outputs: dict[str, NDArray[np.float32]],
                weights: ClipWeights) -> str:
-    """Return the name of the output that has one embedding a row."""
+    """Return the name of the output with embeddings (n, d)."""
     flat = [name for name, output in outputs.items() if output.ndim == 2]
     names = [name for name in flat if name in _EMBEDDINGS] or flat
     if len(names) != 1 or outputs[names[0]].shape[1] != weights.embed_dim:
         shapes = {name: output.shape for name, output in outputs.items()}
-        raise ModelError(f'{network.file} gives {shapes}, expected one output (n, '
-                         f'{weights.embed_dim}), as {CONFIG} says: export a tower with its '
-                         'projection')
+        raise ModelError(f'{network.file} has the outputs {shapes}, expected one output (n, '
+                         f'{weights.embed_dim}) by {CONFIG}: export a tower with its projection')
     return names[0]
 
 
 def _of_text(folder: Path, *names: str) -> int:
-    """Return a size of the text tower, by the names that transformers and open_clip have for it.
+    """Read a size of the text tower, by its names in transformers and open_clip.
 
-    ModelError: the configuration does not say it.
+    ModelError: the configuration does not have it.
     """
     config = read_config(folder / CONFIG, 'it has the sizes of the text tower')
     text: dict[str, Any] = next((config[name] for name in ('text_config', 'text_cfg')
                                  if isinstance(config.get(name), dict)), {})
     size = next((text[name] for name in names if name in text), None)
     if size is None and (config.get('model_type') == 'clip' or 'text_cfg' in config):
-        size = _DEFAULTS[names[0]]  # what equals the default is not written
+        size = _DEFAULTS[names[0]]  # values equal to the default are omitted
     if not isinstance(size, int) or not 2 < size < 2**24:
-        raise ModelError(f"{folder / CONFIG} does not say '{names[0]}' of its text tower: add it")
+        raise ModelError(f"{folder / CONFIG} lacks '{names[0]}' of the text tower: add it")
     return size
 
 
 def _read_tokenizer(folder: Path) -> tuple[Any, int]:
-    """Return the tokenizer of a folder, and the token that fills the end of a text."""
+    """Read the tokenizer of a folder, and the token used for padding."""
     try:
         import ftfy  # noqa: F401
         import tokenizers
     except ModuleNotFoundError as error:
-        raise ModelError(f"{error.name} is not installed, and labels need it: pip install "
+        raise ModelError(f"{error.name} is not installed, but labels need it: pip install "
                          f"{error.name}, or the extra 'runtime'") from error
     files = [file for file in (folder / TOKENIZER, folder / 'textual' / TOKENIZER)
              if file.exists()]
     if not files:
-        raise ModelError(f'{folder / TOKENIZER} is missing, and it splits labels into tokens: put '
-                         'the one of the published network there')
+        raise ModelError(f'{folder / TOKENIZER} is missing; it splits labels into tokens: put the '
+                         'file of the published network there')
     try:
         tokenizer = tokenizers.Tokenizer.from_str(read_file(files[0]).decode())
         if len(tokenizer.encode('a cup').ids) < 3:
-            raise ValueError('it marks no end of a text')
+            raise ValueError('it does not mark the end of a text')
         known, size = _of_text(folder, 'vocab_size'), tokenizer.get_vocab_size()
         if not _LEAST_SHARE * known <= size <= known:
-            raise ValueError(f'it has {size} tokens, the text tower {known}')
-    except Exception as error:  # the library has no exceptions of its own
-        raise ModelError(f'{files[0]} is no tokenizer of a CLIP: {first_line(error)}') from error
+            raise ValueError(f'it has {size} tokens, but the text tower has {known}')
+    except Exception as error:  # the library has no exception classes
+        raise ModelError(f'{files[0]} is not a tokenizer of a CLIP: {first_line(error)}'
+                         ) from error
     padding = 0
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
         stored = parse_json(read_file(files[0]))['padding']

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A detector in an ONNX file: exports of YOLO, and of D-FINE, RT-DETR, DETR and their kin.
+"""Detectors in ONNX files: exports of YOLO, and of D-FINE, RT-DETR, DETR and similar networks.
 
-What the outputs mean is read from the file's metadata and from the configuration beside it.
+The meaning of the outputs is read from the metadata of the file and the configuration next to it.
 """
 
 import ast
@@ -24,40 +24,40 @@ from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_boxes import Letterbox, select_boxes, without_doubles
 
 _CONFIG, _PREPROCESSOR = 'config.json', 'preprocessor_config.json'
-#: The files of a published detector, the ONNX file by preference.
+#: The files of a published detector; of the networks, the first that exists is used.
 NETWORKS = ('model.onnx', 'onnx/model.onnx')
 BESIDE = (_CONFIG, _PREPROCESSOR)
 _LOGITS, _BOXES = 'logits', 'pred_boxes'
-# Of YOLO, where neither the file nor the options say.
+# Default stride of YOLO, for files without one.
 _STRIDE = 32
 
 
 class _Head(Protocol):
-    """What stands before and after a network."""
+    """Pre- and postprocessing of a network."""
 
-    names: dict[int, str]  #: Class number to name
-    has_doubles: bool  #: Whether several boxes of a class may be of one object
+    names: dict[int, str]  #: Class names by index
+    has_doubles: bool  #: Whether an object may have several boxes of a class
 
     def find(self, image_rgb: NDArray[np.uint8], options: DetectorOptions) -> NDArray[np.float32]:
         """Return the boxes (n, 6) in an image: left, top, right, bottom, score, class.
 
-        The most confident is the first.
+        The most confident box is first.
         """
 
 
 class OnnxDetector:
-    """An `ObjectDetector` of an ONNX file, in OpenVINO on a CPU.
+    """An `ObjectDetector` in an ONNX file, run by OpenVINO on a CPU.
 
-    ModelError: files are missing, damaged, or hold no detector; the message names what is missing.
-    OptionsError: the options ask for a GPU, for PyTorch or for prompts.
+    ModelError: a file is missing or damaged, or is not a detector; the message names it.
+    OptionsError: the options request a GPU, PyTorch or prompts.
     """
 
     device, inference = 'cpu', 'openvino'
 
     def __init__(self, options: DetectorOptions) -> None:
         if options.prompts:
-            raise OptionsError(f'{options.model}: its classes are fixed: a vocabulary needs the '
-                               '.pt file of a YOLO-World or YOLOE')
+            raise OptionsError(f'{options.model} has fixed classes: a vocabulary needs the .pt '
+                               'file of a YOLO-World or YOLOE')
         if (options.inference == 'pytorch' or options.precision == 'fp16'
                 or (options.device != 'auto' and resolve_device(options.device) != 'cpu')):
             raise OptionsError(f"{options.model} runs in OpenVINO: set device to 'cpu', precision "
@@ -66,14 +66,14 @@ class OnnxDetector:
         network = OnnxNetwork(file, options.cache_dir)
         self._head: _Head = (DetrHead if {_LOGITS, _BOXES} <= set(network.outputs)
                              else YoloHead)(network)
-        #: All classes that the network knows
+        #: All classes of the network
         self.class_names = tuple(dict.fromkeys(self._head.names.values()))
         self.configure(options)
-        # It sets up kernels before the first image, and shows whether the outputs are as expected.
+        # Sets up kernels before the first image, and tests whether the outputs are as expected.
         try:
             self.detect(np.zeros((64, 64, 3), dtype=np.uint8))
-        except RuntimeError as error:  # OpenVINO has no exceptions of its own
-            raise ModelError(f'OpenVINO does not run {file}: {first_line(error)}; export the '
+        except RuntimeError as error:  # OpenVINO has no exception classes
+            raise ModelError(f'OpenVINO cannot run {file}: {first_line(error)}; export the '
                              'network again') from error
 
     def configure(self, options: DetectorOptions) -> None:
@@ -83,10 +83,10 @@ class OnnxDetector:
     def detect(self, image_rgb: NDArray[np.uint8]) -> Detections:
         """Return the objects in an image (h, w, 3) uint8, the most confident first.
 
-        Several boxes of a class on one object, as weak queries or two texts of a class give them,
-        are one: see ``iou``.
+        Weak queries, and several texts of a class, give duplicate boxes of an object. They are
+        removed, see ``iou``.
 
-        ImageError: for an image of another shape or type, or without pixels.
+        ImageError: the image has another shape or type, or no pixels.
         """
         check_image_rgb(image_rgb)
         names = self._head.names
@@ -102,7 +102,7 @@ class OnnxDetector:
 
 
 def _resolve(options: DetectorOptions) -> Path:
-    """Return the ONNX file that the options name; download it if it is not here yet."""
+    """Return the ONNX file named by the options; download it if necessary."""
     path = Path(options.model).expanduser().absolute()
     if path.suffix == '.onnx' or path.is_file():
         return path
@@ -111,9 +111,9 @@ def _resolve(options: DetectorOptions) -> Path:
 
 
 class YoloHead:
-    """An export of ultralytics: a letterbox before it, and doubles dropped after it.
+    """An export of ultralytics, with a letterbox before it and removal of duplicates after it.
 
-    Its metadata have the class names; files of others have them in ``config.json``.
+    Class names are in its metadata, or in ``config.json`` for files of other programs.
     """
 
     def __init__(self, network: OnnxNetwork) -> None:
@@ -121,10 +121,10 @@ class YoloHead:
         about = network.metadata
         task = about.get('task', 'detect')
         if task not in ('detect', 'segment'):  # YOLOE is published with a head for masks
-            raise ModelError(f"{network.file} is a YOLO model for the task '{task}': one for "
-                             "'detect' is needed")
+            raise ModelError(f"{network.file} is a YOLO model for the task '{task}': give a model "
+                             "for 'detect'")
         self.names = _names(network)
-        # two texts of a class
+        # several texts of a class
         self.has_doubles = len(set(self.names.values())) < len(self.names)
         self._stride = int(about['stride']) if about.get('stride', '').isdecimal() else _STRIDE
         height, width = self._input.shape[2:]
@@ -133,20 +133,20 @@ class YoloHead:
             self._size or (2 * self._stride,) * 2)))))
 
     def _run(self, pixels: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return the output, boxes with scores, for an input with values 0 to 1."""
+        """Return the output, boxes with scores, for an input with values in 0 to 1."""
         outputs = self._network(**{self._input.name: pixels.astype(self._input.type)})
         boxes = [output for output in outputs.values() if output.ndim == 3 and len(output) == 1]
         if len(boxes) != 1:
             raise ModelError(
-                f'{self._network.file} is no detector: its outputs are '
-                f'{ {name: one.shape for name, one in outputs.items()} }, expected one of shape '
-                f"(1, boxes, classes) or '{_LOGITS}' and '{_BOXES}'")
+                f'{self._network.file} is not a detector: its outputs are '
+                f'{ {name: output.shape for name, output in outputs.items()} }, expected one of '
+                f"shape (1, boxes, classes), or '{_LOGITS}' and '{_BOXES}'")
         return boxes[0][0]
 
     def _layout_of(self, output: NDArray[np.float32]) -> str:
-        """Return what an output holds, by its shape: see ``find``."""
+        """Return the layout of an output by its shape; see ``find``."""
         count, file = len(self.names), self._network.file
-        # YOLOv5's own program writes no task, and a column for the confidence in any object
+        # the export of YOLOv5 has no task, but a column for the confidence in any object
         if 'task' not in self._network.metadata and output.shape[1] == 5 + count:
             return 'objectness'
         if output.shape[1] == 6 and output.shape[0] != 4 + count:
@@ -159,7 +159,7 @@ class YoloHead:
                 return 'selected'
             if output.shape[0] > 4 + count:
                 return 'classes'
-        raise ModelError(f'{file} is no detector of {count} classes: its output has the shape '
+        raise ModelError(f'{file} is not a detector of {count} classes: its output has the shape '
                          f'{output.shape}, expected ({4 + count}, boxes) or (boxes, 6)')
 
     def find(self, image_rgb: NDArray[np.uint8], options: DetectorOptions) -> NDArray[np.float32]:
@@ -179,29 +179,29 @@ class YoloHead:
 
 
 class DetrHead:
-    """A network of DETR's kind: queries with logits and boxes, as transformers exports them.
+    """A network like DETR, with logits and boxes of queries, as exported by transformers.
 
-    ``config.json`` has the class names, ``preprocessor_config.json`` how images are prepared.
+    ``config.json`` has the class names, ``preprocessor_config.json`` the preparation of images.
     """
 
-    has_doubles = True  # of weak queries
+    has_doubles = True  # from weak queries
 
     def __init__(self, network: OnnxNetwork) -> None:
         self._network, self._input = network, network.image_input()
         self.names = _names(network)
         file = _beside(network.file, _PREPROCESSOR)
-        about = read_config(file, 'nothing else says how images are prepared')
+        about = read_config(file, 'it defines the preparation of images')
         size = about.get('size')
         fixed = self._input.shape[2:]
         if not isinstance(size, dict) or not ({'height', 'width'} <= size.keys()
                                               or 'shortest_edge' in size):
-            raise ModelError(f"{file}: the field 'size' names neither height and width nor "
+            raise ModelError(f"{file}: the field 'size' has neither height and width nor "
                              f'shortest_edge: {size}')
         if ANY not in fixed:
             if 'height' in size and (size['height'], size['width']) != fixed:
-                raise ModelError(f'{file} says that images are {size["height"]} x '
-                                 f'{size["width"]}, {network.file} takes {fixed[0]} x {fixed[1]}: '
-                                 'they are not of the same network')
+                raise ModelError(f'{file} has an image size of {size["height"]} x '
+                                 f'{size["width"]}, but {network.file} takes {fixed[0]} x '
+                                 f'{fixed[1]}: they are not from the same network')
             size = {'height': fixed[0], 'width': fixed[1]}
         self._size: dict[str, int] = size
         self._scale = np.float32(about.get('rescale_factor', 1 / 255)
@@ -219,8 +219,8 @@ class DetrHead:
         #: Whether the last logit of a query means 'no object'
         self._has_nothing = probe.shape[-1] == len(self.names) + 1
         if probe.shape[-1] not in (len(self.names), len(self.names) + 1):
-            raise ModelError(f'{network.file} has {probe.shape[-1]} classes, {_CONFIG} names '
-                             f'{len(self.names)}: they are not of the same network')
+            raise ModelError(f'{network.file} has {probe.shape[-1]} classes, but {_CONFIG} has '
+                             f'{len(self.names)}: they are not from the same network')
 
     def _run(self, image_rgb: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
         """Return logits (q, c) and boxes (q, 4) for an image (h, w, 3)."""
@@ -231,19 +231,19 @@ class DetrHead:
             scale = min(self._size['shortest_edge'] / min(height, width),
                         self._size.get('longest_edge', np.inf) / max(height, width))
             size = max(1, round(width * scale)), max(1, round(height * scale))
-        # OpenCV's bilinear filter skips pixels where an image shrinks, Pillow's does not
+        # OpenCV's bilinear filter skips pixels when scaling down, Pillow's does not
         scaled = np.asarray(Image.fromarray(image_rgb).resize(size, self._resample))
         pixels = (scaled * self._scale - self._mean) / self._deviation
         given: dict[str, NDArray[Any]] = {self._input.name: np.ascontiguousarray(
             pixels.transpose(2, 0, 1)[None], dtype=self._input.type)}
-        for one in self._network.inputs:
-            if one.name == 'pixel_mask':  # which pixels are no padding
-                shape = [size[1] if side == ANY else side for side in one.shape[1:]]
-                if one.shape[1:] == (ANY, ANY):
+        for port in self._network.inputs:
+            if port.name == 'pixel_mask':  # 1 for pixels of the image, 0 for padding
+                shape = [size[1] if side == ANY else side for side in port.shape[1:]]
+                if port.shape[1:] == (ANY, ANY):
                     shape = [size[1], size[0]]
-                given[one.name] = np.ones((1, *shape), dtype=one.type or np.int64)
-            elif one.name != self._input.name:
-                raise ModelError(f"{self._network.file} has the input '{one.name}', which is "
+                given[port.name] = np.ones((1, *shape), dtype=port.type or np.int64)
+            elif port.name != self._input.name:
+                raise ModelError(f"{self._network.file} has the input '{port.name}', which is "
                                  'unknown: export it with images as its only input')
         outputs = self._network(**given)
         return {name: outputs[name][0] for name in (_LOGITS, _BOXES)}
@@ -258,7 +258,7 @@ class DetrHead:
             scores = (shares / shares.sum(axis=1, keepdims=True))[:, :-1]
             queries, classes = np.arange(len(scores)), scores.argmax(axis=1)
         else:
-            # The library keeps the best pairs of query and class, one for each query on average.
+            # As in transformers: keep the best pairs of query and class, as many as queries.
             scores = 1.0 / (1.0 + np.exp(-logits))
             best = np.argsort(-scores, axis=None, kind='stable')[:len(scores)]
             queries, classes = np.unravel_index(best, scores.shape)
@@ -273,14 +273,14 @@ class DetrHead:
 
 
 def _beside(file: Path, name: str) -> Path:
-    """Return a file beside a network, or above the folder ``onnx`` that it is published in."""
+    """Return a file next to a network, or above the folder ``onnx`` of a published network."""
     above = file.parent.parent / name
     is_above = file.parent.name == 'onnx' and not (file.parent / name).exists() and above.exists()
     return above if is_above else file.parent / name
 
 
 def _names(network: OnnxNetwork) -> dict[int, str]:
-    """Return the names of the classes by their number: of the metadata, or of config.json."""
+    """Read the class names by index, from the metadata or from config.json."""
     where, found = f'{network.file}', None
     if text := network.metadata.get('names'):
         try:
@@ -291,10 +291,10 @@ def _names(network: OnnxNetwork) -> dict[int, str]:
     else:
         file = _beside(network.file, _CONFIG)
         where = f"{file}: the field 'id2label'"
-        found = read_config(file, f'{network.file} holds no class names').get('id2label')
+        found = read_config(file, f'{network.file} has no class names').get('id2label')
     if isinstance(found, list):
         found = dict(enumerate(found))
     if not isinstance(found, dict) or sorted(map(str, found)) != sorted(
             map(str, range(len(found)))) or not found:
-        raise ModelError(f'{where} must have the class names with the keys 0, 1 ...')
+        raise ModelError(f'{where} must have class names with the keys 0, 1 ...')
     return {int(number): str(name) for number, name in found.items()}

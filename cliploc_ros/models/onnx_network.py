@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Networks in ONNX files, run by OpenVINO on a CPU; compiled once and kept on disk."""
+"""Networks in ONNX files, run by OpenVINO on a CPU; compiled once and cached on disk."""
 
 import contextlib
 import glob
@@ -29,12 +29,12 @@ from cliploc_ros.models.files import (
 
 # A compiled network is as large as its file: ViT-L-14 takes 1.2 GB, YOLOv8x .3 GB.
 _MOST_NETWORKS = 8
-# Of the folder that holds a compiled network.
+# Version of the folder of a compiled network; a change makes new folders.
 _FORMAT = 1
 _BLOB, _ABOUT = 'network.blob', 'about.json'
 _FLOATS: dict[str, type[np.number[Any]]] = {'f32': np.float32, 'f16': np.float16}
 _INTEGERS: dict[str, type[np.number[Any]]] = {'i64': np.int64, 'i32': np.int32}
-#: A size of an input that varies.
+#: Marks a variable size of an input.
 ANY = -1
 
 logger = logging.getLogger(__name__)
@@ -44,12 +44,12 @@ class Input(NamedTuple):
     """An input of a network."""
 
     name: str
-    shape: tuple[int, ...]  #: ANY where a size varies
-    type: type[np.number[Any]] | None  #: None for one that no image or text can be fed as
+    shape: tuple[int, ...]  #: ANY where a size is variable
+    type: type[np.number[Any]] | None  #: None for types that hold neither images nor tokens
 
 
 class CompiledNetwork:
-    """A network that OpenVINO compiled; it runs one input at a time."""
+    """A network compiled by OpenVINO; it runs one request at a time."""
 
     def __init__(self, compiled: Any) -> None:
         self._compiled = compiled
@@ -62,25 +62,26 @@ class CompiledNetwork:
             network, 'CPU', _settings(precision)))
 
     def __call__(self, inputs: Any) -> list[NDArray[np.float32]]:
-        """Return the outputs for some inputs, an array or a dictionary by names."""
+        """Run the network on inputs, an array or a dictionary by name; return its outputs."""
         with self._lock:
             return [np.array(output, dtype=np.float32)
                     for output in self._compiled(inputs).values()]
 
 
 class OnnxNetwork:
-    """A network of an ONNX file: inputs by their names in, outputs by their names out.
+    """A network in an ONNX file, with inputs and outputs by name.
 
-    Compiling takes seconds, so the compiled network is kept in the folder ``openvino`` of the
-    cache, by the content of the file, the processor and OpenVINO's version. OpenVINO runs a
-    damaged one without an error (measured: boxes off by 20 px), so its SHA-256 is kept, too.
+    Compiling takes seconds. The compiled network is therefore kept in the folder ``openvino`` of
+    the cache, keyed by the content of the file, the processor and the version of OpenVINO.
+    OpenVINO runs a damaged network without an error (measured: boxes off by 20 px), so its SHA-256
+    is stored and checked.
 
-    ModelError: the file is missing, damaged, or holds operations that OpenVINO does not know.
+    ModelError: the file is missing, damaged, or holds operations that OpenVINO does not support.
 
     Parameters
     ----------
     precision : str or None
-        'f32', or None for the processor's own choice: bf16 where it multiplies matrices in it.
+        'f32', or None for the default of the processor: bf16 if it supports that for matrices.
     """
 
     def __init__(self, file: Path, cache_dir: str, precision: str | None = 'f32') -> None:
@@ -94,7 +95,7 @@ class OnnxNetwork:
             compiled, self.metadata = _stored(folder, precision)
         except FileNotFoundError:
             compiled, self.metadata = _compile(file, folder, precision)
-        except Exception as error:  # OpenVINO has no exceptions of its own
+        except Exception as error:  # OpenVINO has no exception classes
             logger.warning('%s cannot be used (%s): compiling %s again', folder,
                            first_line(error), file.name)
             compiled, self.metadata = _compile(file, folder, precision)
@@ -103,47 +104,47 @@ class OnnxNetwork:
         self.outputs = tuple(_name_of(port) for port in compiled.outputs)
 
     def __call__(self, **inputs: NDArray[Any]) -> dict[str, NDArray[np.float32]]:
-        """Return the outputs for some inputs; both by name."""
+        """Run the network on inputs by name; return its outputs by name."""
         return dict(zip(self.outputs, self._network(inputs), strict=True))
 
     def image_input(self) -> Input:
         """Return the input that takes images (n, 3, h, w); ModelError: there is none."""
-        images = [each for each in self.inputs if len(each.shape) == 4]
+        images = [port for port in self.inputs if len(port.shape) == 4]
         if len(images) != 1 or images[0].shape[0] not in (1, ANY) or (
                 images[0].shape[1] not in (3, ANY)):
             raise ModelError(f'{self.file} takes no single colour image: its inputs are '
                              f'{self.described_inputs()}, expected (1, 3, height, width)')
         if images[0].type not in _FLOATS.values():
-            raise ModelError(f'{self.file} takes images that are no floating-point numbers '
-                             f'({self.described_inputs()}), and nothing says how they are scaled: '
-                             'export it with inputs in fp32')
+            raise ModelError(f'{self.file} takes images that are not floating-point numbers '
+                             f'({self.described_inputs()}), so their scale is unknown: export it '
+                             'with inputs in fp32')
         return images[0]
 
     def described_inputs(self) -> str:
         """Return names and shapes of the inputs for a message."""
-        return ', '.join(f"'{each.name}' {each.shape}" for each in self.inputs)
+        return ', '.join(f"'{port.name}' {port.shape}" for port in self.inputs)
 
 
 def read_config(file: Path, purpose: str) -> dict[str, Any]:
-    """Return the JSON object of a file beside a network; ModelError: it is missing or damaged.
+    """Read the JSON object of a file next to a network; ModelError: it is missing or damaged.
 
-    The error says what it is needed for.
+    The error states the purpose of the file.
     """
     try:
         found = parse_json(read_file(file))
     except FileNotFoundError:
-        raise ModelError(f'{file} is missing, and {purpose}: put the one of the published '
-                         'network there') from None
+        raise ModelError(f'{file} is missing; {purpose}: put the file of the published network '
+                         'there') from None
     except (OSError, ValueError, RecursionError) as error:
         raise ModelError(f'{file} cannot be read: {first_line(error)}') from error
     if not isinstance(found, dict):
-        raise ModelError(f'{file} is no JSON object: download it again')
+        raise ModelError(f'{file} is not a JSON object: download it again')
     return found
 
 
 def _settings(precision: str | None) -> dict[str, Any]:
-    # A pinned thread waits for other processes on its core. The number of threads is that of
-    # PyTorch, whose limits apply here, too.
+    # No pinning: a pinned thread waits for other processes on its core. The number of threads is
+    # that of PyTorch, so that PyTorch's limits apply here too.
     settings: dict[str, Any] = {
         'PERFORMANCE_HINT': 'LATENCY', 'NUM_STREAMS': 1, 'ENABLE_CPU_PINNING': False,
         'INFERENCE_NUM_THREADS': count_threads()}
@@ -153,9 +154,9 @@ def _settings(precision: str | None) -> dict[str, Any]:
 # ---- compiled networks on disk ------------------------------------------------------------------
 
 def _folder(file: Path, cache_dir: str, precision: str | None) -> Path:
-    """Return the folder of a compiled network, by all that it depends on."""
+    """Return the folder of a compiled network, named by a hash of all that it depends on."""
     openvino = import_openvino()
-    # with the file of weights that a large network has beside it
+    # including the file of weights next to a large network
     files = sorted(file.parent.glob(f'{glob.escape(file.name)}*'))
     depends = [_FORMAT, *map(fingerprint_file, files), precision, openvino.get_version(),
                openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME')]
@@ -164,13 +165,13 @@ def _folder(file: Path, cache_dir: str, precision: str | None) -> Path:
 
 
 def _stored(folder: Path, precision: str | None) -> tuple[Any, dict[str, str]]:
-    """Return a compiled network and its metadata.
+    """Load a compiled network and its metadata.
 
     FileNotFoundError: there is none. ValueError and others: it is damaged.
     """
     about = parse_json(read_file(folder / _ABOUT))
     openvino = import_openvino()
-    # A copy of the file: OpenVINO reads it later, too, and a mapped file may be cut short.
+    # Tensor copies the mapped file: OpenVINO also reads it later, when it may be truncated.
     blob = openvino.Tensor(np.memmap(folder / _BLOB, dtype=np.uint8, mode='r'))
     if hashlib.sha256(blob.data).hexdigest() != about['sha256']:
         raise ValueError(f'{_BLOB} is damaged')
@@ -181,11 +182,11 @@ def _stored(folder: Path, precision: str | None) -> tuple[Any, dict[str, str]]:
 
 
 def _compile(file: Path, folder: Path, precision: str | None) -> tuple[Any, dict[str, str]]:
-    """Compile a network and keep it; return it with the metadata of its file."""
+    """Compile and cache a network; return it with the metadata of its file."""
     core = import_openvino().Core()
     try:
         network = core.read_model(file)
-    except Exception as error:  # OpenVINO has no exceptions of its own
+    except Exception as error:  # OpenVINO has no exception classes
         raise _unreadable(file, str(error)) from error
     about = network.get_rt_info()
     metadata: dict[str, str] = {
@@ -194,14 +195,14 @@ def _compile(file: Path, folder: Path, precision: str | None) -> tuple[Any, dict
     try:
         compiled = core.compile_model(network, 'CPU', _settings(precision))
     except Exception as error:
-        raise ModelError(f'OpenVINO does not run {file}: {first_line(error)}; export the network '
+        raise ModelError(f'OpenVINO cannot run {file}: {first_line(error)}; export the network '
                          'again, without quantization') from error
     del network
     try:
         keep_folder(folder, _MOST_NETWORKS, partial(_write, compiled, metadata))
-        # Read again: then the weights are in memory once, and the file is known to be sound.
+        # Loaded from the file, so that the weights are in memory once, and the file is checked.
         compiled, _ = _stored(folder, precision)
-    except Exception as error:  # OpenVINO reports a full disk as it reports a bad network
+    except Exception as error:  # OpenVINO's errors for a full disk and a bad network are the same
         warn_not_kept('the compiled network is not cached and the next start is slow again: '
                       f'cannot write {folder} ({first_line(error)}); make room, or choose a '
                       'writable cache_dir')
@@ -226,10 +227,10 @@ def _unreadable(file: Path, reason: str) -> ModelError:
         return damaged(file, 'its graph ends too early')
     if 'externally stored data' in reason:
         name = reason.partition('(')[2].partition(',')[0]
-        return ModelError(f'the weights of {file} are in a file of their own, {name}, which is '
-                          'missing: put it beside the network')
+        return ModelError(f'the weights of {file} are in a separate file, {name}, which is '
+                          'missing: put it next to the network')
     lines = [line.strip() for line in reason.splitlines() if line.strip()]
-    return ModelError(f'OpenVINO does not read {file}: {" ".join(lines[-2:])[:300]}; update '
+    return ModelError(f'OpenVINO cannot read {file}: {" ".join(lines[-2:])[:300]}; update '
                       'OpenVINO, or export the network with an opset of 11 to 21')
 
 

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Detectors that find what a text names: YOLO-World and YOLOE of ultralytics.
+"""Open-vocabulary detectors: YOLO-World and YOLOE of ultralytics.
 
-Such a network takes embeddings of texts from the text tower that it was trained with: YOLO-World
-from OpenAI's CLIP ViT-B-32, YOLOE from MobileCLIP. Embeddings are kept in the cache, so that a
-start with the same texts needs no tower.
+These networks take embeddings of texts from the text tower that they were trained with: YOLO-World
+from OpenAI's CLIP ViT-B-32, YOLOE from MobileCLIP. Embeddings are cached, so that a start with the
+same texts does not need the text tower.
 """
 
 import logging
@@ -31,9 +31,9 @@ from cliploc_ros.models.label_embeddings import LabelCache
 from cliploc_ros.models.protocols import DetectorOptions, Prompts
 from cliploc_ros.models.yolo_weights import import_ultralytics, resolve_published
 
-#: The most texts of a vocabulary (a guess): LVIS has 1,203 classes, a room some dozens.
+#: Greatest number of texts of a vocabulary (not measured): LVIS has 1,203 classes, a room dozens.
 MOST_TEXTS = 300
-# Of all these networks.
+# Length of an embedding in all these networks.
 _EMBED_DIM = 512
 _TOWERS = {'mobileclip:blt': 'mobileclip_blt.ts', 'mobileclip2:b': 'mobileclip2_b.ts'}
 
@@ -41,9 +41,9 @@ logger = logging.getLogger(__name__)
 
 
 def prompts_of_names(names: str) -> Prompts:
-    """Return the prompts of names, such as 'mug, office chair'.
+    """Return the prompts of a list of names, such as 'mug, office chair'.
 
-    OptionsError: there are none, or too many.
+    OptionsError: there are no names, or too many.
     """
     texts = dict.fromkeys(filter(None, map(str.strip, names.split(','))))
     return _checked([(text, text) for text in texts], 'the vocabulary')
@@ -52,8 +52,8 @@ def prompts_of_names(names: str) -> Prompts:
 def prompts_of_map(landmark_map: LandmarkMap, source: str) -> Prompts:
     """Return the prompts of a map: its classes, and its labels with the class of their landmarks.
 
-    A label of landmarks of several classes gets the most frequent one. Where all are too many,
-    classes alone are prompts. OptionsError: there are none, or too many classes.
+    A label shared by landmarks of several classes gets the most frequent class. If there are too
+    many labels, the prompts are only the classes. OptionsError: there are no classes, or too many.
     """
     found = [(name, name) for name in dict.fromkeys(landmark_map.class_ids) if name.strip()]
     classes = {name for name, _ in found}
@@ -66,7 +66,7 @@ def prompts_of_map(landmark_map: LandmarkMap, source: str) -> Prompts:
         found += [(text, names.most_common(1)[0][0]) for text, names in owners.items()]
     else:
         logger.warning('%s has %d classes and %d other labels, more than %d texts: the detector '
-                       'looks for the classes alone', source, len(found), len(owners), MOST_TEXTS)
+                       'looks only for the classes', source, len(found), len(owners), MOST_TEXTS)
     return _checked(found, source)
 
 
@@ -74,22 +74,20 @@ def _checked(prompts: Sequence[tuple[str, str]], source: str) -> Prompts:
     if not prompts:
         raise OptionsError(f'{source} names no class for the detector')
     if len(prompts) > MOST_TEXTS:
-        raise OptionsError(f'{source} has {len(prompts)} classes for the detector, expected '
-                           f'{MOST_TEXTS} at most: name those that matter in vocabulary')
+        raise OptionsError(f'{source} has {len(prompts)} classes for the detector, expected at '
+                           f'most {MOST_TEXTS}: name the important ones in vocabulary')
     return tuple(prompts)
 
 
 def set_prompts(model: Any, options: DetectorOptions) -> str:
-    """Have a network of ultralytics detect what the options' prompts name.
-
-    Return the key of the text tower, which identifies it.
+    """Set the options' prompts in a network of ultralytics; return the key of the text tower.
 
     Raises
     ------
     OptionsError
-        The network takes no texts.
+        The network does not take texts.
     ModelError
-        The text tower is missing or damaged, or is no tower of this network.
+        The text tower is missing or damaged, or belongs to another network.
     """
     import torch
 
@@ -110,14 +108,14 @@ def set_prompts(model: Any, options: DetectorOptions) -> str:
     if is_yoloe:
         with torch.no_grad():
             network.set_classes(texts, head.get_tpe(embedded))
-    else:  # as WorldModel.set_classes, which loads a tower of its own
+    else:  # as in WorldModel.set_classes, which would load its own text tower
         network.txt_feats, head.nc, network.names = embedded, len(texts), dict(enumerate(texts))
     return key
 
 
 def _tower(name: str, options: DetectorOptions
            ) -> tuple[str, Callable[[Sequence[str]], NDArray[np.float32]]]:
-    """Return the key of a text tower, and what embeds texts with it; errors as of set_prompts."""
+    """Return the key of a text tower, and a function that embeds texts; see set_prompts."""
     if name == 'clip' and not options.text_model.endswith('.ts'):
         try:
             clip = ClipOptions('ViT-B-32', 'openai', checkpoint_path=options.text_model,
@@ -125,7 +123,7 @@ def _tower(name: str, options: DetectorOptions
             weights = resolve_clip_weights(clip)
         except ModelError as error:
             remedy = str(error).replace(f'{CHECKPOINT}{WITHOUT_CLIP}', 'text_model to the file')
-            raise ModelError(f'the text tower of {options.model}: {remedy}') from error
+            raise ModelError(f'text tower of {options.model}: {remedy}') from error
         return weights.key, lambda texts: encode_labels(weights, texts, clip)
     if name not in ('clip', *_TOWERS):
         raise ModelError(f"{options.model} needs the text tower '{name}', which is unknown: "
@@ -135,7 +133,7 @@ def _tower(name: str, options: DetectorOptions
 
 
 def _run_torchscript(file: Path, texts: Sequence[str]) -> NDArray[np.float32]:
-    """Return the embeddings (n, _EMBED_DIM) of texts, unit rows, by a tower of CLIP's tokens."""
+    """Return the embeddings (n, _EMBED_DIM) of texts, unit rows, by a tower in TorchScript."""
     import open_clip
     import torch
 
@@ -143,10 +141,11 @@ def _run_torchscript(file: Path, texts: Sequence[str]) -> NDArray[np.float32]:
     try:
         with torch.inference_mode():
             found = torch.jit.load(file, map_location='cpu')(tokens).float().numpy()
-    except Exception as error:  # PyTorch has no exceptions of its own
-        raise ModelError(f'{file} is no text tower in TorchScript: {first_line(error)}') from error
+    except Exception as error:  # PyTorch has no exception classes
+        raise ModelError(f'{file} is not a text tower in TorchScript: {first_line(error)}'
+                         ) from error
     lengths = np.linalg.norm(found, axis=-1, keepdims=True)
     if found.shape != (len(texts), _EMBED_DIM) or not (np.isfinite(lengths) & (lengths > 0)).all():
-        raise ModelError(f'{file} makes embeddings of the shape {found.shape} or length 0, '
-                         f'expected {(len(texts), _EMBED_DIM)}: it is no tower of this detector')
+        raise ModelError(f'{file} gives embeddings of shape {found.shape} or length 0, expected '
+                         f'{(len(texts), _EMBED_DIM)}: it is not the text tower of this detector')
     return np.asarray(found / lengths, dtype=np.float32)

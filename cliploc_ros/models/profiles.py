@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Profiles: which detector and which encoder suit a device."""
+"""Profiles: detector and encoder for a device."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from cliploc_ros.models.devices import (
     resolve_precision,
 )
 
-if TYPE_CHECKING:  # nodes know the names of profiles before they load a network
+if TYPE_CHECKING:  # not at run time: nodes need the names of profiles before loading networks
     from cliploc_ros.models.clip_weights import ClipOptions
     from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 
@@ -44,29 +44,29 @@ logger = logging.getLogger(__name__)
 
 
 def resolve_profile(profile: str, device: str) -> Profile:
-    """Return the profile of a name; 'auto' is accurate on a GPU and balanced on a CPU.
+    """Return the profile of a name; 'auto' means 'accurate' on a GPU, 'balanced' on a CPU.
 
-    OptionsError: for another name, or a device that is missing.
+    OptionsError: the name is unknown, or the device is missing.
     """
     if profile not in PROFILE_NAMES:
-        raise OptionsError(f"profile '{profile}' is none of {', '.join(PROFILE_NAMES)}")
+        raise OptionsError(f"profile '{profile}' is not one of {', '.join(PROFILE_NAMES)}")
     if profile == 'auto':
         profile = 'balanced' if resolve_device(device) == 'cpu' else 'accurate'
     return PROFILES[profile]
 
 
 def with_detector(options: 'DetectorOptions', profile: str) -> 'DetectorOptions':
-    """Return options that name a detector: that of the profile where the model is ''."""
+    """Return options that name a detector: that of the profile if the model is ''."""
     if options.model:
         return options
     return replace(options, model=resolve_profile(profile, options.device).detector)
 
 
 def with_encoder(options: 'ClipOptions', profile: str) -> 'ClipOptions':
-    """Return options that name an encoder: that of the profile where they name none.
+    """Return options that name an encoder: that of the profile if they do not name one.
 
-    Options that name a model, weights or a file keep them, and have the defaults of ClipOptions
-    for the rest: weights belong to a model.
+    If the options name a model, weights or a file, the missing ones are the defaults of
+    ClipOptions, not those of the profile, because weights belong to a model.
     """
     if options.model or options.pretrained or options.checkpoint_path:
         defaults = type(options)
@@ -77,12 +77,12 @@ def with_encoder(options: 'ClipOptions', profile: str) -> 'ClipOptions':
 
 
 def load_detector(options: 'DetectorOptions') -> 'ObjectDetector':
-    """Load a detector: the one place that knows which kinds there are.
+    """Load a detector of any kind.
 
     Raises
     ------
     ModelError
-        The weights are missing or damaged, or are no detection model.
+        The weights are missing or damaged, or are not those of a detection model.
     OptionsError
         The device or the inference engine is missing.
     """
@@ -101,16 +101,17 @@ def load_detector(options: 'DetectorOptions') -> 'ObjectDetector':
         exported = _exported(file, options)
         if exported is not None:
             return OnnxDetector(exported)
-    with needs_pytorch(f'{file}, which is no ONNX network,'):
+    with needs_pytorch(f'{file}, which is not an ONNX network,'):
         from cliploc_ros.models.yolo_detector import YoloDetector
 
         return YoloDetector(file, options)
 
 
 def _exported(file: Path, options: 'DetectorOptions') -> 'DetectorOptions | None':
-    """Return options that name an ONNX file of the weights, exported once.
+    """Export weights to ONNX once, and return options that name the ONNX file.
 
-    With 'auto', None for a network that cannot be exported; ExportError with 'openvino'.
+    If a network cannot be exported, return None with inference 'auto', and raise an ExportError
+    with 'openvino'.
     """
     from cliploc_ros.models.exports import (
         DETECTOR,
@@ -123,7 +124,7 @@ def _exported(file: Path, options: 'DetectorOptions') -> 'DetectorOptions | None
     identity = detector_identity(file, options)
     folder = find_export(options.cache_dir, 'YOLO', identity)
     if folder is None:
-        with needs_pytorch(f'{file}, which is no ONNX network,'):
+        with needs_pytorch(f'{file}, which is not an ONNX network,'):
             from cliploc_ros.models.yolo_detector import export_detector
 
             try:
@@ -132,6 +133,7 @@ def _exported(file: Path, options: 'DetectorOptions') -> 'DetectorOptions | None
             except ExportError as error:
                 if options.inference == 'openvino':
                     raise
-                logger.warning('%s; PyTorch runs it (inference: pytorch saves the attempt)', error)
+                logger.warning('%s; PyTorch runs it (set inference to pytorch to skip the '
+                               'attempt)', error)
                 return None
     return replace(options, model=str(folder / DETECTOR), prompts=())

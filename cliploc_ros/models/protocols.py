@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a detector and an encoder have to do, whatever network is inside."""
+"""Protocols and options of detectors and encoders, independent of their networks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,39 +9,40 @@ from typing import TYPE_CHECKING, Protocol
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.devices import check_run
 
-if TYPE_CHECKING:  # --help of the programs shows these options, and is fast
+if TYPE_CHECKING:  # not at run time, for a fast --help of the programs
     import numpy as np
     from numpy.typing import NDArray
 
     from cliploc_ros.core.observation import Detections
 
-#: Texts that a detector looks for, and the class that it reports for each.
+#: Texts that a detector looks for, each with the class that it reports.
 Prompts = tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True)
 class DetectorOptions:
-    """Which detector to load, and how to run it. The names are ultralytics' own.
+    """The detector to load, and how to run it. The names are those of ultralytics.
 
-    OptionsError: for values out of range.
+    OptionsError: a value is out of range.
     """
 
-    #: Path of an ONNX file, of a folder with one or of a ``.pt`` file; or what is downloaded once:
-    #: OWNER/NAME[@REVISION][:FILE] of the hub, or a published ``.pt`` file
+    #: Path of an ONNX file, of a folder with one or of a ``.pt`` file; or a network that is
+    #: downloaded once: OWNER/NAME[@REVISION][:FILE] of the hub, or a published ``.pt`` file
     model: str = 'yolov8x.pt'
     conf: float = 0.1  #: Least confidence of a detection, 0 to 1
-    iou: float = 0.7  #: IoU from which the weaker of two boxes of a class is dropped, 0 to 1
-    imgsz: int = 640  #: The network sees the image with its longer side scaled to this [px]
+    iou: float = 0.7  #: Above this IoU, the weaker of two boxes of a class is dropped, 0 to 1
+    imgsz: int = 640  #: Longer side of the scaled image that the network gets [px]
     max_det: int = 300  #: Greatest number of detections in an image; the most confident are kept
     device: str = 'auto'  #: 'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'
     precision: str = 'auto'  #: 'auto' (fp16 on a GPU, fp32 on a CPU), 'fp16' or 'fp32'
-    cache_dir: str = ''  #: Folder for downloads and compiled networks; '' is the user's cache
-    #: 'auto' (OpenVINO on a CPU where it is installed), 'pytorch' or 'openvino'
+    cache_dir: str = ''  #: Folder for downloads and compiled networks; '': the user's cache
+    #: 'auto' (OpenVINO on a CPU if it is installed), 'pytorch' or 'openvino'
     inference: str = 'auto'
-    #: What a YOLO-World or YOLOE looks for; empty: the classes that it was saved with
+    #: Texts that a YOLO-World or YOLOE looks for; empty: the classes stored in its file
     prompts: Prompts = ()
-    #: File of its text tower: CLIP ViT-B-32 for YOLO-World, mobileclip_blt.ts for YOLOE; '' is
-    #: downloaded once. Any other tower ends on .ts: TorchScript from CLIP's tokens to embeddings
+    #: File of the text tower for prompts: CLIP ViT-B-32 for YOLO-World, mobileclip_blt.ts for
+    #: YOLOE; '': downloaded once. Any other tower must be a TorchScript file (.ts) that converts
+    #: CLIP's tokens to embeddings
     text_model: str = ''
 
     def __post_init__(self) -> None:
@@ -56,28 +57,28 @@ class DetectorOptions:
 
 
 class ImageTextEncoder(Protocol):
-    """Embeds image crops and text labels in one space, where cosine means similarity."""
+    """Embeds image crops and text labels in a common space, with cosine similarity."""
 
     key: str  #: Identifies model and weights: equal keys give equal embeddings
 
     def encode_crops(self, image_rgb: 'NDArray[np.uint8]', bboxes_xyxy: 'NDArray[np.float64]'
                      ) -> 'NDArray[np.float32]':
-        """Return one embedding for each box of an image (h, w, 3) uint8, red first.
+        """Return the embeddings (n, d) of n boxes in an image (h, w, 3) uint8, RGB.
 
         The boxes (n, 4) are left, top, right, bottom [px]; each must overlap the image. The
-        embeddings (n, d) have unit length.
+        embeddings have unit length.
         """
 
     def encode_labels(self, labels: Sequence[str]) -> 'NDArray[np.float32]':
-        """Return one embedding (L, d) for each of L labels, float32 rows of unit length."""
+        """Return the embeddings (L, d) of L labels, float32 rows of unit length."""
 
 
 class ObjectDetector(Protocol):
     """Finds the objects in an image."""
 
-    device: str  #: Where the network runs
-    inference: str  #: What runs it, such as 'pytorch'
-    class_names: tuple[str, ...]  #: All classes that it knows
+    device: str  #: The device that the network runs on
+    inference: str  #: The inference engine, such as 'pytorch'
+    class_names: tuple[str, ...]  #: All classes of the network
 
     def configure(self, options: DetectorOptions) -> None:
         """Change the options, except for model, device and inference."""
@@ -85,5 +86,6 @@ class ObjectDetector(Protocol):
     def detect(self, image_rgb: 'NDArray[np.uint8]') -> 'Detections':
         """Return the objects in an image (h, w, 3) uint8, the most confident first.
 
-        Boxes are in pixels of that image. ImageError: it has another shape or type, or no pixels.
+        Boxes are in pixels of that image. ImageError: the image has another shape or type, or no
+        pixels.
         """

@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""XFeat: local features that a small network finds, in OpenVINO on a CPU.
+"""XFeat: local features from a small network, in OpenVINO on a CPU.
 
 Potje et al., "XFeat: Accelerated Features for Lightweight Image Matching", CVPR 2024. The authors
-publish the network for images of 640 x 640; here it takes images of any size, by the same numbers.
+publish the network for images of 640 x 640. Here it takes images of any size, with the same
+weights.
 """
 
 import hashlib
@@ -37,29 +38,29 @@ _URL = ('https://raw.githubusercontent.com/verlab/accelerated_features/'
 _SHA256 = '54041f61f0d9b1968451a65fe0fd79e96692b1d8266c54a6939a73e847df5988'
 _PATIENCE_S = 10.0
 WITHOUT_XFEAT = 'or make the layer again with build_map --keyframe-features sift'
-# Sides of an input are multiples of this, and a cell of the outputs has so many pixels.
+# Sides of an input are multiples of _STEP; a cell of the outputs has _CELL x _CELL pixels.
 _STEP, _CELL = 32, 8
 _DIMENSIONS = 64
-# See FeatureKind. Up to 20 features agree with poses of other places by chance.
+# See FeatureKind. By chance, up to 20 features agree with poses at other places.
 _ZERO, _SCALE, _RATIO, _LEAST_INLIERS = 128, 256.0, 0.95, 21
 _QUERY_PX, _QUERY_MOST = 640, 2000
-# XFeat's own: a feature is the most likely one of the pixels beside it, and at least so likely.
+# As in XFeat: a feature is a maximum among its neighbours, with at least this likelihood.
 _BESIDE, _LEAST = np.ones((5, 5), dtype=np.uint8), 0.05
 # Tensors of the published network: the normalized image, its cells of 8 x 8 pixels as channels,
-# two feature maps that are enlarged, and how much.
+# and two feature maps that are enlarged, with their factors.
 _IMAGE, _CELLS, _ENLARGED = '126', '1250', {'226': 2.0, '241': 4.0}
 
 
 def feature_kinds(cache_dir: str = '') -> FeatureKinds:
-    """Return the kinds of features that layers have; see load_xfeat."""
+    """Return the kinds of features of layers, by name; see load_xfeat."""
     return {SIFT.name: lambda: SIFT, XFEAT: partial(load_xfeat, cache_dir)}
 
 
 def load_xfeat(cache_dir: str = '') -> FeatureKind:
-    """Return XFeat, ready for images. Its file of 2.7 MB is downloaded once.
+    """Load XFeat; its file of 2.7 MB is downloaded once.
 
-    ModelError: the file is missing and cannot be downloaded, or is another one, or OpenVINO is not
-    installed or does not run it.
+    ModelError: the file is missing and cannot be downloaded, or differs from the published file,
+    or OpenVINO is not installed or cannot run it.
     """
     folder = resolve_cache_dir(cache_dir) / 'weights'
     file = folder / FILE_NAME
@@ -68,9 +69,9 @@ def load_xfeat(cache_dir: str = '') -> FeatureKind:
         from urllib.request import urlopen
 
         with urlopen(_URL, timeout=_PATIENCE_S) as answer:
-            content = answer.read(2**26)  # a server may send without end
+            content = answer.read(2**26)  # a limit, in case the server does not stop sending
         if not _is_published(content):
-            raise ValueError('another file came')
+            raise ValueError('the server sent another file')
         with replace_file(file) as partial_file:
             partial_file.write_bytes(content)
         return file
@@ -83,13 +84,13 @@ def load_xfeat(cache_dir: str = '') -> FeatureKind:
 
 
 def _is_published(content: bytes) -> bool:
-    """Return whether a file is the published one: the tensors of another have other names."""
+    """Return whether a file is the published one; in other files, the tensors' names differ."""
     return hashlib.sha256(content).hexdigest() == _SHA256
 
 
 @cache
 def _network(file: Path) -> 'CompiledNetwork':
-    """Return the network of a file; ModelError: see load_xfeat."""
+    """Load the network of a file; ModelError: see load_xfeat."""
     from cliploc_ros.models.onnx_network import CompiledNetwork
 
     if import_openvino() is None:
@@ -99,27 +100,28 @@ def _network(file: Path) -> 'CompiledNetwork':
     except OSError as error:
         raise ModelError(f'{file} cannot be read: {error.strerror}, {WITHOUT_XFEAT}') from error
     if not is_published:
-        raise ModelError(f'{file} is not the published XFeat, whose SHA-256 is {_SHA256}: remove '
-                         f'it, {WITHOUT_XFEAT}')
+        raise ModelError(f'{file} is not the published XFeat (SHA-256 {_SHA256}): remove it, '
+                         f'{WITHOUT_XFEAT}')
     try:
         return CompiledNetwork.of(any_size(import_openvino().Core().read_model(file)))
-    except Exception as error:  # OpenVINO has no exceptions of its own
-        raise ModelError(f'OpenVINO does not run {file}: {first_line(error)}; update OpenVINO, '
+    except Exception as error:  # OpenVINO has no exception classes
+        raise ModelError(f'OpenVINO cannot run {file}: {first_line(error)}; update OpenVINO, '
                          f'{WITHOUT_XFEAT}') from error
 
 
 def any_size(network: Any) -> Any:
-    """Return the published network for images of any size, with one output.
+    """Change the published network to take images of any size, and to have one output.
 
-    The output (1, 130, h / 8, w / 8) has the descriptors as unit vectors (64), how likely each
-    pixel of a cell is the feature (64) and that none is (1), and the reliability (1).
+    The channels of the output (1, 130, h / 8, w / 8) are the descriptor as unit vector (64), the
+    likelihoods that each pixel of the cell is a feature (64) and that none is (1), and the
+    reliability (1).
     """
     from openvino import Model
     from openvino import opset13 as layers
 
     tensors = {name: output for node in network.get_ops() for output in node.outputs()
                for name in output.names}
-    # 640 x 640 of them were cut out one after another
+    # the published network slices the cells of 640 x 640 pixels one by one
     tensors[_CELLS].replace(layers.space_to_depth(
         tensors[_IMAGE], 'blocks_first', _CELL).output(0))
     for name, factor in _ENLARGED.items():
@@ -127,7 +129,7 @@ def any_size(network: Any) -> Any:
         tensors[name].replace(layers.interpolate(
             small, np.full(2, factor, np.float32), 'linear_onnx', 'scales', axes=[2, 3],
             coordinate_transformation_mode='pytorch_half_pixel').output(0))
-    descriptors, likely, reliable = (one.input_value(0) for one in network.get_results())
+    descriptors, likely, reliable = (result.input_value(0) for result in network.get_results())
     joined = layers.concat([layers.normalize_l2(descriptors, np.array([1]), 1e-12, 'max'),
                             layers.softmax(likely, 1), reliable], 1)
     found = Model([layers.result(joined)], network.get_parameters(), 'xfeat')
@@ -137,7 +139,7 @@ def any_size(network: Any) -> Any:
 
 def _extract(file: Path, image_rgb: NDArray[np.uint8], most: int, longest_side_px: int
              ) -> Features:
-    """Return the strongest features of an image (h, w, 3), see FeatureKind."""
+    """Extract the strongest features of an image (h, w, 3), see FeatureKind."""
     sides = np.array(image_rgb.shape[1::-1])
     scale = min(1.0, longest_side_px / sides.max())
     size = np.maximum(1, (scale * sides).astype(np.int64) // _STEP) * _STEP
@@ -157,7 +159,7 @@ def _extract(file: Path, image_rgb: NDArray[np.uint8], most: int, longest_side_p
 
 
 def _sampled(cells: NDArray[np.float32], places: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the vectors (n, d) of cells (h, w, d) at places (n, 2), by cubic interpolation."""
+    """Interpolate cells (h, w, d) at places (n, 2) by bicubic interpolation, giving (n, d)."""
     beside = np.floor(places).astype(np.int64)[..., None] + np.arange(-1, 3)
     off = np.abs(places[..., None] - beside)
     weights = np.where(off < 1.0, (1.25 * off - 2.25) * off**2 + 1.0,

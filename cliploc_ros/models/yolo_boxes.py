@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What YOLO does before and after its network, as ultralytics does it, without PyTorch."""
+"""Pre- and postprocessing of YOLO, as in ultralytics, without PyTorch."""
 
 from dataclasses import dataclass
 
@@ -8,26 +8,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-# The grey of the borders, and the most boxes that are compared, as in training.
+# Grey of the borders, and greatest number of boxes that are compared, as in training.
 _GREY = (114, 114, 114)
 _MOST_BOXES = 30_000
-# The first columns of an output whose doubles the network has dropped itself: box, score, class.
+# Columns of the output of a network that removes duplicates itself: box, score, class.
 _END2END = 6
 
 
 @dataclass(frozen=True)
 class Letterbox:
-    """Where an image lies in a network's input: scaled, in the middle of grey borders [px]."""
+    """The place of an image in a network's input: scaled, and centred in grey borders [px]."""
 
     image_size: tuple[int, int]  #: Width and height of the image
-    scaled_size: tuple[int, int]  #: The same of the scaled image
-    #: Left, top, right, bottom: the borders
+    scaled_size: tuple[int, int]  #: Width and height of the scaled image
+    #: Widths of the borders: left, top, right, bottom
     borders: tuple[int, int, int, int]
 
     @staticmethod
     def of(image_size: tuple[int, int], height: int, width: int, stride: int | None
            ) -> 'Letterbox':
-        """Fit an image into an input; with a stride into the smallest multiple of it."""
+        """Fit an image into an input; with a stride, the input shrinks to a multiple of it."""
         scale = min(height / image_size[1], width / image_size[0])
         scaled = max(round(image_size[0] * scale), 1), max(round(image_size[1] * scale), 1)
         free_x, free_y = width - scaled[0], height - scaled[1]
@@ -38,7 +38,7 @@ class Letterbox:
             round(free_x / 2 + 0.1), round(free_y / 2 + 0.1)))
 
     def fill(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the input (H, W, 3) of an image (h, w, 3)."""
+        """Scale an image (h, w, 3) and add borders, giving an input (H, W, 3)."""
         if self.scaled_size != self.image_size:
             image = cv2.resize(image, self.scaled_size, interpolation=cv2.INTER_LINEAR)
         left, top, right, bottom = self.borders
@@ -46,7 +46,7 @@ class Letterbox:
                                              cv2.BORDER_CONSTANT, value=_GREY))
 
     def in_image(self, boxes_xyxy: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return boxes (n, 4) of the input in the image, clipped to it."""
+        """Convert boxes (n, 4) in the input to boxes in the image, clipped to it."""
         scaled, size, corner = (np.array(pair * 2, dtype=np.float32) for pair in
                                 (self.scaled_size, self.image_size, self.borders[:2]))
         return np.clip((boxes_xyxy - corner) / (scaled / size), 0, size)
@@ -56,8 +56,8 @@ def select_boxes(output: NDArray[np.float32], conf: float, iou: float, max_det: 
                  is_end2end: bool) -> NDArray[np.float32]:
     """Return the boxes (n, 6) of an output: left, top, right, bottom, score, class.
 
-    The output is (4 + classes, boxes), with the middle and size of each box, or (boxes, 6 and
-    more), the most confident first, of a network that drops doubles itself.
+    The output is (4 + classes, boxes), with centre and size of each box. A network that removes
+    duplicates itself has the output (boxes, 6 or more), the most confident box first.
     """
     if is_end2end or output.shape[-1] == _END2END:
         return output[output[:, 4] > conf][:max_det, :_END2END]
@@ -73,10 +73,10 @@ def select_boxes(output: NDArray[np.float32], conf: float, iou: float, max_det: 
 
 def without_doubles(boxes_xyxy: NDArray[np.floating], classes: NDArray[np.number], iou: float,
                     most: int) -> NDArray[np.int64]:
-    """Return the rows of boxes (n, 4) that no better one of their class covers.
+    """Return the rows of boxes (n, 4) that remain after non-maximum suppression by class.
 
-    The boxes are sorted, the best first. A box is dropped where its IoU with one that is kept is
-    above ``iou``.
+    The boxes are sorted, the best first. A box is dropped if its IoU with a kept box of its class
+    exceeds ``iou``.
     """
     left, top, right, bottom = boxes_xyxy.T
     areas = (right - left) * (bottom - top)
@@ -88,10 +88,10 @@ def without_doubles(boxes_xyxy: NDArray[np.floating], classes: NDArray[np.number
         kept.append(row)
         if len(kept) == most:
             break
-        rest = row + 1 + np.flatnonzero(is_open[row + 1:] & (classes[row + 1:] == classes[row]))
-        width = np.minimum(right[row], right[rest]) - np.maximum(left[row], left[rest])
-        height = np.minimum(bottom[row], bottom[rest]) - np.maximum(top[row], top[rest])
+        later = row + 1 + np.flatnonzero(is_open[row + 1:] & (classes[row + 1:] == classes[row]))
+        width = np.minimum(right[row], right[later]) - np.maximum(left[row], left[later])
+        height = np.minimum(bottom[row], bottom[later]) - np.maximum(top[row], top[later])
         shared = np.maximum(width, 0) * np.maximum(height, 0)
-        # false of boxes without an area
-        is_open[rest[shared > np.float32(iou) * (areas[row] + areas[rest] - shared)]] = False
+        # not divided by the union, which is 0 for boxes without area
+        is_open[later[shared > np.float32(iou) * (areas[row] + areas[later] - shared)]] = False
     return np.array(kept, dtype=np.int64)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A YOLO of ultralytics in PyTorch, for a GPU; and its export to ONNX."""
+"""Run a YOLO of ultralytics in PyTorch, for a GPU; export it to ONNX."""
 
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,10 @@ from cliploc_ros.models.yolo_weights import load_yolo, stride_of
 
 
 class YoloDetector:
-    """An `ObjectDetector`: a detection network of ultralytics, of a ``.pt`` file.
+    """An `ObjectDetector`: a detection network of ultralytics in a ``.pt`` file.
 
-    ModelError: when the weights are damaged, or are no detection model. OptionsError: when the
-    device is missing, or the network takes no texts.
+    ModelError: the weights are damaged, or are not those of a detection model. OptionsError: the
+    device is missing, or the network does not take texts.
     """
 
     inference = 'pytorch'
@@ -41,18 +41,18 @@ class YoloDetector:
         if resolve_precision(options.precision, self.device) == 'fp16':
             from ultralytics.utils import DEFAULT_CFG_DICT
 
-            # The name changed within 8.4, and the old one warns with every image.
+            # The name changed within version 8.4; the old one causes a warning for each image.
             has_new_name = 'quantize' in DEFAULT_CFG_DICT
             self._run |= {'quantize': 16} if has_new_name else {'half': True}
         self._stride = stride_of(self._model.model)
         classes = dict(options.prompts)
         self._class_of: dict[int, str] = {number: classes.get(name, name)
                                           for number, name in self._model.names.items()}
-        #: All classes that the model knows
+        #: All classes of the model
         self.class_names = tuple(dict.fromkeys(self._class_of.values()))
         self.configure(options)
-        # The first pass sets up predictor, kernels and memory: do it before the first image. It
-        # leaves one core free on a CPU, for the process.
+        # The first pass sets up predictor, kernels and memory; run it before the first image. On a
+        # CPU, ultralytics also sets the threads of the process to leave a core free: undo that.
         self.detect(np.zeros((self._stride, self._stride, 3), dtype=np.uint8))
         torch.set_num_threads(threads)
 
@@ -65,14 +65,14 @@ class YoloDetector:
     def detect(self, image_rgb: NDArray[np.uint8]) -> Detections:
         """Return the objects in an image (h, w, 3) uint8, the most confident first.
 
-        ImageError: for an image of another shape or type, or without pixels.
+        ImageError: the image has another shape or type, or no pixels.
         """
         check_image_rgb(image_rgb)
         found = self._model.predict(np.ascontiguousarray(image_rgb[..., ::-1]), **self._settings,
                                     **self._run)[0].boxes
         rows = np.asarray(found.data.cpu().numpy())
         if len(self.class_names) < len(self._class_of):
-            # of another text of the same class
+            # several texts of a class give duplicate boxes
             classes = [self.class_names.index(self._class_of[int(index)]) for index in rows[:, 5]]
             rows = rows[without_doubles(rows[:, :4], np.array(classes, dtype=np.int64),
                                         self._settings['iou'], len(rows))]
@@ -84,12 +84,12 @@ class YoloDetector:
 
 def export_detector(file: Path, options: DetectorOptions, folder: Path, half: bool = False
                     ) -> None:
-    """Write a YOLO of ultralytics into a folder; its classes become those of the options' prompts.
+    """Export a YOLO of ultralytics into a folder, with the classes of the options' prompts.
 
-    ``half`` is as in export_clip.
+    ``half``: see export_clip.
 
-    ExportError: the network gives other results than in PyTorch. ModelError: the file is damaged
-    or no detection model. OptionsError: the network takes no texts.
+    ExportError: the results differ from those in PyTorch. ModelError: the file is damaged or not a
+    detection model. OptionsError: the network does not take texts.
     """
     import torch
 

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Weights of YOLO, and ultralytics without network requests, installations and files in the home.
+"""Weights of YOLO, and the import of ultralytics (AGPL-3.0).
 
-Ultralytics (AGPL-3.0) is imported by `import_ultralytics` first. It sets environment variables
-before the import.
+`import_ultralytics` must be called before any other import of ultralytics: it sets environment
+variables that prevent network requests, installations and files in the home directory.
 """
 
 import atexit
@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 @cache
 def import_ultralytics() -> Any:
     """Import ultralytics without network requests, installations and files in the home."""
-    import torch  # first: it reads OMP_NUM_THREADS, which ultralytics sets to 1
+    import torch  # before ultralytics, which sets OMP_NUM_THREADS to 1
 
     if 'ultralytics' in sys.modules:
         logger.warning('ultralytics was imported before the detector: it may use the network')
@@ -39,7 +39,7 @@ def import_ultralytics() -> Any:
     os.environ.update(
         YOLO_OFFLINE='true',  # no look-ups of DNS servers, no analytics
         YOLO_AUTOINSTALL='false',  # no pip
-        YOLO_CONFIG_DIR=folder,  # its settings.json, else in ~/.config
+        YOLO_CONFIG_DIR=folder,  # its settings.json, by default in ~/.config
         YOLO_VERBOSE='false',
         ULTRALYTICS_SAFE_LOAD='true')
     import ultralytics
@@ -47,19 +47,19 @@ def import_ultralytics() -> Any:
     if threads is None:
         os.environ.pop('OMP_NUM_THREADS', None)
     ultralytics.settings.update({'sync': False})
-    # It logs to the standard output instead of the loggers of the process.
+    # By default, it logs to the standard output instead of the loggers of the process.
     ultralytics_logger = logging.getLogger('ultralytics')
     ultralytics_logger.handlers.clear()
     ultralytics_logger.propagate = True
     ultralytics_logger.setLevel(logging.WARNING)
     if not _is_restricted(ultralytics):
-        logger.warning('ultralytics %s with torch %s runs code in files of weights: load trusted '
-                       'files only', ultralytics.__version__, torch.__version__)
+        logger.warning('ultralytics %s with torch %s runs code in files of weights: load only '
+                       'trusted files', ultralytics.__version__, torch.__version__)
     return ultralytics
 
 
 def _is_restricted(ultralytics: Any) -> bool:
-    """Return whether ultralytics reads weights only and refuses code in their files."""
+    """Return whether ultralytics reads only weights, and refuses code in their files."""
     import torch
 
     return (getattr(ultralytics.utils, 'SAFE_LOAD', False)
@@ -67,10 +67,10 @@ def _is_restricted(ultralytics: Any) -> bool:
 
 
 def resolve_published(given: str, cache_dir: str, option: str) -> Path:
-    """Return a file of weights, by its path or the name under which ultralytics published it.
+    """Return a file of weights, by its path or its name in the releases of ultralytics.
 
-    ModelError: it is missing, damaged or unknown, or the download fails; the message names the
-    option.
+    ModelError: the file is missing, damaged or unknown, or the download fails; the message names
+    the option.
     """
     file = Path(given).expanduser().absolute()
     if file.exists() or Path(given).name != given:
@@ -81,16 +81,16 @@ def resolve_published(given: str, cache_dir: str, option: str) -> Path:
     if (folder / name).exists():
         check_weights_file(folder / name)
         return folder / name
-    with needs_pytorch(f'{name}, which is neither a file here nor in {folder},'):
+    with needs_pytorch(f'{name}, which is not a local file and not in {folder},'):
         _refuse_code(folder / name)
     from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES, attempt_download_asset
 
     if name not in GITHUB_ASSETS_NAMES:
-        raise ModelError(f"'{given}' is neither a file here nor a published YOLO model"
+        raise ModelError(f"'{given}' is neither a local file nor a published YOLO model"
                          f'{did_you_mean(name, GITHUB_ASSETS_NAMES, 4, 0.5)}')
 
     def fetch() -> Path:
-        # Ultralytics' early versions write to the final path: only a whole file is moved there.
+        # Old versions of ultralytics download to the final path; move only complete files there.
         with tempfile.TemporaryDirectory(dir=folder) as desk:
             whole = attempt_download_asset(Path(desk) / name, progress=False)
             return Path(whole).replace(folder / name)
@@ -101,42 +101,43 @@ def resolve_published(given: str, cache_dir: str, option: str) -> Path:
 
 
 def _refuse_code(file: Path) -> None:
-    """Raise a ModelError where a file that was or will be downloaded could run code."""
+    """Raise a ModelError if a downloaded file could run code."""
     if not _is_restricted(import_ultralytics()):
-        raise ModelError(f'this ultralytics or PyTorch would run code that {file.name} may hold: '
-                         'update them, or name the path of a file that you trust')
+        raise ModelError(f'this ultralytics or PyTorch would run code in {file.name}: update '
+                         'them, or give the path of a file that you trust')
 
 
 def stride_of(model: Any) -> int:
-    """Return what height and width of an input must be multiples of, as ultralytics has it."""
+    """Return the stride of a model: sides of an input must be multiples of it."""
     return max(int(model.stride.max()), _LEAST_STRIDE)
 
 
 def load_yolo(file: Path, is_download: bool = False) -> Any:
-    """Return ultralytics' detection model of a ``.pt`` file.
+    """Load the detection model of ultralytics in a ``.pt`` file.
 
-    Such a file is a pickle, which can run code. This function reads it in ultralytics' restricted
-    mode (``weights_only=True`` and a list of known classes), which refuses code. An ultralytics
-    without this mode, or a PyTorch before 2.6, falls back to plain pickles: then only a file that
-    the options name by its path is loaded, with a warning to load trusted files only.
+    The file is a pickle, which can run code. This function reads it in the restricted mode of
+    ultralytics (``weights_only=True`` and a list of known classes), which refuses code. Versions
+    of ultralytics without this mode, and PyTorch before 2.6, read plain pickles: in this case,
+    only a file that the options name by its path is loaded, with a warning to load only trusted
+    files.
 
-    ModelError: for a file that is damaged or no detection model.
+    ModelError: the file is damaged or not a detection model.
     """
     ultralytics = import_ultralytics()
     if is_download:
         _refuse_code(file)
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_yolo_') as desk:
-        # Ultralytics rewrites some paths (quotes, yolov5) and requires the suffix.
+        # Ultralytics changes some paths (quotes, yolov5) and requires the suffix.
         neutral = Path(desk) / 'weights.pt'
         neutral.symlink_to(file.resolve())
         try:
             model = ultralytics.YOLO(neutral)
-        except Exception as error:  # ultralytics has no exceptions of its own
+        except Exception as error:  # ultralytics has no exception classes
             reason = first_line(error).removeprefix('ERROR').strip()
-            raise ModelError(f'{file} is no detection model of YOLO: '
+            raise ModelError(f'{file} is not a detection model of YOLO: '
                              f'{reason.replace(str(neutral), "it")}') from error
     # YOLOE is published with a head for masks; its boxes are those of a detector.
     if model.task != 'detect' and not isinstance(model, ultralytics.YOLOE):
-        raise ModelError(f"{file} is a YOLO model for the task '{model.task}': one for 'detect' "
-                         'is needed')
+        raise ModelError(f"{file} is a YOLO model for the task '{model.task}': give a model for "
+                         "'detect'")
     return model

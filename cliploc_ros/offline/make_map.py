@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Mapping as a library: a recording becomes a map with labels, embeddings and keyframes."""
+"""Mapping as a library: make a map with labels, embeddings and keyframes from a recording."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -40,7 +40,8 @@ from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_lay
 from cliploc_ros.offline.vocabulary.phrase_embeddings import phrases_of_classes
 from cliploc_ros.offline.vocabulary.vocabulary import Vocabulary, load_vocabulary, shipped_phrases
 
-# Trial maps that find a scale by objects of known size, and when it has settled.
+# A scale by objects of known size: greatest number of trial maps, and the relative change of the
+# scale below which they end.
 _TRIALS, _SAME_SIZE = 4, 0.01
 
 
@@ -52,26 +53,26 @@ class MadeMap:
     report: MappingReport | UpdateReport  #: Landmarks found and objects left out, with reasons
     embeddings: LandmarkEmbeddings | None = None  #: Embeddings of the crops of each landmark
     layer: KeyframeLayer | None = None
-    mount: MountCorrection | None = None  #: Where a correction was asked for
-    removed: LandmarkMap | None = None  #: Landmarks that updates took out of the map
+    mount: MountCorrection | None = None  #: Correction of the mount, if requested
+    removed: LandmarkMap | None = None  #: Landmarks that updates removed from the map
 
 
 @dataclass(frozen=True)
 class Labeller:
-    """Describes landmarks by phrases, or by their class where CLIP is missing."""
+    """Labels landmarks with phrases, or with their class if there is no CLIP."""
 
     vocabulary: Vocabulary
     #: The CLIP that made the embeddings of the recording, with its weights; None: labels are class
     #: names
     clip: ClipOptions | None = None
     weights: ClipWeights | None = None
-    note: str = ''  #: Why labels are class names; '' if they are not
+    note: str = ''  #: The reason why labels are class names; '' if they are not
 
     def describe(self, landmark_map: LandmarkMap, detections: PosedDetections,
                  shown: NDArray[np.int64]) -> tuple[LandmarkMap, LandmarkEmbeddings | None]:
         """Return the map with labels, and its image embeddings.
 
-        The array shown (n,) has the row of the landmark that each box shows, -1 for none.
+        `shown` (n,) has the row of the landmark of each box, -1 for none.
         CliplocError: the text tower cannot be loaded.
         """
         if not _has_embeddings(detections):
@@ -90,12 +91,12 @@ class Labeller:
 
 def find_labeller(detections: PosedDetections, clip: Callable[[], ClipOptions] | None,
                   vocabulary: Path | None = None) -> Labeller:
-    """Return the labeller of the landmarks of a recording.
+    """Return the labeller for the landmarks of a recording.
 
     Parameters
     ----------
     clip : callable, optional
-        Returns the CLIP of the recording; called only where the recording has embeddings. None:
+        Returns the CLIP of the recording; called only if the recording has embeddings. None:
         labels are class names.
     vocabulary : Path, optional
         Phrases by class (YAML), in addition to the shipped phrases.
@@ -103,7 +104,7 @@ def find_labeller(detections: PosedDetections, clip: Callable[[], ClipOptions] |
     Raises
     ------
     OptionsError, ModelError
-        The vocabulary is invalid, or given where nothing can be labelled.
+        The vocabulary is invalid, or it is given although labels can only be class names.
     """
     words = load_vocabulary(vocabulary)
     try:
@@ -121,11 +122,11 @@ def find_labeller(detections: PosedDetections, clip: Callable[[], ClipOptions] |
 
 
 def _weights_of(detections: PosedDetections, clip: ClipOptions) -> ClipWeights:
-    """Return the weights that made the embeddings; ModelError where they are not at hand."""
+    """Return the weights that made the embeddings; ModelError: the options name others."""
     hint = 'give the profile, or the CLIP model with its weights, of the recording'
     theirs = detections.encoder_key.split(':')[0]
     ours = Path(clip.model).stem if clip.model.endswith('.json') else clip.model.replace('/', '-')
-    # compared first, since the weights of another model would be downloaded in vain
+    # compared first, to avoid a useless download of the weights of another model
     if not names_onnx(clip) and ours != theirs:
         raise ModelError(f"the embeddings are of CLIP model '{theirs}', not '{ours}'; {hint}")
     weights = resolve_clip_weights(clip)
@@ -135,7 +136,7 @@ def _weights_of(detections: PosedDetections, clip: ClipOptions) -> ClipWeights:
     assert detections.embeddings is not None
     if detections.embeddings.shape[1] != weights.embed_dim:
         raise ModelError(f'the embeddings have {detections.embeddings.shape[1]} numbers, but '
-                         f'{weights.key} gives {weights.embed_dim}; record them again')
+                         f'those of {weights.key} have {weights.embed_dim}; record them again')
     return weights
 
 
@@ -148,12 +149,13 @@ def make_map(detections: PosedDetections, labeller: Labeller,
              options: MappingOptions | None = None, frames: Frames | None = None,
              layer: LayerOptions | None = None,
              progress: Callable[[str, float], None] | None = None) -> MadeMap:
-    """Make a map of a recording.
+    """Make a map from a recording.
 
     Parameters
     ----------
     detections : PosedDetections
-        Boxes and poses of the recording: ``load_observations``, or ``record_once`` for images.
+        Boxes and poses of the recording, from ``load_observations``, or from ``record_once`` for
+        images.
     labeller : Labeller
         See find_labeller.
     frames : Frames, optional
@@ -161,12 +163,12 @@ def make_map(detections: PosedDetections, labeller: Labeller,
     layer : LayerOptions, optional
         None: without keyframes.
     progress : callable, optional
-        Called with the name of a stage and the share of it that is done, 0 to 1.
+        Called with the name of a stage and its progress, 0 to 1.
 
     Raises
     ------
     CliplocError
-        No map can be made of this input; the message says what to correct.
+        The input does not allow a map; the message says what to correct.
     """
     built = build_map(detections, options, progress)
     landmark_map, embeddings = labeller.describe(built.landmark_map, detections, built.shown)
@@ -177,26 +179,26 @@ def make_map(detections: PosedDetections, labeller: Labeller,
 
 def scale_of_objects(detections: PosedDetections, options: MappingOptions, class_name: str,
                      metres: float) -> tuple[float, int]:
-    """Return metres of a unit of the poses, by the longest extent of the objects of a class [m].
+    """Compute the metres per unit of the poses from the longest extent of a class's objects [m].
 
-    Of the objects of a trial map the median counts. Mapping knows sizes in metres, so that the
-    trial is repeated with the scale found. The number of these objects is returned, too.
+    The median of the objects in a trial map is used. Mapping uses sizes in metres, so that the
+    trial is repeated with the scale found. The number of these objects is returned too.
 
     Raises
     ------
     MappingError
-        The detections have depth, which says the scale, or no object of the class is mapped.
+        The detections have depth, which determines the scale, or no object of the class is mapped.
     """
     if detections.depths is not None:
         raise MappingError('`object_size`: the recording has depth, which is in metres; give '
-                           '`scale` where the poses are not')
+                           '`scale` if the poses are not')
     scale = 1.0
     for _ in range(_TRIALS):
         built = build_map(detections.moved(scale, np.eye(3)), options).landmark_map
         own = [row for row, class_id in enumerate(built.class_ids) if class_id == class_name]
         if not own:
             raise MappingError(
-                f"`object_size`: no object of class '{class_name}' is mapped; there are "
+                f"`object_size`: no object of class '{class_name}' is mapped; the classes are "
                 f'{", ".join(sorted(set(built.class_ids)))}')
         step = metres / float(np.median(2.0 * built.semi_axes[own].max(axis=1)))
         scale *= step
@@ -207,10 +209,10 @@ def scale_of_objects(detections: PosedDetections, options: MappingOptions, class
 
 def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
                options: MappingOptions) -> MadeMap:
-    """Bring a map file up to date with a recording; its file is not written.
+    """Update the map in a file with a recording; the file is not written.
 
-    Poses are refined against the map, as far as ``pose_errors`` or the boxes tell that they are
-    off.
+    Poses are refined against the map by the errors in ``pose_errors``; without these, if the boxes
+    show that the poses are inaccurate.
 
     Raises
     ------
@@ -225,7 +227,7 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
     landmark_map, first = updated.landmark_map, updated.first_new
     if first == len(landmark_map):
         return MadeMap(landmark_map, updated.report, updated.embeddings, removed=updated.removed)
-    # only the new landmarks get labels; the others keep theirs
+    # only new landmarks are labelled; the others keep their labels
     new, _ = labeller.describe(landmark_map.select(range(first, len(landmark_map))), detections,
                                np.where(updated.shown >= first, updated.shown - first, -1))
     texts = dict(zip(new.landmark_ids, new.labels, strict=True))
@@ -233,7 +235,8 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
         replace(landmark_map, labels=landmark_map.labels[:first] + new.labels,
                 details=landmark_map.details[:first] + new.details),
         replace(updated.report, new=tuple(
-            replace(one, label=texts[one.landmark_id]) for one in updated.report.new)),
+            replace(landmark, label=texts[landmark.landmark_id])
+            for landmark in updated.report.new)),
         updated.embeddings, removed=updated.removed)
 
 
@@ -241,7 +244,8 @@ def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording
                    updated: Path | None = None) -> list[str]:
     """Write a map and the files next to it as one set; return lines about its keyframes.
 
-    Those of a map that is updated in its place stay, those of any other map before go.
+    If a map is updated in place, its keyframes stay. The keyframes of any other map that is
+    replaced are removed.
 
     CliplocError: a file cannot be written; nothing was changed.
     """

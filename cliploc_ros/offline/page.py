@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pages of HTML: one style and the parts of all pages. They have no scripts and request nothing.
+"""HTML pages: a common style and common parts, without scripts or network requests.
 
-A function that takes texts escapes them; one that takes parts takes HTML.
+Functions escape the texts that they get; parts are HTML already.
 """
 
 from base64 import b64encode
@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from typing import NamedTuple
 
-#: Okabe and Ito's colours, which colour-blind readers can distinguish.
+#: Colours of Okabe and Ito, which colour-blind readers can distinguish.
 ACCEPTED, REFUSED, MISLED = '#0072B2', '#E69F00', '#D55E00'
 GOOD, BAD, FAINT = ACCEPTED, MISLED, '#999999'
 _TYPES = {b'\x89PNG': 'png', b'\xff\xd8\xff\xe0': 'jpeg'}
@@ -58,7 +58,7 @@ summary {{ font-weight: 600; cursor: pointer }}
 
 
 class Bar(NamedTuple):
-    """A figure beside its threshold."""
+    """A number and its threshold."""
 
     name: str
     shown: str  #: The value and its threshold, in words
@@ -77,7 +77,7 @@ def page(title: str, *parts: str) -> str:
 
 
 def first_screen(left: Iterable[str], right: Iterable[str]) -> str:
-    """Return two columns, which fill a screen."""
+    """Return two columns that fill a screen."""
     return f'<div class="first"><div>{"".join(left)}</div><div>{"".join(right)}</div></div>'
 
 
@@ -87,14 +87,14 @@ def verdict(text: str, is_good: bool) -> str:
 
 
 def tiles(numbers: Iterable[tuple[str, str, bool]]) -> str:
-    """Return a few numbers in large type: each with its words, and whether it is good."""
+    """Return numbers in large type, each with a caption, and whether it is good."""
     return '<div class="tiles">' + ''.join(
         f'<div class="{"good" if is_good else "bad"}"><b>{escape(number)}</b>{escape(words)}</div>'
         for number, words, is_good in numbers) + '</div>'
 
 
 def bars(rows: Iterable[Bar]) -> str:
-    """Return bars with a mark at each threshold."""
+    """Return a chart of bars, each with a mark at its threshold."""
     return '<div class="bars">' + ''.join(
         f'<span>{escape(row.name)}</span><span class="bar">'
         f'<i{"" if row.is_good else " class=over"} style="width:{_percent(row.value)}"></i>'
@@ -108,19 +108,19 @@ def _percent(share: float) -> str:
 
 
 def card(text: str, image: bytes | None = None, caption: str = '') -> str:
-    """Return a text and a caption beside a picture, if there is one."""
+    """Return a text and a caption, next to an optional picture."""
     picture = '' if image is None else f'<img alt="a view" src="{_embedded(image)}">'
     return f'<div class="card">{picture}<div><p>{escape(text)}</p>{note(caption)}</div></div>'
 
 
 def fold(heading: str, *parts: str, is_open: bool = False) -> str:
-    """Return parts that a click on their heading shows."""
+    """Return parts that fold out at a click on their heading."""
     return (f'<details{" open" if is_open else ""}><summary>{escape(heading)}</summary>'
             f'{"".join(parts)}</details>')
 
 
 def figure(image: bytes | str, caption: str, name: str = '') -> str:
-    """Return a picture, embedded or by the name of a file beside the page; PNG or JPEG."""
+    """Return a picture, embedded (PNG or JPEG) or by the name of a file next to the page."""
     source = escape(image) if isinstance(image, str) else _embedded(image)
     return (f'<figure><img alt="{escape(name)}" src="{source}" loading="lazy">'
             f'<figcaption>{escape(caption)}</figcaption></figure>')
@@ -131,7 +131,7 @@ def _embedded(image: bytes) -> str:
 
 
 def side_by_side(parts: Iterable[str]) -> str:
-    """Return parts side by side, where there is room."""
+    """Return parts side by side, or below each other on a narrow screen."""
     return f'<div class="row">{"".join(parts)}</div>'
 
 
@@ -146,12 +146,12 @@ def note(text: str) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str | tuple[str, str]]]) -> str:
-    """Return a table; a cell may have a class, and # before a heading aligns to the right."""
+    """Return a table; a cell may have a CSS class, and # in a heading right-aligns its column."""
     kinds = ['number' if title.startswith('#') else '' for title in head]
     lines = [(('th', title.lstrip('#'), kind) for title, kind in zip(head, kinds, strict=True))
              ] if any(head) else []
-    lines += [(('td', *((one, kind) if isinstance(one, str) else one))
-               for one, kind in zip(row, kinds, strict=True)) for row in rows]
+    lines += [(('td', *((cell, kind) if isinstance(cell, str) else cell))
+               for cell, kind in zip(row, kinds, strict=True)) for row in rows]
     return '<div class="scroll"><table>' + ''.join(
         '<tr>' + ''.join(f'<{tag}{f" class={kind}" if kind else ""}>{escape(text)}</{tag}>'
                          for tag, text, kind in line) + '</tr>' for line in lines

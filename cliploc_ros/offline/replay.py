@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publish a recording: the recorded bytes, with the recorded QoS, at the recorded times.
 
-Own code, because neither PyPI's ROS nor ROS's base installation has `ros2 bag play`.
+It replaces `ros2 bag play`, which is missing in ROS from PyPI and in the base installation of ROS.
 """
 
 import time
@@ -33,12 +33,12 @@ from cliploc_ros.units import NS_PER_S
 
 CLOCK_TOPIC = '/clock'
 _POLL_S = 0.02
-#: Wait this long after a subscriber appears here: it must discover this publisher too, and ROS
-#: does not report that.
+#: Delay after a subscriber appears: it must discover this publisher too, and ROS does not report
+#: when it has.
 _DISCOVERY_S = 0.2
-#: Depth where the recording has none: discovery does not report a publisher's history.
+#: Depth if none was recorded: discovery does not report a publisher's history.
 DEFAULT_DEPTH = 10
-#: A recorded duration of this or more is infinite. Foxy's Fast DDS wrote the least such value.
+#: A recorded duration of this or more is infinite. Foxy's Fast DDS wrote exactly this value.
 _INFINITE_S = 2**31 - 1
 
 
@@ -46,41 +46,41 @@ _INFINITE_S = 2**31 - 1
 class PlayOptions:
     """Options of playing a recording."""
 
-    #: Speed; 1 is as recorded.
+    #: Factor of the recorded speed.
     rate: float = 1.0
-    #: Begin this long after the recording's start.
+    #: Start this long after the beginning of the recording.
     start_offset_s: float = 0.0
-    #: Play these only.
+    #: Play only these topics; None: all.
     topics: Collection[str] | None = None
-    #: Leave these out.
+    #: Topics to leave out.
     exclude: Collection[str] = ()
     #: New names of topics, by recorded name.
     remap: Mapping[str, str] = field(default_factory=dict)
-    #: Publish the recording's time on /clock this often per second of real time.
+    #: Rate of messages on /clock with the recording's time [Hz of real time]; None: no clock.
     clock_hz: float | None = None
-    #: Begin again at the end, until stopped.
+    #: Start again at the end, until stopped.
     loop: bool = False
 
 
 @dataclass(frozen=True)
 class PlayReport:
-    """Counts of published messages."""
+    """Numbers of published messages."""
 
-    #: Messages by recorded topic name.
+    #: Number of messages, by recorded topic name.
     counts: Counter[str]
-    #: How often the recording was played to its end.
+    #: Number of times that the recording was played to its end.
     passes: int = 0
-    #: Messages that the recording lists but that were not found in it.
+    #: Number of messages that the recording lists but does not contain.
     unread: int = 0
-    #: The longest that a message was published after its time.
+    #: Greatest delay of a message after its time.
     worst_lateness_s: float = 0.0
 
 
 class Player:
     """Publishes an open recording; `stop` ends every wait and the playback within milliseconds.
 
-    DatasetError: if nothing is left to play, a topic is not recorded, or a type is not installed
-    or has another definition.
+    DatasetError: there is nothing to play, a topic is not recorded, or a type is not installed or
+    has another definition.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Player:
         if self.start_ns > self.end_ns:
             length_s = (reader.end_ns - reader.start_ns) / NS_PER_S
             raise DatasetError(
-                f'{reader.path}: start offset {options.start_offset_s} s lies after its end at '
+                f'{reader.path}: start offset {options.start_offset_s} s is after its end at '
                 f'{length_s:.3f} s'
             )
         self._publishers = {
@@ -103,9 +103,9 @@ class Player:
         self._clock = node.create_publisher(Clock, CLOCK_TOPIC, 10) if options.clock_hz else None
 
     def wait_for_subscribers(self, topics: Iterable[str], timeout_s: float) -> None:
-        """Wait until each of some topics, by recorded name, has a subscriber; of all if empty.
+        """Wait until each topic, given by recorded name, has a subscriber; default: all topics.
 
-        DatasetError: if a topic is not played, or has no subscriber in time; the message names it.
+        DatasetError: a topic is not played, or has no subscriber in time; the message names it.
         """
         names = list(topics) or list(self._publishers)
         if unknown := [name for name in names if name not in self._publishers]:
@@ -113,10 +113,12 @@ class Player:
                                f'{", ".join(self._publishers)}')
         publishers = [self._publishers[name] for name in names]
         deadline = time.monotonic() + timeout_s
-        while lonely := [one for one in publishers if not one.get_subscription_count()]:
+        while unmatched := [publisher for publisher in publishers
+                            if not publisher.get_subscription_count()]:
             if time.monotonic() >= deadline:
-                raise DatasetError(f'no subscriber within {timeout_s:g} s on '
-                                   f'{", ".join(one.topic_name for one in lonely)}')
+                raise DatasetError(
+                    f'no subscriber within {timeout_s:g} s on '
+                    f'{", ".join(publisher.topic_name for publisher in unmatched)}')
             if self._stop.wait(_POLL_S):
                 return
         self._stop.wait(_DISCOVERY_S)
@@ -124,7 +126,7 @@ class Player:
     def play(self, on_message: Callable[[BagMessage], None] = lambda message: None) -> PlayReport:
         """Publish the messages, each at its time; `on_message` is called after each.
 
-        DatasetError: where the recording is damaged.
+        DatasetError: the recording is damaged.
         """
         counts = self._publish_latched()
         messages = self._read_ahead()
@@ -137,12 +139,12 @@ class Player:
             if self._stop.is_set():
                 break
             passes += 1
-            # a recording does not list how many messages follow a start offset
+            # the metadata do not count the messages after a start offset
             unread = 0 if self.start_ns > self._reader.start_ns else max(
                 sum(topic.message_count for topic in self.topics) - played.total(), 0)
             if not self._options.loop:
                 break
-            # The next pass follows at the mean distance of messages, and never at once.
+            # The gap before the next pass is the mean interval of messages, and never 0.
             length_ns = self.end_ns - self.start_ns
             gap_ns = length_ns // max(played.total() - 1, 1) or NS_PER_S
             origin_ns += round((length_ns + gap_ns) / self._options.rate)
@@ -152,21 +154,22 @@ class Player:
     def wait_for_acknowledgement(self, timeout_s: float) -> tuple[str, ...]:
         """Wait until all reliable subscribers have acknowledged all messages, or until stopped.
 
-        The middleware resends lost messages only while their publisher exists: a process that
-        ends right after its last message loses it under load. Fast DDS requests acknowledgements
-        every 3 s. Returns the topics with a subscriber that did not acknowledge all in time.
+        The middleware resends lost messages only while their publisher exists. Under load, a
+        process that ends right after its last message loses that message. Fast DDS requests
+        acknowledgements every 3 s. Returns the topics with missing acknowledgements.
         """
         deadline = time.monotonic() + timeout_s
         waiting = list(self._publishers.values())
         while not self._stop.is_set():
-            waiting = [one for one in waiting if not one.wait_for_all_acked(Duration())]
+            waiting = [publisher for publisher in waiting
+                       if not publisher.wait_for_all_acked(Duration())]
             if not waiting or time.monotonic() >= deadline:
                 return tuple(publisher.topic_name for publisher in waiting)
             self._stop.wait(_POLL_S)
         return ()
 
     def _read_ahead(self) -> Iterator[BagMessage]:
-        """Read the first message already, so that opening files makes no message late."""
+        """Open the messages and read the first one, so that opening files delays no message."""
         messages = self._reader.messages(self._publishers, start_ns=self.start_ns)
         return chain(list(islice(messages, 1)), messages)
 
@@ -176,7 +179,7 @@ class Player:
         origin_ns: int,
         on_message: Callable[[BagMessage], None],
     ) -> tuple[Counter[str], float]:
-        """Publish messages; return how many on each topic, and the greatest lateness [s]."""
+        """Publish messages; return their number by topic, and the greatest delay [s]."""
         timeline = _Timeline(origin_ns, self.start_ns, self._options.rate, self._stop)
         ticker = None
         if self._clock is not None and self._options.clock_hz:
@@ -196,7 +199,7 @@ class Player:
         return counts, worst_lateness_s
 
     def _publish_latched(self) -> Counter[str]:
-        """Publish what a late subscriber would still receive from before the start offset."""
+        """Publish latched messages from before the start, which late subscribers would receive."""
         counts: Counter[str] = Counter()
         latched = [topic.name for topic in self.topics if is_latched(topic.offered_qos)]
         if self.start_ns == self._reader.start_ns or not latched:
@@ -208,24 +211,24 @@ class Player:
 
 
 class _Timeline:
-    """Maps recorded stamps to the monotonic clock from one origin, so that no drift adds up."""
+    """Maps recorded stamps to the monotonic clock from a fixed origin, without drift."""
 
     def __init__(self, origin_ns: int, start_ns: int, rate: float, stop: Interruption) -> None:
         self.start_ns, self.rate = start_ns, rate
         self._origin_ns, self._stop = origin_ns, stop
 
     def wait_for(self, stamp_ns: int) -> bool:
-        """Sleep until a stamp's time; return False if stopped instead."""
+        """Sleep until a stamp's time; return False if stopped before."""
         left_s = -self.lateness_s(stamp_ns)
         return not self._stop.wait(left_s) if left_s > 0 else not self._stop.is_set()
 
     def lateness_s(self, stamp_ns: int) -> float:
-        """Return how long ago a stamp's time was [s]; negative for the future."""
+        """Return the time since a stamp's time [s]; negative in the future."""
         due_ns = self._origin_ns + (stamp_ns - self.start_ns) / self.rate
         return (time.monotonic_ns() - due_ns) / NS_PER_S
 
     def now_ns(self) -> int:
-        """Return the recording's time now [ns]."""
+        """Return the current time of the recording [ns]."""
         return self.start_ns + round((time.monotonic_ns() - self._origin_ns) * self.rate)
 
 
@@ -238,7 +241,7 @@ class _Ticker:
         self.next_ns = timeline.start_ns
 
     def tick(self) -> None:
-        """Publish the tick that is due, and skip those already missed."""
+        """Publish the tick that is due, and skip missed ticks."""
         message = Clock()
         message.clock.sec, message.clock.nanosec = divmod(self.next_ns, NS_PER_S)
         self._publisher.publish(message)
@@ -249,7 +252,7 @@ class _Ticker:
 def select_topics(reader: BagReader, options: PlayOptions) -> list[BagTopic]:
     """Return the topics to play.
 
-    DatasetError: if a named topic is not recorded, or nothing is left to play.
+    DatasetError: a named topic is not recorded, or there is nothing to play.
     """
     names = list(reader.topics) if options.topics is None else list(options.topics)
     for name in (*names, *options.exclude, *options.remap):
@@ -265,9 +268,9 @@ def select_topics(reader: BagReader, options: PlayOptions) -> list[BagTopic]:
 
 def _playable(topics: list[BagTopic], options: PlayOptions
               ) -> tuple[list[BagTopic], list[BagTopic]]:
-    """Return the topics whose types are installed, and the others.
+    """Split topics into those whose types are installed, and the others.
 
-    DatasetError: a topic that is asked for by name, or each of them, lacks its type.
+    DatasetError: the type of a topic requested by name is missing, or the types of all topics are.
     """
     lacking = []
     for topic in topics:
@@ -284,9 +287,9 @@ def _playable(topics: list[BagTopic], options: PlayOptions
 
 
 def create_publisher(node: Node, topic: BagTopic, name: str) -> Publisher:
-    """Make a publisher, named before ROS's own remapping, with the QoS that was recorded.
+    """Make a publisher with the recorded QoS; ROS may still remap its name.
 
-    DatasetError: if the type is not installed, or differs from the recorded one.
+    DatasetError: the type is not installed, or differs from the recorded one.
     """
     publisher: Publisher = node.create_publisher(
         message_class(topic), name, qos_profile(topic.offered_qos)
@@ -298,7 +301,7 @@ def create_publisher(node: Node, topic: BagTopic, name: str) -> Publisher:
 def message_class(topic: BagTopic) -> Any:
     """Return the installed class of a topic's messages.
 
-    DatasetError: naming the package to install.
+    DatasetError: the type is not installed; the message names the package.
     """
     package, _, name = topic.msgtype.partition('/')
     namespace, _, name = name.rpartition('/')
@@ -313,15 +316,15 @@ def message_class(topic: BagTopic) -> Any:
 
 
 def qos_profile(offered: Collection[Qos]) -> QoSProfile:
-    """Return the profile that replays what a topic's publishers offered.
+    """Return the QoS profile that a topic's publishers offered.
 
-    Of several publishers' offers it takes the strongest reliability and durability, which
-    match all their subscribers. The history's depth is 10 where none was recorded.
+    With several publishers, the strongest reliability and durability are used, which match all
+    their subscribers. The default depth of the history is 10.
     """
     if not offered:
         return QoSProfile(depth=DEFAULT_DEPTH)
     first = next(iter(offered))
-    best_effort = all(one.reliability == QosReliability.BEST_EFFORT for one in offered)
+    best_effort = all(qos.reliability == QosReliability.BEST_EFFORT for qos in offered)
     profile = QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=first.depth or DEFAULT_DEPTH,
@@ -345,11 +348,11 @@ def qos_profile(offered: Collection[Qos]) -> QoSProfile:
 
 def is_latched(offered: Collection[Qos]) -> bool:
     """Return whether a recorded publisher kept messages for late subscribers."""
-    return any(one.durability == QosDurability.TRANSIENT_LOCAL for one in offered)
+    return any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in offered)
 
 
 def _check_definition(node: Node, topic: BagTopic, name: str) -> None:
-    """Refuse bytes that were recorded with another definition than the installed one."""
+    """Refuse a topic whose recorded definition differs from the installed one."""
     if not topic.type_hash.startswith('RIHS01_'):
         return  # recorded before Iron, which introduced the hash
     for endpoint in node.get_publishers_info_by_topic(name):
@@ -357,6 +360,6 @@ def _check_definition(node: Node, topic: BagTopic, name: str) -> None:
             topic.type_hash, 'INVALID'
         ):
             raise DatasetError(
-                f'{topic.name} was recorded with another definition of {topic.msgtype} than the '
-                f'installed one; leave it out: --exclude {topic.name}'
+                f'{topic.name} was recorded with a definition of {topic.msgtype} that differs '
+                f'from the installed one; leave it out: --exclude {topic.name}'
             )

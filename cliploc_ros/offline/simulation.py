@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated detector and CLIP of a robot; for check_map, the studio and studies.
+"""Simulated detector and CLIP of a robot, for check_map, the studio and studies.
 
-The detector's boxes have guessed or measured errors. CLIP's similarities of crops and labels are
-simulated: a label is a vector, a part of its class and a part of its words, each word a random
-direction. So labels of equal text are equal, and labels that share words are alike. A crop is the
-vector of what it shows and noise, more for small boxes. Level and spread are those of the
-simulation that the project's figures are measured with (top-1 about 0.6 on TUM fr3); no recording
-of CLIP fits them to a user's images.
+The errors of the detector's boxes are assumed or measured. CLIP's similarities of crops and labels
+are simulated. A label is a vector: the sum of a part of its class and a part of its words, each
+word a random direction. Labels of equal text are therefore equal, and labels that share words are
+similar. A crop is the vector of the object that it shows, with noise, which is stronger for small
+boxes. Level and spread of the similarities are those of the simulation behind the project's
+figures (top-1 about 0.6 on TUM fr3); they are not fitted to the user's images.
 """
 
 import re
@@ -24,25 +24,25 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.visibility import SHOWN_SHARE, boxes_in_image
 from cliploc_ros.core.observation import Detections
 
-#: Standard deviation of a box's edge: [px], and as a share of the box's extent; both are added in
-#: squares.
+#: Standard deviations of a box's edge: [px], and as a share of the box's extent; their variances
+#: are added.
 EDGE_SIGMA_PX, EDGE_SIGMA_SHARE = 2.0, 0.04
-# Frames count for a pose if they saw the landmark from within this angle of its direction.
+# Frames count for a pose if their direction to the landmark differs by less than this angle.
 _NEAR_COSINE = np.cos(np.radians(30.0))
-# Frames that the landmark's overall ratio stands for, where few frames are near.
+# Weight of the landmark's overall ratio, in frames; it matters where few frames count.
 _PRIOR_FRAMES = 3.0
 _SCORE = 0.8
-# Without a recording; guesses.
+# Assumptions without a recording; not measured.
 _GUESSED_RATIO = 0.6
 _GUESSED_REACH_M = 5.0
 GUESSED_MIN_SIDE_PX = 12.0
 _GUESSED_CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
 # Length of the vectors of labels and crops.
 _SIZE = 256
-#: Part of a vector's square that all objects of a class share.
+#: Share of a vector's squared length that all objects of a class have in common.
 CLASS_SHARE = 0.3
 _NOISE = 0.43
-# Part of the noise's variance that all crops of one landmark share.
+# Share of the noise's variance that all crops of a landmark have in common.
 _SHARED_NOISE = 0.3
 _STOP_WORDS = frozenset((
     'a', 'an', 'and', 'at', 'by', 'from', 'in', 'is', 'of', 'on', 'or', 'seen', 'standing', 'the',
@@ -50,7 +50,7 @@ _STOP_WORDS = frozenset((
 
 
 class Sightings(NamedTuple):
-    """Frames that should show a landmark: its direction (k, 3) from them, and if it was seen."""
+    """Frames with a landmark in view: its direction (k, 3), and whether it was detected (k,)."""
 
     directions: NDArray[np.float64]
     was_seen: NDArray[np.bool_]
@@ -60,37 +60,36 @@ class Sightings(NamedTuple):
 class DetectorModel:
     """A detector's misses and errors: L landmarks."""
 
-    landmark_map: LandmarkMap  #: What there is to see
+    landmark_map: LandmarkMap  #: The landmarks to detect
     camera: Camera
     sightings: tuple[Sightings, ...]  #: Sightings of each landmark; empty without a recording
-    #: (L,): share of the expected frames in which each landmark was detected, and from how far
-    #: away it can be [m]
+    #: (L,): detection ratio of each landmark in the frames that have it in view, and the greatest
+    #: distance at which it can be detected [m]
     ratios: NDArray[np.float64]
     reach_m: NDArray[np.float64]
     edge_scale: float  #: Scale of the standard deviations of edges
     min_side_px: float  #: Smaller boxes are not detected
-    #: tuple of ((k, 4), tuple of str): boxes [px] of no landmark in single frames, and their
-    #: classes
+    #: Boxes (k, 4) [px] that belong to no landmark, and their classes, frame by frame
     clutter: tuple[tuple[NDArray[np.float64], tuple[str, ...]], ...]
 
     def in_view(self, map_from_camera: NDArray[np.float64]
                 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the landmarks (k,) that a camera could detect, and their boxes (k, 4) [px]."""
-        one = self.landmark_map
-        found = boxes_in_image(self.camera, invert_transform(map_from_camera), one.centers,
-                               one.shapes, SHOWN_SHARE, self.min_side_px)
-        distances = np.linalg.norm(one.centers - map_from_camera[:3, 3], axis=1)
+        centers = self.landmark_map.centers
+        found = boxes_in_image(self.camera, invert_transform(map_from_camera), centers,
+                               self.landmark_map.shapes, SHOWN_SHARE, self.min_side_px)
+        distances = np.linalg.norm(centers - map_from_camera[:3, 3], axis=1)
         rows = np.nonzero(found.is_shown & (distances <= self.reach_m))[0]
         return rows, found.shown[rows]
 
     def expected_detections(self, map_from_camera: NDArray[np.float64]) -> float:
-        """Return how many landmarks the detector finds on average."""
+        """Return the expected number of detected landmarks."""
         rows, _ = self.in_view(map_from_camera)
         return sum(self._chance(row, map_from_camera) for row in rows)
 
     def detect(self, map_from_camera: NDArray[np.float64], rng: np.random.Generator
                ) -> tuple[Detections, NDArray[np.int64]]:
-        """Return simulated detections, and the landmark that each box shows."""
+        """Simulate n detections; also return the landmark (n,) of each box, -1 for none."""
         rows, boxes = self.in_view(map_from_camera)
         chances = np.array([self._chance(row, map_from_camera) for row in rows])
         seen = rng.random(len(rows)) < chances
@@ -122,7 +121,7 @@ class DetectorModel:
 
 
 def guess_detector(landmark_map: LandmarkMap) -> DetectorModel:
-    """Return a detector without any measurement."""
+    """Return a detector with assumed errors, for a map without a recording."""
     count = len(landmark_map)
     ratios = np.full(count, _GUESSED_RATIO)
     for row, detail in enumerate(landmark_map.details):
@@ -134,14 +133,14 @@ def guess_detector(landmark_map: LandmarkMap) -> DetectorModel:
 
 @dataclass(frozen=True)
 class LabelModel:
-    """Labels and classes as vectors: L landmarks."""
+    """Labels of L landmarks as vectors of length D."""
 
     labels: NDArray[np.float64]  #: (L, D): unit vectors
-    biases: NDArray[np.float64]  #: (L, D): how all crops of a landmark differ from its label
+    biases: NDArray[np.float64]  #: (L, D): noise that all crops of a landmark have in common
 
     @staticmethod
     def of(landmark_map: LandmarkMap) -> 'LabelModel':
-        """Return the model of a map's labels."""
+        """Make the model of a map's labels."""
         vectors = np.array([
             np.sqrt(CLASS_SHARE) * _direction(f'class {class_id}')
             + np.sqrt(1.0 - CLASS_SHARE) * _label_vector(landmark_map, row)
@@ -154,7 +153,7 @@ class LabelModel:
     def similarities(self, shown: NDArray[np.int64], class_ids: tuple[str, ...],
                      bboxes_xyxy: NDArray[np.float64], rng: np.random.Generator
                      ) -> NDArray[np.float32]:
-        """Return the similarities (n, L) of n crops.
+        """Simulate the similarities (n, L) of n crops and the labels.
 
         Parameters
         ----------
@@ -177,7 +176,7 @@ class LabelModel:
 
 
 def shared_noise(biases: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the noise (n, D) of crops. All crops of an object share a part of it."""
+    """Return the noise (n, D) of crops; all crops of an object share a part of it."""
     return np.asarray(np.sqrt(1.0 - _SHARED_NOISE) * noise + np.sqrt(_SHARED_NOISE) * biases)
 
 
@@ -186,8 +185,8 @@ def similarities_of(crops: NDArray[np.float64], strength: float, noise: NDArray[
                     ) -> NDArray[np.float32]:
     """Return the similarities (n, L) of crops (n, D) with labels (L, D).
 
-    The strength of the noise (n, D) is that of a box with sides of 64 px. Smaller boxes have more
-    noise, and lower similarities.
+    `strength` is the factor of the noise (n, D) for a box with sides of 64 px. Smaller boxes have
+    more noise, and lower similarities.
     """
     sizes = np.sqrt(np.prod(np.maximum(bboxes_xyxy[:, 2:] - bboxes_xyxy[:, :2], 1.0), axis=1))
     levels = np.log2(sizes / 64.0)[:, None]
@@ -207,7 +206,7 @@ def _label_vector(landmark_map: LandmarkMap, row: int) -> NDArray[np.float64]:
 
 
 def _direction(text: str) -> NDArray[np.float64]:
-    """Return the unit vector (D,) of a text: random, but always the same."""
+    """Return the unit vector (D,) of a text: random, but equal for equal texts."""
     rng = np.random.default_rng(zlib.crc32(text.encode('utf-8', 'replace')))
     return _unit(rng.normal(size=_SIZE))
 

@@ -194,7 +194,7 @@ def test_metadata_is_as_jazzy_reads_it(tmp_path, plugin):
 def test_existing_output_is_kept(tmp_path, plugin):
     (tmp_path / 'bag').mkdir()
     (tmp_path / 'bag' / 'precious').write_text('data')
-    with pytest.raises(DatasetError, match='exists already'), BagWriter(tmp_path / 'bag', plugin):
+    with pytest.raises(DatasetError, match='already exists'), BagWriter(tmp_path / 'bag', plugin):
         pass
     assert [path.name for path in tmp_path.rglob('*')] == ['bag', 'precious']
 

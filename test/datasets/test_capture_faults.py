@@ -60,7 +60,7 @@ def test_numbers_of_transforms_json_that_cannot_be(fields, expected, shots, tmp_
 def test_names_of_no_file_are_counted(name, shots, tmp_path):
     folder = edited(write_nerf(tmp_path, shots), lambda values: values['frames'][0].update(
         file_path=name))
-    assert any('1 of 4 images that are listed are missing' in note
+    assert any('1 of 4 listed images are missing' in note
                for note in read_folder(folder, METRES).notes)
 
 
@@ -73,12 +73,12 @@ def test_folders_without_poses_or_images(shots, tmp_path):
     refuses(tmp_path / ('x' * 300), 'no such folder')
     (tmp_path / 'photos').mkdir()
     shutil.copy(shots[0].path, tmp_path / 'photos')
-    refuses(tmp_path / 'photos', 'need poses')
+    refuses(tmp_path / 'photos', 'images without poses')
     (tmp_path / 'scan.r3d').touch()
     refuses(tmp_path / 'scan.r3d', 'unpack it')
     (tmp_path / 'photos/metadata.yaml').touch()
     refuses(tmp_path / 'photos', '`bag`')
-    refuses(tmp_path / 'photos', 'no COLMAP model here', FolderOptions(layout='colmap'))
+    refuses(tmp_path / 'photos', 'has no COLMAP model', FolderOptions(layout='colmap'))
     folder = write_colmap(tmp_path / 'scan', shots)
     shutil.move(folder / 'images', tmp_path / 'moved')
     refuses(folder, 'none of 4 .* `images`')
@@ -94,7 +94,7 @@ def test_the_unit_must_be_known(shots, tmp_path):
     refuses(tmp_path / 'c', 'named z.jpg',
             FolderOptions(known_distance=('z.jpg', shots[1].path.name, 1.0)))
     name = shots[0].path.name
-    refuses(tmp_path / 'c', 'at one place',
+    refuses(tmp_path / 'c', 'at the same place',
             FolderOptions(known_distance=(name, name, 1.0)))
     refuses(write_nerf(tmp_path / 'z', shots, applied_scale=0), 'applied_scale is 0')
     doubled = []

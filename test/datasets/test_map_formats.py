@@ -171,7 +171,7 @@ def test_what_no_map_can_hold_is_left_out_with_the_reason(tmp_path):
             'object 4': 'not finite',
             'object 5': 'has 9 numbers, not 16', 'object 6': '0 categories',
             'object 7': 'not symmetric', 'cup_8': 'semi-axes are 1 1 200 m',
-            'cup_0': 'its id occurs before'}.items():
+            'cup_0': 'its id is repeated'}.items():
         assert reason in reasons[name]
 
 

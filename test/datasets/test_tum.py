@@ -94,8 +94,8 @@ def test_malformed_files_are_named(sequence_folder, name, text, message):
 
 
 @pytest.mark.parametrize(('truth', 'message'), [
-    (None, 'no groundtruth.txt here; give a `trajectory`'),
-    ('9000 0 0 0 0 0 0 1\n', 'another clock')])
+    (None, 'groundtruth.txt is missing; give a `trajectory`'),
+    ('9000 0 0 0 0 0 0 1\n', 'different clocks')])
 def test_images_alone_need_no_poses(sequence_folder, truth, message):
     """The studio shows the images of a map that was made with a trajectory of its own."""
     for path in (sequence_folder / 'rgb').iterdir():
@@ -239,7 +239,7 @@ def test_what_is_no_pose_of_seven_scenes(tmp_path):
     with pytest.raises(DatasetError, match=r'color\.jpg is 1e\+300 m from the origin'):
         rgbd_frames(tmp_path, NO_OPTIONS)
     path.write_text('1 0 0 0\n0 1 0\n')
-    with pytest.raises(DatasetError, match=r'pose\.txt:2: is no 4x4 matrix'):
+    with pytest.raises(DatasetError, match=r'pose\.txt:2: is not a 4x4 matrix'):
         rgbd_frames(tmp_path, NO_OPTIONS)
 
 

@@ -210,7 +210,7 @@ def test_images_of_several_maps_are_compared_together_or_not_at_all(clip, tmp_pa
     rows = embed_map(clip, both, files, 'image')
     assert np.array_equal(np.asarray(rows), plain[[*range(len(ROOM)), 2, 0, 1]])
     warning, = (record for record in caplog.records if record.levelname == 'WARNING')
-    assert f'{files[1]} has no images' in warning.getMessage()
+    assert f'{files[1]} has no image embeddings' in warning.getMessage()
 
 
 def options_of(model: str, file: object, tmp_path: Path, **changes) -> ClipOptions:
@@ -231,7 +231,7 @@ def refusal(clip_options: ClipOptions) -> str:
     (b'version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 3\n', 'git lfs pull'),
     (b'\n<!DOCTYPE html><html><body>Sign in</body></html>', 'is a web page'),
     (b'just text', 'holds no weights'), (b'PK\x03\x04' + bytes(1000), 'truncated'),
-    (b'\x80\x02garbage', 'no checkpoint')])
+    (b'\x80\x02garbage', 'not a checkpoint')])
 def test_files_that_are_no_weights(tmp_path, content, message):
     file = tmp_path / 'weights.pt'
     file.write_bytes(content)
@@ -261,8 +261,8 @@ class Hostile:
 def test_pickled_code_is_never_run(tmp_path, zipped):
     file, proof = tmp_path / 'weights.pt', tmp_path / 'proof'
     torch.save({'visual.proj': Hostile(proof)}, file, _use_new_zipfile_serialization=zipped)
-    assert 'no checkpoint' in refusal(options_of('ViT-B-32', file, tmp_path))
-    with pytest.raises(ModelError, match='no detection'):
+    assert 'not a checkpoint' in refusal(options_of('ViT-B-32', file, tmp_path))
+    with pytest.raises(ModelError, match='not a detection'):
         load_detector(DetectorOptions(str(file), device='cpu'))
     assert not proof.exists()
 

@@ -127,7 +127,7 @@ def test_a_revision_and_a_file(hub, tmp_path):
 def test_another_file_under_the_same_name(hub, tmp_path):
     hub.sent['onnx/model.onnx'] = os.urandom(100_000)
     text = resolve(tmp_path)['error']
-    assert 'model.onnx is not the file that the hub named' in text
+    assert 'the digest of model.onnx differs from that on the hub' in text
     hub.sent.clear()
     assert 'network' in resolve(tmp_path)
 

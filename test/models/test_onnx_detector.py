@@ -219,13 +219,13 @@ def refusal(load, model) -> str:
 
 
 @pytest.mark.parametrize(('outputs', 'metadata', 'changes', 'message'), [
-    ({'logits': np.zeros((1, 1000), np.float32)}, TWO, {}, 'is no detector: its outputs are'),
+    ({'logits': np.zeros((1, 1000), np.float32)}, TWO, {}, 'is not a detector: its outputs are'),
     (YOLO, {**TWO, 'task': 'classify'}, {}, "for the task 'classify'"),
-    (YOLO, {}, {}, 'config.json is missing, and .* holds no class names'),
+    (YOLO, {}, {}, 'config.json is missing; .* has no class names'),
     (YOLO, {'names': 'what('}, {}, 'class names in its metadata cannot be read'),
     (YOLO, {'names': "{0: 'mug', 2: 'box'}"}, {}, 'with the keys 0, 1'),
     ({'output0': np.zeros((1, 9, 84), np.float32)}, TWO, {}, r'of 2 classes: .*\(9, 84\)'),
-    (YOLO, TWO, {'kind': TensorProto.UINT8}, 'no floating-point numbers'),
+    (YOLO, TWO, {'kind': TensorProto.UINT8}, 'not floating-point numbers'),
     (YOLO, TWO, {'shape': (4, 3, 64, 64)}, 'takes no single colour image'),
     (YOLO, TWO, {'shape': (1, 1, 64, 64)}, 'takes no single colour image'),
     (DETR, {}, {}, 'config.json is missing')])
@@ -238,11 +238,11 @@ def test_files_that_are_no_detector(load, tmp_path, outputs, metadata, changes, 
 def test_configurations_that_do_not_fit(load, tmp_path):
     write_network(tmp_path / 'model.onnx', DETR)
     write_configs(tmp_path, ('mug',) * 4)
-    assert 'has 2 classes, config.json names 4' in refusal(load, tmp_path)
+    assert 'has 2 classes, but config.json has 4' in refusal(load, tmp_path)
     write_configs(tmp_path, ('mug', 'box'), size={'height': 32, 'width': 32})
-    assert 'not of the same network' in refusal(load, tmp_path)
+    assert 'not from the same network' in refusal(load, tmp_path)
     write_configs(tmp_path, ('mug', 'box'), size=64)
-    assert "'size' names neither" in refusal(load, tmp_path)
+    assert "'size' has neither" in refusal(load, tmp_path)
     write_configs(tmp_path, ('mug', 'box'), do_normalize=True)
     assert "'image_mean'" in refusal(load, tmp_path)
     (tmp_path / 'preprocessor_config.json').unlink()
@@ -295,7 +295,7 @@ def test_a_damaged_compiled_network_is_compiled_again(plain, images, tmp_path, c
 
 
 def test_other_requests_are_refused(load, plain):
-    with pytest.raises(OptionsError, match='its classes are fixed'):
+    with pytest.raises(OptionsError, match='has fixed classes'):
         load(plain, prompts=(('cup', 'cup'),))
     with pytest.raises(OptionsError, match='runs in OpenVINO'):
         load(plain, inference='pytorch')

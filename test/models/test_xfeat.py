@@ -182,7 +182,7 @@ def test_only_the_published_file_is_kept_of_a_download(published, tmp_path, monk
         monkeypatch.setattr(
             'cliploc_ros.models.xfeat._URL', f'http://127.0.0.1:{server.server_port}/{FILE_NAME}')
         (served / FILE_NAME).write_bytes(published.read_bytes()[:-1])
-        with pytest.raises(ModelError, match='another file came'):
+        with pytest.raises(ModelError, match='the server sent another file'):
             load_xfeat(str(tmp_path))
         assert list((tmp_path / 'weights').iterdir()) == []
         shutil.copy(published, served / FILE_NAME)

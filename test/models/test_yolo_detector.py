@@ -96,7 +96,7 @@ def refusal(file: Path) -> str:
 
 
 def test_files_that_are_no_yolo(small_clip, tmp_path):
-    assert 'no detection model' in refusal(small_clip.file)
+    assert 'not a detection model' in refusal(small_clip.file)
     assert 'does not exist' in refusal(tmp_path / 'gone.pt')
     assert 'has none of model.onnx' in refusal(tmp_path)
     (tmp_path / 'text.pt').write_text('text')

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Check that images and poses of a recording agree, and find the reading of them that does.
+"""Check that the images and poses of a recording agree; if not, find the conventions that do.
 
-Points that two images share lie on epipolar lines. Only pairs count whose matches some epipolar
-geometry explains, whatever the poses are: images that do not overlap prove nothing.
+Matched points of two images lie on epipolar lines. A pair of images counts only if some epipolar
+geometry, independent of the poses, explains its matches. Images without overlap prove nothing.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,10 +26,10 @@ from cliploc_ros.errors import DatasetError
 
 _Pose = NDArray[np.float64]
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-# of a body whose axes are forward, left, up (REP 103), and a camera that looks forward
+# A camera that looks forward, on a body with the axes forward, left, up (REP 103).
 _BODY_FROM_CAMERA = make_transform(
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
-#: Conventions of a stored pose, and map_from_camera with OpenCV's axes from each.
+#: Conventions of a stored pose; each function converts to map_from_camera with OpenCV's axes.
 AXES: Mapping[str, Callable[[_Pose], _Pose]] = {
     'opencv': lambda pose: pose,
     'opengl': lambda pose: pose @ _FLIP,
@@ -37,59 +37,61 @@ AXES: Mapping[str, Callable[[_Pose], _Pose]] = {
     'opengl-inverse': lambda pose: invert_transform(pose) @ _FLIP,
     'ros': lambda pose: pose @ _BODY_FROM_CAMERA}
 
-# Pairs of images that tell the axes: with this much of a turn, which an error of axes turns round.
+# Number of image pairs to compare, of first images to try, and of later images to try with each.
 _PAIRS, _TRIED, _REACH = 4, 12, 20
+# The rotation between the images of a pair [degrees]: wrong axes reverse it.
 _TURN_DEG = (4.0, 30.0)
 _FEATURES, _LONGEST_PX = 500, 480
-# Matches that one epipolar geometry explains to within this many pixels, and their least share.
+# Least number and share of the matches that one epipolar geometry explains, and its gate [px].
 _LEAST_MATCHES, _LEAST_SHARE, _GATE_PX = 25, 0.5, 2.0
-# Median epipolar errors at an image _LONGEST_PX wide [px]: a true choice has 0.3 to 2 of them.
+# Median epipolar errors at an image width of _LONGEST_PX [px]: correct conventions give 0.3 to 2.
 _GOOD_PX, _WRONG_PX, _BETTER = 3.0, 4.0, 0.35
 
 
 class View(NamedTuple):
-    """An image and its pose, as a recording has them."""
+    """An image and its pose, as recorded."""
 
     pose: _Pose | None
-    #: Returns image and camera; given whether to turn the image by its EXIF orientation
+    #: Returns the image and its camera; the argument: apply the image's EXIF orientation
     look: Callable[[bool], tuple[NDArray[np.uint8], Camera]]
-    #: Returns the pose this much later than the image [ns]
+    #: Returns the pose at a delay after the image's stamp [ns]
     pose_after: Callable[[int], _Pose | None] | None = None
 
 
 class Reading(NamedTuple):
-    """A way to read a recording."""
+    """Conventions under which the poses, cameras and stamps of a recording are read."""
 
-    remedy: str  #: Advice if it fits and the given convention does not
+    remedy: str  #: Advice if this reading fits and the given one does not
     pose: Callable[[_Pose], _Pose] = AXES['opencv']
     camera: Callable[[Camera], Camera] = lambda camera: camera
-    upright: bool = False  #: Images are turned by their EXIF orientation
-    shift_ns: int = 0  #: Poses are those of this much later
-    #: Median error of the given way beyond which this one may be meant [px], and the share of it
-    #: that this one may have
+    upright: bool = False  #: Whether to apply the EXIF orientation of images
+    shift_ns: int = 0  #: Delay of the pose after the image's stamp
+    #: This reading replaces the given one only if the given one's median error exceeds least_px
+    #: [px], and its own is below that error times `better`
     least_px: float = _WRONG_PX
     better: float = _BETTER
 
 
 def w_first(pose: _Pose) -> _Pose:
-    """Return the pose of a quaternion that was read as x y z w, and is w x y z."""
+    """Correct a pose (4, 4) whose quaternion w x y z was read as x y z w."""
     return transform_from_pose(pose[:3, 3], np.roll(quaternion_from_transform(pose), -1))
 
 
 def check_agreement(views: Sequence[View], readings: Mapping[str, Reading], where: object) -> str:
-    """Return a note where images and poses do not fit; '' if they do, or do not tell.
+    """Return a note if images and poses do not fit; '' if they fit, or if the check cannot decide.
 
     Parameters
     ----------
     views : sequence
-        In an order in which neighbours may overlap.
+        Neighbours in this order should overlap.
     readings : mapping
-        The ways to read them by name; the first is the given one. Of equal ones the first counts.
+        The readings by name; the first is the given one. Of readings with equal errors the first
+        wins.
 
     Raises
     ------
     DatasetError
-        They fit well if read in another way; says which.
+        Images and poses fit well under another reading; the message names it.
     """
     given, first = next(iter(readings.items()))
     found: dict[str, list[float]] = {name: [] for name in readings}
@@ -107,8 +109,8 @@ def check_agreement(views: Sequence[View], readings: Mapping[str, Reading], wher
     if errors[given] > reading.least_px and errors[best] < min(_GOOD_PX,
                                                                reading.better * errors[given]):
         raise DatasetError(f'{where}: the images do not fit the poses as {given} (median epipolar '
-                           f'error {errors[given]:.1f} px), but do as {best} ({errors[best]:.1f} '
-                           f'px): {reading.remedy}')
+                           f'error {errors[given]:.1f} px), but they fit as {best} '
+                           f'({errors[best]:.1f} px): {reading.remedy}')
     if errors[given] < _WRONG_PX:
         return ''
     return (f'the images do not fit the poses: median epipolar error {errors[given]:.1f} px, '
@@ -116,7 +118,7 @@ def check_agreement(views: Sequence[View], readings: Mapping[str, Reading], wher
 
 
 def _pairs(views: Sequence[View], given: Reading) -> Iterator[tuple[View, View]]:
-    """Yield pairs of views that are near each other in order, and turned."""
+    """Yield pairs of views close in order, with a rotation of _TURN_DEG between them."""
     turns = [given.pose(view.pose)[:3, :3] for view in views if view.pose is not None]
     last = len(views) - 1
     for start in np.unique(np.linspace(0, max(0, last - 1), _TRIED).astype(int)).tolist():
@@ -130,21 +132,22 @@ def _pairs(views: Sequence[View], given: Reading) -> Iterator[tuple[View, View]]
 
 def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]
                      ) -> dict[str, float]:
-    """Return the median epipolar error of two images by the name of the reading [px].
+    """Return the median epipolar error of two images under each reading, by its name [px].
 
-    Empty if no epipolar geometry explains enough matches, as those of images without overlap.
+    The result is empty if no epipolar geometry explains enough matches, as for images without
+    overlap.
     """
     errors = {}
-    ways = dict.fromkeys((one.upright, one.camera) for one in readings.values())
+    ways = dict.fromkeys((reading.upright, reading.camera) for reading in readings.values())
     try:
         seen = {upright: _match(pair, upright) for upright, _ in ways}
         kept = {way: _overlapping(*seen[way[0]], way[1]) for way in ways}
-    except DatasetError:  # whoever reads the images says so
+    except DatasetError:  # the caller reports it when it reads the images
         return {}
     for name, reading in readings.items():
         points, focal_px = kept[reading.upright, reading.camera]
-        first, second = (one.pose if one.pose_after is None or not reading.shift_ns
-                         else one.pose_after(reading.shift_ns) for one in pair)
+        first, second = (view.pose if view.pose_after is None or not reading.shift_ns
+                         else view.pose_after(reading.shift_ns) for view in pair)
         if len(points[0]) and first is not None and second is not None:
             step = invert_transform(reading.pose(second)) @ reading.pose(first)
             errors[name] = focal_px * float(np.median(_sampson(points[0], points[1], step)))
@@ -153,8 +156,8 @@ def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]
 
 def _match(pair: tuple[View, View], upright: bool
            ) -> tuple[list[Camera], list[NDArray[np.float64]]]:
-    """Return the cameras of two images, and the pixels (n, 2) of their matches."""
-    looks = [one.look(upright) for one in pair]
+    """Match two images; return their cameras, and the matched pixels (n, 2) of each."""
+    looks = [view.look(upright) for view in pair]
     features = [extract(image, _FEATURES, _LONGEST_PX) for image, _ in looks]
     ours, theirs = (unit_rows(feature.descriptors) for feature in features)
     rows, _ = match(ours, theirs)
@@ -164,10 +167,10 @@ def _match(pair: tuple[View, View], upright: bool
 
 def _overlapping(cameras: Sequence[Camera], pixels: Sequence[NDArray[np.float64]],
                  change: Callable[[Camera], Camera]) -> tuple[NDArray[np.float64], float]:
-    """Return points (2, n, 2) at z = 1 that both images show, and their focal length [px].
+    """Return the inliers (2, n, 2) of an epipolar geometry at z = 1, and the focal length [px].
 
-    They are those that an epipolar geometry explains, whatever the poses are; none where these are
-    too few.
+    The geometry is estimated from the matches, independent of the poses. With too few inliers, the
+    result is empty.
     """
     points = np.array([change(camera).normalize_points(pixel)
                        for camera, pixel in zip(cameras, pixels, strict=True)])
@@ -185,10 +188,10 @@ def _overlapping(cameras: Sequence[Camera], pixels: Sequence[NDArray[np.float64]
 
 def _sampson(ours: NDArray[np.float64], theirs: NDArray[np.float64], step: _Pose
              ) -> NDArray[np.float64]:
-    """Return how far points (n, 2) at z = 1 are from their epipolar lines, to first order."""
+    """Return the Sampson distances (n,) of matched points (n, 2) at z = 1 to epipolar lines."""
     x, y, z = step[:3, 3] / max(float(np.linalg.norm(step[:3, 3])), 1e-12)
     essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ step[:3, :3]
-    first, second = (np.column_stack([one, np.ones(len(one))]) for one in (ours, theirs))
+    first, second = (np.column_stack([points, np.ones(len(points))]) for points in (ours, theirs))
     lines, back = first @ essential.T, second @ essential
     with np.errstate(divide='ignore', invalid='ignore'):
         return np.nan_to_num(np.abs(np.sum(second * lines, axis=1)) / np.sqrt(

@@ -35,18 +35,18 @@ from cliploc_ros.units import NS_PER_S
 
 _IMAGES = (bag_messages.IMAGE, bag_messages.COMPRESSED_IMAGE)
 _COMPRESSED = '/compressed'
-# Images that wait for their depth. A depth image is recorded at most this many images later.
+# Images that wait for their depth image, which is recorded at most this many images later.
 _MAX_WAITING = 15
-# Images that are compared with poses: parts of a recording, images of a part, its length [s].
-# Then by how much stamps may be off [s], and the error that rectified images have, taken for raw,
-# or the reverse [px], with the share of it that is left without this fault.
+# Offsets of the stamps that are tried when images and poses are compared [s].
 _SHIFTS_S = (-0.5, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.5)
+# Reading.least_px and Reading.better where rectified images are read as raw, or the reverse.
 _RECTIFIED_PX, _RECTIFIED_BETTER = 0.6, 0.6
+# The sample of images compared with poses: parts of a recording, images of a part, its length [s].
 _COMPARED_PARTS, _COMPARED_OF_PART, _PART_S = 12, 8, 4.0
 
 
 class _Selected(NamedTuple):
-    """An image of a recording, and the depth image that belongs to it."""
+    """A serialized image of a recording, and its depth image."""
 
     place: int
     stamp_ns: int
@@ -58,37 +58,38 @@ class _Selected(NamedTuple):
 
 @dataclass(frozen=True)
 class BagTopics:
-    """The topics of a recording by their content."""
+    """The topics of a recording, and how to read them."""
 
     #: sensor_msgs/Image or CompressedImage, and CameraInfo
     image: str = '/image'
     camera_info: str = '/camera_info'
-    rectified: bool = False  #: Whether images are rectified, so that P holds, without distortion
+    rectified: bool = False  #: Whether images are rectified; then P is used, without distortion
     #: sensor_msgs/Image of depth, 16UC1 or 32FC1, or CompressedImage of compressedDepth; '' for
     #: none
     depth: str = ''
-    intrinsics: str | None = None  #: The camera to use in place of camera_info, see find_camera
-    #: A depth image belongs to a colour image at most this far away in time [ns]
+    intrinsics: str | None = None  #: The camera to use instead of camera_info, see find_camera
+    #: Greatest difference between the stamps of a colour image and its depth image [ns]
     tolerance_ns: int = STAMP_TOLERANCE_NS
-    tf: str | None = None  #: tf from depth to image, see poses_of_tf
+    tf: str | None = None  #: Topic of the tf from depth to image, see poses_of_tf
 
     def of_camera(self, name: str) -> 'BagTopics':
-        """Return the topics of one of several cameras; '' changes nothing."""
+        """Return the topics of a camera of a rig; an empty name changes nothing."""
         return replace(self, image=topic_of(name, self.image),
                        camera_info=topic_of(name, self.camera_info),
                        depth=topic_of(name, self.depth))
 
 
 def topic_of(camera: str, topic: str) -> str:
-    """Return the topic of one of several cameras: NAME/topic; '' changes nothing."""
+    """Return the topic /NAME/topic of a camera of a rig; an empty name changes nothing."""
     return f'/{camera.strip("/")}/{topic.lstrip("/")}' if camera and topic else topic
 
 
 def find_topics(bag: Path, image: str | None, camera_info: str | None) -> tuple[str, str]:
-    """Return the topics of image and camera_info; None is found where there is one candidate.
+    """Return the topics of image and camera_info; where one is None, find the only candidate.
 
-    Depth and debug images are not candidates; raw images go before compressed ones of the same
-    camera. DatasetError: there is none, or there are several; names them and the parameter.
+    Depth and debug images are not candidates. Raw images are preferred to compressed images of the
+    same camera. DatasetError: there are no candidates, or several; the message lists them and
+    names the parameter.
     """
     with BagReader(bag) as reader:
         def named(types: Sequence[str]) -> list[str]:
@@ -136,11 +137,11 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
 
     def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
         with BagReader(bag) as reader:
-            for one in _paired(reader, topics, poses, is_wanted):
+            for image in _paired(reader, topics, poses, is_wanted):
                 yield RawFrame(
-                    one.place, one.stamp_ns, one.pose,
-                    cameras.decoder(one.stamp_ns, one.recorded_ns, one.data),
-                    None if one.depth is None else partial(decode_depth, one.depth))
+                    image.place, image.stamp_ns, image.pose,
+                    cameras.decoder(image.stamp_ns, image.recorded_ns, image.data),
+                    None if image.depth is None else partial(decode_depth, image.depth))
     return Frames(bag, count, read_raw, varies=len(cameras.infos) > 1, notes=tuple(
         f'note: {note}' for note in notes if note))
 
@@ -151,16 +152,16 @@ class _Cameras(NamedTuple):
     where: str
     msgtype: str  #: Message type of the images
     rectified: bool
-    infos: tuple[bytes, ...]  #: Those that differ; empty if a file says the camera
-    #: (c,): when each message holds [ns], by its stamp or, without stamps, by its recording
+    infos: tuple[bytes, ...]  #: The distinct messages; empty if a file gives the camera
+    #: (c,): time of each message [ns]: its stamp or, without stamps, its time of recording
     times_ns: NDArray[np.int64]
-    rows: NDArray[np.int64]  #: (c,): which of the infos it is
-    by_stamp: bool
-    given: Camera | None = None
+    rows: NDArray[np.int64]  #: (c,): index of each message's content in infos
+    by_stamp: bool  #: Whether times_ns are stamps
+    given: Camera | None = None  #: The camera from a file
 
     @classmethod
     def read(cls, reader: BagReader, topics: BagTopics) -> '_Cameras':
-        """Return those of a recording; messages without a calibration are left out."""
+        """Read the cameras of a recording; messages without a calibration are left out."""
         where, msgtype = f'{reader.path}: {topics.image}', reader.topic(topics.image).msgtype
         none = np.empty(0, dtype=np.int64)
         if topics.intrinsics is not None:
@@ -178,20 +179,22 @@ class _Cameras(NamedTuple):
         _check_one_camera(map(_frame_of, sound.values()), f'{reader.path}: {topics.camera_info}')
         for stamp_ns, _, content in found:
             if content not in sound and len(sound) < len(infos):
-                reader.leave_out(topics.camera_info, f'that at {stamp_ns / NS_PER_S:.6f} s has no '
-                                 'calibration')
-        kept = [one for one in found if one[2] in sound]
+                reader.leave_out(topics.camera_info, f'the message at {stamp_ns / NS_PER_S:.6f} s '
+                                 'has no calibration')
+        kept = [times for times in found if times[2] in sound]
         rows = {content: row for row, content in enumerate(sound)}
-        by_stamp = all(one[0] for one in kept)
+        stamps_ns = [stamp_ns for stamp_ns, _, _ in kept]
+        by_stamp = all(stamps_ns)
         if by_stamp:
-            check_forward([one[0] for one in kept], f'{reader.path}: {topics.camera_info}')
+            check_forward(stamps_ns, f'{reader.path}: {topics.camera_info}')
+        times_ns = stamps_ns if by_stamp else [recorded_ns for _, recorded_ns, _ in kept]
         return cls(where, msgtype, topics.rectified, tuple(sound.values()),
-                   np.array([one[not by_stamp] for one in kept], dtype=np.int64),
-                   np.array([rows[one[2]] for one in kept], dtype=np.int64), by_stamp)
+                   np.array(times_ns, dtype=np.int64),
+                   np.array([rows[content] for _, _, content in kept], dtype=np.int64), by_stamp)
 
     def decoder(self, stamp_ns: int, recorded_ns: int, data: bytes
                 ) -> Callable[[], tuple[NDArray[np.uint8], Camera]]:
-        """Return a decoder of an image, with the camera_info nearest in time."""
+        """Return a function that decodes an image, and its camera_info nearest in time."""
         info: bytes | Camera
         if self.given is not None:
             info = self.given
@@ -215,17 +218,17 @@ def _is_calibrated(info: Any, rectified: bool) -> bool:
 
 
 def _check_one_camera(frame_ids: Iterable[str], where: str) -> None:
-    """Refuse messages of several cameras on one topic; DatasetError: they are, and which."""
+    """Refuse a topic with messages of several cameras; DatasetError: names their frames."""
     names = sorted({*frame_ids} - {''})
     if len(names) > 1:
-        raise DatasetError(f'{where} is of several coordinate frames, {", ".join(names)}: record '
-                           'each camera under topics of its own')
+        raise DatasetError(f'{where} has messages of several coordinate frames, '
+                           f'{", ".join(names)}: record each camera on its own topics')
 
 
 def _depth_of_its_camera(reader: BagReader, topics: BagTopics, form: DepthFormat) -> DepthFormat:
-    """Return how to read depth that is in the coordinate frame of another camera.
+    """Return the format of depth, with its camera if it is not in the image's coordinate frame.
 
-    DatasetError: camera_info of depth, or tf between the two, is missing.
+    DatasetError: the camera_info of depth, or the tf between the two frames, is missing.
     """
     image, depth = (plain_name(str(reader.first(topic).header.frame_id))
                     for topic in (topics.image, topics.depth))
@@ -239,11 +242,11 @@ def _depth_of_its_camera(reader: BagReader, topics: BagTopics, form: DepthFormat
         try:
             if not _is_calibrated(info, rectified=False):
                 raise DatasetError(f'{beside} has no calibration')
-            way = poses_of_tf(image, depth, 10 * NS_PER_S, topics.tf)(reader, depth)
-            pose = way.pose_at(bag_messages.stamp_ns(reader.first(topics.depth)))
+            chain = poses_of_tf(image, depth, 10 * NS_PER_S, topics.tf)(reader, depth)
+            pose = chain.pose_at(bag_messages.stamp_ns(reader.first(topics.depth)))
             if pose is not None:
                 return replace(form, camera=DepthCamera(fx, fy, cx, cy, pose))
-            problem = 'tf between them is of another time'
+            problem = 'tf between them does not cover the first depth image'
         except DatasetError as error:
             problem = str(error).removeprefix(f'{reader.path}: ')
     raise DatasetError(f"{reader.path}: depth is in the coordinate frame '{depth}', the image in "
@@ -253,7 +256,7 @@ def _depth_of_its_camera(reader: BagReader, topics: BagTopics, form: DepthFormat
 
 def _sampled(reader: BagReader, topics: BagTopics, poses: Poses, cameras: _Cameras
              ) -> list[View]:
-    """Return some images of parts of a recording; they are read when they are looked at."""
+    """Return a sample of the images of a recording; each image is read on demand."""
     views, last = [], np.iinfo(np.int64).min
     for begin in np.linspace(reader.start_ns, reader.end_ns, _COMPARED_PARTS, endpoint=False):
         begin_ns = max(int(begin), last)
@@ -274,11 +277,11 @@ def _pose_after(poses: Poses, stamp_ns: int, later_ns: int) -> NDArray[np.float6
 
 
 def _readings(cameras: _Cameras, rectified: bool) -> dict[str, Reading]:
-    """Return how the images and poses of a recording may be meant, the given way first."""
+    """Return the possible readings of a recording's images and poses, the given one first."""
     given = 'rectified' if rectified else 'given'
     mount = 'give the `mount` {} of the camera on the body of the poses, or the `camera_frame`'
     readings = {given: Reading('')}
-    infos = [deserialize(one, bag_messages.CAMERA_INFO, cameras.where) for one in cameras.infos]
+    infos = [deserialize(data, bag_messages.CAMERA_INFO, cameras.where) for data in cameras.infos]
     if len(infos) == 1:
         with suppress(CliplocError, ValueError):
             info = infos[0]
@@ -299,9 +302,9 @@ def _readings(cameras: _Cameras, rectified: bool) -> dict[str, Reading]:
 
 
 def _notes(reader: BagReader, topics: BagTopics) -> list[str]:
-    """Return unusual properties of the camera of a recording, by its first messages.
+    """Return notes on unusual properties of a recording's camera, from its first messages.
 
-    DatasetError: its images are certainly rectified, and read as raw.
+    DatasetError: the images are certainly rectified, but are read as raw.
     """
     if topics.intrinsics is not None:
         return []
@@ -312,7 +315,7 @@ def _notes(reader: BagReader, topics: BagTopics) -> list[str]:
         check_faults(faults)
     except CliplocError as error:
         raise DatasetError(f'{reader.path}: {error}') from error
-    with suppress(CliplocError):  # who decodes the image says so
+    with suppress(CliplocError):  # the error is reported when the image is decoded
         size = messages.image_from_msg(image).shape[1::-1]
         camera = messages.camera_from_msg(info, size, topics.rectified)
         faults += messages.faults_of_camera_info(info, camera, topics.rectified)
@@ -320,43 +323,45 @@ def _notes(reader: BagReader, topics: BagTopics) -> list[str]:
 
 
 def bag_images(bag: Path, topics: BagTopics) -> 'BagImages':
-    """Return the images of a recording, to be read in any order.
+    """Open the images of a recording, to be read in any order.
 
     The recording is read once, for the stamps. DatasetError: a topic is missing, of another type,
     or empty.
     """
     with BagReader(bag) as reader:
         _check_topics(reader, topics)
-        times_ns = [(_peek_stamp_ns(one), one.stamp_ns) for one in reader.messages([topics.image])]
+        times_ns = [(_peek_stamp_ns(message), message.stamp_ns)
+                    for message in reader.messages([topics.image])]
         return BagImages(bag, topics.image, np.array(times_ns, dtype=np.int64).reshape(-1, 2),
                          _Cameras.read(reader, topics))
 
 
 @dataclass(frozen=True)
 class BagImages:
-    """The images of a recording, read one at a time through its index of time."""
+    """The images of a recording, read one at a time by their time of recording."""
 
     bag: Path
     topic: str
-    #: (F, 2): when each image was taken, and when it was recorded [ns]
+    #: (F, 2): stamp and time of recording of each image [ns]
     times_ns: NDArray[np.int64]
     cameras: _Cameras
 
     def look(self, place: int, upright: bool) -> tuple[NDArray[np.uint8], Camera]:
-        """Return an image and its camera; no message says that it is to be turned."""
+        """Read an image and its camera; messages have no EXIF orientation to apply."""
         return self.read(place)
 
     def read(self, place: int) -> tuple[NDArray[np.uint8], Camera]:
-        """Return an image (h, w, 3), red first, and its camera.
+        """Read an image (h, w, 3), RGB, and its camera.
 
-        DatasetError: it cannot be decoded, or the recording changed.
+        DatasetError: the image cannot be decoded, or the recording has changed.
         """
         taken_ns, recorded_ns = self.times_ns[place].tolist()
         with BagReader(self.bag) as reader:
             for message in reader.messages([self.topic], recorded_ns, recorded_ns + 1):
                 if _peek_stamp_ns(message) == taken_ns:
                     return self.cameras.decoder(taken_ns, recorded_ns, message.data)()
-        raise DatasetError(f'{self.bag}: image {place} of {self.topic} is gone; start again')
+        raise DatasetError(f'{self.bag}: image {place} of {self.topic} is missing: the recording '
+                           'has changed; start again')
 
 
 def _check_topics(reader: BagReader, topics: BagTopics) -> None:
@@ -402,7 +407,7 @@ def _paired(reader: BagReader, topics: BagTopics, poses: Poses, is_wanted: Wante
 
 
 def _peek_stamp_ns(recorded: BagMessage) -> int:
-    """Return the header stamp of a serialized message [ns], without reading the rest of it."""
+    """Return the header stamp of a serialized message [ns], without deserializing it."""
     try:
         seconds, nanoseconds = struct.unpack_from(f'{_order(recorded.data)}iI', recorded.data, 4)
     except (struct.error, IndexError) as error:
@@ -421,7 +426,7 @@ def _frame_of(data: bytes) -> str:
 
 
 def _order(data: bytes) -> str:
-    """Return the byte order of a serialized message, as struct has it."""
+    """Return the byte order of a serialized message, as a format character of struct."""
     return '<' if data[1] & 1 else '>'
 
 

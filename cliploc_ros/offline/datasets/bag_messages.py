@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of recordings, to and from the package's types, without a sourced ROS.
+"""Make and read messages of recordings, without a ROS installation.
 
-The message objects are those of the rosbags library; their fields have rclpy's names.
+The message objects are from the rosbags library; their fields have the same names as in rclpy.
 """
 
 from typing import Any
@@ -31,7 +31,7 @@ def stamp_ns(message: Any) -> int:
 
 
 def image_message(stamp: int, frame_id: str, pixels_rgb: NDArray[np.uint8]) -> Any:
-    """Make a sensor_msgs/Image of pixels (height, width, 3), red first; the stamp is in ns."""
+    """Make a sensor_msgs/Image of pixels (height, width, 3), RGB; the stamp is in ns."""
     height, width, channels = pixels_rgb.shape
     return _make(IMAGE, header=_header(stamp, frame_id), height=height, width=width,
                  encoding='rgb8', is_bigendian=0, step=width * channels,
@@ -39,8 +39,8 @@ def image_message(stamp: int, frame_id: str, pixels_rgb: NDArray[np.uint8]) -> A
 
 
 def compressed_image_message(stamp: int, frame_id: str, data: bytes, codec: str) -> Any:
-    """Make a sensor_msgs/CompressedImage of a file's own bytes, a ``png`` or ``jpeg``."""
-    # As image_transport writes it: the image was rgb8, its decoder yields bgr8.
+    """Make a sensor_msgs/CompressedImage of the bytes of a file; the codec: png or jpeg."""
+    # The format as image_transport writes it: the image was rgb8, and decodes to bgr8.
     return _make(COMPRESSED_IMAGE, header=_header(stamp, frame_id),
                  format=f'rgb8; {codec} compressed bgr8', data=np.frombuffer(data, dtype=np.uint8))
 
@@ -58,7 +58,7 @@ def camera_info_message(stamp: int, frame_id: str, camera: Camera) -> Any:
 
 
 def detections_message(stamp: int, frame_id: str, detections: Detections) -> Any:
-    """Make a vision_msgs/Detection2DArray; all headers equal the image's."""
+    """Make a vision_msgs/Detection2DArray; all its headers equal the header of the image."""
     header = _header(stamp, frame_id)
     no_pose = _make('geometry_msgs/msg/PoseWithCovariance', pose=_pose(np.eye(4)),
                     covariance=np.zeros(36))
@@ -78,14 +78,14 @@ def detections_message(stamp: int, frame_id: str, detections: Detections) -> Any
 
 
 def pose_message(stamp: int, frame_id: str, map_from_camera: NDArray[np.float64]) -> Any:
-    """Make a geometry_msgs/PoseStamped of the camera (4, 4) in the map's coordinate frame."""
+    """Make a geometry_msgs/PoseStamped of a camera pose (4, 4); frame_id names the map's frame."""
     return _make(POSE, header=_header(stamp, frame_id), pose=_pose(map_from_camera))
 
 
 def imu_message(stamp: int, frame_id: str, acceleration: NDArray[np.float64]) -> Any:
-    """Make a sensor_msgs/Imu of an acceleration (3,) [m/s^2] alone."""
+    """Make a sensor_msgs/Imu that holds only an acceleration (3,) [m/s^2]."""
     missing = np.zeros(9)
-    missing[0] = -1.0  # says that a field is not measured
+    missing[0] = -1.0  # marks a field that is not measured
     vector = 'geometry_msgs/msg/Vector3'
     x, y, z = acceleration.tolist()
     return _make(IMU, header=_header(stamp, frame_id), orientation=_make(

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poses of the camera of a rosbag2 recording, from a topic of poses or from tf.
 
-Each transform of the tf's chain is interpolated at the stamp on its own, as tf2 does. Beyond tf2,
-a gap between two samples has a limit.
+As in tf2, each transform of a chain is interpolated separately at the stamp. Unlike in tf2, the
+gap between two samples is limited.
 """
 
 import math
@@ -29,19 +29,19 @@ from cliploc_ros.offline.datasets.poses import (
 )
 from cliploc_ros.units import NS_PER_S
 
-# Where each type of message has its pose.
+# Reads the pose from each type of message.
 _POSE_TYPES: dict[str, Callable[[Any], Any]] = {
     'geometry_msgs/msg/PoseStamped': lambda message: message.pose,
     'geometry_msgs/msg/PoseWithCovarianceStamped': lambda message: message.pose.pose,
     'nav_msgs/msg/Odometry': lambda message: message.pose.pose,
 }
-#: Makes the poses of an open recording; given the coordinate frame of its images.
+#: Reads the poses of an open recording, given the coordinate frame of its images.
 ReadPoses = Callable[[BagReader, str], Poses]
-#: Where poses are looked for: the topic that tum_to_bag writes, and the map's frame in tf.
+#: Default sources of poses: the topic that tum_to_bag writes, and the map's frame in tf.
 GROUND_TRUTH, MAP_FRAME = '/ground_truth', 'map'
 _TF, _TF_STATIC = '/tf', '/tf_static'
 _TF_TYPE = 'tf2_msgs/msg/TFMessage'
-# Poses of two sources are compared at this many stamps, and are the same within this [m] [deg].
+# Two sources of poses are compared at this many stamps, and agree within this [m] [deg].
 _COMPARED, _SAME_M, _SAME_DEG = 50, 0.05, 2.0
 
 
@@ -50,9 +50,10 @@ def poses_of_topic(name: str, max_gap_ns: int = 0,
                    tolerance_ns: int = STAMP_TOLERANCE_NS, tf: str | None = None) -> ReadPoses:
     """Return a reader of a topic of PoseStamped, PoseWithCovarianceStamped or Odometry.
 
-    Its parameters are those of TimedPoses. Without a mount, poses of a child_frame_id other than
-    the images' are led on to the camera by tf. DatasetError, when it reads: the topic is missing,
-    of another type, many poses are invalid, or nothing leads to the camera.
+    The parameters are those of TimedPoses. If no mount is given and the child_frame_id differs
+    from the images' frame, tf supplies the transform to the camera. The reader raises a
+    DatasetError if the topic is missing or of another type, if many poses are invalid, or if the
+    transform to the camera is missing.
     """
     def read(reader: BagReader, camera_frame: str) -> Poses:
         pose_of = _POSE_TYPES.get(reader.topic(name).msgtype)
@@ -72,9 +73,9 @@ def poses_of_topic(name: str, max_gap_ns: int = 0,
                         max_gap_ns=max_gap_ns, body_from_camera=body_from_camera,
                         tolerance_ns=tolerance_ns)
         if len(children) > 1:
-            raise DatasetError(f'{reader.path}: {name} has the poses of several coordinate '
-                               f'frames, {", ".join(sorted(children))} (child_frame_id): record '
-                               'those of one')
+            raise DatasetError(f'{reader.path}: {name} has poses of several coordinate frames, '
+                               f'{", ".join(sorted(children))} (child_frame_id): record the '
+                               'poses of one frame')
         child = ''.join(children)
         if body_from_camera is not None or child in ('', plain_name(camera_frame)):
             return poses
@@ -92,11 +93,11 @@ def poses_of_topic(name: str, max_gap_ns: int = 0,
 def find_poses(max_gap_ns: int, ground_truth: str = GROUND_TRUTH,
                camera_frame: str | None = None, topic_gap_ns: int | None = None,
                tolerance_ns: int = STAMP_TOLERANCE_NS, tf: str | None = None) -> ReadPoses:
-    """Return a reader of the camera's poses for a recording whose source of poses is not named.
+    """Return a reader that finds the source of the camera's poses in a recording.
 
-    It takes the topic of ground truth, else tf in the coordinate frame `map`. It takes no other
-    topic, because nothing says which body its poses describe. The greatest gap of a topic may
-    differ from that of tf. DatasetError, when it reads: there are no poses.
+    It reads the topic of ground truth if there is one, otherwise tf in the coordinate frame `map`.
+    Other topics are not used: it is unknown which body their poses describe. The greatest gap may
+    differ between the topic and tf. The reader raises a DatasetError if there are no poses.
     """
     def read(reader: BagReader, image_frame: str) -> Poses:
         problem, of_tf = 'no tf', None
@@ -110,23 +111,24 @@ def find_poses(max_gap_ns: int, ground_truth: str = GROUND_TRUTH,
                 ground_truth, max_gap_ns if topic_gap_ns is None else topic_gap_ns, None,
                 tolerance_ns, tf)(reader, camera_frame or image_frame)
             if of_tf is not None and (far := _difference(of_topic, of_tf)):
-                reader.notes.append(f'{ground_truth} and tf say different poses of the camera: '
-                                    f'{far}; {ground_truth} is used; give `map_frame` for tf')
+                reader.notes.append(f'{ground_truth} and tf give different poses of the camera: '
+                                    f'{far} apart; {ground_truth} is used; give `map_frame` for '
+                                    'tf')
             return of_topic
         if of_tf is not None:
             return of_tf
         there = ', '.join(name for name, topic in reader.topics.items()
                           if topic.msgtype in _POSE_TYPES and topic.message_count) or 'none'
         raise DatasetError(f'{reader.path}: say where the poses are: `pose_topic`, `map_frame` '
-                           f'(tf) or `trajectory`; topics with poses here: {there}; {problem}')
+                           f'(tf) or `trajectory`; topics with poses: {there}; {problem}')
     return read
 
 
-def _difference(one: Poses, other: Poses) -> str:
-    """Return how far poses of two sources differ, in words; '' if they do not."""
-    (first, last), errors = one.span_ns or (0, 0), []
+def _difference(poses: Poses, others: Poses) -> str:
+    """Describe the median difference of two sources of poses; '' if they agree."""
+    (first, last), errors = poses.span_ns or (0, 0), []
     for stamp in np.linspace(first, last, _COMPARED).astype(np.int64).tolist():
-        pair = one.pose_at(stamp), other.pose_at(stamp)
+        pair = poses.pose_at(stamp), others.pose_at(stamp)
         if pair[0] is not None and pair[1] is not None:
             errors.append(pose_error(pair[0], pair[1]))
     far_m, far_deg = np.median(errors, axis=0) if errors else (0.0, 0.0)
@@ -136,7 +138,7 @@ def _difference(one: Poses, other: Poses) -> str:
 
 @dataclass(frozen=True)
 class FixedPose:
-    """A pose that holds at any time."""
+    """A pose that is constant in time."""
 
     pose: NDArray[np.float64]  #: (4, 4)
     span_ns = (-2**63, 2**63 - 1)
@@ -148,18 +150,18 @@ class FixedPose:
 
 @dataclass(frozen=True)
 class TransformChain:
-    """The way between two coordinate frames through their common ancestor.
+    """The transforms from two coordinate frames up to their common ancestor.
 
     Each link is the pose of a coordinate frame in its parent.
     """
 
-    up: tuple[Poses, ...]  #: From the map up to the common ancestor
-    down: tuple[Poses, ...]  #: From the camera up to the common ancestor
+    up: tuple[Poses, ...]  #: Links from the map to the common ancestor
+    down: tuple[Poses, ...]  #: Links from the camera to the common ancestor
 
     @property
     def span_ns(self) -> tuple[int, int] | None:
-        """Return the first and last stamp at which all of the chain is known [ns]."""
-        spans = [FixedPose.span_ns, *(one.span_ns for one in (*self.up, *self.down))]
+        """Return the first and last stamp at which all links are known [ns]."""
+        spans = [FixedPose.span_ns, *(link.span_ns for link in (*self.up, *self.down))]
         if None in spans:
             return None
         return max(span[0] for span in spans if span), min(span[1] for span in spans if span)
@@ -178,7 +180,7 @@ class TransformChain:
 
 @dataclass(frozen=True)
 class ChainedPoses:
-    """The poses of a body, and the way from it to the camera."""
+    """The poses of a body, and the transforms from the body to the camera."""
 
     body: Poses
     chain: Poses
@@ -198,22 +200,24 @@ def poses_of_tf(map_frame: str, camera_frame: str | None, max_gap_ns: int,
                 tf: str | None = None) -> ReadPoses:
     """Return a reader of a camera's poses in a map, from /tf and /tf_static.
 
-    DatasetError, when it reads: the recording has no tf, or nothing connects the two frames.
+    The reader raises a DatasetError if the recording has no tf, or if tf does not connect the two
+    frames.
 
     Parameters
     ----------
     map_frame, camera_frame : str
-        Coordinate frames; the camera's is the optical one (z forward), by default the images'.
+        Coordinate frames. The camera's is the optical frame (z forward); default: the frame of the
+        images.
     max_gap_ns : int
         Greatest gap between two samples to interpolate over [ns].
     tf : str, optional
-        The topic instead of /tf; the static one is its name with _static.
+        The topic to use instead of /tf. The static topic has its name with the suffix _static.
     """
     def read(reader: BagReader, image_frame: str) -> TransformChain:
         topics = _tf_topics(reader, tf)
         if not topics:
             raise DatasetError(f'{reader.path}: has neither {_TF} nor {_TF_STATIC}; record them, '
-                               'or name a topic or file of poses')
+                               'or give a topic or file of poses')
         parents, up, down = _find_way(reader, topics, plain_name(map_frame),
                                       plain_name(camera_frame or image_frame))
         links = _read_links(reader, topics, {*up, *down}, parents, max_gap_ns)
@@ -223,9 +227,9 @@ def poses_of_tf(map_frame: str, camera_frame: str | None, max_gap_ns: int,
 
 
 def _tf_topics(reader: BagReader, tf: str | None) -> list[str]:
-    """Return the topics of tf: the named one, /tf, or the only one under a robot's name.
+    """Return the topics of tf: the given topic, /tf, or the only one in a robot's namespace.
 
-    DatasetError: there are those of several robots, or one is of another type.
+    DatasetError: several robots have tf topics, or a topic is of another type.
     """
     there = [name for name, topic in reader.topics.items()
              if topic.msgtype == _TF_TYPE and name.endswith((_TF, _TF_STATIC))]
@@ -235,7 +239,7 @@ def _tf_topics(reader: BagReader, tf: str | None) -> list[str]:
     if tf is None:
         tf = _TF if _TF in reader.topics or not names else names[0]
     elif tf not in reader.topics:
-        reader.topic(tf)  # says which there are
+        reader.topic(tf)  # raises an error that lists the topics
     topics = [name for name in dict.fromkeys((tf, f'{tf}_static', _TF_STATIC))
               if name in reader.topics]
     for name in topics:
@@ -247,7 +251,7 @@ def _tf_topics(reader: BagReader, tf: str | None) -> list[str]:
 
 def _sound(reader: BagReader, topic: str, message: Any, offset: Any, turn: Any
            ) -> tuple[float, ...] | None:
-    """Return the numbers of a pose or transform; None, and left out, where it can be none."""
+    """Return x, y, z, qx, qy, qz, qw of a pose; leave it out and return None if it is invalid."""
     numbers = (offset.x, offset.y, offset.z, turn.x, turn.y, turn.z, turn.w)
     if np.isfinite(numbers).all() and abs(math.hypot(*numbers[3:]) - 1.0) <= MAX_NORM_ERROR:
         return numbers
@@ -258,9 +262,10 @@ def _sound(reader: BagReader, topic: str, message: Any, offset: Any, turn: Any
 
 def _find_way(reader: BagReader, topics: Collection[str], map_frame: str, camera_frame: str
               ) -> tuple[dict[str, str], list[str], list[str]]:
-    """Return the parents, and the frames below the common ancestor from the map and the camera.
+    """Find the chain of tf frames between the map and the camera.
 
-    It reads until the two are connected.
+    Return the parent of each known frame, and the frames below the common ancestor, from the map
+    and from the camera. Reading stops as soon as the two are connected.
     """
     parents: dict[str, str] = {}
     up, down = [map_frame], [camera_frame]
@@ -287,7 +292,7 @@ def _find_way(reader: BagReader, topics: Collection[str], map_frame: str, camera
 
 
 def _ancestors(parents: Mapping[str, str], frame: str) -> list[str]:
-    """Return a frame and its ancestors, up to the root; a loop is cut."""
+    """Return a frame and its ancestors up to the root; a loop ends the list."""
     way = [frame]
     while way[-1] in parents and parents[way[-1]] not in way:
         way.append(parents[way[-1]])
@@ -296,7 +301,7 @@ def _ancestors(parents: Mapping[str, str], frame: str) -> list[str]:
 
 def _read_links(reader: BagReader, topics: Collection[str], children: Collection[str],
                 parents: Mapping[str, str], max_gap_ns: int) -> dict[str, Poses]:
-    """Return the poses of some children in their parents; of a static one, the last."""
+    """Read the poses of frames in their parents, by frame; a static frame has its last pose."""
     samples: dict[str, dict[str, tuple[list[int], list[tuple[float, ...]]]]] = {
         topic: {child: ([], []) for child in children} for topic in topics}
     for topic, recorded in reader.readable(topics):
@@ -319,7 +324,7 @@ def _read_links(reader: BagReader, topics: Collection[str], children: Collection
         where = f"{reader.path}: tf of '{child}'"
         fixed = [samples[name][child] for name in topics if name.endswith('_static')]
         moving = [samples[name][child] for name in topics if not name.endswith('_static')]
-        stamps, rows = next((one for one in fixed if one[0]), ([], []))
+        stamps, rows = next((recorded for recorded in fixed if recorded[0]), ([], []))
         if stamps:
             pose = TimedPoses.from_samples(stamps[-1:], rows[-1:], where).pose_at(stamps[-1])
             assert pose is not None
@@ -333,14 +338,14 @@ def _read_links(reader: BagReader, topics: Collection[str], children: Collection
 
 
 def plain_name(frame_id: str) -> str:
-    """Return the name of a coordinate frame as tf2 has it."""
+    """Return the name of a coordinate frame as in tf2, without a leading slash."""
     return frame_id.removeprefix('/')
 
 
 def bag_odometry(bag: Path, image_topic: str, read_odometry: ReadPoses) -> Poses:
-    """Return the poses of a recording's camera by odometry.
+    """Read the poses of a recording's camera in the odometry frame.
 
-    DatasetError: the topic or tf is missing or broken, or of another time than the images.
+    DatasetError: the topic or tf is missing or invalid, or does not overlap the images in time.
     """
     with BagReader(bag) as reader:
         return poses_of_images(reader, image_topic, read_odometry, f'{bag}: odometry')
@@ -348,9 +353,9 @@ def bag_odometry(bag: Path, image_topic: str, read_odometry: ReadPoses) -> Poses
 
 def poses_of_images(reader: BagReader, image_topic: str, read_poses: ReadPoses, where: str
                     ) -> Poses:
-    """Return the poses of the camera of a topic of images.
+    """Read the poses of the camera of an image topic.
 
-    DatasetError: they are missing or broken, or of another time than the images.
+    DatasetError: the poses are missing or invalid, or do not overlap the images in time.
     """
     image = reader.first(image_topic)
     poses = read_poses(reader, str(image.header.frame_id))

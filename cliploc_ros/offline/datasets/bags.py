@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read and write rosbag2 recordings (sqlite3 and mcap) with the rosbags library.
 
-Not with rosbag2_py, which PyPI lacks: recordings are also read and written where no ROS is
-installed. The module imports little, for replay.
+rosbag2_py is not on PyPI, but recordings are also read and written without ROS. For a fast start
+of replay, this module imports little.
 """
 
 import shutil
@@ -40,11 +40,11 @@ _VISION_MSGS = ('Point2D', 'Pose2D', 'BoundingBox2D', 'ObjectHypothesis',
 STORAGES: Mapping[str, StoragePlugin] = {'sqlite3': StoragePlugin.SQLITE3,
                                          'mcap': StoragePlugin.MCAP}
 
-#: A share of a topic's messages that may be left out where they cannot be used.
+#: Greatest share of a topic's messages that may be unusable and left out.
 MOST_LEFT_OUT = 0.2
 _INFINITE = QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
 
-#: The default of rclcpp, as camera drivers and detectors offer it; matches best-effort and
+#: The default of rclcpp, which camera drivers and detectors offer. It matches best-effort and
 #: reliable subscribers.
 RELIABLE_QOS = Qos(QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE,
                    _INFINITE, _INFINITE, QosLiveliness.AUTOMATIC, _INFINITE, False)
@@ -54,9 +54,9 @@ LATCHED_QOS = RELIABLE_QOS._replace(depth=1, durability=QosDurability.TRANSIENT_
 
 @cache
 def typestore() -> Typestore:
-    """Return the types of ROS 2 Jazzy's common interfaces and the seven of vision_msgs.
+    """Return the types of ROS 2 Jazzy's common interfaces, and seven types of vision_msgs.
 
-    All callers share it: do not register types in it.
+    All callers share the store: do not register types in it.
     """
     store = get_typestore(Stores.ROS2_JAZZY)
     folder = files('cliploc_ros.offline.datasets') / 'vision_msgs' / 'msg'
@@ -67,21 +67,21 @@ def typestore() -> Typestore:
 
 
 def deserialize(data: bytes, msgtype: str, where: str) -> Any:
-    """Return a message of its bytes. DatasetError: they are not such a message."""
+    """Deserialize a message. DatasetError: the bytes are not a message of this type."""
     try:
         return typestore().deserialize_cdr(data, msgtype)
-    except Exception as error:  # the library raises what the bytes happen to cause
-        raise DatasetError(f'{where}: a message is no {msgtype}: {error}') from error
+    except Exception as error:  # the library raises whatever exception the bytes cause
+        raise DatasetError(f'{where}: a message is not a valid {msgtype}: {error}') from error
 
 
 @dataclass(frozen=True)
 class BagTopic:
-    """One topic of a recording."""
+    """A topic of a recording."""
 
-    #: As ``/image`` and ``sensor_msgs/msg/Image``
+    #: Name and type, such as ``/image`` and ``sensor_msgs/msg/Image``
     name: str
     msgtype: str
-    message_count: int  #: Number of messages that the recording lists
+    message_count: int  #: Number of messages according to the metadata
     #: QoS of its publishers during the recording; empty if unknown
     offered_qos: tuple[Qos, ...] = ()
     type_hash: str = ''  #: RIHS01 hash of the type; empty if not recorded
@@ -89,26 +89,26 @@ class BagTopic:
 
 @dataclass(frozen=True)
 class BagMessage:
-    """One recorded message, still serialized."""
+    """A serialized message of a recording."""
 
-    topic: str  #: Name of its topic
-    stamp_ns: int  #: When it was recorded [ns]
-    data: bytes  #: CDR, with its four-byte header
+    topic: str  #: Name of the topic
+    stamp_ns: int  #: Time of recording [ns]
+    data: bytes  #: CDR, with the four-byte header
 
 
 class BagReader:
     """Reads a rosbag2 folder, or a single .mcap or .db3 file, in order of recording.
 
-    A context manager. It streams messages: memory does not grow with the recording. It unpacks
-    compressed files (zstd) into the temporary folder while it is open. DatasetError: on entry, if
-    the recording cannot be read; the message names path and reason.
+    A context manager. It streams messages, so that its memory does not grow with the recording.
+    While open, it keeps compressed files (zstd) unpacked in the temporary folder. DatasetError, on
+    entry: the recording cannot be read; the message names path and reason.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._reader: Reader | None = None
         self._topics: dict[str, BagTopic] = {}
-        #: Messages that cannot be used, by topic: why, and when
+        #: Reasons and times of unusable messages, by topic
         self.left_out: dict[str, dict[str, None]] = {}
         self.notes: list[str] = []  #: Notes for the user about the recording
 
@@ -118,13 +118,13 @@ class BagReader:
             raise DatasetError(f'{self.path}: no such recording')
         if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
             raise DatasetError(
-                f'{self.path}: has no metadata.yaml; it is not a rosbag2 recording, or an '
-                f'incomplete one that `ros2 bag reindex {self.path}` rebuilds'
+                f'{self.path}: has no metadata.yaml; it is not a rosbag2 recording, or it is an '
+                f'incomplete one that `ros2 bag reindex {self.path}` repairs'
             )
         try:
             reader = Reader(self.path)
             reader.open()
-        except Exception as error:  # the library's own, sqlite's, the operating system's
+        except Exception as error:  # from the library, SQLite or the operating system
             raise self._unreadable(error) from error
         self._reader = reader
         try:
@@ -168,7 +168,8 @@ class BagReader:
         DatasetError: the recording has no topic of that name; the message lists its topics.
         """
         if name not in self._topics:
-            recorded = ', '.join(f'{one.name} ({one.msgtype})' for one in self._topics.values())
+            recorded = ', '.join(f'{topic.name} ({topic.msgtype})'
+                                 for topic in self._topics.values())
             raise DatasetError(f'{self.path}: has no topic {name}; it has {recorded or "none"}')
         return self._topics[name]
 
@@ -176,12 +177,12 @@ class BagReader:
                  stop_ns: int | None = None) -> Iterator[BagMessage]:
         """Yield messages in the order of their stamps.
 
-        DatasetError: for an unknown topic, or at a damaged part of the recording.
+        DatasetError: a topic is unknown, or the recording is damaged.
 
         Parameters
         ----------
         topics : collection of str, optional
-            Names of topics; all of them by default.
+            Names of topics; default: all.
         start_ns, stop_ns : int, optional
             Yield only messages at or after start_ns and before stop_ns [ns].
         """
@@ -195,12 +196,12 @@ class BagReader:
                 connection, stamp_ns, data = next(stream)
             except StopIteration:
                 return
-            except Exception as error:  # the library's own, sqlite's, the operating system's
+            except Exception as error:  # from the library, SQLite or the operating system
                 raise self._unreadable(error) from error
             yield BagMessage(connection.topic, stamp_ns, bytes(data))
 
     def readable(self, topics: Collection[str]) -> Iterator[tuple[str, Any]]:
-        """Yield topic and message of topics; those that cannot be read are left out."""
+        """Yield the topic and object of each message; unreadable messages are left out."""
         for recorded in self.messages(topics):
             try:
                 message = self.deserialize(recorded)
@@ -210,16 +211,16 @@ class BagReader:
                 yield recorded.topic, message
 
     def first(self, topic: str) -> Any:
-        """Return the first message of a topic that can be read; DatasetError: there is none."""
+        """Return the first readable message of a topic; DatasetError: there is none."""
         found = next(self.readable([topic]), None)
         if found is None:
-            raise DatasetError(f'{self.path}: {topic} has no message that can be read')
+            raise DatasetError(f'{self.path}: {topic} has no readable message')
         return found[1]
 
     def leave_out(self, topic: str, reason: str) -> None:
-        """Count a message that cannot be used; the same one again counts once.
+        """Count an unusable message; equal reasons of a topic count once.
 
-        DatasetError: too many cannot, so that the fault is not an accident.
+        DatasetError: the share of unusable messages exceeds MOST_LEFT_OUT.
         """
         reasons = self.left_out.setdefault(topic, {})
         reasons[reason] = None
@@ -228,15 +229,15 @@ class BagReader:
                                f'{next(iter(reasons))}')
 
     def left_out_notes(self) -> list[str]:
-        """Return the messages that were left out, topic by topic, in words."""
+        """Return a note for each topic with messages that were left out."""
         return [f'{len(reasons)} of {self.topic(topic).message_count} messages of {topic} left '
                 f'out: {next(iter(reasons))}' for topic, reasons in self.left_out.items()]
 
     def deserialize(self, message: BagMessage) -> Any:
-        """Turn a message's bytes into an object with the fields of its type.
+        """Deserialize a message into an object with the fields of its type.
 
-        DatasetError: the type is unknown here or was recorded with another definition, or if the
-        bytes do not fit it.
+        DatasetError: the type is unknown, was recorded with another definition, or does not fit
+        the bytes.
         """
         topic = self.topic(message.topic)
         store = typestore()
@@ -244,8 +245,8 @@ class BagReader:
             raise DatasetError(f'{self.path}: {topic.name} has an unknown type, {topic.msgtype}')
         if topic.type_hash and topic.type_hash != store.hash_rihs01(topic.msgtype):
             raise DatasetError(
-                f'{self.path}: {topic.name} was recorded with another definition of '
-                f'{topic.msgtype} than in Jazzy')
+                f'{self.path}: {topic.name} was recorded with a definition of {topic.msgtype} '
+                'that differs from that of Jazzy')
         return deserialize(message.data, topic.msgtype,
                            f'{self.path}: {topic.name} at {message.stamp_ns}')
 
@@ -257,27 +258,30 @@ class BagReader:
 
     def _collect_topics(self, connections: Collection[Connection]) -> dict[str, BagTopic]:
         topics: dict[str, BagTopic] = {}
-        for one in connections:
-            assert isinstance(one.ext, ConnectionExtRosbag2)
-            known = topics.get(one.topic, BagTopic(one.topic, one.msgtype, 0))
-            if known.msgtype != one.msgtype:
+        for connection in connections:
+            assert isinstance(connection.ext, ConnectionExtRosbag2)
+            name, msgtype = connection.topic, connection.msgtype
+            known = topics.get(name, BagTopic(name, msgtype, 0))
+            if known.msgtype != msgtype:
                 raise DatasetError(
-                    f'{self.path}: {one.topic} has two types, {known.msgtype} and {one.msgtype}')
-            topics[one.topic] = BagTopic(
-                one.topic, one.msgtype, known.message_count + one.msgcount,
-                known.offered_qos + tuple(one.ext.offered_qos_profiles),
-                known.type_hash or one.digest)
+                    f'{self.path}: {name} has two types, {known.msgtype} and {msgtype}')
+            topics[name] = BagTopic(
+                name, msgtype, known.message_count + connection.msgcount,
+                known.offered_qos + tuple(connection.ext.offered_qos_profiles),
+                known.type_hash or connection.digest)
         return topics
 
     def _connections(self, names: Collection[str]) -> list[Connection]:
-        """Return the library's handles of topics, of the recording and of each of its files.
+        """Return the library's connections of topics, for the recording and each of its files.
 
         The library silently drops the messages of a file whose QoS differs from that in
-        metadata.yaml, which people edit to repair QoS. The files' own handles always match.
+        metadata.yaml, and users edit metadata.yaml to repair QoS. The connections of the files
+        always match.
         """
         reader = self._open_reader
         files = getattr(reader.storage, 'storages', [])
-        handles = [*reader.connections, *(one for file in files for one in file.connections)]
+        handles = [*reader.connections,
+                   *(connection for file in files for connection in file.connections)]
         return [handle for handle in handles if handle.topic in names]
 
     def _unreadable(self, error: Exception) -> DatasetError:
@@ -288,8 +292,8 @@ class BagReader:
 class BagWriter:
     """Writes a rosbag2 folder as Jazzy does (metadata version 9).
 
-    A context manager. It builds the recording beside its final path and moves it there when it is
-    complete. If the block raises, nothing remains. DatasetError: the path exists or cannot be
+    A context manager. It builds the recording next to its final path, and moves it there when it
+    is complete. If the block raises, nothing remains. DatasetError: the path exists or cannot be
     written, for example because the disk is full.
 
     Parameters
@@ -303,14 +307,14 @@ class BagWriter:
     def __init__(self, path: str | Path, storage: str = 'sqlite3') -> None:
         self.path = Path(path)
         if storage not in STORAGES:
-            raise DatasetError(f'storage {storage!r} is none of {", ".join(STORAGES)}')
+            raise DatasetError(f'storage {storage!r} is not one of {", ".join(STORAGES)}')
         self._storage = STORAGES[storage]
         self._staging: Path | None = None
         self._writer: Writer | None = None
         self._connections: dict[str, Connection] = {}
 
     def __enter__(self) -> Self:
-        """Begin the recording beside its final path."""
+        """Begin the recording next to its final path."""
         self._check_free()
         try:
             with self._naming_failures():
@@ -350,16 +354,16 @@ class BagWriter:
         Parameters
         ----------
         name, msgtype : str
-            As ``/image`` and ``sensor_msgs/msg/Image``.
+            Such as ``/image`` and ``sensor_msgs/msg/Image``.
         qos : Qos
-            What its publisher would offer.
+            The QoS that the topic's publisher would offer.
         """
         with self._naming_failures():
             self._connections[name] = self._open_writer.add_connection(
                 name, msgtype, typestore=typestore(), offered_qos_profiles=[qos])
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Append a message of a declared topic, or its bytes, as recorded at a stamp [ns]."""
+        """Append a message, or its CDR bytes, to a declared topic, recorded at a stamp [ns]."""
         connection = self._connections[topic]
         data = (message if isinstance(message, bytes)
                 else typestore().serialize_cdr(message, connection.msgtype))
@@ -374,7 +378,7 @@ class BagWriter:
 
     def _check_free(self) -> None:
         if self.path.exists() or self.path.is_symlink():
-            raise DatasetError(f'{self.path}: exists already and is not overwritten')
+            raise DatasetError(f'{self.path}: already exists and is not overwritten')
         if not self.path.parent.is_dir():
             raise DatasetError(f'{self.path}: the folder {self.path.parent} does not exist')
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Folders of images with poses: the table of their layouts, and the one reader of all of them.
+"""Folders of images with poses: the table of their layouts, and a reader for all layouts.
 
-TUM RGB-D, with or without depth, and 7-Scenes are read here, the others in ``captures``.
+This module reads TUM RGB-D, with or without depth, and 7-Scenes; ``captures`` reads the others.
 """
 
 import hashlib
@@ -31,8 +31,8 @@ from cliploc_ros.offline.datasets.tum import TumSequence, read_image_list, read_
 from cliploc_ros.offline.mapping.tilt import NO_VERTICAL, find_tilt, tilt_note
 from cliploc_ros.units import NS_PER_S
 
-# Colour images of 7-Scenes are not registered, and its authors give no intrinsics for them. These
-# values make the edges of colour and depth agree best (measured for this project on RedKitchen).
+# Depth and colour of 7-Scenes are not registered, and its authors give no intrinsics for colour.
+# These values align the edges of colour and depth best (measured for this project on RedKitchen).
 _SEVEN_SCENES_COLOR = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
 _SEVEN_SCENES_DEPTH = DepthCamera(
     585.0, 585.0, 320.0, 240.0,
@@ -40,14 +40,14 @@ _SEVEN_SCENES_DEPTH = DepthCamera(
 _SEVEN_SCENES_NAME = re.compile(r'frame-(\d+)\.color\.(?:jpe?g|png)')
 _SEVEN_SCENES_HZ = 30
 _NO_OPTIONS = FolderOptions()
-# Layouts that are read: a part of one that is here, and the part that lacks.
+# Incomplete layouts: name, a file that identifies the layout, and the file that is missing.
 _NEARLY = (('TUM RGB-D', 'groundtruth.txt', 'rgb.txt'), ('TUM RGB-D', 'depth.txt', 'rgb.txt'),
            ('Stray Scanner', 'camera_matrix.csv', 'odometry.csv'),
            ('ARKitScenes', 'lowres_wide', 'lowres_wide.traj'),
            ('7-Scenes', 'frame-*.pose.txt', 'frame-000000.color.jpg'),
            ('Record3D', 'rgbd', 'metadata.json'), ('Polycam', 'mesh_info.json', 'keyframes'),
            ('COLMAP', 'database.db', 'sparse/0 (run its mapper)'))
-# Layouts that are not read, by files of theirs.
+# Layouts that are not supported, and the files that identify them.
 _OTHERS = {'EuRoC': ('mav0',), 'KITTI': ('image_[0-3]', 'times.txt'),
            'ScanNet': ('color', 'pose', 'intrinsic'), 'Replica': ('results', 'traj.txt'),
            'ScanNet++': ('iphone', 'dslr'), 'nuScenes': ('samples', 'sweeps'),
@@ -55,39 +55,39 @@ _OTHERS = {'EuRoC': ('mav0',), 'KITTI': ('image_[0-3]', 'times.txt'),
 
 
 class Layout(NamedTuple):
-    """A layout of folders."""
+    """A layout of folders, and its reader."""
 
     key: str
-    name: str  #: For people
-    #: Returns whether a folder has it, and its images
-    is_layout: Callable[[Path], bool]
+    name: str  #: Name in messages
+    is_layout: Callable[[Path], bool]  #: Returns whether a folder has this layout
     read: Callable[[Path, FolderOptions], Capture]
-    #: Which of intrinsics, trajectory, mount and images its reader uses; others are refused
+    #: The options among intrinsics, trajectory, mount and images that the reader uses; the others
+    #: are refused
     takes: tuple[str, ...] = ()
 
 
 def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
-    """Return the images of a folder of any layout, with poses in metres and OpenCV's camera axes.
+    """Read a folder of any known layout, with poses in metres and OpenCV's camera axes.
 
-    Images and poses are compared, so that a wrong choice of axes is refused.
+    Images are checked against poses, to refuse a wrong choice of axes.
 
     Raises
     ------
     DatasetError
-        The folder has no known layout, or cannot be used; says what to do.
+        The folder has no known layout, or cannot be used; the message gives a remedy.
     """
     layout = find_layout(folder, options.layout)
     if layout is None:
         remedy = ('it is a recording: give it as `bag`' if (folder / 'metadata.yaml').is_file()
                   else 'unpack it' if folder.suffix in ('.r3d', '.zip') else _unread(folder)
-                  or 'images alone need poses, as COLMAP makes them')
-        raise DatasetError(f'{folder}: has the files of no known layout: '
-                           f'{", ".join(sorted({one.name for one in LAYOUTS}))}; {remedy}')
+                  or 'images without poses need a pose estimator, such as COLMAP')
+        known = ', '.join(sorted({layout.name for layout in LAYOUTS}))
+        raise DatasetError(f'{folder}: has none of the known layouts ({known}); {remedy}')
     given = {'intrinsics': options.intrinsics, 'trajectory': options.trajectory,
              'mount': options.body_from_camera, 'images': options.images}
     for name, value in given.items():
         if value is not None and name not in layout.takes:
-            able = sorted({one.name for one in LAYOUTS if name in one.takes})
+            able = sorted({other.name for other in LAYOUTS if name in other.takes})
             raise DatasetError(f'{folder}: {layout.name} takes no `{name}`: it is for '
                                f'{" and ".join(able)}')
     with naming(folder, OSError, what='cannot be read: '):
@@ -95,20 +95,20 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
 
 
 def _unread(folder: Path) -> str:
-    """Return which layout a folder nearly has, or that it is one that is not read; '' for none."""
+    """Describe the incomplete or unsupported layout of a folder; '' if there is none."""
     for name, mark, lacking in _NEARLY:
         if any(folder.glob(mark)) and not (folder / lacking).exists():
             return f'it has {mark} as {name} does, but lacks {lacking}'
     other = next((name for name, marks in _OTHERS.items()
                   if all(any(folder.glob(mark)) for mark in marks)), '')
-    return other and (f'it is of {other}: write rgb.txt, groundtruth.txt and camera.json as TUM '
-                      'RGB-D has them beside its images, or a transforms.json')
+    return other and (f'its layout is that of {other}: write rgb.txt, groundtruth.txt and '
+                      'camera.json next to its images, as in TUM RGB-D, or a transforms.json')
 
 
 def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Camera, str]:
-    """Return images and poses of a folder of one camera, the camera, and its source.
+    """Read images and poses of a folder of one camera; also return the camera and its source.
 
-    DatasetError: it has several cameras, a video, or no unit.
+    DatasetError: the folder has several cameras, a video, or poses of unknown unit.
     """
     layout = find_layout(folder)
     if layout is None or layout.key == 'rgbd':
@@ -131,14 +131,14 @@ def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Ca
 
 
 def find_layout(folder: Path, key: str = '') -> Layout | None:
-    """Return the layout of a key, or the one whose files are there; None for none.
+    """Return the layout of a key, or the first one whose files exist; None if there is none.
 
-    DatasetError: there is no such folder.
+    DatasetError: the folder does not exist.
     """
     if not os.path.exists(folder):  # noqa: PTH110 - never raises
         raise DatasetError(f'{folder}: no such folder')
-    return next((one for one in LAYOUTS
-                 if one.key == key or (not key and one.is_layout(folder))), None)
+    return next((layout for layout in LAYOUTS
+                 if layout.key == key or (not key and layout.is_layout(folder))), None)
 
 
 def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptions) -> Frames:
@@ -152,10 +152,10 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
              placing.check_axes(capture.files, axes, folder)]
     if options.known_distance is not None:
         scale = placing.find_scale(files, *options.known_distance, folder)
-        notes.append(f'a unit is {scale:.5g} m, by the known distance')
+        notes.append(f'a unit is {scale:.5g} m by the known distance')
     if scale is None and not capture.is_metric and not options.any_unit:
-        raise DatasetError(f'{folder}: {layout.name} does not know its unit: give the `scale` '
-                           'of a unit (1 where they are metres), a `known_distance` or an '
+        raise DatasetError(f'{folder}: the unit of {layout.name} is unknown: give `scale`, the '
+                           'metres of a unit (1 for metres), a `known_distance` or an '
                            '`object_size`')
     files = placing.place_images(capture.files, axes, scale or 1.0, turn)
     poses = np.array([file.pose for file in files if file.pose is not None]).reshape(-1, 4, 4)
@@ -169,7 +169,7 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
         notes.append(tilt_note(poses))
     form = replace(capture.depth, unit_m=options.depth.unit_m or capture.depth.unit_m,
                    camera=options.depth.camera or capture.depth.camera)
-    if not capture.is_metric:  # its depth is in the unit of its poses
+    if not capture.is_metric:  # depth has the unit of the poses
         form = replace(form, scale=1.0 if options.depth.unit_m else form.scale * (scale or 1.0))
     frames = folder_frames(folder, files, form)
     flat = sum(file.depth is None for file in files)
@@ -177,15 +177,15 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
         notes.append(f'{flat} of {len(files)} images have no depth image')
     posed = [(file, file.pose) for file in files if file.pose is not None]
     digest = ' '.join(hashlib.sha256(repr(known).encode()).hexdigest()[:12] for known in (
-        [(one.color.name, one.stamp_ns, one.camera) for one, _ in posed],
+        [(file.color.name, file.stamp_ns, file.camera) for file, _ in posed],
         [np.round(pose, 6).tolist() for _, pose in posed]))
     return replace(frames, digest=digest, notes=(*filter(None, notes), *frames.notes))
 
 
 def tum_frames(sequence: TumSequence, camera: Camera) -> Frames:
-    """Return the frames of a TUM folder, taken by one camera; without depth.
+    """Return the frames of a TUM folder of one camera, without depth.
 
-    DatasetError: there are no poses, or they are of another time.
+    DatasetError: there are no poses, or their time span does not overlap that of the images.
     """
     files = _tum_files(sequence, camera, sequence.trajectory, {})
     _check_trajectory(sequence.folder, files, sequence.trajectory)
@@ -193,9 +193,9 @@ def tum_frames(sequence: TumSequence, camera: Camera) -> Frames:
 
 
 def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
-    """Return the frames of a folder with depth: of 7-Scenes, or TUM RGB-D.
+    """Return the frames of a folder with depth: 7-Scenes or TUM RGB-D.
 
-    DatasetError: the folder has neither layout, or poses and intrinsics are missing.
+    DatasetError: the folder has neither layout, or poses or intrinsics are missing.
     """
     is_tum = (folder / 'rgb.txt').exists()
     if is_tum and not (folder / 'depth.txt').exists():
@@ -204,7 +204,7 @@ def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
 
 
 def _tum(folder: Path, options: FolderOptions, with_depth: bool = True) -> Capture:
-    """Return a TUM folder; each image has the nearest depth image."""
+    """Read a TUM folder; each image gets the depth image nearest in time."""
     sequence, camera = read_tum(folder), find_camera(options.intrinsics, folder)[0]
     depths: dict[int, Path] = {}
     if with_depth and (folder / 'depth.txt').exists():
@@ -224,21 +224,21 @@ def _tum(folder: Path, options: FolderOptions, with_depth: bool = True) -> Captu
 
 def _tum_files(sequence: TumSequence, camera: Camera, trajectory: TimedPoses,
                depths: Mapping[int, Path]) -> tuple[ImageFile, ...]:
-    """Return the images of a folder, each with the pose at its stamp, if there is one."""
+    """Return the images of a folder, each with its pose and depth image; None where missing."""
     return tuple(ImageFile(stamp, path, camera, trajectory.pose_at(stamp), depths.get(stamp))
                  for stamp, path in zip(sequence.stamps_ns, sequence.image_paths, strict=True))
 
 
 def _check_trajectory(folder: Path, files: Sequence[ImageFile], trajectory: TimedPoses) -> None:
-    """Refuse a trajectory without poses, or of another time than the images."""
+    """Refuse a trajectory that has no poses or does not overlap the images in time."""
     if not len(trajectory):
-        raise DatasetError(f'{folder}: there are no poses: no groundtruth.txt here; give '
+        raise DatasetError(f'{folder}: there are no poses: groundtruth.txt is missing; give '
                            'a `trajectory`')
     check_clock(trajectory, files[0].stamp_ns, files[-1].stamp_ns, str(folder))
 
 
 def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
-    """Return the images of 7-Scenes, whose poses are the depth camera's."""
+    """Read a folder of 7-Scenes; its poses are those of the depth camera."""
     camera = (_SEVEN_SCENES_COLOR if options.intrinsics is None
               else read_camera(options.intrinsics))
     images = {int(match[1]): path for path in folder.iterdir()
@@ -265,16 +265,16 @@ def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
 
 
 def _read_pose(path: Path) -> NDArray[np.float64] | None:
-    """Return a pose (4, 4); None where tracking was lost, which is written as NaN or infinite."""
+    """Read a pose (4, 4); None where tracking was lost: the file has NaN or infinite numbers."""
     rows = []
     for where, line in read_lines(path):
         cells = line.partition('#')[0].split()
         if len(cells) != 4:
-            raise DatasetError(f'{where}: is no 4x4 matrix: {line[:60]!r}')
+            raise DatasetError(f'{where}: is not a 4x4 matrix: {line[:60]!r}')
         rows.append(parse_all(cells, float, where))
     pose = np.array(rows)
     if pose.shape != (4, 4):
-        raise DatasetError(f'{path}: is no 4x4 matrix, its shape is {pose.shape}')
+        raise DatasetError(f'{path}: is not a 4x4 matrix, its shape is {pose.shape}')
     if not np.isfinite(pose).all():
         return None
     if not transforms.is_rigid(pose, tolerance=1e-3):
@@ -283,7 +283,8 @@ def _read_pose(path: Path) -> NDArray[np.float64] | None:
 
 
 _TUM_TAKES = 'intrinsics', 'trajectory', 'mount'
-#: The first one whose files are there is read. TUM RGB-D without depth only where asked for.
+#: The first layout whose files exist is read. `tum` (TUM RGB-D without depth) is only read if
+#: requested.
 LAYOUTS = (
     Layout('rgbd', 'TUM RGB-D', lambda folder: (folder / 'rgb.txt').is_file(), _tum, _TUM_TAKES),
     Layout('7scenes', '7-Scenes', lambda folder: any(folder.glob('frame-*.color.*')),
@@ -296,7 +297,7 @@ LAYOUTS = (
            devices.read_record3d),
     Layout('arkitscenes', 'ARKitScenes', lambda folder: (folder / 'lowres_wide.traj').is_file(),
            devices.read_arkitscenes),
-    # of HoloLens2ForCV's StreamRecorder
+    # the output of StreamRecorder, a sample of HoloLens2ForCV
     Layout('hololens', 'HoloLens 2', lambda folder: any(folder.glob('*_pv.txt')),
            devices.read_hololens),
     Layout('nerf', 'transforms.json', lambda folder: folder.name.endswith('.json') or

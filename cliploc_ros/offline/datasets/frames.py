@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Images with their cameras, poses and depth, out of folders and recordings alike.
+"""Images with their cameras, poses and depth, from folders and recordings.
 
-The one reader of evaluation, mapping and map editor. A source is read as a stream of raw frames:
+Evaluation, mapping and the map editor share this reader. It yields a stream of raw frames:
 unwanted frames are never decoded, and a raw frame can be decoded in another process.
 """
 
@@ -25,14 +25,14 @@ from cliploc_ros.core.geometry.transforms import move_poses
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.units import NS_PER_S
 
-_MOST_NOTES = 5  # on cameras; each image may have its own
-# Places computed for an undistorted image, of 0.6 kB each.
+_MOST_NOTES = 5  # on cameras; each image may have a different camera
+# Greatest number of pixels to compute for an undistorted image; each takes 0.6 kB.
 _MOST_PLACES = 1_000_000
 
 
 @dataclass(frozen=True)
 class PosedImage:
-    """An image (h, w, 3) uint8, red first, with its camera, pose and depth.
+    """An image (h, w, 3) uint8, RGB, with its camera, pose and depth.
 
     ``map_from_camera`` is None if no pose is known at ``stamp_ns``.
     """
@@ -46,22 +46,22 @@ class PosedImage:
 
 @dataclass(frozen=True)
 class RawFrame:
-    """A frame that is not decoded yet; small, and fit for another process."""
+    """A frame that is not decoded yet; it is small, and can be sent to another process."""
 
-    place: int  #: Number of the image in its source
+    place: int  #: Index of the image in its source
     stamp_ns: int  #: [ns]
     map_from_camera: NDArray[np.float64] | None  #: (4, 4)
     color: Callable[[], tuple[NDArray[np.uint8], Camera]]  #: Returns the image and its camera
     depth: Callable[[], DepthImage] | None = None  #: Returns the depth image
-    camera: str = ''  #: Its name, of several cameras
+    camera: str = ''  #: Name of the camera; '' if there is only one
 
     def __str__(self) -> str:
-        """Name the frame in messages."""
+        """Return the frame's name for messages."""
         of = f' of {self.camera}' if self.camera else ''
         return f'image {self.place}{of} at {self.stamp_ns / NS_PER_S:.6f} s'
 
     def decode(self) -> PosedImage:
-        """Return the frame.
+        """Decode the frame.
 
         DatasetError: the image cannot be decoded, or its camera is invalid.
         """
@@ -70,29 +70,29 @@ class RawFrame:
                           None if self.depth is None else self.depth())
 
 
-#: Returns whether to read the frame of a place, stamp [ns] and pose.
+#: Returns whether to read a frame, given its index, stamp [ns] and pose.
 Wanted = Callable[[int, int, 'NDArray[np.float64] | None'], bool]
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of a source that is read again each time, one image in memory at a time."""
+    """Frames of a source, with one image in memory at a time; each use reads the source again."""
 
     source: Path  #: Folder or file
-    count: int  #: How many images there are
-    #: Returns an iterator over the wanted frames, asked once for each image in order
+    count: int  #: Number of images
+    #: Returns an iterator over the wanted frames; calls its argument once for each image, in order
     read_raw: Callable[[Wanted], Iterator[RawFrame]]
-    camera: str = ''  #: Its name, of several cameras
-    #: The frames of each of several cameras; empty for one
+    camera: str = ''  #: Name of the camera; '' if there is only one
+    #: The frames of each camera; empty if there is only one
     of_cameras: tuple['Frames', ...] = ()
-    varies: bool = False  #: Whether each image has a camera of its own
-    #: Digest of images and cameras, then of poses, which may change while the folder stays
+    varies: bool = False  #: Whether the camera differs between images
+    #: Digests of images with cameras, and of poses, which may change without the images
     digest: str = ''
-    notes: tuple[str, ...] = ()  #: Notes for the user about the reading
+    notes: tuple[str, ...] = ()  #: Notes for the user on the source
 
     @property
     def each(self) -> tuple['Frames', ...]:
-        """Return the frames of each camera, one at least."""
+        """Return the frames of each camera; there is at least one."""
         return self.of_cameras or (self,)
 
     def read(self) -> Iterator[PosedImage]:
@@ -101,7 +101,7 @@ class Frames:
             yield raw.decode()
 
     def select(self, places: Iterable[int]) -> 'Frames':
-        """Return some of the frames, by their places: 0 is the first."""
+        """Select frames by index; 0 is the first frame."""
         chosen = frozenset(places)
 
         def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
@@ -111,7 +111,7 @@ class Frames:
 
 
 def move_frames(frames: Frames, scale: float, rotation: NDArray[np.float64]) -> Frames:
-    """Return frames with other poses, see move_poses."""
+    """Scale and rotate the poses of frames, see move_poses."""
     def moved(pose: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
         return None if pose is None else move_poses(pose[None], scale, rotation)[0]
 
@@ -121,11 +121,11 @@ def move_frames(frames: Frames, scale: float, rotation: NDArray[np.float64]) -> 
             yield replace(raw, map_from_camera=moved(raw.map_from_camera))
     return replace(
         frames, read_raw=read_raw, digest=f'{frames.digest} {scale} {rotation.tolist()}',
-        of_cameras=tuple(move_frames(one, scale, rotation) for one in frames.of_cameras))
+        of_cameras=tuple(move_frames(part, scale, rotation) for part in frames.of_cameras))
 
 
 def join_frames(of_cameras: Mapping[str, Frames]) -> Frames:
-    """Return the frames of several cameras of one recording, by name: camera after camera."""
+    """Join the frames of the cameras of a recording, given by name, one camera after another."""
     first, parts = 0, []
     for name, frames in of_cameras.items():
         def read_raw(is_wanted: Wanted, name: str = name, frames: Frames = frames,
@@ -144,15 +144,15 @@ NO_STAMP = -2**63
 
 
 class ImageFile(NamedTuple):
-    """An image of a folder, with its camera, its pose, and its depth image if there is one."""
+    """An image of a folder, with its camera, pose and depth image; None where missing."""
 
-    stamp_ns: int  #: NO_STAMP where the layout has none
+    stamp_ns: int  #: NO_STAMP if the layout has no stamps
     color: Path  #: An image, or a video
     camera: Camera
-    #: (4, 4): as the folder stores it, or map_from_camera; None if it is not known
+    #: (4, 4): in the convention of the folder, later map_from_camera; None if unknown
     pose: NDArray[np.float64] | None = None
     depth: Path | None = None
-    confidence: Path | None = None  #: Image of the depth's size, 0 for guesses
+    confidence: Path | None = None  #: Image of the size of the depth image; 0: unreliable depth
     number: int | None = None  #: Number of the image in a video
 
 
@@ -160,15 +160,15 @@ class ImageFile(NamedTuple):
 class DepthFormat:
     """Format of depth images."""
 
-    #: Metres of one count. None: 1 mm for 16-bit integers, 1 m for floats.
+    #: Metres per count. None: 1 mm for 16-bit integers, 1 m for floats.
     unit_m: float | None = None
     camera: DepthCamera | None = None  #: None: registered to the colour image
-    scale: float = 1.0  #: Metres of what unit_m counts, where that is the unit of the poses
+    scale: float = 1.0  #: Further factor of depth [m], if unit_m is in the unit of the poses
 
 
 def folder_frames(folder: Path, files: Sequence[ImageFile], depth: DepthFormat | None = None
                   ) -> Frames:
-    """Return the frames of image files, whose poses are map_from_camera."""
+    """Return the frames of image files; the poses of the files are map_from_camera."""
     form = depth or DepthFormat()
 
     def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
@@ -177,18 +177,19 @@ def folder_frames(folder: Path, files: Sequence[ImageFile], depth: DepthFormat |
                 yield RawFrame(place, file.stamp_ns, file.pose, partial(read_color, file),
                                None if file.depth is None else partial(read_depth, file, form))
     cameras = dict.fromkeys(file.camera for file in files)
-    # pictures may be cut out of larger pictures without a record: no fault is certain
-    notes = dict.fromkeys(f'note: {fault.text}' for one in cameras for fault in camera_faults(one))
+    # images may have been cropped without a record, so that no fault is certain
+    notes = dict.fromkeys(f'note: {fault.text}' for camera in cameras
+                          for fault in camera_faults(camera))
     return Frames(folder, len(files), read_raw, varies=len(cameras) > 1,
                   notes=tuple(notes)[:_MOST_NOTES])
 
 
 def read_color(file: ImageFile, upright: bool = False) -> tuple[NDArray[np.uint8], Camera]:
-    """Return the image (h, w, 3) of a file, red first, and its camera.
+    """Read an image (h, w, 3), RGB, and its camera.
 
-    It is turned by its EXIF orientation where `upright` says so, or the camera's size does: width
-    and height are those of the turned image alone. DatasetError: the image cannot be decoded, or
-    is not of the camera's size.
+    The EXIF orientation is applied if `upright` is set, or if only the rotated image has the
+    camera's size. DatasetError: the image cannot be decoded, or its size differs from the
+    camera's.
     """
     path, camera = file.color, file.camera
     image = (_read_image(path, upright) if file.number is None
@@ -205,19 +206,19 @@ def read_color(file: ImageFile, upright: bool = False) -> tuple[NDArray[np.uint8
         raise DatasetError(
             f'{path} has {image.shape[1]}x{image.shape[0]} px, but the camera has '
             f'{camera.width}x{camera.height} px' + (
-                '; is it turned by its EXIF orientation? turn the pixels, as with mogrify '
-                '-auto-orient' if turned else ''))
+                '; does its EXIF orientation rotate it? Rotate the pixels, for example with '
+                'mogrify -auto-orient' if turned else ''))
     return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8), camera
 
 
 def _read_image(path: Path, upright: bool) -> Any:
-    """Return an image (h, w, 3), blue first; None if it cannot be read."""
+    """Read an image (h, w, 3), BGR; None if it cannot be read."""
     return cv2.imread(str(path), cv2.IMREAD_COLOR | (0 if upright
                                                      else cv2.IMREAD_IGNORE_ORIENTATION))
 
 
 class _Video:
-    """A video that is read forward; a jump back opens it again."""
+    """A video that is read forward; to go back, it is opened again."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -229,7 +230,7 @@ class _Video:
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
 
     def image(self, number: int) -> NDArray[np.uint8] | None:
-        """Return an image (h, w, 3), blue first; None if there is none."""
+        """Read an image (h, w, 3), BGR, by its index; None if there is none."""
         if number < self._next:
             self._open()
         while self._next < number:
@@ -245,7 +246,7 @@ _open_video = lru_cache(1)(_Video)
 
 
 def read_depth(file: ImageFile, form: DepthFormat) -> DepthImage:
-    """Return the depth image of a file that has one; DatasetError: it cannot be read."""
+    """Read the depth image that belongs to an image; DatasetError: it cannot be read."""
     counts = cv2.imread(str(file.depth), cv2.IMREAD_UNCHANGED)
     if counts is None:
         raise DatasetError(f'{file.depth} cannot be read as a depth image')
@@ -262,14 +263,14 @@ def read_depth(file: ImageFile, form: DepthFormat) -> DepthImage:
 
 def undistorted(image_rgb: NDArray[np.uint8], camera: Camera, pinhole: Camera | None = None
                 ) -> NDArray[np.uint8]:
-    """Return an image (h, w, 3) as a pinhole would show it, its camera's own by default.
+    """Undistort an image (h, w, 3) to a pinhole camera; default: the pinhole of its camera.
 
-    It is black where the camera saw nothing.
+    Pixels outside the camera's view are black.
     """
     pinhole = pinhole or camera.pinhole
     if pinhole == camera.pinhole and camera.is_pinhole:
         return image_rgb
-    # a large image has a coarser grid of places, and those between: a lens is smooth
+    # large images: a coarse grid is interpolated, since lens distortion is smooth
     step = max(1, math.isqrt(pinhole.width * pinhole.height // _MOST_PLACES))
     columns, rows = np.meshgrid(*(step * np.arange(-1, side // step + 2) + 0.5 * (step - 1)
                                   for side in (pinhole.width, pinhole.height)))

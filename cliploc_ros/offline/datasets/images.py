@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The images of a recording: a folder, or the cameras of a rosbag2 recording."""
+"""Random access to the images of a folder or a rosbag2 recording."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -25,18 +25,18 @@ from cliploc_ros.offline.mapping.posed_detections import (
 )
 from cliploc_ros.units import NS_PER_S
 
-# A view and its image have the same stamp; files hold it to a microsecond or so.
+# A view and its image have the same stamp, but files round it to about a microsecond.
 _MAX_DELAY_NS = 20_000_000
 _IMAGES_KEPT = 32
 _NO_OPTIONS = FolderOptions()
 
 
 class Images:
-    """The images of a folder or a recording, taken at stamps (F,) [ns].
+    """The images of a folder or a recording, by their stamps (F,) [ns].
 
-    ``read`` returns image and camera of a place, 0 to F - 1; ``cameras`` are the names (F,) of
-    several cameras; of a folder, whose stamps differ, the stamp is enough. ``read_depth`` returns
-    the depth image of a place, or None.
+    ``read`` returns the image and camera of an index, 0 to F - 1. ``cameras`` are the camera names
+    (F,) of a recording; a folder needs none, because its stamps are unique. ``read_depth`` returns
+    the depth image of an index, or None.
     """
 
     def __init__(self, stamps_ns: NDArray[np.int64],
@@ -46,28 +46,29 @@ class Images:
         self._stamps_ns = stamps_ns
         self._read_raw, self._read_depth = read, read_depth
         self._cameras = np.array(cameras, dtype=np.str_)
-        self._lock = threading.Lock()  # readers of recordings are for one thread at a time
+        self._lock = threading.Lock()  # readers of recordings are not thread-safe
         self._read: Callable[[int, Camera | None], NDArray[np.uint8]] = lru_cache(_IMAGES_KEPT)(
             lambda place, pinhole: undistorted(*read(place), pinhole))
 
     def near(self, stamp_s: float, camera: str = '', pinhole: Camera | None = None
              ) -> NDArray[np.uint8] | None:
-        """Return the undistorted image (h, w, 3) of a camera at a time [s], red first.
+        """Return the undistorted image (h, w, 3) of a camera at a time [s], RGB.
 
-        It is as a pinhole shows it, such as that of the boxes. None without one.
+        `pinhole` is the camera model of the result, such as that of the boxes; default: the
+        camera's own. None: there is no image at that time.
         """
         place = self._place(stamp_s, camera)
         with self._lock:
             return None if place is None else self._read(place, pinhole)
 
     def of(self, detections: PosedDetections, view: int) -> NDArray[np.uint8] | None:
-        """Return the undistorted image of a view of a recording, red first; None without one."""
+        """Return the undistorted image (h, w, 3) of a view, RGB; None if there is none."""
         return self.near(float(detections.stamps_s[view]), detections.name_of(view),
                          detections.camera_of(view))
 
     def depth_near(self, stamp_s: float, camera: str = ''
                    ) -> tuple[NDArray[np.uint8], Camera, DepthImage] | None:
-        """Return a camera's image at a time [s], distorted as it is, with its depth image."""
+        """Return a camera's distorted image at a time [s], its camera and its depth image."""
         place = self._place(stamp_s, camera)
         with self._lock:
             depth = None if place is None else self._read_depth(place)
@@ -84,7 +85,7 @@ class Images:
 
 
 def images_of_recording(recording: MapRecording, cameras: Sequence[str]) -> Images | None:
-    """Open the images that a map was built from; None if they are gone."""
+    """Open the images that a map was built from; None if they are missing."""
     if recording.source is None:
         return None
     return open_images(recording.source, BagTopics(
@@ -95,9 +96,9 @@ def images_of_recording(recording: MapRecording, cameras: Sequence[str]) -> Imag
 
 def open_images(path: Path, topics: BagTopics, cameras: Sequence[str] = ('',),
                 folder: FolderOptions = _NO_OPTIONS) -> Images:
-    """Open the images of a folder, or those of each camera of a rosbag2 recording.
+    """Open the images of a folder, or of all given cameras of a rosbag2 recording.
 
-    DatasetError: it is neither, or lacks a camera.
+    DatasetError: the path is neither, or a camera is missing.
     """
     if not path.exists():
         raise DatasetError(f'{path}: no such folder or recording')
@@ -109,21 +110,21 @@ def open_images(path: Path, topics: BagTopics, cameras: Sequence[str] = ('',),
                       lambda place: (None if files[place].depth is None
                                      else read_depth(files[place], capture.depth)))
     of_cameras = [bag_images(path, topics.of_camera(name)) for name in cameras]
-    places = [(one, place) for one in of_cameras for place in range(len(one.times_ns))]
-    names = np.repeat(np.array(cameras), [len(one.times_ns) for one in of_cameras])
-    return Images(np.concatenate([one.times_ns[:, 0] for one in of_cameras]),
+    places = [(images, place) for images in of_cameras for place in range(len(images.times_ns))]
+    names = np.repeat(np.array(cameras), [len(images.times_ns) for images in of_cameras])
+    return Images(np.concatenate([images.times_ns[:, 0] for images in of_cameras]),
                   lambda number: places[number][0].read(places[number][1]), names.tolist())
 
 
 def views_of_folder(path: Path) -> PosedDetections:
-    """Return the poses of a folder as views without boxes; DatasetError: it has no poses."""
+    """Read the poses of a folder as views without boxes; DatasetError: it has no poses."""
     layout = find_layout(path)
     if layout is None:
-        raise DatasetError(f'{path}: has no poses to look from; give --observations, too')
+        raise DatasetError(f'{path}: has no camera poses; also give --observations')
     capture = layout.read(path, FolderOptions())
     if not capture.is_metric:
-        raise DatasetError(f'{path}: {layout.name} does not know its unit; give --observations, '
-                           'too: build_map makes them, with --scale')
+        raise DatasetError(f'{path}: the unit of {layout.name} is unknown; also give '
+                           '--observations, which build_map writes with --scale')
     posed, cameras = [], []
     for raw in read_folder(path).read_raw(lambda place, stamp_ns, pose: pose is not None):
         posed.append((raw.stamp_ns, raw.map_from_camera))

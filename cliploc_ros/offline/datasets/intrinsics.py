@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Camera intrinsics: those of the TUM sequences, and the user's own in a camera.json."""
+"""Camera intrinsics: presets of the TUM sequences, or a camera.json of the user."""
 
 import re
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ def _tum_camera(fx: float, fy: float, cx: float, cy: float, *distortion: float) 
     return Camera(640, 480, fx, fy, cx, cy, 'plumb_bob', distortion)
 
 
-#: The dataset's published values (ROS calibration of the colour cameras).
+#: The published values of the dataset (ROS calibration of the colour cameras).
 PRESETS: Mapping[str, Camera] = {
     'fr1': _tum_camera(517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
     'fr2': _tum_camera(520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
@@ -26,7 +26,7 @@ _SEQUENCE_NAME = re.compile(r'(?<![a-z])(?:freiburg|fr)([123])(?![0-9])', re.IGN
 
 
 def find_camera(choice: str | None, folder: Path) -> tuple[Camera, str]:
-    """Return the camera of a sequence, and for the user where its intrinsics are from.
+    """Return the camera of a sequence, and the source of its intrinsics, as a text for the user.
 
     DatasetError: neither choice nor folder determines the camera, or the file is invalid.
 
@@ -55,9 +55,9 @@ def find_camera(choice: str | None, folder: Path) -> tuple[Camera, str]:
 def read_camera(path: str | Path) -> Camera:
     """Read a camera.json.
 
-    The file holds a mapping with ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` [px] and,
-    for a lens with distortion, ``distortion_model`` and its coefficients ``d``. DatasetError: a
-    field is missing, unknown or invalid; the message names file and field.
+    The file is a mapping of ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` [px] and, for a
+    lens with distortion, ``distortion_model`` and its coefficients ``d``. DatasetError: a field is
+    missing, unknown or invalid; the message names file and field.
     """
     path = Path(path)
     if not path.is_file():

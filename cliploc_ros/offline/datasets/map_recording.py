@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recording of a map: NAME.recording.json next to NAME.yaml.
 
-It leads ``check_map`` and the studio to observations and images. Paths in it are relative to the
-map, so that folders can be moved together.
+``check_map`` and the studio use it to find observations and images. Its paths are relative to the
+map, so that the folders can be moved together.
 """
 
 import json
@@ -21,50 +21,50 @@ from cliploc_ros.files.storage import open_file, parse_json, read_file, write_te
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
-# Comments at the head of a map take fewer bytes.
+# The comments at the head of a map are shorter than this [bytes].
 _HEAD = 65_536
 _PATHS = ('observations', 'source', 'images')
 
 
 @dataclass(frozen=True)
 class MapRecording:
-    """A recording of the place of a map."""
+    """The recording that a map was built from."""
 
     observations: Path
-    source: Path | None = None  #: The bag or folder with the images; None: none is known
+    source: Path | None = None  #: The bag or folder with the images; None if unknown
     #: For a bag: topics of image and camera_info, and whether images are rectified
     image: str = ''
     camera_info: str = ''
     rectified: bool = False
-    #: For a folder: the key of its layout, its camera, and the folder of its images
+    #: For a folder: key of the layout, camera, and folder of the images
     layout: str = ''
     intrinsics: str | None = None
     images: Path | None = None
-    #: The options of a folder that say what its poses are, see FolderOptions; only those given
+    #: The options that were given for the poses of a folder, see FolderOptions
     placing: dict[str, Any] = field(default_factory=dict)
-    #: From the poses of the observations to those of the map: positions times a scale, then turned
-    #: by a rotation (3, 3)
+    #: From poses of the observations to poses in the map: a factor of the positions, then a
+    #: rotation (3, 3)
     scale: float = 1.0
     rotation: list[list[float]] = field(default_factory=lambda: np.eye(3).tolist())
 
     @property
     def is_moved(self) -> bool:
-        """Return whether the poses of the map are others than those of the recording."""
+        """Return whether the poses of the map differ from those of the recording."""
         return self.scale != 1.0 or not np.array_equal(self.rotation, np.eye(3))
 
     def load(self) -> PosedDetections:
-        """Return the observations in the map; DatasetError: they cannot be read."""
+        """Read the observations, with poses in the map; DatasetError: they cannot be read."""
         return load_observations(self.observations).moved(self.scale, np.array(self.rotation))
 
 
 def recording_path(map_file: Path) -> Path:
-    """Return the file that says what a map was built from."""
+    """Return the file that describes the recording of a map."""
     return map_file.with_suffix('.recording.json')
 
 
 def save_recording(map_file: Path, recording: MapRecording, place: Path | None = None,
                    set_digest: str = '') -> None:
-    """Write the sources of a map next to it, or to a place in the same folder.
+    """Write the recording of a map next to it, or to another file in the same folder.
 
     CliplocError: the file cannot be written.
     """
@@ -77,9 +77,9 @@ def save_recording(map_file: Path, recording: MapRecording, place: Path | None =
 
 
 def load_recording(map_file: Path) -> MapRecording | None:
-    """Return the sources of a map; None if they are not recorded, or its observations are gone.
+    """Read the recording of a map; None if there is none, or if its observations are missing.
 
-    A source that is gone is None. DatasetError: the file is damaged.
+    Missing images are None. DatasetError: the file is damaged.
     """
     path = recording_path(map_file)
     if not path.is_file():
@@ -93,7 +93,7 @@ def load_recording(map_file: Path) -> MapRecording | None:
         paths = {name: map_file.resolve().parent / values[name] for name in _PATHS
                  if values.get(name) is not None}
         found = MapRecording(**(values | {
-            name: one if one.exists() else None for name, one in paths.items()}))
+            name: path if path.exists() else None for name, path in paths.items()}))
         turn = np.array(found.rotation, dtype=float)
         is_valid = turn.shape == (3, 3) and 0.0 < found.scale < np.inf and is_rigid(
             make_transform(turn, np.zeros(3)))

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Observation and query files: recorded boxes and camera poses.
 
-Mapping, evaluation and the map editor read the same observations, so that the networks run once.
-A query file has the similarities of a map, too: identical input for every method.
+The networks run once: mapping, evaluation and the map editor read the same observations. A query
+file also holds the similarities to a map's labels, so that all methods get identical input.
 """
 
 import math
@@ -48,9 +48,9 @@ FRAME_FIELDS = {
     'depths': npz.Field('floats', ('n',), (npz.Check(
         'is not positive and finite', lambda depths: (depths <= 0.0) | np.isinf(depths)),),
         is_optional=True),
-    # exact, which a float64 of seconds is not [ns]
+    # exact, unlike a float64 of seconds [ns]
     'stamps_ns': npz.Field('integers', ('F',), (_check_stamps,), is_optional=True),
-    # time that the networks took [ms], NaN where unknown
+    # run time of the networks [ms], NaN where unknown
     **dict.fromkeys(_STAGES, npz.Field('numbers', ('F',), (_NOT_NEGATIVE,), is_optional=True)),
 }
 
@@ -75,7 +75,7 @@ _QUERIES = npz.Schema('query file', {
         npz.UNIQUE, npz.Check('is empty', lambda ids: ids == ''))),
     **FRAME_FIELDS,
     'intrinsics_fx_fy_cx_cy': npz.Field('numbers', (4,), (npz.FINITE, npz.Check(
-        'is a focal length that is not above 0',
+        'has a focal length that is not above 0',
         lambda numbers: (numbers <= 0) & (np.arange(4) < 2)))),
     # half precision rounds some cosines to just above 1
     'similarities': npz.Field('numbers', ('n', 'L'), (npz.FINITE, npz.Check(
@@ -101,12 +101,12 @@ class QueryFrame:
     #: (n,): index into the landmarks, -1 where unknown. For evaluation only.
     true_landmark: NDArray[np.int64]
     map_from_camera: NDArray[np.float64]  #: (4, 4): ground truth
-    group: int  #: The query to which the frame belongs
-    is_main: bool  #: Whether the frame is the query itself and not one of its neighbours
+    group: int  #: Number of the query that the frame belongs to
+    is_main: bool  #: Whether the frame is the query itself, not one of its neighbours
     #: Processing time of the image [ms]; NaN if not recorded
     detector_ms: float = math.nan
     clip_ms: float = math.nan
-    #: (n,): depth of what each box shows [m], NaN where unknown; None without a depth camera
+    #: (n,): depth of the object in each box [m], NaN where unknown; None without a depth camera
     depths: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
@@ -118,8 +118,8 @@ class QueryFrame:
 class Queries:
     """The content of a query file."""
 
-    landmark_ids: tuple[str, ...]  #: The landmarks of the columns of the similarities
-    intrinsics_fx_fy_cx_cy: tuple[float, float, float, float]  #: Without distortion [px]
+    landmark_ids: tuple[str, ...]  #: The landmark of each column of the similarities
+    intrinsics_fx_fy_cx_cy: tuple[float, float, float, float]  #: Of the undistorted image [px]
     frames: tuple[QueryFrame, ...]  #: In the file's order
 
     def __len__(self) -> int:
@@ -144,9 +144,9 @@ class Queries:
 
 
 def _stamps_ns(arrays: npz.Arrays) -> NDArray[np.int64]:
-    """Return exact stamps [ns], or the microseconds of a float64 of seconds, which it still holds.
+    """Return the exact stamps (F,) [ns]; without them, the float64 seconds rounded to 1 us.
 
-    A float64 of today's seconds resolves 0.24 us.
+    A float64 of today's seconds has a resolution of 0.24 us.
     """
     rounded = np.round(arrays['timestamps'].astype(np.float64) * 1e6).astype(np.int64) * 1000
     return arrays.get('stamps_ns', rounded).astype(np.int64)
@@ -155,13 +155,13 @@ def _stamps_ns(arrays: npz.Arrays) -> NDArray[np.int64]:
 def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) -> Queries:
     """Read and validate a query file.
 
-    With `landmark_ids`, those of a map, the file must contain no others. DatasetError: the message
-    names file, array and error.
+    With the `landmark_ids` of a map, the file must contain no other landmarks. DatasetError: the
+    message names file, array and error.
     """
     path = Path(path)
     arrays = _QUERIES.read(path)
-    unknown = [one for one in map(str, arrays['landmark_ids'])
-               if landmark_ids is not None and one not in landmark_ids]
+    unknown = [landmark for landmark in map(str, arrays['landmark_ids'])
+               if landmark_ids is not None and landmark not in landmark_ids]
     if unknown:
         more = f' (and {len(unknown) - 1} more)' if len(unknown) > 1 else ''
         raise DatasetError(f'{path}: array landmark_ids has {unknown[0]!r}, which the map does '
@@ -207,7 +207,8 @@ def save_queries(path: str | Path, queries: Queries) -> None:
             'similarities': rows('similarities', np.empty((0, len(queries.landmark_ids)))
                                  ).astype(np.float32),
             'true_landmark': rows('true_landmark', np.empty(0, dtype=np.int64)),
-            'map_from_camera': np.array([one.map_from_camera for one in frames]).reshape(-1, 4, 4),
+            'map_from_camera': np.array([frame.map_from_camera for frame in frames]
+                                        ).reshape(-1, 4, 4),
             # Python's division of integers rounds once, NumPy's twice.
             'timestamps': np.array([frame.stamp_ns / NS_PER_S for frame in frames]),
             'query_group': np.array([frame.group for frame in frames], dtype=np.int64),
@@ -217,7 +218,8 @@ def save_queries(path: str | Path, queries: Queries) -> None:
         }
         if any(frame.depths is not None for frame in frames):
             arrays['depths'] = np.concatenate([
-                np.full(len(one), np.nan) if one.depths is None else one.depths for one in frames])
+                np.full(len(frame), np.nan) if frame.depths is None else frame.depths
+                for frame in frames])
     except ValueError as error:  # arrays of different widths
         raise DatasetError(f'{path}: cannot be written: {error}') from error
     _QUERIES.write(path, arrays, compress=True)
@@ -227,7 +229,7 @@ _OF_CAMERAS = ('camera_names', 'camera_sizes', 'camera_intrinsics', 'camera_rows
 
 
 def _check_cameras(name: str, arrays: npz.Arrays) -> None:
-    if missing := [one for one in _OF_CAMERAS if one not in arrays]:
+    if missing := [field for field in _OF_CAMERAS if field not in arrays]:
         raise npz.ArrayError(f'array {missing[0]} is missing next to {name}')
     if name != 'camera_rows':
         return
@@ -244,7 +246,7 @@ _OBSERVATIONS = npz.Schema('observation file', {
     'image_size': npz.Field('integers', (2,)),
     'depth_spreads': npz.Field('floats', ('n',), (_NOT_NEGATIVE,), is_optional=True),
     'open_edges': npz.Field('booleans', ('n', 4), is_optional=True),
-    # large, and few of the rows are in use at once
+    # large, and few rows are needed at a time
     'embeddings': npz.Field('floats', ('n', 'd'), (npz.FINITE,), is_optional=True, stays=True),
     'encoder_key': npz.Field('text', is_optional=True),
     # a row without odometry is NaN
@@ -252,8 +254,8 @@ _OBSERVATIONS = npz.Schema('observation file', {
         'is not a rigid transform',
         lambda poses: ~np.isnan(poses).all(axis=(1, 2)) & ~are_rigid(poses)),), is_optional=True),
     'image_counts': npz.Field('integers', (2,), (_NOT_NEGATIVE,), is_optional=True),
-    # of several cameras: their names, width and height, fx, fy, cx, cy, and the camera of each
-    # frame; image_size and intrinsics_fx_fy_cx_cy are the first one's
+    # with several cameras: names, width and height, fx, fy, cx, cy, and the camera of each frame;
+    # image_size and intrinsics_fx_fy_cx_cy are those of the first camera
     'camera_names': npz.Field('text', ('C',), (npz.UNIQUE, _check_cameras), is_optional=True),
     'camera_sizes': npz.Field('integers', ('C', 2), (_check_cameras,), is_optional=True),
     'camera_intrinsics': npz.Field('numbers', ('C', 4), (npz.FINITE, _check_cameras),
@@ -269,23 +271,23 @@ _OPTIONAL = ('depths', 'depth_spreads', 'embeddings', 'odom_from_camera', 'open_
 
 @dataclass(frozen=True)
 class Recorded:
-    """Observations and how they came about: F frames."""
+    """Observations of F frames, with the settings and run times of their recording."""
 
     detections: PosedDetections
     stamps_ns: NDArray[np.int64]  #: (F,): exact stamps [ns]
-    #: (F,): time that the networks took [ms]; NaN where unknown
+    #: (F,): run time of the networks [ms]; NaN where unknown
     detector_ms: NDArray[np.float64]
     clip_ms: NDArray[np.float64]
-    #: Images of the source, and those of them without a pose
+    #: Number of images in the source, and of images without a pose
     images: int
     without_pose: int
-    described: str  #: All that the observations depend on; '' where unknown
+    described: str  #: All inputs and settings of the observations; '' where unknown
 
 
 def camera_from_numbers(size: NDArray[Any], intrinsics: NDArray[Any]) -> Camera:
-    """Return the camera of width and height (2,), and fx, fy, cx, cy (4,).
+    """Make a camera of width and height (2,), and fx, fy, cx, cy (4,) [px].
 
-    CameraError: they are invalid.
+    CameraError: the values are invalid.
     """
     (width, height), (fx, fy, cx, cy) = map(int, size), map(float, intrinsics)
     return Camera(width, height, fx, fy, cx, cy)
@@ -294,15 +296,14 @@ def camera_from_numbers(size: NDArray[Any], intrinsics: NDArray[Any]) -> Camera:
 def load_observations(path: str | Path) -> PosedDetections:
     """Read and validate an observation file.
 
-    Frames are put in the order of time. A frame may lack boxes; a file may lack frames with boxes
-    only if mapping is told so later. DatasetError: the message names the file, the array, what is
-    wrong with it, and what to do.
+    Frames are sorted by time. A frame may have no boxes. A file without any boxes is valid here,
+    but mapping refuses it. DatasetError: the message names file, array, error and remedy.
     """
     return load_recorded(path).detections
 
 
 def load_recorded(path: str | Path) -> Recorded:
-    """Read and validate an observation file, and how it came about; see load_observations."""
+    """Read and validate an observation file with its settings; see load_observations."""
     arrays = _OBSERVATIONS.read(Path(path))
     try:
         cameras = tuple(camera_from_numbers(*numbers) for numbers in zip(
@@ -337,7 +338,7 @@ def load_recorded(path: str | Path) -> Recorded:
 
 
 def save_observations(path: str | Path, detections: PosedDetections) -> None:
-    """Write an observation file in one step: an existing file is replaced complete, or stays.
+    """Write an observation file atomically; an existing file is replaced.
 
     DatasetError: the detections are malformed, or the file cannot be written.
     """
@@ -345,7 +346,7 @@ def save_observations(path: str | Path, detections: PosedDetections) -> None:
 
 
 def save_recorded(path: str | Path, recorded: Recorded) -> None:
-    """Write an observation file that says how it came about; see save_observations."""
+    """Write an observation file with its settings; see save_observations."""
     _write(Path(path), recorded.detections, {
         'stamps_ns': recorded.stamps_ns, 'detector_ms': recorded.detector_ms,
         'clip_ms': recorded.clip_ms, 'described': np.array(recorded.described),
@@ -353,8 +354,9 @@ def save_recorded(path: str | Path, recorded: Recorded) -> None:
 
 
 def _write(path: Path, detections: PosedDetections, more: npz.Arrays) -> None:
-    sizes = np.array([[one.width, one.height] for one in detections.cameras])
-    intrinsics = np.array([[one.fx, one.fy, one.cx, one.cy] for one in detections.cameras])
+    sizes = np.array([[camera.width, camera.height] for camera in detections.cameras])
+    intrinsics = np.array([[camera.fx, camera.fy, camera.cx, camera.cy]
+                           for camera in detections.cameras])
     names = np.array(detections.class_names, dtype=np.str_)
     arrays: dict[str, NDArray[Any]] = {
         'intrinsics_fx_fy_cx_cy': intrinsics[0], 'image_size': sizes[0],
@@ -373,5 +375,5 @@ def _write(path: Path, detections: PosedDetections, more: npz.Arrays) -> None:
                    'camera_intrinsics': intrinsics, 'camera_rows': detections.frame_cameras}
     if detections.encoder_key:
         arrays['encoder_key'] = np.array(detections.encoder_key)
-    # embeddings do not compress, and take minutes to try
+    # compressing embeddings takes minutes and saves nothing
     _OBSERVATIONS.write(path, arrays, compress='embeddings' not in arrays)

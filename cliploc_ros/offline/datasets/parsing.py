@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Texts, tables and JSON of other programs, checked as they are read.
+"""Read and check texts, tables and JSON of other programs.
 
 Every error is a DatasetError that names the file and the line or field.
 """
@@ -31,7 +31,7 @@ class FieldError(DatasetError):
 
 @contextmanager
 def naming(where: object, *kinds: type[Exception], what: str = '') -> Iterator[None]:
-    """Turn exceptions of some kinds into a DatasetError that names a file or a place in it."""
+    """Convert exceptions of some kinds to a DatasetError that names a file or a place in it."""
     try:
         yield
     except kinds as error:
@@ -48,7 +48,7 @@ def read_text(path: Path) -> str:
 def read_lines(path: Path, header: int = 0) -> Iterator[tuple[str, str]]:
     """Yield 'file:line' and the text of each line that is neither blank nor a comment.
 
-    The first lines may be a header, whatever they hold.
+    The first `header` lines are skipped.
     """
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         stripped = line.strip()
@@ -57,10 +57,11 @@ def read_lines(path: Path, header: int = 0) -> Iterator[tuple[str, str]]:
 
 
 def read_cells(path: Path, expected: str, header: int = 0) -> Iterator[tuple[str, list[str]]]:
-    """Yield 'file:line' and the cells of each line after a header, between spaces or commas.
+    """Yield 'file:line' and the cells of each line after a header, split at spaces or commas.
 
-    DatasetError: the file cannot be read, or a line has an empty cell before its last comma, or
-    other cells than the expected names, of which '...' stands for any number.
+    `expected` lists the names of the cells; a final '...' stands for any number of cells.
+    DatasetError: the file cannot be read, a line has the wrong number of cells, or a cell between
+    commas is empty.
     """
     names = expected.split()
     for where, line in read_lines(path, header):
@@ -75,12 +76,12 @@ def read_cells(path: Path, expected: str, header: int = 0) -> Iterator[tuple[str
 
 
 def read_numbers(path: Path, expected: str) -> list[list[float]]:
-    """Return the numbers of each line of a table, see read_cells; they may be infinite or NaN."""
+    """Read the numbers of each line of a table, see read_cells; they may be infinite or NaN."""
     return [parse_all(cells, float, where) for where, cells in read_cells(path, expected)]
 
 
 def parse_all[T](cells: Sequence[str], kind: Callable[[str], T], where: str) -> list[T]:
-    """Return cells as numbers of a kind; DatasetError: a cell is none."""
+    """Convert cells to numbers of a type; DatasetError: a cell is not a number."""
     numbers = []
     for cell in cells:
         try:
@@ -91,9 +92,9 @@ def parse_all[T](cells: Sequence[str], kind: Callable[[str], T], where: str) -> 
 
 
 def unit_of_stamps(texts: Iterable[str]) -> Decimal:
-    """Return the unit of the times of a file [s]: seconds where all can be, else ms, us or ns.
+    """Return the unit of the times of a file [s]: the largest of s, ms, us, ns that is possible.
 
-    Texts that are not numbers are passed over.
+    A unit is possible if all times are within MAX_STAMP_S. Texts that are not numbers are ignored.
     """
     greatest = 0.0
     for text in texts:
@@ -111,11 +112,11 @@ def parse_stamp_ns(text: str, where: str, unit_s: Decimal = Decimal(1)) -> int:
     Parameters
     ----------
     text : str
-        As ``1341847980.722988`` or ``1.341847980722988e9``.
+        Such as ``1341847980.722988`` or ``1.341847980722988e9``.
     where : str
         File and line, for the message.
     unit_s : Decimal, optional
-        Seconds of a unit.
+        The unit of the time [s].
     """
     try:
         seconds = Decimal(text) * unit_s
@@ -130,7 +131,7 @@ def parse_stamp_ns(text: str, where: str, unit_s: Decimal = Decimal(1)) -> int:
 
 def unit_quaternion(quat: Sequence[float], where: str, tolerance: float
                     ) -> NDArray[np.float64]:
-    """Return a quaternion (4,) of unit length; DatasetError: it is far from it."""
+    """Normalize a quaternion (4,); DatasetError: its norm is not 1 within the tolerance."""
     norm = math.hypot(*quat)
     if not abs(norm - 1.0) <= tolerance:
         raise DatasetError(f'{where}: quaternion {list(quat)} has norm {norm:.3g}, not 1')
@@ -139,9 +140,9 @@ def unit_quaternion(quat: Sequence[float], where: str, tolerance: float
 
 def pose_of(position: Sequence[float], quat_xyzw: Sequence[float], where: str
             ) -> NDArray[np.float64] | None:
-    """Return the transform (4, 4) of a position and a quaternion; None if they are not finite.
+    """Make a transform (4, 4) of a position and a quaternion; None if they are not finite.
 
-    DatasetError: the quaternion is far from unit.
+    DatasetError: the norm of the quaternion is not 1.
     """
     if not np.isfinite([*position, *quat_xyzw]).all():
         return None
@@ -150,16 +151,16 @@ def pose_of(position: Sequence[float], quat_xyzw: Sequence[float], where: str
 
 
 def camera_of(where: str, *values: Any) -> Camera:
-    """Return a camera; DatasetError: no camera can have these values."""
+    """Make a camera; DatasetError: the values are invalid."""
     with naming(where, CameraError):
         return Camera(*values)
 
 
 class WrittenFloat(float):
-    """A float that keeps how a file writes it, for stamps that a float would round."""
+    """A float that keeps its text in the file, for stamps that a float would round."""
 
     def __new__(cls, text: str) -> Self:
-        """Keep the text."""
+        """Convert the text and keep it."""
         made = super().__new__(cls, text)
         made.text = text
         return made
@@ -174,7 +175,7 @@ class WrittenFloat(float):
 class Fields:
     """A JSON mapping whose fields are checked as they are read.
 
-    FieldError: a field is missing without a default, or is of another type or shape.
+    FieldError: a field without a default is missing, or has the wrong type or shape.
     """
 
     def __init__(self, values: Any, where: str) -> None:
@@ -185,13 +186,13 @@ class Fields:
 
     @classmethod
     def of_file(cls, path: Path, read: Callable[[Path], str | bytes] = read_text) -> 'Fields':
-        """Return the mapping that a file holds."""
+        """Read the mapping in a file."""
         text = read(path)
         with naming(path, ValueError, what='is not JSON: '):
             return cls(parse_json(text, parse_float=WrittenFloat), str(path))
 
     def __contains__(self, name: str) -> bool:
-        """Return whether a field is there."""
+        """Return whether a field exists."""
         return name in self.values
 
     def number(self, name: str, default: float | None = None) -> float:
@@ -200,13 +201,13 @@ class Fields:
 
     def numbers(self, name: str, shape: tuple[int, ...], default: Any = None
                 ) -> NDArray[np.float64]:
-        """Return finite numbers; a length of -1 is any."""
+        """Return an array of finite numbers; a length of -1 in the shape stands for any length."""
         value = self._value(name, default)
         try:
             found = np.array(value)
-            # NumPy takes a boolean beside numbers for one of them
+            # NumPy converts a boolean among numbers to a number
             if found.size and (found.dtype.kind not in 'iuf' or any(
-                    isinstance(one, bool) for one in np.array(value, dtype=object).flat)):
+                    isinstance(number, bool) for number in np.array(value, dtype=object).flat)):
                 raise ValueError
             found = found.astype(np.float64)
         except (ValueError, OverflowError, TypeError):
@@ -219,7 +220,7 @@ class Fields:
         return found
 
     def written(self, name: str) -> str:
-        """Return a number or a text as the file writes it."""
+        """Return a number or a text as it is written in the file."""
         value = self._value(name, None)
         if isinstance(value, bool) or not isinstance(value, str | int | float):
             raise FieldError(f'{self.where}: field {name!r} is {str(value)[:40]!r}, neither a '
@@ -235,7 +236,7 @@ class Fields:
         return self._typed(name, list, 'a list')
 
     def mapping(self, name: str) -> dict[str, Any]:
-        """Return a mapping, which is empty if it is missing."""
+        """Return a mapping; an empty one if the field is missing."""
         return self._typed(name, dict, 'a mapping', {})
 
     def size(self, width: str, height: str) -> tuple[int, int]:

@@ -14,19 +14,19 @@ from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.parsing import unit_quaternion
 from cliploc_ros.units import NS_PER_S
 
-#: A stamp has a pose only if a sample lies this close to it, unless the user says otherwise.
+#: Default: a stamp has a pose only if a sample lies this close to it.
 STAMP_TOLERANCE_NS = 20_000_000
-#: Greatest deviation of the length of a unit quaternion from 1.
+#: Greatest deviation of a quaternion's norm from 1.
 MAX_NORM_ERROR = 0.01
-# A clock that is off by less than this is a late start of the recording, not another clock.
+# A smaller offset is taken for a late start of the recording, a larger one for another clock.
 _OTHER_CLOCK_S = 60.0
-# Messages are recorded late, and out of order, by less than this; a clock that begins again is
-# not [s].
+# Delayed messages are out of order by less than this; a clock that restarts jumps back by more
+# [s].
 _BACK_S = 1.0
 
 
 class Poses(Protocol):
-    """Something that knows the pose of a camera over time."""
+    """A source of a camera's poses over time."""
 
     def pose_at(self, stamp_ns: int) -> NDArray[np.float64] | None:
         """Return ``map_from_camera`` (4, 4) at a stamp [ns]; None if it is not known."""
@@ -38,26 +38,26 @@ class Poses(Protocol):
 
 @dataclass(frozen=True)
 class TimedPoses:
-    """Samples of the pose of a camera, or of a body on which it is mounted, in order of time."""
+    """Pose samples of a camera, or of the body on which it is mounted, in order of time."""
 
     #: (t,) of int64: time of each sample [ns], strictly increasing. May be empty.
     stamps_ns: NDArray[np.int64]
     positions_xyz: NDArray[np.float64]  #: (t, 3): in the map [m]
     quats_xyzw: NDArray[np.float64]  #: (t, 4): rotation into map axes, unit norm
-    #: Greatest gap between two samples to interpolate over [ns]. One sample within the tolerance
-    #: is always enough.
+    #: Greatest gap between two samples to interpolate over [ns]. A single sample within the
+    #: tolerance is always sufficient.
     max_gap_ns: int = 0
-    #: (4, 4): the mount of the camera; None: the poses are the camera's own
+    #: (4, 4): the mount of the camera; None: the poses are those of the camera
     body_from_camera: NDArray[np.float64] | None = None
     tolerance_ns: int = STAMP_TOLERANCE_NS
 
     @classmethod
     def from_samples(cls, stamps_ns: Sequence[int], rows: Sequence[Sequence[float]], where: str,
                      tolerance: float = MAX_NORM_ERROR) -> 'TimedPoses':
-        """Return the poses of unsorted samples (x, y, z, qx, qy, qz, qw).
+        """Make poses from unsorted samples (x, y, z, qx, qy, qz, qw).
 
-        Of equal stamps the first counts. DatasetError: a sample is not finite or has no unit
-        quaternion.
+        Of samples with equal stamps, the first is used. DatasetError: a sample is not finite or
+        has no unit quaternion.
         """
         stamps, order = np.unique(np.array(stamps_ns, dtype=np.int64), return_index=True)
         samples = np.array(rows, dtype=np.float64).reshape(-1, 7)[order]
@@ -81,8 +81,8 @@ class TimedPoses:
     def pose_at(self, stamp_ns: int) -> NDArray[np.float64] | None:
         """Return ``map_from_camera`` (4, 4) at a stamp; None if no sample is near enough.
 
-        Positions are interpolated linearly, rotations by slerp. Just outside the samples it is
-        the first or last one, without extrapolation.
+        Positions are interpolated linearly, rotations by slerp. There is no extrapolation: before
+        the first or after the last sample, the pose of that sample is returned.
         """
         if len(self) == 0:
             return None
@@ -105,7 +105,7 @@ def slerp(start_xyzw: NDArray[np.float64], end_xyzw: NDArray[np.float64], fracti
           ) -> NDArray[np.float64]:
     """Interpolate between two unit quaternions along the shorter great arc (Shoemake 1985).
 
-    SciPy's Slerp differs from it in the last digits, and maps of recordings with it.
+    SciPy's Slerp differs in the last digits, and would change the maps of recordings.
     """
     cosine = float(start_xyzw @ end_xyzw)
     if cosine < 0:  # q and -q are the same rotation: take the nearer one
@@ -119,9 +119,9 @@ def slerp(start_xyzw: NDArray[np.float64], end_xyzw: NDArray[np.float64], fracti
 
 
 def mount_from_numbers(numbers: Sequence[float]) -> NDArray[np.float64]:
-    """Return a mount (4, 4) given as x y z [m] and a quaternion qx qy qz qw.
+    """Convert a mount x y z [m] qx qy qz qw to a transform (4, 4).
 
-    DatasetError: the quaternion is far from unit.
+    DatasetError: a number is not finite, or the norm of the quaternion is not 1.
     """
     if not np.isfinite(numbers).all():
         raise DatasetError(f'mount {list(numbers)}: needs x y z and a unit quaternion '
@@ -131,34 +131,35 @@ def mount_from_numbers(numbers: Sequence[float]) -> NDArray[np.float64]:
 
 
 def check_forward(stamps_ns: Sequence[int], where: str) -> None:
-    """Refuse stamps, in the order of recording, that begin again: of two runs in one recording.
+    """Refuse stamps, in order of recording, that jump back, as when a recording has two runs.
 
-    DatasetError: they do; says where.
+    DatasetError: they jump back; the message gives the stamps.
     """
     stamps = np.array(stamps_ns, dtype=np.int64)
     latest = np.maximum.accumulate(stamps)
     again = np.nonzero(latest - stamps > _BACK_S * NS_PER_S)[0]
     if len(again):
         raise DatasetError(
-            f'{where}: the stamps begin again: {stamps[again[0]] / NS_PER_S:.3f} s comes after '
+            f'{where}: the stamps jump back: {stamps[again[0]] / NS_PER_S:.3f} s comes after '
             f'{latest[again[0]] / NS_PER_S:.3f} s; poses of two runs would be mixed: record each '
-            'run on its own, or cut them by `ros2 bag convert`')
+            'run separately, or split them with `ros2 bag convert`')
 
 
 def check_clock(poses: Poses, first_ns: int, last_ns: int, where: str) -> None:
     """Refuse poses that do not overlap the time of the images.
 
-    DatasetError: there are no poses, or they are of another time; says by how much.
+    DatasetError: there are no poses, or their time span does not overlap that of the images; the
+    message gives the offset.
     """
     span = poses.span_ns
     if span is None:
-        raise DatasetError(f'{where}: there are no poses; name the topic, tf or file that has '
+        raise DatasetError(f'{where}: there are no poses; give the topic, tf or file that has '
                            'them')
     if span[0] <= last_ns and first_ns <= span[1]:
         return
     gap_s = max(span[0] - last_ns, first_ns - span[1]) / NS_PER_S
     offset_s = (span[0] - first_ns) / NS_PER_S
-    remedy = ('one of them uses another clock: record all of them with the same use_sim_time'
+    remedy = ('they use different clocks: record all nodes with the same use_sim_time'
               if gap_s > _OTHER_CLOCK_S else 'record images and poses at the same time')
     raise DatasetError(
         f'{where}: images begin at {first_ns / NS_PER_S:.3f} s, poses at '

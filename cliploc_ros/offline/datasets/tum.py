@@ -19,7 +19,7 @@ _COLUMNS = 'timestamp tx ty tz qx qy qz qw'
 _SECONDS = {'s': Decimal(1), 'ms': Decimal('1e-3'), 'us': Decimal('1e-6'), 'µs': Decimal('1e-6'),
             'ns': Decimal('1e-9')}
 _METRES = {'mm': 0.001, 'cm': 0.01}
-# Files of the dataset round their quaternions to four decimals.
+# Files of the dataset have quaternions of four decimals.
 _MAX_NORM_ERROR = 0.05
 
 
@@ -30,8 +30,8 @@ class TumSequence:
     folder: Path
     #: Stamp of each image [ns], exact to the last decimal, strictly increasing
     stamps_ns: tuple[int, ...]
-    image_paths: tuple[Path, ...]  #: The existing image file of each stamp
-    #: Ground truth, map from camera; empty if the folder has no groundtruth.txt
+    image_paths: tuple[Path, ...]  #: The image file of each stamp; all exist
+    #: Ground truth, map_from_camera; empty if the folder has no groundtruth.txt
     trajectory: TimedPoses
 
     def __len__(self) -> int:
@@ -43,12 +43,12 @@ class TumSequence:
         return self.trajectory.pose_at(stamp_ns)
 
     def every(self, step: int) -> 'TumSequence':
-        """Return the sequence with every ``step``-th image only, beginning with the first.
+        """Return the sequence with only every ``step``-th image, starting with the first.
 
         DatasetError: the step is less than 1.
         """
         if step < 1:
-            raise DatasetError(f'every {step}th image is not a selection: give 1 or more')
+            raise DatasetError(f'every {step}th image cannot be selected: give 1 or more')
         return replace(
             self, stamps_ns=self.stamps_ns[::step], image_paths=self.image_paths[::step])
 
@@ -56,8 +56,8 @@ class TumSequence:
 def read_tum(folder: str | Path) -> TumSequence:
     """Read a TUM RGB-D folder, except for the pixels of its images.
 
-    It holds ``rgb.txt``, the images that this lists, and optionally ``groundtruth.txt``.
-    DatasetError: the message names the file and the line that is invalid.
+    It holds ``rgb.txt``, the images listed there, and optionally ``groundtruth.txt``.
+    DatasetError: the message names the file and the invalid line.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -69,21 +69,22 @@ def read_tum(folder: str | Path) -> TumSequence:
 
 
 def read_tum_trajectory(path: str | Path) -> TimedPoses:
-    """Read a trajectory in TUM format: ``timestamp tx ty tz qx qy qz qw`` a line.
+    """Read a trajectory in TUM format, with lines ``timestamp tx ty tz qx qy qz qw``.
 
-    A first line that names the columns, as EuRoC's does, says another order and units: names that
-    are not of a pose are ignored. Without names, a line may also have a stamp and a matrix of 3 or
-    4 rows. Where a stamp is beyond any second, all of the file are in ms, us or ns. Lines may have
-    any order; of equal stamps the first counts. ``#`` begins a comment. DatasetError: a line holds
-    something else, or its quaternion is far from unit norm; the message names file and line.
+    A first line with the names of the columns, as in EuRoC, may define another order and other
+    units; columns that are not part of a pose are ignored. Without names, a line may also hold a
+    stamp and a matrix of 3 or 4 rows. If a stamp is too large for seconds, all stamps of the file
+    are in ms, us or ns. Lines may have any order. Of lines with equal stamps, the first is used.
+    ``#`` begins a comment. DatasetError: a line is invalid, or the norm of its quaternion is not
+    1; the message names file and line.
     """
     path = Path(path)
     order, stamp_s, metres, header = _named_columns(path)
     table = list(parsing.read_cells(path, 'timestamp ...', header))
     widths = {len(cells) for _, cells in table}
     if order is None and widths == {12}:
-        raise DatasetError(f'{path}: has matrices without stamps, as KITTI has: put the stamp of '
-                           'each image before them')
+        raise DatasetError(f'{path}: has matrices without stamps, like KITTI: put the stamp of '
+                           'its image before each matrix')
     if order is None and widths == {7}:
         raise DatasetError(f'{path}: has poses without stamps: expected {_COLUMNS}')
     if stamp_s is None:
@@ -110,9 +111,10 @@ def read_tum_trajectory(path: str | Path) -> TimedPoses:
 
 
 def _named_columns(path: Path) -> tuple[list[int] | None, Decimal | None, float, int]:
-    """Return the columns of a pose, seconds of a stamp, metres of a length, and lines to skip.
+    """Read the header of a table of poses.
 
-    None: the file does not say it.
+    Return the columns of a pose, the unit of stamps [s], the unit of lengths [m], and the number
+    of lines to skip. The columns or the unit of stamps are None if the header does not give them.
     """
     for number, line in enumerate(parsing.read_text(path).splitlines()):
         text = line.strip().lstrip('#').strip()
@@ -132,7 +134,7 @@ def _named_columns(path: Path) -> tuple[list[int] | None, Decimal | None, float,
 
 
 def _role(name: str) -> str:
-    """Return which column of TUM's a name stands for; '' for none."""
+    """Return the column of the TUM format that a name stands for; '' if there is none."""
     word = re.sub(r'[\[(].*|_([nuµm]?s|[cm]?m)$', '', name.strip().lower()).strip()
     if word.startswith(('time', 'stamp', '#time')) or word == 't':
         return 'timestamp'
@@ -143,16 +145,16 @@ def _role(name: str) -> str:
 
 
 def _pose_of_matrix(numbers: list[float], where: str) -> list[float]:
-    """Return position and quaternion of 12 or 16 numbers of a matrix, row after row."""
+    """Convert a matrix of 12 or 16 numbers, by rows, to a position and a quaternion."""
     pose = np.array([*numbers[:12], 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
     if numbers[12:] not in ([], [0.0, 0.0, 0.0, 1.0]) or not is_rigid(pose, 1e-2):
-        raise DatasetError(f'{where}: {len(numbers)} numbers are not a matrix of a pose; expected '
-                           f'{_COLUMNS}, or name the columns in the first line')
+        raise DatasetError(f'{where}: {len(numbers)} numbers are not the matrix of a pose; '
+                           f'expected {_COLUMNS}, or name the columns in the first line')
     return [*pose[:3, 3].tolist(), *quaternion_from_transform(pose).tolist()]
 
 
 def read_tum_accelerometer(path: str | Path) -> tuple[list[int], NDArray[np.float64]]:
-    """Return the stamps [ns] and accelerations (n, 3) [m/s^2] of an accelerometer.txt.
+    """Read the stamps [ns] and accelerations (n, 3) [m/s^2] of an accelerometer.txt.
 
     DatasetError: a line does not hold four numbers; the message names file and line.
     """
@@ -161,10 +163,10 @@ def read_tum_accelerometer(path: str | Path) -> tuple[list[int], NDArray[np.floa
 
 
 def read_stamped(path: Path, names: str) -> tuple[list[int], list[list[float]]]:
-    """Return the stamps [ns] and the named numbers of the lines of a file.
+    """Read a stamp [ns] and the named numbers from each line of a file.
 
-    DatasetError: a line holds others, or numbers that are not finite; the message names file and
-    line.
+    DatasetError: a line has other cells, or a number that is not finite; the message names file
+    and line.
     """
     stamps_ns, rows = [], []
     for where, (stamp, *cells) in parsing.read_cells(path, f'timestamp {names}'):
@@ -176,9 +178,9 @@ def read_stamped(path: Path, names: str) -> tuple[list[int], list[list[float]]]:
 
 
 def read_image_list(path: Path) -> tuple[tuple[int, ...], tuple[Path, ...]]:
-    """Return the stamps [ns] and files that a list such as rgb.txt names.
+    """Read the stamps [ns] and image files listed in a file such as rgb.txt.
 
-    DatasetError: the message names the file and line that cannot be used.
+    DatasetError: the message names the file and the invalid line.
     """
     if not path.exists():
         raise DatasetError(f'{path}: no such file; a TUM folder lists its images in rgb.txt')
@@ -191,7 +193,7 @@ def read_image_list(path: Path) -> tuple[tuple[int, ...], tuple[Path, ...]]:
         image_path = path.parent / name[0]
         stamps_ns.append(parsing.parse_stamp_ns(stamp, where))
         if len(stamps_ns) > 1 and stamps_ns[-1] <= stamps_ns[-2]:
-            raise DatasetError(f'{where}: timestamp {stamp} does not exceed the one before')
+            raise DatasetError(f'{where}: timestamp {stamp} is not later than the previous one')
         if not image_path.is_file():
             raise DatasetError(f'{where}: image {image_path} does not exist')
         image_paths.append(image_path)

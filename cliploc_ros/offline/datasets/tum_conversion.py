@@ -20,7 +20,7 @@ from cliploc_ros.offline.datasets.bags import BagWriter
 from cliploc_ros.offline.datasets.parsing import Fields, naming, parse_stamp_ns
 from cliploc_ros.offline.datasets.tum import TumSequence, read_tum_accelerometer
 
-#: Passes on an iterable of stamp [ns] and file of each image, and shows progress.
+#: Wraps an iterable of the stamp [ns] and file of each image, and shows progress.
 Progress = Callable[[Iterable[tuple[int, Path]]], Iterable[tuple[int, Path]]]
 
 _NAMESPACE = re.compile(r'/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*/?|/?')
@@ -32,14 +32,14 @@ class ConversionOptions:
     """Format, topics and coordinate frames of the recording."""
 
     storage: str = 'sqlite3'  #: ``sqlite3`` or ``mcap``
-    #: ``raw`` for sensor_msgs/Image; ``compressed`` for sensor_msgs/CompressedImage with the
-    #: files' own bytes
+    #: ``raw`` for sensor_msgs/Image; ``compressed`` for sensor_msgs/CompressedImage, with the
+    #: bytes of the files
     image_format: str = 'raw'
     prefix: str = ''  #: Namespace of all topics: ``camera`` gives ``/camera/image``
     #: Coordinate frame of images, camera_info and detections (optical axes)
     camera_frame: str = 'camera_optical_frame'
-    world_frame: str = 'world'  #: Coordinate frame of the ground-truth poses: the map's
-    imu_frame: str = 'imu'  #: Coordinate frame of the accelerometer, whose mount TUM does not give
+    world_frame: str = 'world'  #: Coordinate frame of the ground-truth poses, and of the map
+    imu_frame: str = 'imu'  #: Coordinate frame of the accelerometer; TUM does not give its mount
 
     def topic(self, name: str) -> str:
         """Return the absolute name of a topic.
@@ -53,7 +53,7 @@ class ConversionOptions:
 
 @dataclass(frozen=True)
 class ConversionResult:
-    """Counts of written messages."""
+    """Numbers of written messages."""
 
     images: int  #: Images, each with a camera_info
     poses: int  #: Images with ground truth
@@ -67,10 +67,9 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
     """Write a sequence as a rosbag2 recording.
 
     Topics: ``image`` or ``image/compressed``, ``camera_info``, ``ground_truth``, ``detections`` if
-    given, and ``imu`` where the folder has an accelerometer.txt. All headers of a frame have
-    exactly the image's stamp, which is also the time of recording. DatasetError: an image is
-    invalid, no image has detections, or the output cannot be written. No partial recording
-    remains.
+    given, and ``imu`` if the folder has an accelerometer.txt. All headers of a frame have the
+    image's exact stamp, which is also the time of recording. DatasetError: an image is invalid, no
+    image has detections, or the output cannot be written. No partial recording remains.
 
     Parameters
     ----------
@@ -86,8 +85,8 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
     recorded = detections or {}
     if detections is not None and not any(stamp in detections for stamp in sequence.stamps_ns):
         raise DatasetError(
-            f'{sequence.folder}: the recorded detections have the stamps of none of its images; '
-            'are they of another sequence?')
+            f'{sequence.folder}: no recorded detection has the stamp of an image; are the '
+            'detections from another sequence?')
     is_compressed = options.image_format == 'compressed'
     image_topic = options.topic('image/compressed' if is_compressed else 'image')
     info_topic, pose_topic = options.topic('camera_info'), options.topic('ground_truth')
@@ -128,14 +127,14 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
 
 def _image_message(stamp_ns: int, frame_id: str, path: Path, camera: Camera, is_compressed: bool
                    ) -> Any:
-    """Return an image file as message; DatasetError: it is damaged, or of another size."""
+    """Make a message of an image file; DatasetError: it is damaged or has another size."""
     with naming(path, OSError, what='cannot be read: '):
         data = read_file(path)
-    # Compressed images are decoded too: this refuses a damaged file before a node receives it.
+    # Compressed images are decoded too, to refuse a damaged file before a node receives it.
     try:
         pixels_bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
     except cv2.error:
-        pixels_bgr = None  # OpenCV raises for an empty buffer and returns None for a damaged one
+        pixels_bgr = None  # OpenCV raises on an empty buffer, but returns None for a damaged image
     if pixels_bgr is None:
         raise DatasetError(f'{path}: cannot be decoded as an image')
     height, width = pixels_bgr.shape[:2]
@@ -155,7 +154,7 @@ def read_recorded_detections(path: str | Path, image_size: tuple[int, int] | Non
                              ) -> dict[int, Detections]:
     """Read recorded detections; return them by exact stamp [ns].
 
-    The form is ``{"image_size": [w, h], "frames": [{"timestamp": "1341847980.722988",
+    The format is ``{"image_size": [w, h], "frames": [{"timestamp": "1341847980.722988",
     "detections": [{"class_id": "book", "score": 0.58, "bbox_xyxy": [173, 138, 219, 208]}]}]}``;
     ``image_size`` is optional. A frame without detections has an empty entry.
 
@@ -176,9 +175,9 @@ def read_recorded_detections(path: str | Path, image_size: tuple[int, int] | Non
         timestamp = frame.written('timestamp')
         stamp_ns = parse_stamp_ns(timestamp, frame.where)
         if stamp_ns in detections:
-            raise DatasetError(f'{frame.where}: timestamp {timestamp} is a repetition')
-        found = [_parse_detection(Fields(one, f'{frame.where}, detection {number}'))
-                 for number, one in enumerate(frame.entries('detections'))]
+            raise DatasetError(f'{frame.where}: timestamp {timestamp} is repeated')
+        found = [_parse_detection(Fields(detection, f'{frame.where}, detection {number}'))
+                 for number, detection in enumerate(frame.entries('detections'))]
         detections[stamp_ns] = Detections(
             np.array([box for box, _, _ in found], dtype=np.float64).reshape(-1, 4),
             tuple(class_id for _, class_id, _ in found),
@@ -186,12 +185,12 @@ def read_recorded_detections(path: str | Path, image_size: tuple[int, int] | Non
     return detections
 
 
-def _parse_detection(one: Fields) -> tuple[list[float], str, float]:
+def _parse_detection(fields: Fields) -> tuple[list[float], str, float]:
     """Return box, class and score."""
-    class_id, score = one.text('class_id'), one.number('score')
+    class_id, score = fields.text('class_id'), fields.number('score')
     if not 0 <= score <= 1:
-        raise DatasetError(f'{one.where}: score is {score}, outside 0 to 1')
-    left, top, right, bottom = box = one.numbers('bbox_xyxy', (4,)).tolist()
+        raise DatasetError(f'{fields.where}: score is {score}, outside 0 to 1')
+    left, top, right, bottom = box = fields.numbers('bbox_xyxy', (4,)).tolist()
     if left >= right or top >= bottom:
-        raise DatasetError(f'{one.where}: bbox_xyxy {box} is not left, top, right, bottom')
+        raise DatasetError(f'{fields.where}: bbox_xyxy {box} is not left, top, right, bottom')
     return box, class_id, score

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes of a recording: choice of images, features, and their places in the map."""
+"""Build a layer of keyframes: choose images, extract features, and place them in the map."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -26,46 +26,47 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, MappingError, OptionsError
 from cliploc_ros.offline.datasets.frames import Frames, PosedImage, undistorted
 
-# Features that are found in an image, before those without a point are left out.
+# Features extracted from an image, before those without a point are left out.
 _MOST_FOUND = 2000
-# A larger image is made smaller first.
+# A larger image is scaled down first.
 _LONGEST_PX = 800
 # An image with fewer points is not a keyframe.
 _LEAST_POINTS = 20
-# Stored images are for people: 7 to 9 kB each.
+# Stored images are for visual inspection; each takes 7 to 9 kB.
 _IMAGE_PX, _JPEG_QUALITY = 256, 60
-# Rays that cross at a smaller angle place a point too roughly.
+# Rays that cross at a smaller angle do not locate a point accurately enough.
 _LEAST_PARALLAX = np.radians(1.5)
-# A ray misses its point by no more than 2 px at f = 525 px.
+# Greatest distance of a ray from its point: 2 px at f = 525 px.
 _MOST_ERROR = 2.0 / 525.0
-# Images that each image is compared with: the nearest images with the same direction.
+# Neighbours of an image, for matching: the nearest images with a similar direction.
 _NEIGHBOURS = 8
 _LEAST_M, _MOST_M, _MOST_COS = 0.05, 2.0, np.cos(np.radians(40.0))
-#: The points of a room or hall are this far [m].
+#: Range of depths of points in a room or hall [m].
 _DEPTHS_M = (0.2, 40.0)
-# Number of words. 1,024 find the keyframes of the kitchen as well as comparing all descriptors.
+# Number of words. 1,024 words find the keyframes of the kitchen as well as comparing all
+# descriptors.
 _WORDS = 1024
 # Descriptors that the words are learned from, and steps of k-means.
 _MOST_LEARNED, _STEPS = 50_000, 8
-# Pixels beside a pixel; one that is further away by this share belongs to another surface.
+# A neighbouring pixel whose depth is greater by this share belongs to another surface.
 _BESIDE, _EDGE = np.ones((3, 3), dtype=np.uint8), 0.1
 
 
 @dataclass(frozen=True)
 class LayerOptions:
-    """Choice of keyframes, and the number of their points."""
+    """Spacing of keyframes, and the number of their points."""
 
-    #: An image becomes a keyframe unless one of them is nearer than both. 0: every image.
+    #: An image becomes a keyframe unless a keyframe is nearer than both limits. 0: every image.
     distance_m: float = 0.1
     angle_deg: float = 5.0
     #: Points per keyframe. A point takes 146 bytes: 600 points of 50 keyframes take 4.4 MB.
     most_points: int = 600
-    #: Whether to store small images of the keyframes, too, for people to look at
+    #: Whether to store small images of the keyframes, for visual inspection
     images: bool = False
     kind: FeatureKind = SIFT  #: Kind of the features
 
     def __post_init__(self) -> None:
-        """Refuse values that make no layer."""
+        """Refuse values out of range."""
         if not (self.distance_m >= 0.0 and self.angle_deg >= 0.0):
             raise OptionsError(f'keyframes {self.distance_m} m or {self.angle_deg} degrees apart: '
                                'give 0 or more')
@@ -96,12 +97,12 @@ class _Keyframe(NamedTuple):
 
 def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions = _DEFAULT
                 ) -> KeyframeLayer:
-    """Return the keyframes of each camera of a recording, in the coordinate frame of its poses.
+    """Build the keyframes of all cameras of a recording, in the coordinate frame of its poses.
 
     Parameters
     ----------
     frames : Frames
-        With depth, or posed images that overlap, which triangulate the points.
+        Images with depth, or overlapping images, whose points are triangulated.
     landmark_map : LandmarkMap
         The map that the layer belongs to.
 
@@ -111,24 +112,25 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         No image has enough points.
     """
     seen = [_look(frame, options) for part in frames.each for frame in _chosen(part, options)]
-    images = [one.posed for one in seen]
-    # of each keyframe (n, 3), in its own coordinate frame; NaN where unknown
-    points = [np.column_stack([one.posed.bearings, np.ones(len(one.depths))]) * one.depths[:, None]
-              if np.isfinite(one.depths).any() else triangulate(images, row, options.kind)
-              for row, one in enumerate(seen)]
+    images = [keyframe.posed for keyframe in seen]
+    has_depth = [bool(np.isfinite(keyframe.depths).any()) for keyframe in seen]
+    # points (n, 3) of each keyframe, in its camera's coordinate frame; NaN where unknown
+    points = [np.column_stack([image.bearings, np.ones(len(keyframe.depths))])
+              * keyframe.depths[:, None] if known else triangulate(images, row, options.kind)
+              for row, (keyframe, image, known) in enumerate(
+                  zip(seen, images, has_depth, strict=True))]
     # the strongest features that have a point
     kept = [np.nonzero(np.isfinite(found).all(axis=1))[0][:options.most_points]
             for found in points]
     rows = [row for row, found in enumerate(kept) if len(found) >= _LEAST_POINTS]
     if not rows:
-        raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images none has '
-                           f'{_LEAST_POINTS} features with a place in the map; record depth, or '
-                           'images that overlap and are 5 cm or more apart')
+        raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images, none has '
+                           f'{_LEAST_POINTS} features with a point in the map; record depth, or '
+                           'overlapping images 5 cm or more apart')
     layer = _assemble(landmark_map, [seen[row].camera for row in rows],
                       [images[row] for row in rows],
                       [points[row] for row in rows], [kept[row] for row in rows],
-                      FROM_DEPTH if any(np.isfinite(one.depths).any() for one in seen)
-                      else TRIANGULATED, options.kind)
+                      FROM_DEPTH if any(has_depth) else TRIANGULATED, options.kind)
     if not options.images:
         return layer
     jpegs = [seen[row].jpeg for row in rows]
@@ -137,8 +139,8 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
 
 
 def _chosen(frames: Frames, options: LayerOptions) -> Iterator[PosedImage]:
-    """Yield the images whose view no earlier one of them has, decoded."""
-    size = options.distance_m or 1.0  # of the cells that poses lie in; no pose is nearer than 0
+    """Yield the images of the keyframes: those without an earlier keyframe nearby."""
+    size = options.distance_m or 1.0  # of the cells that hold poses; at 0, every image is new
     cells: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
 
     def is_new(place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
@@ -158,13 +160,13 @@ def _chosen(frames: Frames, options: LayerOptions) -> Iterator[PosedImage]:
     for raw in frames.read_raw(is_new):
         try:
             frame = raw.decode()
-        except DatasetError:  # the recorder says which images cannot be used
+        except DatasetError:  # the recorder reports unusable images
             continue
         yield frame
 
 
 def _look(frame: PosedImage, options: LayerOptions) -> _Keyframe:
-    """Return the features of an image; with depth, only those that have some."""
+    """Extract the features of an image; if it has depth, only features with known depth."""
     assert frame.map_from_camera is not None
     features = options.kind.extract(frame.image_rgb, _MOST_FOUND, _LONGEST_PX)
     bearings = frame.camera.normalize_points(features.pixels)
@@ -180,7 +182,7 @@ def _look(frame: PosedImage, options: LayerOptions) -> _Keyframe:
 
 
 def _small_jpeg(frame: PosedImage) -> bytes:
-    """Return an image, undistorted and small, as JPEG."""
+    """Return a small undistorted image as JPEG."""
     camera = frame.camera
     scale = min(1.0, _IMAGE_PX / max(camera.width, camera.height))
     width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
@@ -216,15 +218,15 @@ def _assemble(landmark_map: LandmarkMap, cameras: Sequence[Camera],
         descriptors, nearest_words(kind.units(descriptors), kind.units(vocabulary)
                                    ).astype(np.uint16), vocabulary, deviation_per_metre,
         other_cameras=tuple(others), camera_rows=None if not others else np.array(
-            [[camera, *others].index(one) for one in cameras]), kind=kind)
+            [[camera, *others].index(own) for own in cameras]), kind=kind)
 
 
 def triangulate(images: Sequence[PosedFeatures], row: int, kind: FeatureKind = SIFT
                 ) -> NDArray[np.float64]:
-    """Return the points (n, 3) of an image's features in its own coordinate frame [m].
+    """Triangulate the points (n, 3) of an image's features, in its camera's frame [m].
 
-    Each feature is matched in the neighbouring images. Each match gives a point. The point
-    with which most matches agree is kept, or that with the widest angle. NaN: no point.
+    Each feature is matched in the neighbouring images, and each match gives a point. The point
+    that most matches agree with is kept; ties are broken by the widest angle. NaN: no point.
     """
     ours = images[row]
     poses = np.array([image.map_from_camera for image in images])
@@ -232,7 +234,7 @@ def triangulate(images: Sequence[PosedFeatures], row: int, kind: FeatureKind = S
     cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], poses[row, :3, :3]) - 1.0)
     fit = (distances > _LEAST_M) & (distances < _MOST_M) & (cosines > _MOST_COS)
     order = np.argsort(distances, kind='stable')
-    neighbours = [int(one) for one in order[fit[order]][:_NEIGHBOURS]]
+    neighbours = order[fit[order]][:_NEIGHBOURS].tolist()
     count = len(ours.bearings)
     seen = np.full((len(neighbours), count, 2), np.nan)
     cameras = np.array([invert_transform(images[neighbour].map_from_camera) @ ours.map_from_camera
@@ -259,7 +261,7 @@ def triangulate(images: Sequence[PosedFeatures], row: int, kind: FeatureKind = S
 def _crossings(ours: NDArray[np.float64], theirs: NDArray[np.float64],
                theirs_from_ours: NDArray[np.float64]
                ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return where pairs of rays are nearest, in our coordinate frame, and their angles [rad]."""
+    """Return the midpoints (n, 3) between pairs of rays, in our frame, and their angles [rad]."""
     back = invert_transform(theirs_from_ours)
     first = _unit(np.column_stack([ours, np.ones(len(ours))]))
     second = _unit(np.column_stack([theirs, np.ones(len(theirs))])) @ back[:3, :3].T
@@ -275,7 +277,7 @@ def _crossings(ours: NDArray[np.float64], theirs: NDArray[np.float64],
 
 def _agrees(points: NDArray[np.float64], bearings: NDArray[np.float64],
             camera: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which points (n, 3) a camera sees at its bearings (n, 2)."""
+    """Return a mask (n,): the points (n, 3) that a camera sees at its bearings (n, 2)."""
     inside = points @ camera[:3, :3].T + camera[:3, 3]
     with np.errstate(divide='ignore', invalid='ignore'):
         errors = np.linalg.norm(inside[:, :2] / inside[:, 2:] - bearings, axis=1)
@@ -288,7 +290,7 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float64]
                      ) -> NDArray[np.float32]:
-    """Return the depth at single pixels.
+    """Return the depth at the pixels of a colour image.
 
     Parameters
     ----------
@@ -300,8 +302,8 @@ def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float
     Returns
     -------
     ndarray (n,) float32
-        Along z of the colour camera [m]: the nearest surface within a pixel of each; NaN where
-        nothing was measured, and at edges, where a neighbour is much further away.
+        Depth along z of the colour camera [m], of the nearest surface within one pixel. NaN where
+        nothing was measured, and at edges, where a neighbour is much farther away.
     """
     height, width = depth.depths_m.shape
     seen, values = points_in_color(depth, camera, 1)
@@ -320,9 +322,9 @@ def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float
 
 
 def learn_words(descriptors: NDArray[np.uint8], kind: FeatureKind = SIFT) -> NDArray[np.uint8]:
-    """Return the vocabulary (W, d) of some descriptors (n, d), by k-means.
+    """Learn a vocabulary (W, d) from descriptors (n, d) by k-means.
 
-    The start is every n-th descriptor, so equal layers have equal words.
+    The initial words are evenly spaced descriptors, so that equal layers have equal words.
     """
     step = max(1, len(descriptors) // _MOST_LEARNED)
     learned = kind.units(descriptors[::step])

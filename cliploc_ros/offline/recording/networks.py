@@ -25,7 +25,7 @@ from cliploc_ros.offline.datasets.frames import RawFrame
 from cliploc_ros.offline.datasets.observations import camera_from_numbers
 from cliploc_ros.offline.mapping.views import at_border
 
-#: The most detections of an image that are used, as in the relocalizer node.
+#: Greatest number of detections per image, as in the relocalizer node.
 MAX_DETECTIONS = 50
 
 
@@ -33,7 +33,7 @@ MAX_DETECTIONS = 50
 class SeenFrame:
     """Results of detector and CLIP for a frame: n boxes."""
 
-    #: Number of the image in its source, name of its camera ('' for one), and its stamp [ns]
+    #: Index of the image in its source, name of its camera ('' if there is one), and stamp [ns]
     place: int
     camera: str
     stamp_ns: int
@@ -42,7 +42,7 @@ class SeenFrame:
     camera_numbers: NDArray[np.float64]
     bboxes_xyxy: NDArray[np.float64]  #: (n, 4): undistorted [px]
     open_edges: NDArray[np.bool_]  #: (n, 4): see PosedDetections
-    is_distorted: bool  #: The open edges cannot be told from the undistorted boxes
+    is_distorted: bool  #: Whether open edges cannot be computed from the undistorted boxes
     #: (n,)
     class_ids: NDArray[np.str_]
     scores: NDArray[np.float64]
@@ -50,7 +50,7 @@ class SeenFrame:
     #: (n,): [m]; NaN where unknown
     depths: NDArray[np.float32]
     depth_spreads: NDArray[np.float32]
-    #: Time taken [ms]
+    #: Run time [ms]
     detector_ms: float
     clip_ms: float
 
@@ -60,7 +60,7 @@ class SeenFrame:
         return camera_from_numbers(self.camera_numbers[:2], self.camera_numbers[2:])
 
     def to_bytes(self) -> bytes:
-        """Return the frame as bytes, without pickles."""
+        """Serialize the frame, without pickle."""
         buffer = io.BytesIO()
         arrays: dict[str, Any] = {name: np.asarray(value) for name, value in vars(self).items()}
         np.savez(buffer, **arrays)
@@ -68,7 +68,7 @@ class SeenFrame:
 
     @staticmethod
     def from_bytes(data: bytes) -> 'SeenFrame':
-        """Return the frame that was written as bytes."""
+        """Deserialize a frame."""
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return SeenFrame(**{name: array.item() if array.ndim == 0 else array
                                 for name, array in arrays.items()})
@@ -80,12 +80,12 @@ class LoadNetworks:
 
     detector: DetectorOptions
     clip: ClipOptions | None  #: None: classes and boxes only
-    threads: int = 0  #: Threads of a network on a CPU; 0 leaves its own choice
+    threads: int = 0  #: Threads of a network on a CPU; 0: the default of the network
 
     def __call__(self) -> Callable[[RawFrame], SeenFrame | str]:
-        """Return the function that looks at a frame.
+        """Load the networks; return the function that runs them on a frame.
 
-        ModelError or OptionsError: from loading.
+        ModelError or OptionsError: the networks cannot be loaded.
         """
         if self.threads:
             set_threads(self.threads)
@@ -96,7 +96,7 @@ class LoadNetworks:
 
 
 def _look_if_readable(look: 'RunNetworks', raw: RawFrame) -> SeenFrame | str:
-    """Return the networks' output for a frame, or the reason if its images are unusable."""
+    """Run the networks on a frame; return the reason instead if its images are unusable."""
     try:
         return look(raw)
     except DatasetError as error:
@@ -112,7 +112,7 @@ class RunNetworks:
     encoder: ImageTextEncoder | None = None
 
     def __call__(self, raw: RawFrame) -> SeenFrame:
-        """Return the networks' output for a frame with a pose.
+        """Run the networks on a frame that has a pose.
 
         DatasetError: the image or depth image cannot be used.
         """
@@ -127,7 +127,7 @@ class RunNetworks:
         open_edges = at_border(bboxes, np.array(size * 2))
         if not camera.is_pinhole:
             bboxes = camera.bboxes_in_pixels(camera.normalize_bboxes(bboxes))
-        rows = np.nonzero((bboxes[:, 2:] > bboxes[:, :2]).all(axis=1))[0]  # never true of NaN
+        rows = np.nonzero((bboxes[:, 2:] > bboxes[:, :2]).all(axis=1))[0]  # False for NaN
         sound = detections.select(rows)
         embeddings = (np.empty((len(rows), 0)) if self.encoder is None
                       else self.encoder.encode_crops(frame.image_rgb, sound.bboxes_xyxy))

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Record observations once: an observation file next to the recording.
+"""Record observations once, in an observation file next to the recording.
 
-The file's name depends on everything that determines its content: source, networks, keyframes. A
-run that is stopped leaves its partial results beside it, and the next run continues.
+The file is named after a hash of all that determines its content: source, networks, keyframes. An
+interrupted run keeps its partial results next to the file, and the next run continues.
 """
 
 import base64
@@ -45,18 +45,18 @@ from cliploc_ros.offline.recording.networks import LoadNetworks, SeenFrame
 from cliploc_ros.units import NS_PER_S
 
 logger = logging.getLogger(__name__)
-# In the name of an observation file beside its source.
+# Separates the name of the source and the hash in the name of an observation file.
 _BESIDE = '.cliploc-'
-# The unit of depth is judged by the boxes of this number of frames.
+# The unit of depth is checked in this number of frames.
 _FRAMES_FOR_UNIT = 10
 _UNKNOWN = np.full((4, 4), np.nan)
 
 
 @dataclass(frozen=True)
 class KeyframeOptions:
-    """Spacing of keyframes: either limit is enough."""
+    """Spacing of keyframes; exceeding one limit is sufficient."""
 
-    #: [m] [deg]. 0 takes every frame with a pose.
+    #: [m] [deg]. 0: every frame with a pose.
     distance_m: float = 0.1
     angle_deg: float = 5.0
 
@@ -72,7 +72,7 @@ EVERY_FRAME = KeyframeOptions(0.0, 0.0)
 
 
 class KeyframeFilter:
-    """Chooses the keyframes among the frames of a camera, which come in order."""
+    """Chooses keyframes among the frames of a camera, which are passed in order."""
 
     def __init__(self, options: KeyframeOptions) -> None:
         self._options = options
@@ -99,43 +99,43 @@ _DEFAULT_KEYFRAMES = KeyframeOptions()
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """Options of reading a recording."""
+    """Options for recording observations."""
 
     detector: DetectorOptions
     clip: ClipOptions | None  #: None: no embeddings
     keyframes: KeyframeOptions = _DEFAULT_KEYFRAMES
-    #: Says all else that the frames depend on, such as topics, mount and depth format
+    #: All other settings that the frames depend on, such as topics, mount and depth format
     reading: str = ''
-    workers: int = 1  #: Local processes. The result does not depend on it.
+    workers: int = 1  #: Number of local processes; the result does not depend on it
     scheduler: str = ''  #: Address of a Dask scheduler; '' for none
 
     @property
     def networks(self) -> LoadNetworks:
         """Return a function that loads the networks.
 
-        PyTorch rounds in another way on another number of threads. With one for each worker, the
-        result is the same on any number of workers and on a cluster.
+        PyTorch's rounding depends on the number of threads. With one thread per worker, the result
+        is the same for any number of workers and on a cluster.
         """
         threads = 0 if self.workers == 1 and not self.scheduler else 1
         return LoadNetworks(self.detector, self.clip, threads)
 
 
 def observation_file(frames: Frames, options: RecordingOptions) -> Path:
-    """Return the observation file beside a source, named after all that it depends on."""
+    """Return the path of the observation file next to a source; see `describe`."""
     source = frames.source.resolve()
     digest = hashlib.sha256(describe(frames, options).encode()).hexdigest()[:12]
     return source.with_name(f'{source.name}{_BESIDE}{digest}.npz')
 
 
 def source_of(observations: Path) -> Path | None:
-    """Return the source beside an observation file, see observation_file; None without one."""
-    name, _, rest = observations.name.partition(_BESIDE)
+    """Return the source next to an observation file, see observation_file; None if missing."""
+    name, _, digest = observations.name.partition(_BESIDE)
     source = observations.with_name(name or observations.name)
-    return source if rest and source.exists() else None
+    return source if digest and source.exists() else None
 
 
 def describe(frames: Frames, options: RecordingOptions) -> str:
-    """Return all that the observations depend on, as JSON."""
+    """Return everything that the observations depend on, as JSON."""
     clip = options.clip
     files = [options.detector.model]
     if options.detector.text_model:
@@ -146,29 +146,28 @@ def describe(frames: Frames, options: RecordingOptions) -> str:
         'source': [frames.source.name, _state(frames.source.resolve()), frames.count,
                    *([frames.digest] if frames.digest else [])],
         'yolo': _settings(options.detector), 'clip': None if clip is None else _settings(clip),
-        # the path of '' would be the working folder, which changes with every file written there
+        # Path('') is the working folder, whose state changes with every file written there
         'files': [_state(Path(file)) if file else None for file in files],
         'keyframes': asdict(options.keyframes), 'reading': options.reading})
 
 
 def record_once(frames: Frames, options: RecordingOptions, file: Path | None = None,
                 odometry: Mapping[str, Poses] | None = None) -> Recorded:
-    """Return the observations of a source: those of an earlier run, or record them.
+    """Return the observations of a source; record them unless an earlier run did.
 
-    The networks do not depend on odometry: an earlier run without it can be used as well.
+    The networks do not depend on odometry, so that an earlier run without odometry is used too.
 
     Parameters
     ----------
     file : Path, optional
         The observation file; None: see observation_file.
     odometry : dict, optional
-        Poses of each camera by its name, with odometry's coordinate frame in the place of the
-        map's.
+        Poses of each camera in the odometry frame, by the camera's name.
 
     Raises
     ------
     CliplocError
-        From loading the networks, from reading the source, or from writing the file.
+        The networks cannot be loaded, the source cannot be read, or the file cannot be written.
     """
     described = describe(frames, options)
     file = file or observation_file(frames, options)
@@ -183,12 +182,12 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
                 if new is not None and (old is None or not np.array_equal(old, new, True)):
                     save_recorded(file, linked)
                 return linked
-            logger.warning('recording again, with other options: %s', file)
+            logger.warning('recording again, because the options changed: %s', file)
         except DatasetError as error:
             logger.warning('recording again: %s', error)
     with closing(Log(file.with_name(f'.{file.name}.unfinished'), DatasetError,
-                     'make room or name another file with `record_to`, then run again: it goes '
-                     'on from here', _parse_entry)) as log:
+                     'make room or name another file with `record_to`, then run again: it '
+                     'continues from here', _parse_entry)) as log:
         recorded = _with_odometry(_record(frames, options, described, log, file), odometry)
         save_recorded(file, recorded)
         log.remove()
@@ -197,7 +196,7 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
 
 
 def _with_odometry(recorded: Recorded, odometry: Mapping[str, Poses] | None) -> Recorded:
-    """Return observations with the odometry at their stamps, in the place of any other one."""
+    """Return observations with the odometry at their stamps; earlier odometry is replaced."""
     placed = None
     if odometry is not None:
         poses = [odometry[recorded.detections.name_of(frame)].pose_at(int(stamp_ns))
@@ -207,9 +206,9 @@ def _with_odometry(recorded: Recorded, odometry: Mapping[str, Poses] | None) -> 
 
 
 def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame | str]) -> Recorded:
-    """Return the output of given networks for every frame with a pose; write nothing.
+    """Run given networks on every frame with a pose; write no file.
 
-    Frames that cannot be decoded are left out: for these, look returns why.
+    Frames that cannot be decoded are left out: for these, `look` returns the reason.
     """
     with _read_keyframes(frames, EVERY_FRAME) as (raws, filters):
         seen = [found for raw in raws if isinstance(found := look(raw), SeenFrame)]
@@ -217,9 +216,9 @@ def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame | st
 
 
 def _earlier(frames: Frames, described: str, file: Path) -> dict[tuple[str, int], SeenFrame]:
-    """Return the output of the same networks for these images earlier, by camera and stamp.
+    """Return earlier outputs of the same networks for these images, by camera and stamp.
 
-    Boxes do not depend on the poses, as those of another scale, nor on the keyframes.
+    Boxes do not depend on poses, whose scale may have changed, nor on the choice of keyframes.
     """
     def networks(described: str) -> dict[str, Any]:
         tree = parse_json(described.encode())
@@ -238,12 +237,13 @@ def _earlier(frames: Frames, described: str, file: Path) -> dict[tuple[str, int]
         if is_same:
             logger.warning('using the boxes of an earlier run with other poses or keyframes: %s',
                            path)
-            found |= {(one.camera, one.stamp_ns): one for one in _seen_frames(recorded, frames)}
+            found |= {(frame.camera, frame.stamp_ns): frame
+                      for frame in _seen_frames(recorded, frames)}
     return found
 
 
 def _seen_frames(recorded: Recorded, frames: Frames) -> Iterator[SeenFrame]:
-    """Yield the frames of a recording as the networks saw them; depth is unknown."""
+    """Yield the outputs of the networks for recorded frames, without depth."""
     all_boxes = recorded.detections
     for frame, stamp_ns in enumerate(recorded.stamps_ns.tolist()):
         rows = slice(*all_boxes.frame_offsets[frame:frame + 2].tolist())
@@ -263,7 +263,7 @@ def _seen_frames(recorded: Recorded, frames: Frames) -> Iterator[SeenFrame]:
 
 
 def _seen_again(raw: RawFrame, earlier: Mapping[tuple[str, int], SeenFrame]) -> SeenFrame | None:
-    """Return the earlier output for an image, with its pose and depth now; None: look again."""
+    """Return the earlier output for an image with its present pose and depth; None if unusable."""
     found = earlier.get((raw.camera, raw.stamp_ns))
     if found is None or raw.map_from_camera is None:
         return None
@@ -279,7 +279,7 @@ def _seen_again(raw: RawFrame, earlier: Mapping[tuple[str, int], SeenFrame]) -> 
 
 def _unseen(raws: Iterator[RawFrame], seen: dict[int, SeenFrame],
             earlier: Mapping[tuple[str, int], SeenFrame]) -> Iterator[RawFrame]:
-    """Yield the frames that no run has seen, and add those of an earlier run to `seen`."""
+    """Yield the frames without an output, and add the outputs of an earlier run to `seen`."""
     for raw in raws:
         if raw.place not in seen:
             again = _seen_again(raw, earlier)
@@ -291,8 +291,8 @@ def _unseen(raws: Iterator[RawFrame], seen: dict[int, SeenFrame],
 
 def _record(frames: Frames, options: RecordingOptions, described: str, log: Log, file: Path
             ) -> Recorded:
-    """Look at all keyframes that neither an unfinished run nor an earlier one has seen."""
-    # another release may have other fields
+    """Run the networks on all keyframes without an output of an unfinished or earlier run."""
+    # the fields may differ between releases
     run = {'run': described, 'fields': list(SeenFrame.__dataclass_fields__)}
     entries, _ = log.read()
     seen: dict[int, SeenFrame] = {}
@@ -302,7 +302,7 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log,
         log.restart([run])
     unusable: list[str] = []
     if seen:
-        logger.warning('going on after %d frames of an unfinished run', len(seen))
+        logger.warning('continuing after %d frames of an unfinished run', len(seen))
     try:
         with _read_keyframes(frames, options.keyframes) as (raws, filters):
             tasks = _unseen(raws, seen, _earlier(frames, described, file))
@@ -315,14 +315,14 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log,
                 elif result is not None:
                     log.append({'frame': base64.b64encode(result.to_bytes()).decode()})
                     seen[result.place] = result
-                    # an implausible unit is refused early, before the work of hours is done
+                    # refuse an implausible unit at once, not after hours of work
                     if len(seen) <= _FRAMES_FOR_UNIT:
-                        check_depth_unit(np.concatenate([one.depths for one in seen.values()]),
+                        check_depth_unit(np.concatenate([frame.depths for frame in seen.values()]),
                                          str(frames.source))
     except BaseException:
         if seen:
-            logger.warning('%d frames are kept in %s: run again to go on from there, or delete it',
-                           len(seen), log.path)
+            logger.warning('%d frames are kept in %s: run again to continue from there, or delete '
+                           'it', len(seen), log.path)
         else:
             log.remove()
         raise
@@ -341,7 +341,7 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log,
 
 
 def _parse_entry(line: bytes) -> Any:
-    """Return the run that the first entry names, or the frame of any other entry."""
+    """Parse an entry of the log: the description of the run, or a frame."""
     entry = parse_json(line)
     return entry if 'run' in entry else SeenFrame.from_bytes(base64.b64decode(entry['frame']))
 
@@ -349,7 +349,7 @@ def _parse_entry(line: bytes) -> Any:
 @contextmanager
 def _read_keyframes(frames: Frames, options: KeyframeOptions
                     ) -> Iterator[tuple[Iterator[RawFrame], dict[str, KeyframeFilter]]]:
-    """Yield the keyframes of each camera and its filter, and show a bar on a terminal."""
+    """Yield the keyframes of all cameras, and their filters; show a progress bar on a terminal."""
     filters = {part.camera: KeyframeFilter(options) for part in frames.each}
     with tqdm(total=frames.count, desc='detector and CLIP', unit='image', disable=None) as bar:
         def wanted_of(part: Frames) -> Iterator[RawFrame]:
@@ -362,51 +362,53 @@ def _read_keyframes(frames: Frames, options: KeyframeOptions
 
 def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, KeyframeFilter],
               encoder_key: str, described: str) -> Recorded:
-    """Return the observations of frames in the order of time.
+    """Return the observations of frames, in order of time.
 
-    DatasetError: a camera has no frames, or changes.
+    DatasetError: a camera has no frames, or its intrinsics change.
     """
-    seen, source = sorted(seen, key=lambda one: (one.stamp_ns, one.place)), frames.source
-    cameras = tuple(_camera_of([one for one in seen if one.camera == name], f'{source}: {name}:'
-                               if name else f'{source}:', keyframes.asked, frames.varies)
+    seen, source = sorted(seen, key=lambda frame: (frame.stamp_ns, frame.place)), frames.source
+    cameras = tuple(_camera_of([frame for frame in seen if frame.camera == name],
+                               f'{source}: {name}:' if name else f'{source}:', keyframes.asked,
+                               frames.varies)
                     for name, keyframes in filters.items())
     camera_names = tuple(filters)
-    rows = np.array([camera_names.index(one.camera) for one in seen])
+    rows = np.array([camera_names.index(frame.camera) for frame in seen])
     if frames.varies:
-        cameras, rows = group_cameras([one.pinhole for one in seen])
+        cameras, rows = group_cameras([frame.pinhole for frame in seen])
         camera_names = names_of_group(cameras)
-        seen = [_seen_by(one, cameras[row]) for one, row in zip(seen, rows, strict=True)]
-    names = np.concatenate([one.class_ids for one in seen])
+        seen = [_seen_by(frame, cameras[row]) for frame, row in zip(seen, rows, strict=True)]
+    names = np.concatenate([frame.class_ids for frame in seen])
     class_names, classes = np.unique(names, return_inverse=True)
-    depths = np.concatenate([one.depths for one in seen])
+    depths = np.concatenate([frame.depths for frame in seen])
     has_depth = bool(np.isfinite(depths).any())
-    are_told = len(names) > 0 and any(one.is_distorted for one in seen)
+    needs_edges = len(names) > 0 and any(frame.is_distorted for frame in seen)
     detections = PosedDetections(
         cameras=cameras,
-        map_from_camera=np.array([one.map_from_camera for one in seen]),
-        stamps_s=np.array([one.stamp_ns / NS_PER_S for one in seen]),
-        frame_offsets=np.cumsum([0, *(len(one.scores) for one in seen)]),
-        bboxes_xyxy=np.concatenate([one.bboxes_xyxy for one in seen]),
+        map_from_camera=np.array([frame.map_from_camera for frame in seen]),
+        stamps_s=np.array([frame.stamp_ns / NS_PER_S for frame in seen]),
+        frame_offsets=np.cumsum([0, *(len(frame.scores) for frame in seen)]),
+        bboxes_xyxy=np.concatenate([frame.bboxes_xyxy for frame in seen]),
         class_names=tuple(str(name) for name in class_names), classes=classes.reshape(-1),
-        scores=np.concatenate([one.scores for one in seen]),
+        scores=np.concatenate([frame.scores for frame in seen]),
         depths=depths if has_depth else None,
-        depth_spreads=(np.concatenate([one.depth_spreads for one in seen]) if has_depth
+        depth_spreads=(np.concatenate([frame.depth_spreads for frame in seen]) if has_depth
                        else None),
-        embeddings=(np.concatenate([one.embeddings for one in seen])
-                    if any(one.embeddings.shape[1] for one in seen) else None),
+        embeddings=(np.concatenate([frame.embeddings for frame in seen])
+                    if any(frame.embeddings.shape[1] for frame in seen) else None),
         encoder_key=encoder_key,
-        open_edges=np.concatenate([one.open_edges for one in seen]) if are_told else None,
+        open_edges=np.concatenate([frame.open_edges for frame in seen]) if needs_edges else None,
         camera_rows=None if camera_names == ('',) else rows,
         camera_names=camera_names)
     return Recorded(
-        detections, np.array([one.stamp_ns for one in seen], dtype=np.int64),
-        np.array([one.detector_ms for one in seen]), np.array([one.clip_ms for one in seen]),
-        sum(one.asked for one in filters.values()),
-        sum(one.without_pose for one in filters.values()), described)
+        detections, np.array([frame.stamp_ns for frame in seen], dtype=np.int64),
+        np.array([frame.detector_ms for frame in seen]),
+        np.array([frame.clip_ms for frame in seen]),
+        sum(keyframes.asked for keyframes in filters.values()),
+        sum(keyframes.without_pose for keyframes in filters.values()), described)
 
 
 def _seen_by(seen: SeenFrame, other: Camera) -> SeenFrame:
-    """Return the boxes of a frame as another pinhole of its place shows them."""
+    """Return a frame with the boxes that another pinhole camera at the same pose would see."""
     if seen.pinhole == other:
         return seen
     rays = seen.pinhole.normalize_bboxes(seen.bboxes_xyxy)
@@ -414,32 +416,32 @@ def _seen_by(seen: SeenFrame, other: Camera) -> SeenFrame:
 
 
 def _camera_of(seen: list[SeenFrame], where: str, images: int, varies: bool) -> Camera:
-    """Return the camera of frames that one camera took, or of the first one where it varies.
+    """Return the camera of frames; of the first frame if the camera may vary.
 
-    DatasetError: there are none, they are of several cameras, or their depth has another unit.
+    DatasetError: there are no frames, their cameras differ, or the unit of depth is implausible.
     """
     if not seen:
         raise DatasetError(f'{where} none of {images} images has a pose; interpolate over wider '
                            'gaps with `max_gap`, or record poses with the images')
     camera = seen[0].pinhole
-    other = next((one for one in seen if one.pinhole != camera), None)
+    other = next((frame for frame in seen if frame.pinhole != camera), None)
     if other is not None and not varies:
-        raise DatasetError(f'{where} the camera changes at {other.stamp_ns / NS_PER_S:.6f}, but '
-                           'observations of one name have one camera; name several with '
-                           '`cameras`')
-    check_depth_unit(np.concatenate([one.depths for one in seen]), where.removesuffix(':'))
+        raise DatasetError(f'{where} the camera changes at {other.stamp_ns / NS_PER_S:.6f} s, but '
+                           'all observations of a camera must have the same intrinsics; name '
+                           'several cameras with `cameras`')
+    check_depth_unit(np.concatenate([frame.depths for frame in seen]), where.removesuffix(':'))
     return camera
 
 
 def _settings(options: DetectorOptions | ClipOptions) -> dict[str, Any]:
-    """Return the options that change what a network says."""
+    """Return the options that change the output of a network."""
     return {name: value for name, value in asdict(options).items()
             if name not in ('cache_dir', 'max_batch', 'inference')
-            and (value or name not in ('prompts', 'text_model'))}  # as files of before have it
+            and (value or name not in ('prompts', 'text_model'))}  # as in files of older versions
 
 
 def _state(path: Path) -> tuple[int, int] | None:
-    """Return a value that changes with a file; None for the name of a published model."""
+    """Return size and time of change of a file; None for the name of a published model."""
     try:
         stat = path.stat()
     except OSError:
@@ -448,9 +450,9 @@ def _state(path: Path) -> tuple[int, int] | None:
 
 
 def check_depth_unit(depths_m: NDArray[np.float32], where: str) -> None:
-    """Refuse depths of boxes that no camera in a room or hall measures.
+    """Refuse depths of boxes that are implausible in a room or hall.
 
-    DatasetError: the median is implausible; says how to give the unit.
+    DatasetError: the median is implausible; the message says how to set the unit.
     """
     known = depths_m[np.isfinite(depths_m)]
     if len(known) == 0:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Embeddings of a vocabulary's phrases: encoded once, class by class in the cache."""
+"""Embeddings of a vocabulary's phrases: encoded once, and cached class by class."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights
 from cliploc_ros.models.label_embeddings import LabelCache
 from cliploc_ros.offline.vocabulary.vocabulary import Phrases
 
-# The COCO classes and as many of a user; a file of ViT-L-14 takes 3 MB at most.
+# Enough for the 80 COCO classes and as many of the user; a file of ViT-L-14 takes at most 3 MB.
 _MOST_FILES = 200
 
 logger = logging.getLogger(__name__)
@@ -22,9 +22,9 @@ logger = logging.getLogger(__name__)
 
 def embed_phrases(weights: ClipWeights, options: ClipOptions,
                   phrases: Mapping[str, Sequence[str]]) -> dict[str, NDArray[np.float32]]:
-    """Return the embeddings (P, d) of the P phrases of each class, unit rows.
+    """Return the embeddings (P, d) of the P phrases of each class, as unit rows.
 
-    The text tower is loaded once, and only if the cache lacks a class.
+    The text tower is loaded only if a class is missing in the cache, and only once.
 
     ModelError, OptionsError: see cliploc_ros.models.clip_encoder.load_encoder.
     """
@@ -38,7 +38,7 @@ def embed_phrases(weights: ClipWeights, options: ClipOptions,
             found[name] = rows
     if missing:
         all_texts = [text for texts in missing.values() for text in texts]
-        logger.warning('CLIP reads %d phrases of %d classes; the next run finds them in the cache',
+        logger.warning('CLIP encodes %d phrases of %d classes; later runs use the cache',
                        len(all_texts), len(missing))
         encoded = encode_labels(weights, all_texts, options)
         ends = np.cumsum([len(texts) for texts in missing.values()])
@@ -50,9 +50,9 @@ def embed_phrases(weights: ClipWeights, options: ClipOptions,
 
 def phrases_of_classes(weights: ClipWeights, options: ClipOptions,
                        parts: Sequence[Mapping[str, Sequence[str]]]) -> dict[str, list[Phrases]]:
-    """Return the phrases of each class with their embeddings; errors as of embed_phrases.
+    """Return the phrases of each class with their embeddings; errors as in embed_phrases.
 
-    Those that change together belong into one part: the cache then keeps the others.
+    Put phrases that change together into one part: the cache then keeps the other parts.
     """
     found: dict[str, list[Phrases]] = {}
     for part in parts:

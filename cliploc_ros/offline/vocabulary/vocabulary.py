@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The phrases of classes: those of COCO and Objects365 are shipped, a file adds more."""
+"""The phrases of classes: those of COCO and Objects365 are shipped; a file can add more."""
 
 import os
 import re
@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import OptionsError
 
-#: Symbols with a meaning of their own: the first kind, and a colour other than the first one.
+#: Reserved symbols: the first kind, and a colour that differs from that of {colour}.
 NAME, SECOND = 'name', 'second'
-#: The most phrases of one class. ViT-L-14 reads about 30 phrases per second of a processor.
+#: Greatest number of phrases of a class. ViT-L-14 encodes about 30 phrases per second on a CPU.
 MOST_PHRASES = 2000
-# CLIP reads 77 tokens.
+# CLIP reads at most 77 tokens.
 _MOST_CHARACTERS = 200
 _MOST_STEPS = 20
 _SYMBOL = re.compile(r'\{(\w+)\}')
@@ -33,27 +33,27 @@ _GENERAL = 'general'
 
 
 class Phrases(NamedTuple):
-    """Some phrases: P texts and their embeddings (P, d), unit rows."""
+    """P phrases: texts and embeddings (P, d), unit rows."""
 
     texts: tuple[str, ...]
     embeddings: NDArray[np.float32]
 
 
 def expand_phrases(rules: Rules) -> tuple[str, ...]:
-    """Return all phrases of a grammar, each once, in the order of its templates.
+    """Return all distinct phrases of a grammar, in the order of its templates.
 
     Parameters
     ----------
     rules : mapping of str to sequence of str
-        ``phrases`` are the templates. A word in braces is a symbol: each of its alternatives
-        fills its place, the same one wherever it occurs in a phrase. Alternatives may hold
-        symbols, too. ``{name}`` is the first ``kind``; ``{second}`` is each ``colour`` but the
-        one that fills ``{colour}``.
+        ``phrases`` are the templates. A word in braces is a symbol, which is replaced by each of
+        its alternatives; a symbol that occurs twice in a phrase has the same value. Alternatives
+        may contain symbols. ``{name}`` is the first ``kind``; ``{second}`` is each ``colour``
+        except that of ``{colour}``.
 
     Raises
     ------
     OptionsError
-        A symbol has no rule, rules do not end, or the phrases are too many or too long.
+        A symbol has no rule, rules refer to each other, or phrases are too many or too long.
     """
     phrases = [_A_BEFORE_VOWEL.sub(r'\1n', phrase) for template in rules['phrases']
                for phrase in islice(_expand(template, rules, {}, 0), MOST_PHRASES + 1)]
@@ -67,7 +67,7 @@ def _expand(text: str, rules: Rules, chosen: dict[str, str], steps: int) -> Iter
     if len(text) > _MOST_CHARACTERS:
         raise OptionsError(f"'{text[:40]}...' has more than {_MOST_CHARACTERS} characters")
     if steps > _MOST_STEPS:
-        raise OptionsError(f"'{text}' does not end: rules refer to each other")
+        raise OptionsError(f"'{text}' cannot be expanded: rules refer to each other")
     symbol = _SYMBOL.search(text)
     if symbol is None:
         yield text
@@ -99,20 +99,20 @@ class Vocabulary:
     added: Mapping[str, tuple[str, ...]]  #: Phrases of a user, in addition to the shipped phrases
 
     def phrases(self, class_name: str) -> tuple[str, ...]:
-        """Return the phrases of a class, each once; the user's come first.
+        """Return the distinct phrases of a class; those of the user come first.
 
-        A class that is not in the vocabulary is described by the general grammar.
+        A class that is not in the vocabulary gets the phrases of the general grammar.
         """
         return tuple(dict.fromkeys(self.added.get(class_name, ()) + shipped_phrases(class_name)))
 
 
 def load_vocabulary(path: str | os.PathLike[str] | None = None) -> Vocabulary:
-    """Return the shipped vocabulary, and the phrases of a file if one is given.
+    """Load the shipped vocabulary, with the phrases of a file if one is given.
 
     Parameters
     ----------
     path : str or path, optional
-        A YAML file: class names to a list of phrases, or to rules as in coco.yaml.
+        A YAML file that maps class names to a list of phrases, or to rules as in coco.yaml.
 
     Raises
     ------
@@ -123,29 +123,29 @@ def load_vocabulary(path: str | os.PathLike[str] | None = None) -> Vocabulary:
         return Vocabulary({})
     entries = read_parameter_file(path)
     if not entries:
-        raise OptionsError(f'{path}: holds no classes')
+        raise OptionsError(f'{path}: has no classes')
     return Vocabulary({name: _phrases_of(name, entry, f"{path}: class '{name}'")
                        for name, entry in entries.items()})
 
 
 def coco_classes() -> tuple[str, ...]:
-    """Return the classes of COCO, by their numbers."""
+    """Return the classes of COCO, in the order of their indices."""
     return tuple(_shipped('coco.yaml'))
 
 
 def shipped_classes() -> tuple[str, ...]:
-    """Return the names of classes that the shipped vocabulary knows, in lower case."""
+    """Return the class names in the shipped vocabulary, in lower case."""
     return (*coco_classes(), *_shipped('objects365.yaml'), *_shipped('aliases.yaml'))
 
 
 def common_name(name: str) -> str:
-    """Return the name under which vocabulary and sizes have a detector's class."""
+    """Return the name of a detector's class in the vocabulary and in the table of sizes."""
     plain = ' '.join(name.lower().split())
     return str(_shipped('aliases.yaml').get(plain, plain))
 
 
 def shipped_phrases(name: str) -> tuple[str, ...]:
-    """Return the phrases of a class without those of a user."""
+    """Return the shipped phrases of a class, without those of the user."""
     common = common_name(name)
     entry = _shipped('coco.yaml').get(common, _shipped('objects365.yaml').get(common, {}))
     return _phrases_of(common if entry else name, entry, f"class '{name}'")
@@ -165,7 +165,7 @@ def _phrases_of(name: str, entry: Any, where: str) -> tuple[str, ...]:
                            f'not {entry!r:.60}')
     rules = {rule: _words(words, f'{where}: {rule}') for rule, words in entry.items()
              if rule != 'grammar'}
-    # a detector may name a class tv_monitor; braces would be symbols
+    # a detector's class may be named tv_monitor; braces would be read as symbols
     plain = ' '.join(re.sub(r'[_{}]', ' ', name).split()) or 'object'
     grammar = _grammar(entry.get('grammar', _GENERAL), where)
     try:
@@ -175,18 +175,18 @@ def _phrases_of(name: str, entry: Any, where: str) -> tuple[str, ...]:
 
 
 def _grammar(name: Any, where: str) -> dict[str, list[str]]:
-    """Return the rules of a grammar and, where it has none, those of the general one."""
+    """Return the rules of a grammar; missing rules are those of the general grammar."""
     grammars = _shipped('grammars.yaml')
     if not isinstance(name, str) or name not in grammars:
-        raise OptionsError(f'{where}: grammar: {name!r:.60} is none of {", ".join(grammars)}')
+        raise OptionsError(f'{where}: grammar: {name!r:.60} is not one of {", ".join(grammars)}')
     return {**grammars[_GENERAL], **grammars[name]}
 
 
 def _words(words: Any, where: str) -> list[str]:
     if where.endswith((f': {NAME}', f': {SECOND}')):
-        raise OptionsError(f'{where}: has a meaning of its own; choose another name')
+        raise OptionsError(f'{where}: is a reserved name; choose another one')
     if not isinstance(words, list) or not words:
-        raise OptionsError(f'{where}: expected a list of text, not {words!r:.60}')
+        raise OptionsError(f'{where}: expected a list of texts, not {words!r:.60}')
     for word in words:
         if not isinstance(word, str) or not word.strip():
             raise OptionsError(f'{where}: {word!r:.60} is not text (quote numbers and yes/no)')

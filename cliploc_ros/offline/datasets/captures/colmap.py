@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Models of COLMAP: cameras and images, as text or binary (colmap.github.io/format.html)."""
+"""Read cameras and images of COLMAP models, text or binary (colmap.github.io/format.html)."""
 
 import mmap
 import struct
@@ -27,12 +27,12 @@ _REMEDY = 'undistort the images with colmap image_undistorter, and give its outp
 
 
 class _Model(NamedTuple):
-    """A camera model: name, number of focal lengths, distortion model, places of its values."""
+    """A camera model of COLMAP."""
 
     name: str
-    focals: int
-    distortion: str = ''
-    #: Index in OpenCV's order of the coefficient that each value of the file stands for
+    focals: int  #: Number of focal lengths
+    distortion: str = ''  #: Distortion model
+    #: Index, in OpenCV's order of coefficients, of each distortion value in the file
     places: tuple[int, ...] = ()
 
     @property
@@ -40,7 +40,8 @@ class _Model(NamedTuple):
         return self.focals + 2 + len(self.places)
 
 
-# By COLMAP's number. It counts pixels from the corner of the first one, OpenCV from its centre.
+# By COLMAP's number of the model. COLMAP's pixel origin is the corner of the first pixel, OpenCV's
+# is its centre.
 _MODELS = {
     0: _Model('SIMPLE_PINHOLE', 1), 1: _Model('PINHOLE', 2),
     2: _Model('SIMPLE_RADIAL', 1, 'plumb_bob', (0,)), 3: _Model('RADIAL', 1, 'plumb_bob', (0, 1)),
@@ -65,25 +66,25 @@ class _Posed(NamedTuple):
 
 
 def read_colmap(folder: Path, options: capture.FolderOptions) -> capture.Capture:
-    """Return the images of a model, or of the largest one of a project.
+    """Read the images of a model, or of the largest model of a project.
 
-    The folder is that of the model (cameras and images, .bin or .txt), or of the project around
-    it. Without a folder of images, they are in ``images/`` beside the model or above it.
-    DatasetError: the model cannot be used; names what to mend.
+    The folder is that of the model (cameras and images, .bin or .txt), or that of the project.
+    By default, the images are looked for in ``images/``, next to the model or above it.
+    DatasetError: the model cannot be used; the message says how to correct it.
     """
     models = models_of(folder)
     if not models:
-        raise DatasetError(f'{folder}: no COLMAP model here: it has cameras.bin and images.bin, '
+        raise DatasetError(f'{folder}: has no COLMAP model: expected cameras.bin and images.bin, '
                            'or .txt; run the mapper of COLMAP first')
-    whole = [one for one in models if _has(one, 'bin') or _has(one, 'txt')]
+    whole = [model for model in models if _has(model, 'bin') or _has(model, 'txt')]
     if not whole:
         lacking = [part for part in _PARTS if not any(
             (models[0] / f'{part}.{end}').is_file() for end in ('bin', 'txt'))]
-        missing = f'{lacking[0]}.bin' if lacking else 'cameras and images of one ending'
+        missing = f'{lacking[0]}.bin' if lacking else 'cameras and images of the same ending'
         raise DatasetError(f'{models[0]}: the COLMAP model lacks {missing}: export it again')
-    models = [one for one in whole if not _is_distorted(one, folder)] or whole
+    models = [model for model in whole if not _is_distorted(model, folder)] or whole
     found = {model: list(_images(model)) for model in models}
-    model = max(models, key=lambda one: len(found[one]))
+    model = max(models, key=lambda model: len(found[model]))
     cameras, notes = dict(_cameras(model)), []
     if _has(model, 'bin') and _has(model, 'txt'):
         _check_same(model, cameras, found[model])
@@ -96,36 +97,36 @@ def read_colmap(folder: Path, options: capture.FolderOptions) -> capture.Capture
     roots = [options.images] if options.images else [
         *(above / name for above in (folder, *model.resolve().parents[:3]) for name in beside),
         folder]
-    root = next((one for one in roots if capture.beside(one / first)),
-                next((one for one in roots if one.is_dir()), folder))
+    root = next((path for path in roots if capture.beside(path / first)),
+                next((path for path in roots if path.is_dir()), folder))
     files = []
-    for one in found[model]:
-        if one.camera_id not in cameras:
-            raise DatasetError(f'{model}: image {one.name} is of camera {one.camera_id}, which '
-                               'the model does not have')
-        color = root / one.name
-        if capture.beside(color) is None:  # named on another system
+    for image in found[model]:
+        if image.camera_id not in cameras:
+            raise DatasetError(f'{model}: image {image.name} is of camera {image.camera_id}, '
+                               'which the model does not have')
+        color = root / image.name
+        if capture.beside(color) is None:  # a path of another operating system
             color = next(filter(None, (capture.beside(root / name) for name in (
-                one.name.replace('\\', '/'), PureWindowsPath(one.name).name))), color)
-        files.append(ImageFile(NO_STAMP, color, cameras[one.camera_id], one.pose))
+                image.name.replace('\\', '/'), PureWindowsPath(image.name).name))), color)
+        files.append(ImageFile(NO_STAMP, color, cameras[image.camera_id], image.pose))
     there = sum(file.suffix.lower() in capture.IMAGES for file in root.rglob('*'))
     return capture.Capture.of(files, model, 'opencv', is_metric=False, notes=notes, images=there)
 
 
 def _check_same(model: Path, cameras: Mapping[int, Camera], images: Sequence[_Posed]) -> None:
-    """Refuse a model whose text and binary files say different things."""
+    """Refuse a model whose text and binary files differ."""
     text = dict(_cameras(model, 'txt'))
     poses = {image.name: image.pose for image in _images(model, 'txt')}
     if any(not np.allclose(camera.matrix, text[number].matrix, rtol=1e-3)
            for number, camera in cameras.items() if number in text) or any(
                image.pose is not None and (other := poses.get(image.name)) is not None
                and not np.allclose(image.pose, other, atol=1e-3) for image in images):
-        raise DatasetError(f'{model}: the .bin and .txt files of the model say different cameras '
-                           'or poses: remove those that are old')
+        raise DatasetError(f'{model}: the .bin and .txt files of the model have different cameras '
+                           'or poses: remove the outdated files')
 
 
 def models_of(folder: Path) -> list[Path]:
-    """Return the folders of models in a folder, also of those that lack a file."""
+    """Return the folders of models in a folder; a model may lack a file."""
     places = [folder / place for place in _PLACES]
     sparse = folder / 'sparse'
     places += sorted(sparse.iterdir()) if sparse.is_dir() else []
@@ -134,7 +135,7 @@ def models_of(folder: Path) -> list[Path]:
 
 
 def _is_distorted(model: Path, folder: Path) -> bool:
-    """Return whether a model is of the images as they were taken, in a project of splatting."""
+    """Return whether a model of a splatting project describes the images before undistortion."""
     return 'distorted' in model.relative_to(folder).parts
 
 
@@ -143,7 +144,7 @@ def _has(model: Path, end: str) -> bool:
 
 
 def _cameras(model: Path, kind: str = '') -> Iterator[tuple[int, Camera]]:
-    """Yield the cameras of a model by their ids; the kind is txt, or '' for what is there."""
+    """Yield the id and camera of each camera; kind 'txt' reads text even if binary files exist."""
     binary = model / 'cameras.bin'
     if kind == 'txt' or not _has(model, 'bin'):
         lines = parsing.read_cells(model / 'cameras.txt', 'CAMERA_ID MODEL WIDTH HEIGHT ...')
@@ -165,7 +166,7 @@ def _camera(where: str, number: int, name: str, size: tuple[int, int], values: S
             ) -> Camera:
     model = _MODELS.get(number)
     if model is None:
-        raise DatasetError(f'{where} has the camera model {name}, which is not known here; '
+        raise DatasetError(f'{where} has the camera model {name}, which is not supported; '
                            f'{_REMEDY}')
     if len(values) != model.length:
         raise DatasetError(f'{where}: {model.name} has {model.length} values, not {len(values)}')
@@ -177,7 +178,7 @@ def _camera(where: str, number: int, name: str, size: tuple[int, int], values: S
 
 
 def _images(model: Path, kind: str = '') -> Iterator[_Posed]:
-    """Yield the images of a model, see _cameras."""
+    """Yield the images of a model; see _cameras for the kind."""
     binary = model / 'images.bin'
     if kind == 'txt' or not _has(model, 'bin'):
         yield from _text_images(model / 'images.txt')
@@ -191,7 +192,7 @@ def _images(model: Path, kind: str = '') -> Iterator[_Posed]:
 
 
 def _text_images(path: Path) -> Iterator[_Posed]:
-    """Yield the images of a text file: two lines each, the second one may be empty."""
+    """Yield the images of a text file; each has two lines, and the second may be empty."""
     lines = [line for line in parsing.read_text(path).split('\n') if not line.startswith('#')]
     for number, line in enumerate(lines[::2]):
         cells = line.strip().split(maxsplit=9)
@@ -213,7 +214,7 @@ def _posed(name: str, camera_id: int, numbers: Sequence[float], where: str) -> _
 
 
 class _Bytes:
-    """A binary file that is read from its start; no count in it is trusted."""
+    """A binary file that is read sequentially; its counts are checked against its size."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._place = path, 0
@@ -229,7 +230,7 @@ class _Bytes:
         self._data.close()
 
     def count(self, least_bytes: int) -> int:
-        """Return the number of entries that follow, each of this size at least."""
+        """Read the number of entries that follow, each of at least this size."""
         count = int(self.take('<Q')[0])
         if count * least_bytes > len(self._data):
             raise self._short(f'{count} entries do not fit')
@@ -246,7 +247,7 @@ class _Bytes:
             raise self._short(f'byte {self._place} is missing')
 
     def name(self) -> str:
-        """Return a text that ends with a zero byte."""
+        """Read a text that ends with a zero byte."""
         end = self._data.find(b'\0', self._place, self._place + _MOST_NAME)
         if end < 0:
             raise self._short('the name of an image does not end')

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of phones and headsets, and the transforms.json of nerfstudio and Instant-NGP.
 
-Polycam, Record3D, Stray Scanner, ARKitScenes, HoloLens 2: their trackers measure in metres and
-know the vertical: ARKit and HoloLens have y up. Camera axes of a transforms.json are OpenGL's: x
-right, y up, z back. Fields that are not used here are ignored.
+The devices are Polycam, Record3D, Stray Scanner, ARKitScenes and HoloLens 2. Their trackers
+measure in metres and know the vertical; y is up for ARKit and HoloLens. A transforms.json has
+OpenGL's camera axes: x right, y up, z backward. Unused fields are ignored.
 """
 
 import math
@@ -26,16 +26,16 @@ from cliploc_ros.offline.datasets.poses import TimedPoses
 from cliploc_ros.units import NS_PER_S
 
 _IN_MILLIMETRES = DepthFormat(MILLIMETRE)
-# HoloLens counts 100 ns from 1601, ROS from 1970.
+# HoloLens counts ticks of 100 ns since 1601; ROS counts from 1970.
 _TICK_NS, _TICKS_TO_1970 = 100, 116_444_736_000_000_000
-# ARKitScenes rounds the times of its files to a millisecond.
+# ARKitScenes rounds the times in its file names to a millisecond.
 _ROUNDING_S = 0.001
-# Its poses come at 10 Hz, its images up to 60 Hz.
+# ARKitScenes has poses at 10 Hz, and images at up to 60 Hz.
 _MAX_GAP_NS = 200_000_000
 
 
 def read_polycam(folder: Path, options: capture.FolderOptions) -> capture.Capture:
-    """Return the keyframes of Polycam's raw data, with optimized poses if there are any."""
+    """Read the keyframes of Polycam's raw data, with optimized poses if there are any."""
     root, kind = folder / 'keyframes', 'corrected_'
     if not ((root / 'corrected_images').is_dir() and (root / 'corrected_cameras').is_dir()):
         kind = ''
@@ -52,19 +52,19 @@ def read_polycam(folder: Path, options: capture.FolderOptions) -> capture.Captur
             ImageFile(1000 * int(path.stem) if is_stamp else NO_STAMP,
                       root / f'{kind}images' / f'{path.stem}.jpg', camera, pose),
             root / 'depth', root / 'confidence', path.stem))
-    notes = () if kind else ('its poses are not optimized: they drift as ARKit does',)
+    notes = () if kind else ('its poses are not optimized: they have the drift of ARKit',)
     return capture.Capture.of(files, root, 'opengl', _IN_MILLIMETRES, 'y', notes=notes)
 
 
 def _with_depth(image: ImageFile, depths: Path, confidences: Path, stem: str) -> ImageFile:
-    """Return an image with the depth image of its name, where there is one."""
+    """Add the depth and confidence images of a stem to an image, if they exist."""
     depth = capture.beside(depths / f'{stem}.png')
     return image._replace(depth=depth,
                           confidence=depth and capture.beside(confidences / f'{stem}.png'))
 
 
 def read_record3d(folder: Path, options: capture.FolderOptions) -> capture.Capture:
-    """Return the images of Record3D. Its depth is compressed in a way that is not read here."""
+    """Read the images of Record3D; its compressed depth is not supported."""
     path = metadata_of_record3d(folder)
     assert path is not None
     meta = parsing.Fields.of_file(path)
@@ -76,7 +76,7 @@ def read_record3d(folder: Path, options: capture.FolderOptions) -> capture.Captu
     if own is None:
         if len(matrix) != 9:
             raise DatasetError(f'{path}: has no intrinsics: K has {len(matrix)} numbers, not 9')
-        own = np.tile(matrix[[0, 4, 6, 7]], (len(rows), 1))  # K is column after column
+        own = np.tile(matrix[[0, 4, 6, 7]], (len(rows), 1))  # K is stored by columns
     times = meta.numbers('frameTimestamps', (-1,), [])
     images = folder / ('rgbd' if (folder / 'rgbd').is_dir() else 'rgb')
     files = []
@@ -88,20 +88,20 @@ def read_record3d(folder: Path, options: capture.FolderOptions) -> capture.Captu
             parsing.camera_of(where, *size, *intrinsics.tolist()),
             parsing.pose_of(pose[4:], pose[:4], where)))
     return capture.Capture.of(files, path, 'opengl', up='y', notes=(
-        'the depth of Record3D is not read: it is compressed by LZFSE or EXR',))
+        'the depth of Record3D is not read: it is compressed with LZFSE or EXR',))
 
 
 def metadata_of_record3d(folder: Path) -> Path | None:
-    """Return the file of an unpacked .r3d file, or of an export of Record3D; None without one."""
+    """Return the metadata file of an unpacked .r3d or an export of Record3D; None if missing."""
     if not any((folder / name).is_dir() for name in ('rgbd', 'rgb')):
         return None
     return capture.beside(folder / 'metadata') or capture.beside(folder / 'metadata.json')
 
 
 def read_stray(folder: Path, options: capture.FolderOptions) -> capture.Capture:
-    """Return the images of Stray Scanner: of its video, or of rgb/, where they were unpacked to.
+    """Read the images of Stray Scanner, from its video or from rgb/ if it was unpacked there.
 
-    Its quaternions are of OpenCV's camera axes.
+    The quaternions refer to OpenCV's camera axes.
     """
     path, lens = folder / 'odometry.csv', folder / 'camera_matrix.csv'
     table = parsing.read_cells(path, 'timestamp frame x y z qx qy qz qw ...', header=1)
@@ -125,7 +125,7 @@ def read_stray(folder: Path, options: capture.FolderOptions) -> capture.Capture:
 
 
 def _size_of(folder: Path, video: Path | None) -> tuple[int, int]:
-    """Return width and height of the images of Stray Scanner, which no file tells."""
+    """Read width and height of Stray Scanner's images from the first image: no file has them."""
     first = next((file for file in sorted((folder / 'rgb').glob('*.*'))
                   if file.suffix in capture.IMAGES), None)
     size = None
@@ -134,12 +134,16 @@ def _size_of(folder: Path, video: Path | None) -> tuple[int, int]:
     elif video is not None and (image := cv2.VideoCapture(str(video)).read()[1]) is not None:
         size = image.shape[1], image.shape[0]
     if size is None:
-        raise DatasetError(f'{folder}: has no images that can be read: neither rgb.mp4 nor rgb/')
+        raise DatasetError(f'{folder}: has no readable images: neither rgb.mp4 nor rgb/')
     return size
 
 
 def read_arkitscenes(folder: Path, options: capture.FolderOptions) -> capture.Capture:
-    """Return a scan of ARKitScenes: camera_from_map of OpenCV's axes as axis and angle, z up."""
+    """Read a scan of ARKitScenes.
+
+    The file of poses has camera_from_map as rotation vector and translation, with OpenCV's camera
+    axes. z is up.
+    """
     path = folder / 'lowres_wide.traj'
     lines = parsing.read_numbers(path, 'timestamp rx ry rz tx ty tz ...')
     rows = np.array([line[:7] for line in lines]).reshape(-1, 7)
@@ -171,7 +175,7 @@ def read_arkitscenes(folder: Path, options: capture.FolderOptions) -> capture.Ca
 
 
 def _pincam(folder: Path, scan: str, time_s: float) -> Camera | None:
-    """Return the camera of an image, from a file whose time may be rounded; None without it."""
+    """Read the camera of an image, from a file whose time may be rounded; None if missing."""
     for shift_s in (0.0, -_ROUNDING_S, _ROUNDING_S):
         path = capture.beside(folder / f'{scan}_{time_s + shift_s:.3f}.pincam')
         if path is not None:
@@ -184,9 +188,9 @@ def _pincam(folder: Path, scan: str, time_s: float) -> Camera | None:
 
 
 def read_hololens(folder: Path, options: capture.FolderOptions) -> capture.Capture:
-    """Return the images of the photo-video camera, unpacked and converted to PNG by the sample.
+    """Read the images of the photo-video camera, unpacked and converted to PNG by the sample.
 
-    Its long-throw depth needs a table of rays and is not read here.
+    Long-throw depth needs a table of rays and is not supported.
     """
     path = min(folder.glob('*_pv.txt'))
     images = folder / ('PV' if (folder / 'PV').is_dir() else 'rgb')
@@ -198,7 +202,7 @@ def read_hololens(folder: Path, options: capture.FolderOptions) -> capture.Captu
     files = []
     for where, (time, *cells) in lines[1:]:
         row = parsing.parse_all(cells, float, where)
-        # a float does not hold the 18 digits of the time, which names the image
+        # the time names the image; a float cannot hold its 18 digits
         if len(row) < 18 or not (time.isdecimal() and len(time) < 20):
             raise DatasetError(f'{where}: expected time, fx, fy and the 16 numbers of the pose')
         pose = np.array(row[2:18]).reshape(4, 4)
@@ -211,12 +215,12 @@ def read_hololens(folder: Path, options: capture.FolderOptions) -> capture.Captu
 
 
 def _stamp_ns(time_s: float) -> int:
-    """Return a time [s] in nanoseconds; NO_STAMP if it is none."""
+    """Convert a time [s] to nanoseconds; NO_STAMP if it is out of range."""
     return round(time_s * NS_PER_S) if abs(time_s) < 1e15 else NO_STAMP
 
 
 TRANSFORMS = 'transforms.json'
-_SAME_FOCAL = 1.02  # the focal length is in two fields, rounded
+_SAME_FOCAL = 1.02  # greatest ratio of the focal lengths in two fields, which are rounded
 _PERSPECTIVE = ('PINHOLE', 'SIMPLE_PINHOLE', 'SIMPLE_RADIAL', 'RADIAL', 'OPENCV', 'PERSPECTIVE')
 _FISHEYE = ('OPENCV_FISHEYE', 'FISHEYE')
 _INTRINSICS = ('w', 'h', 'fl_x', 'fl_y', 'cx', 'cy', 'camera_angle_x', 'k1', 'k2', 'k3', 'k4',
@@ -226,11 +230,11 @@ _ENDINGS = ('.png', '.jpg', '.jpeg', '.JPG', '.PNG')
 
 
 def read_nerf(folder: Path, options: capture.FolderOptions) -> capture.Capture:
-    """Return the images that a transforms.json lists; the folder may be this file.
+    """Read the images listed in a transforms.json; `folder` may be that file.
 
-    It is of nerfstudio, Instant-NGP or the original NeRF.
-    The folder of images holds them by their names alone; None: they are where the file says.
-    DatasetError: a field cannot be used; names it.
+    The file is that of nerfstudio, Instant-NGP or the original NeRF. If a folder of images is
+    given, they are looked up there by name; otherwise the paths of the file are used.
+    DatasetError: a field is invalid; the message names it.
     """
     path = folder if folder.name.endswith('.json') else folder / TRANSFORMS
     meta = parsing.Fields.of_file(path)
@@ -242,7 +246,7 @@ def read_nerf(folder: Path, options: capture.FolderOptions) -> capture.Capture:
         raise DatasetError(f'{path}: applied_scale is {scale:g}, not above 0')
     files, cameras, images = [], dict[str, Camera](), options.images
     for place, values in enumerate(frames):
-        # a frame's own values come before those of all
+        # values of a frame override those of the file
         frame = parsing.Fields(values, f'{path}: frame {place}')
         both = parsing.Fields({**meta.values, 'frames': None, **frame.values}, frame.where)
         name = frame.text('file_path')
@@ -258,7 +262,7 @@ def read_nerf(folder: Path, options: capture.FolderOptions) -> capture.Capture:
         depth = frame.text('depth_file_path', frame.text('depth_path', ''))
         files.append(ImageFile(NO_STAMP, color, cameras[shown], full,
                                _file_of(path.parent, depth, None) if depth else None))
-    # depth is in the unit of the poses, which no field tells: in metres, or as COLMAP chose it
+    # depth has the unit of the poses: metres, or the arbitrary unit of COLMAP; no field gives it
     unit = next((meta.number(name) for name in ('depth_unit_scale_factor', 'integer_depth_scale')
                  if name in meta), None)
     if unit is not None and unit <= 0.0:
@@ -268,23 +272,24 @@ def read_nerf(folder: Path, options: capture.FolderOptions) -> capture.Capture:
 
 
 def _file_of(folder: Path, name: str, images: Path | None) -> Path:
-    """Return the image file that a name in a transforms.json stands for, also of Windows.
+    """Find the image file of a name in a transforms.json, which may be a path of Windows.
 
-    If a folder of images is given, or the whole path does not exist, only the last part of the
-    name counts.
+    If a folder of images is given, or the path does not exist, only the last part of the name is
+    used.
     """
-    alone = PureWindowsPath(name).name  # of / and \\ alike
+    alone = PureWindowsPath(name).name  # splits at / and at \\
     within = name.replace('\\', '/')
-    paths = [folder / name, folder / within, *(folder / one / alone for one in _IMAGE_FOLDERS)]
+    paths = [folder / name, folder / within,
+             *(folder / images_folder / alone for images_folder in _IMAGE_FOLDERS)]
     if images is not None:
         paths = [images / within, images / alone]
-    # the original NeRF leaves the ending of an image away
+    # the original NeRF omits the endings of images
     endings = [Path(f'{path}{end}') for path in paths for end in ('', *_ENDINGS)]
     return next(filter(None, map(capture.beside, endings)), paths[0])
 
 
 def _camera(values: parsing.Fields, image: Path) -> Camera:
-    """Return the camera of a frame. Pixels are counted from the corner of the first one."""
+    """Return the camera of a frame; the pixel origin of the file is a corner, not a centre."""
     where = values.where
     model = values.text('camera_model', 'OPENCV')
     if 'w' in values and 'h' in values:
@@ -305,7 +310,7 @@ def _camera(values: parsing.Fields, image: Path) -> Camera:
         angle = values.number(name, 0.0)
         by_angle = 0.5 * side / math.tan(0.5 * angle) if angle else focal_px
         if focal_px > 0.0 and not 1.0 / _SAME_FOCAL < by_angle / focal_px < _SAME_FOCAL:
-            raise DatasetError(f'{where}: says two focal lengths: {focal_px:.5g} px, and '
+            raise DatasetError(f'{where}: has two focal lengths: {focal_px:.5g} px, and '
                                f'{by_angle:.5g} px by {name}: correct or remove the wrong one')
     cx, cy = values.number('cx', 0.5 * width) - 0.5, values.number('cy', 0.5 * height) - 0.5
     k1, k2, k3, k4, p1, p2 = (values.number(name, 0.0)
@@ -315,6 +320,6 @@ def _camera(values: parsing.Fields, image: Path) -> Camera:
                                  (k1, k2, k3, k4))
     if model not in _PERSPECTIVE or k4:
         raise DatasetError(f'{where}: camera_model {model} ' + ('with k4 ' if k4 else '')
-                           + 'is not known here; undistort the images to PINHOLE')
+                           + 'is not supported; undistort the images to PINHOLE')
     return parsing.camera_of(where, width, height, fx, fy, cx, cy, 'plumb_bob',
                              (k1, k2, p1, p2, k3))

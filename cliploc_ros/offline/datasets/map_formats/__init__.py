@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps of other systems: one module for each format, a path in, ellipsoids out."""
+"""Read maps of other systems: from a path to ellipsoids."""

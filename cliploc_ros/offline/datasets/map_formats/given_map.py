@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The result of a reader of a map format, its conversion to our map, and readers of texts."""
+"""Maps read from other formats, their conversion to our maps, and readers of MSG-Loc and CSV."""
 
 import codecs
 import csv
@@ -24,38 +24,38 @@ from cliploc_ros.offline.datasets.parsing import FieldError, Fields, naming, uni
 from cliploc_ros.offline.mapping.refit import refit_map
 from cliploc_ros.offline.vocabulary.vocabulary import coco_classes
 
-# A thinner semi-axis is a fit that collapsed; a larger one does not belong to an object. Guesses.
+# A smaller semi-axis is a collapsed fit; a larger one does not belong to an object. Not measured.
 _SEMI_AXIS_RANGE_M = (1e-3, 100.0)
 _MAX_COORDINATE_M = 1e6
 _MAX_NORM_ERROR = 0.01
 MAX_FILE_BYTES = 512 * 1024 * 1024
 COCO = coco_classes()
 _MAX_LENGTH = 1000
-# A map file holds four decimals of a weight. A class with less means nothing.
+# A map file holds four decimals of a weight; classes with a smaller share are dropped.
 _LEAST_SHARE = 0.001
 
 
 class GivenLandmark(NamedTuple):
-    """A landmark as its file has it, in the file's coordinate frame and unit of length."""
+    """A landmark as stored, in the file's coordinate frame and unit of length."""
 
     landmark_id: str
     label: str
     class_id: str
     center: Sequence[float]
     semi_axes: Sequence[float]
-    quat_xyzw: Sequence[float]  #: Landmark axes into the file's axes
+    quat_xyzw: Sequence[float]  #: Rotation from landmark axes into the file's axes
     details: LandmarkDetails = LandmarkDetails()
 
 
 class Skipped(NamedTuple):
-    """A landmark of the file that is not in the map, and why."""
+    """A landmark of the file that is not in the map, and the reason."""
 
     landmark_id: str
     reason: str
 
 
 class GivenMap(NamedTuple):
-    """The content of a file: landmarks, objects that could not be read, and notes on the file."""
+    """The content of a file: landmarks, unreadable objects, and notes on the file."""
 
     landmarks: list[GivenLandmark]
     left_out: list[Skipped]
@@ -63,7 +63,7 @@ class GivenMap(NamedTuple):
 
 
 class ImportedMap(NamedTuple):
-    """A map of ours, the objects left out with their reasons, and notes for the user."""
+    """A converted map, the objects left out with reasons, and notes for the user."""
 
     landmark_map: LandmarkMap
     left_out: tuple[Skipped, ...]
@@ -73,28 +73,28 @@ class ImportedMap(NamedTuple):
 def place(given: GivenMap, source: str, frame_id: str, scale: float,
           map_from_given: NDArray[np.float64], errors: tuple[float, float] | None = None
           ) -> ImportedMap:
-    """Return a given map in the coordinate frame and unit of ours.
+    """Convert a map to our coordinate frame and to metres.
 
-    Landmarks that no map can hold are left out. DatasetError: no landmark is left; the message
-    says why the first one was left out.
+    Invalid landmarks are left out. DatasetError: no landmark is valid; the message gives the
+    reason of the first.
 
     Parameters
     ----------
     source : str
-        What the landmarks say of where they come from.
+        The source that each landmark stores.
     frame_id : str
         Coordinate frame of the map, where x_map = map_from_given @ (scale * x_given).
     scale : float
-        Metres in one unit of length of the file.
+        Metres per unit of length of the file.
     map_from_given : ndarray (4, 4)
     errors : tuple of two floats, optional
-        How far the landmarks are off on each axis where the file does not say it, each on its own
-        and all together [m], and by how much they are turned together [deg].
+        Standard deviation of the position on each axis, both of single landmarks and of all
+        together [m], and of the rotation of all together [deg]; used if the file has none.
     """
     kept: dict[str, GivenLandmark] = {}
     left_out = list(given.left_out)
     for landmark in given.landmarks:
-        reason = ('its id occurs before' if landmark.landmark_id in kept
+        reason = ('its id is repeated' if landmark.landmark_id in kept
                   else _reason_against(landmark, scale))
         if reason is None:
             kept[landmark.landmark_id] = landmark
@@ -116,7 +116,7 @@ def place(given: GivenMap, source: str, frame_id: str, scale: float,
 
 def _with_errors(details: LandmarkDetails, scale: float, errors: tuple[float, float] | None
                  ) -> LandmarkDetails:
-    """Return details with the deviation of the file in metres, or with given deviations."""
+    """Set the standard deviations of details: those of the file in metres, or the given ones."""
     if details.position_sigma is not None:
         return replace(details, position_sigma=scale * details.position_sigma)
     if errors is None:
@@ -126,10 +126,10 @@ def _with_errors(details: LandmarkDetails, scale: float, errors: tuple[float, fl
 
 
 def refit(imported: ImportedMap, observations: Path, keep_unsupported: bool) -> ImportedMap:
-    """Return an imported map fitted to the boxes of an observation file.
+    """Fit an imported map to the boxes of an observation file.
 
-    `keep_unsupported` keeps landmarks that cannot be fitted, where the file has them.
-    CliplocError: the file is invalid, or nothing can be fitted to it.
+    `keep_unsupported` keeps landmarks that cannot be fitted, unchanged. CliplocError: the file is
+    invalid, or no landmark can be fitted.
     """
     detections = load_observations(observations)
     before = imported.landmark_map
@@ -157,7 +157,7 @@ def refit(imported: ImportedMap, observations: Path, keep_unsupported: bool) -> 
 
 
 def _reason_against(landmark: GivenLandmark, scale: float) -> str | None:
-    """Return why no map can hold a landmark, or None."""
+    """Return the reason why a landmark is invalid; None if it is valid."""
     numbers = np.array([*landmark.center, *landmark.semi_axes, *landmark.quat_xyzw])
     if not np.isfinite(numbers).all():
         return 'it has numbers that are not finite'
@@ -175,15 +175,15 @@ def _reason_against(landmark: GivenLandmark, scale: float) -> str | None:
 
 
 def make_id(class_id: str, number: int | str) -> str:
-    """Return an id for a landmark that has only a number: its class and the number."""
+    """Make an id of class and number, for a landmark that has only a number."""
     word = ''.join(char if char.isalnum() else '_' for char in class_id)
     return f'{word}_{number}'
 
 
 def read_bytes(path: Path) -> bytes:
-    """Return the content of a regular file that is neither empty nor too large.
+    """Read a regular file that is neither empty nor too large.
 
-    DatasetError: the message names the file and what is wrong with it.
+    DatasetError: the message names the file and its fault.
     """
     with naming(path, OSError, what='cannot be read: '):
         content = read_file(path, MAX_FILE_BYTES)
@@ -193,7 +193,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_class_names(path: Path) -> tuple[str, ...]:
-    """Read a text file with one class name in each line.
+    """Read a text file with one class name per line.
 
     DatasetError: the message names the file and the line to correct.
     """
@@ -202,20 +202,20 @@ def read_class_names(path: Path) -> tuple[str, ...]:
     names = tuple(line.strip() for line in lines)
     for number, name in enumerate(names, 1):
         if not name or len(name) > _MAX_LENGTH:
-            raise DatasetError(f'{path}: line {number} must be a class name, one in each line')
+            raise DatasetError(f'{path}: line {number} must be a class name; give one per line')
     return names
 
 
 def class_name(names: Sequence[str], index: int) -> str:
     """Return the name of a class; DatasetError: the list of names has no such index."""
     if not 0 <= index < len(names):
-        raise DatasetError(f'class index {index} is not among {len(names)} names; name the '
-                           'classes that the map was made with: `class_names`')
+        raise DatasetError(f'class index {index} is not among {len(names)} names; give the names '
+                           'of the classes that the map was made with: `class_names`')
     return names[index]
 
 
 def shares(weights: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
-    """Return classes with their shares, the greatest first; those below a thousandth go."""
+    """Return classes with their shares, the greatest first; shares up to 0.001 are dropped."""
     least = _LEAST_SHARE * sum(weights.values())
     ranked = sorted(((name, weight) for name, weight in weights.items() if weight > least),
                     key=lambda pair: -pair[1])
@@ -224,10 +224,10 @@ def shares(weights: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
 
 
 _NUMBER_OF_SYMBOL = (1 << 56) - 1
-# Where a file has likelihoods alone, classes below this share of the greatest one are left out.
-# A guess.
+# Where a node has only likelihoods, classes below this share of the greatest are left out. Not
+# measured.
 _LEAST_LIKELIHOOD = 0.5
-_MOST_SHARE = 1e300  # sums of more are infinite
+_MOST_SHARE = 1e300  # sums of larger numbers are infinite
 
 
 def read_msgloc(path: Path, class_names: Sequence[str]) -> GivenMap:
@@ -236,14 +236,14 @@ def read_msgloc(path: Path, class_names: Sequence[str]) -> GivenMap:
     | field of a node | content |
     |---|---|
     | id | a symbol of GTSAM: the letter q in the highest byte, and a number |
-    | translation, radii | centre and semi-axes; signs of radii have no meaning |
+    | translation, radii | centre and semi-axes; the signs of radii are ignored |
     | orientation | quaternion w, x, y, z |
     | baseline_label | class to [share of the detections by score, ...] |
     | msgloc_label | class to [likelihood]: how often the class was proposed by the detector |
 
-    Class weights are the shares of the detections. Likelihoods serve where a node lacks them: they
-    sum to more than 1, and say which classes the detector confuses. DatasetError: the message
-    names the file and what is wrong with it.
+    Class weights are the shares of the detections. For a node without shares, likelihoods are
+    used: they sum to more than 1, and show which classes the detector confuses. DatasetError: the
+    message names the file and its fault.
 
     Parameters
     ----------
@@ -298,21 +298,21 @@ def _class_weights(node: Fields, class_names: Sequence[str]) -> tuple[tuple[str,
 
 
 def _labels(node: Fields, field: str, class_names: Sequence[str]) -> Mapping[str, float]:
-    """Return the first number of each class of a field."""
+    """Return the first number of each class in a field."""
     found: dict[str, float] = {}
     for key, values in node.mapping(field).items():
         where = f"{node.where}: '{field}' of class {key[:40]!r}"
         first = Fields({'share': values[0] if isinstance(values, list) and values else None},
                        where).number('share')
         if not 0.0 <= first < _MOST_SHARE:
-            raise FieldError(f'{where} is {first:g}, not a number from 0')
+            raise FieldError(f'{where} is {first:g}, expected 0 or more')
         name = _name_of(key, class_names, where)
         found[name] = found.get(name, 0.0) + first
     return found
 
 
 def _name_of(key: str, class_names: Sequence[str], where: str) -> str:
-    """Return the class of a key: an index, written as a float, or a name."""
+    """Return the class of a key, which is an index written as a float, or a name."""
     try:
         index = float(key)
     except ValueError:
@@ -336,15 +336,15 @@ _NO_TURN = [0.0, 0.0, 0.0, 1.0]
 def read_table(path: Path) -> GivenMap:
     """Read a map from a table: CSV of an editor or a spreadsheet, with a header.
 
-    Separators are commas, semicolons or tabs. Next to semicolons and tabs, numbers may have
-    decimal commas.
+    Separators are commas, semicolons or tabs. With semicolons or tabs, numbers may have decimal
+    commas.
 
-    A row without an id gets its class and number as one, a row without a label its class. A table
-    without qx, qy, qz and qw has ellipsoids along the axes of its coordinate frame. DatasetError:
-    the message names the file, the line and the column to correct.
+    The default id of a row is its class and number, the default label its class. In a table
+    without qx, qy, qz and qw, the ellipsoids are aligned with the axes of the coordinate frame.
+    DatasetError: the message names the file, the line and the column to correct.
     """
     content = read_bytes(path)
-    is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # of a spreadsheet
+    is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # spreadsheets
     try:
         text = content.decode('utf-16' if is_utf16 else 'utf-8-sig').lstrip()
     except UnicodeDecodeError as error:
@@ -366,7 +366,8 @@ def read_table(path: Path) -> GivenMap:
             landmark = _landmark_of_row(row, len(given.landmarks) + 1, where)
             first = lines.setdefault(landmark.landmark_id, reader.line_num)
             if first != reader.line_num:
-                raise DatasetError(f"{where}: id '{landmark.landmark_id}' is that of line {first}")
+                raise DatasetError(f"{where}: id '{landmark.landmark_id}' is already used in line "
+                                   f'{first}')
             given.landmarks.append(landmark)
     except csv.Error as error:
         raise DatasetError(f'{path}: line {reader.line_num}: {error}') from error
@@ -388,7 +389,7 @@ def _read_header(cells: Sequence[str], path: Path) -> list[str]:
 
 def _row(header: Sequence[str], cells: Sequence[str], delimiter: str, where: str
          ) -> dict[str, str]:
-    """Return the values of a line by their column; numbers with decimal points."""
+    """Return the values of a line by column, with decimal points in numbers."""
     if any(cell.strip() for cell in cells[len(header):]):
         raise DatasetError(f'{where}: has {len(cells)} values for {len(header)} columns; quote '
                            f'text that has a {delimiter!r}')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps of dual quadrics: of GOReloc, and of OA-SLAM in both forms in which it saves them.
+"""Read maps of dual quadrics: those of GOReloc, and both formats of OA-SLAM.
 
 | file | content |
 |---|---|
@@ -11,8 +11,8 @@
 | map_NAME.mapobjects (OA-SLAM) | repeated mapobject = 1 {ellipsoid = 1, track id = 2} |
 | map_NAME.objecttracks | next to it: repeated track = 1 {id = 1, category = 2, boxes = 8} |
 
-The facts on OA-SLAM are from its sources; no map that it saved was at hand. A monocular map has no
-metric scale, and its coordinate frame is the first camera's: z forward, y down.
+The format of OA-SLAM is taken from its source code; no saved map was available. A monocular map
+has no metric scale, and its coordinate frame is that of the first camera: z forward, y down.
 """
 
 from collections import Counter, defaultdict
@@ -38,19 +38,19 @@ _MAX_VARINT_BYTES = 10
 
 
 class QuadricError(Exception):
-    """Why a dual quadric is not an ellipsoid."""
+    """A dual quadric is not an ellipsoid; the text gives the reason."""
 
 
 class WireError(Exception):
-    """A fault of a protocol buffer; the caller adds the file's name."""
+    """A protocol buffer is invalid; the caller adds the name of the file."""
 
 
 def read_goreloc(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
     """Read the objects of a GOReloc map, NAME.objects.
 
-    Class weights are the counts of its categories. An object without a category, or that is no
-    ellipsoid, is left out. `class_names` are those of the category indices. DatasetError: the
-    message names the file and what is wrong with it.
+    Class weights are proportional to the counts of an object's categories. Objects without a
+    category, or that are not ellipsoids, are left out. `class_names` has the name of each category
+    index. DatasetError: the message names the file and its fault.
     """
     given = given_map.GivenMap([], [], [])
     with naming(path, WireError, what='is not a complete NAME.objects of GOReloc: '):
@@ -74,7 +74,7 @@ def read_goreloc(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
 def read_oaslam(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
     """Read the objects of an OA-SLAM map.
 
-    DatasetError: the message names the file and what is wrong with it.
+    DatasetError: the message names the file and its fault.
 
     Parameters
     ----------
@@ -86,8 +86,8 @@ def read_oaslam(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
     if path.suffix == '.mapobjects':
         return _read_saved_map(path, class_names)
     given = given_map.GivenMap([], [], [_NOTE])
-    with naming(path, UnicodeDecodeError, what='is no map_objects_NAME.txt of OA-SLAM, nor ends '
-                'in .mapobjects as a saved map: '):
+    with naming(path, UnicodeDecodeError, what='is neither a map_objects_NAME.txt of OA-SLAM nor '
+                'a saved map, which ends in .mapobjects: '):
         lines = given_map.read_bytes(path).decode('ascii').splitlines()
     for line_number, line in enumerate(lines, 1):
         words = line.split()
@@ -118,7 +118,8 @@ def _read_saved_map(path: Path, class_names: Sequence[str]) -> given_map.GivenMa
             track, quadric = _integer(item, 2), _quadric(item)
             if track not in tracks:
                 given.left_out.append(given_map.Skipped(
-                    f'track {track}', f'{tracks_path.name} has no such track, and so no class'))
+                    f'track {track}', f'{tracks_path.name} has no such track, so the class is '
+                    'unknown'))
                 continue
             category, support = tracks[track]
             _add(given, given_map.class_name(class_names, category), track, quadric,
@@ -128,7 +129,7 @@ def _read_saved_map(path: Path, class_names: Sequence[str]) -> given_map.GivenMa
 
 def _add(given: given_map.GivenMap, name: str, number: int, quadric: list[float],
          details: LandmarkDetails = _NO_DETAILS, shown: str = '') -> None:
-    """Append an object to the content of a file, unless it is not an ellipsoid."""
+    """Add an object to a map, or to the objects left out if it is not an ellipsoid."""
     landmark_id = given_map.make_id(name, number)
     try:
         ellipsoid = decompose(quadric)
@@ -140,7 +141,7 @@ def _add(given: given_map.GivenMap, name: str, number: int, quadric: list[float]
 
 
 def decompose(numbers: list[float]) -> tuple[list[float], list[float], list[float]]:
-    """Return centre, semi-axes and quaternion x, y, z, w of a dual quadric, 16 numbers by rows.
+    """Convert a dual quadric, 16 numbers by rows, to centre, semi-axes and quaternion x, y, z, w.
 
     QuadricError: it is not an ellipsoid.
     """
@@ -168,15 +169,15 @@ def decompose(numbers: list[float]) -> tuple[list[float], list[float], list[floa
 
 # ---- protocol buffers ---------------------------------------------------------------------------
 #
-# A message is a sequence of fields. Each begins with a varint, 8 * number + wire type; what
-# follows depends on the wire type: protobuf.dev/programming-guides/encoding. The package protobuf
-# is not a dependency of others here, and would need compiled schemas.
+# A message is a sequence of fields. A field begins with a varint, 8 * number + wire type; the wire
+# type determines the content: protobuf.dev/programming-guides/encoding. The package protobuf would
+# be a new dependency, and needs compiled schemas.
 
 _Fields = Mapping[int, list[int | memoryview]]
 
 
 def _messages(path: Path, is_strict: bool = True) -> Iterator[_Fields]:
-    """Yield the messages of a file; WireError: a strict one has other fields."""
+    """Yield the messages in field 1 of a file; WireError: a strict file has other fields."""
     fields = _fields(memoryview(given_map.read_bytes(path)))
     for number in fields:
         if is_strict and number != 1:
@@ -187,12 +188,12 @@ def _messages(path: Path, is_strict: bool = True) -> Iterator[_Fields]:
 
 
 def _quadric(item: _Fields) -> list[float]:
-    """Return the numbers of the ellipsoid that is field 1 of an object."""
+    """Return the numbers of an object's ellipsoid, field 1."""
     numbers: list[float] = []
     for ellipsoid in item.get(1, ()):
         for value in _fields(_message(ellipsoid)).get(1, ()):
             if isinstance(value, int) or len(value) % 4:
-                raise WireError('field 1 holds no 32-bit floats')
+                raise WireError('field 1 does not hold 32-bit floats')
             numbers += np.frombuffer(value, dtype='<f4').tolist()
     return numbers
 
@@ -204,7 +205,7 @@ def _message(value: int | memoryview) -> memoryview:
 
 
 def _integer(item: _Fields, number: int) -> int:
-    """Return a number of a message; a zero is not stored."""
+    """Return an integer field of a message; 0 if it is missing, as zeros are not stored."""
     value = item.get(number, [0])[-1]
     if not isinstance(value, int):
         raise WireError(f'field {number} is a message where a number was expected')
@@ -212,7 +213,7 @@ def _integer(item: _Fields, number: int) -> int:
 
 
 def _integers(item: _Fields, number: int) -> list[int]:
-    """Return the numbers of a repeated field, packed or not."""
+    """Return the integers of a repeated field, packed or not."""
     numbers = []
     for value in item.get(number, ()):
         if isinstance(value, int):
@@ -220,13 +221,13 @@ def _integers(item: _Fields, number: int) -> list[int]:
             continue
         place = 0
         while place < len(value):
-            one, place = _read_varint(value, place)
-            numbers.append(one)
+            found, place = _read_varint(value, place)
+            numbers.append(found)
     return numbers
 
 
 def _fields(data: memoryview) -> _Fields:
-    """Return the values of a message by the number of their field; nothing is copied.
+    """Return the values of a message by field number, without copying.
 
     WireError: the bytes are not a message, or end too early.
     """
@@ -248,15 +249,15 @@ def _fields(data: memoryview) -> _Fields:
         else:
             raise WireError(f'byte {place}: wire type {wire_type} does not exist')
         if size > len(data) - place:
-            raise WireError(f'byte {place}: field {number} has {size} bytes, and only '
-                            f'{len(data) - place} are left')
+            raise WireError(f'byte {place}: field {number} has {size} bytes, but only '
+                            f'{len(data) - place} follow')
         fields[number].append(data[place:place + size])
         place += size
     return fields
 
 
 def _read_varint(data: memoryview, place: int) -> tuple[int, int]:
-    """Return the number that begins at a place, and the place after it."""
+    """Read the varint at an index; also return the index after it."""
     value = 0
     for count in range(_MAX_VARINT_BYTES):
         if place >= len(data):
