@@ -26,7 +26,7 @@ from cliploc_ros.files.storage import MAKE_ROOM, open_file, replace_file
 #: Arrays by name.
 Arrays = Mapping[str, NDArray[Any]]
 
-# Kinds of NumPy types; any other type of a field is the name of a NumPy type.
+# Groups of NumPy types by their kind codes. A field may also name a single NumPy type.
 _KINDS = {'text': 'U', 'numbers': 'fiu', 'floats': 'f', 'integers': 'iu', 'booleans': 'b'}
 _ROWS_AT_ONCE = 10_000
 # Offsets in a member of a zip file: of the lengths of its name and extra field, and of its name.
@@ -88,7 +88,7 @@ def _is_repeated(values: NDArray[Any]) -> NDArray[np.bool_]:
 
 FINITE = Check(f'is beyond {_MOST:g} or not finite', _is_not_finite)
 UNIQUE = Check('repeats an id', _is_repeated)
-BOX = Check('is not left, top, right, bottom',
+BOX = Check('is not in the order left, top, right, bottom',
             lambda boxes: (boxes[:, :2] >= boxes[:, 2:]).any(axis=1))
 SHARE = Check('is outside 0 to 1', lambda shares: (shares < 0) | (shares > 1))
 
@@ -163,7 +163,7 @@ class Schema:
                              f'{MAKE_ROOM}') from error
 
     def check(self, arrays: Arrays) -> None:
-        """Raise ArrayError if a type, a shape or a value is wrong."""
+        """Raise ArrayError if a type, a shape or a value is invalid."""
         sizes: dict[str, int] = {}
         fields = {name: entry for name, entry in self.fields.items() if name in arrays}
         for name, entry in fields.items():
@@ -209,7 +209,7 @@ class Schema:
                 try:
                     for member in archive.infolist():
                         archive.open(member).close()  # a damaged name would hide an array
-                except Exception as error:  # as above
+                except Exception as error:  # see above
                     raise ArrayError(f'is damaged ({error})') from error
                 return self._arrays_of(file, archive)
 
@@ -227,7 +227,8 @@ class Schema:
                          and members[name].compress_type == zipfile.ZIP_STORED)
                   for name, entry in self.fields.items() if name in members}
         unpacked = sum(member.file_size for member, stays in wanted.values() if not stays)
-        on_disk = 512 * status.st_blocks or status.st_size  # 0 blocks: some network file systems
+        # some network file systems report 0 blocks
+        on_disk = 512 * status.st_blocks or status.st_size
         if unpacked > max(_MOST_BYTES, _MOST_GROWTH * on_disk):
             raise ArrayError(f'unpacks to {unpacked >> 20} MiB, more than {_MOST_GROWTH} times '
                              'its size on disk')

@@ -51,7 +51,7 @@ class Log:
             self.close()
             raise error(f'{path}: open in another studio or run; close that first') from problem
         except OSError:
-            pass  # some file systems have no locks
+            pass  # some file systems do not support locks
         self._end = self._file.seek(0, os.SEEK_END)
 
     def read(self) -> tuple[list[Any], bool]:

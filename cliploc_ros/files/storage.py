@@ -145,7 +145,7 @@ def replace_set(path: Path, digest: str, write: WriteOfSet,
     Raises
     ------
     OSError
-        Nothing was changed. The same holds for exceptions of the callables.
+        Nothing was changed. The callables may raise other exceptions, with the same effect.
     OptionsError
         The set was written, but a file of an older set cannot be removed.
     """
@@ -254,7 +254,7 @@ def warn_not_kept(text: str) -> None:
 
 
 def resolve_cache_dir(cache_dir: str) -> Path:
-    """Return the folder for downloads, label embeddings and kernels; '' means the user's cache.
+    """Return the folder for downloads, label embeddings and kernels; '' gives the user's cache.
 
     The user's cache is ``$XDG_CACHE_HOME/cliploc_ros`` or else ``~/.cache/cliploc_ros``. A forged
     label embedding leads to wrong poses, and a forged kernel runs arbitrary code. So if the user

@@ -3,8 +3,8 @@
 """Extract local features of an image, and match the features of two images.
 
 A FeatureKind extracts and matches features. SIFT is built in (Lowe, "Distinctive Image Features
-from Scale-Invariant Keypoints", 2004), with the square root of Arandjelovic and Zisserman ("Three
-things everyone should know to improve object retrieval", 2012). OpenCV extracts the features; a
+from Scale-Invariant Keypoints", 2004), as RootSIFT (Arandjelovic and Zisserman, "Three things
+everyone should know to improve object retrieval", 2012). OpenCV extracts the features. A
 descriptor takes 128 bytes.
 """
 
@@ -25,7 +25,7 @@ _DARK = 160.0
 _CONTRAST = 0.02
 # A match is refused if another feature of the other image is nearly as similar (Lowe, 2004).
 _RATIO = 0.85
-# Rounding error of a cosine: two equal descriptors must not differ in clearness.
+# Rounding error of a cosine. It is added to distances, so that equal descriptors have ratio 1.
 _SAME = 1e-6
 
 

@@ -45,8 +45,8 @@ VERSION = 1
 _CAMERA = ('width', 'height', 'fx', 'fy', 'cx', 'cy')
 _HASH_DIGITS = 12
 _MOST_DEVIATION = 1.0
-# A map whose landmarks of equal name have moved farther than this (median) is another map [m]. An
-# update or an edit moves few landmarks.
+# If landmarks of the same name have moved farther than this (median), the layer belongs to another
+# map [m]. An update or an edit moves few landmarks.
 _MOST_MOVED_M = 0.25
 
 

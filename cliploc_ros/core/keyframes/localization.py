@@ -81,7 +81,7 @@ _KEYFRAME_M, _KEYFRAME_RAD, PER_RADIAN = 0.012, np.radians(0.45), 0.04
 class _Matched(NamedTuple):
     """The k matches of an image: features, points in the map, their keyframes and rows.
 
-    The shares measure the clearness of the matches, see core.keyframes.features.match.
+    The shares measure how distinctive the matches are, see core.keyframes.features.match.
     """
 
     features: NDArray[np.int64]
@@ -223,7 +223,7 @@ class KeyframeLocalizer:
         matched = self._match(descriptors, chosen, deadline)
         first = _place(matched, look)
         if first is None or first.agreed < _ENOUGH_INLIERS:
-            # more keyframes: near the pose, and next in similarity
+            # also match keyframes near the pose, and the next similar keyframes
             near = keyframes_near(self.layer.map_from_camera, first.map_from_camera
                                    )[:_MORE].tolist() if first else []
             more = [rank for rank in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
@@ -292,7 +292,7 @@ class KeyframeLocalizer:
             matched = matched.join(_Matched(
                 kept, theirs[of_points], np.full(len(kept), keyframe),
                 of_points + self.layer.rows(keyframe).start, np.ones(len(kept), np.float32)))
-        # count a match that was found twice only once
+        # drop duplicate matches
         _, kept = np.unique([matched.features, matched.rows], axis=1, return_index=True)
         matched = matched.select(np.sort(kept))
         refined = refine(matched.points, look.bearings[matched.features], camera_from_map)

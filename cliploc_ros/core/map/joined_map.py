@@ -22,8 +22,8 @@ from cliploc_ros.errors import MapError
 
 #: Maximum number of maps in a request: each map adds candidates, which share the time budget.
 MAX_MAPS = 100
-# Distance between joined maps, in multiples of the largest semi-axis. A landmark half that far
-# away cannot match even a box one pixel wide, at focal lengths below 10,000 px (IoU above .2).
+# Distance between joined maps, in multiples of the largest semi-axis. At half that distance, a
+# landmark cannot match even a box one pixel wide, at focal lengths below 10,000 px (IoU above .2).
 _APART = 100_000.0
 
 

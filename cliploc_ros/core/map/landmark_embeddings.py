@@ -33,7 +33,7 @@ def _is_no_direction(rows: NDArray[Any]) -> NDArray[np.bool_]:
     return np.asarray(~(np.abs(lengths - 1.0) <= 5e-3))  # true for NaN
 
 
-# L landmarks, m medoids, d numbers.
+# L landmarks, m medoids, d dimensions.
 _SCHEMA = Schema('file of embeddings', {
     'encoder_key': Field('text', (), (_check_key,)),
     'landmark_ids': Field('text', ('L',), (UNIQUE,)),
@@ -152,7 +152,7 @@ def save_landmark_embeddings(path: str | os.PathLike[str], embeddings: LandmarkE
 
 def with_images(labels: LabelEmbeddings, images: LandmarkEmbeddings, compare: str
                 ) -> LabelEmbeddings:
-    """Combine label and image embeddings into one row for each landmark, to compare crops with.
+    """Combine label and image embeddings into one row for each landmark, for use with crops.
 
     A landmark without images keeps its label. If crops are compared with images alone, its label's
     similarity is scaled and shifted to the range of image similarities.

@@ -169,8 +169,8 @@ def objects_of(centers: NDArray[np.float64], shapes: NDArray[np.float64],
                neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the object number of each landmark (L,); duplicates share a number.
 
-    Landmarks of one class are duplicates if they overlap deeply. Books side by side are not
-    duplicates.
+    Landmarks of one class are duplicates if their centres are close relative to their sizes. Books
+    side by side are not duplicates.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ class LandmarkMap:
             pick(self.details) if self.details else ())
 
     def with_more(self, other: 'LandmarkMap') -> 'LandmarkMap':
-        """Return the map with the landmarks of another one behind its own."""
+        """Return the map with the landmarks of another map appended."""
         def details(part: LandmarkMap) -> tuple[LandmarkDetails, ...]:
             return part.details or (LandmarkDetails(),) * len(part)
 
@@ -231,7 +231,7 @@ class LandmarkMap:
             map_set=self.map_set)
 
     def joined(self, into: NDArray[np.int64]) -> 'LandmarkMap':
-        """Return the map with the labels and classes of parts added to the landmarks they form.
+        """Return the map with the labels and classes of parts added to their whole landmarks.
 
         The array into (L,) has the row of the landmark that each landmark is a part of, or its own
         row.
@@ -273,7 +273,7 @@ class LandmarkMap:
 
     @property
     def weighted_labels(self) -> tuple[WeightedLabels, ...]:
-        """Return all labels that describe each landmark, with their weights."""
+        """Return all labels of each landmark, with their weights."""
         if not self.details:
             return tuple(((label, 1.0),) for label in self.labels)
         return tuple(detail.labels_with(label)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Write a map as a ROS 2 parameter file, see LandmarkMap.from_file, and the files next to it."""
+"""Write a map as a ROS 2 parameter file, which LandmarkMap.from_file reads, and related files."""
 
 import hashlib
 import json

@@ -6,10 +6,10 @@ The tree is built from the parser's events, without recursion and without instan
 Size and depth are limited, so a hostile file causes an error and not a crash.
 
 PyYAML creates an object for each token of a file: 100,000 landmarks take 10 to 30 s. Files of
-build_map, import_map and the studio repeat one layout, so a regular expression for one landmark
-reads them ten times faster. It accepts only a small subset of YAML, on which it agrees with the
-parser. For any other file, such as a handwritten or invalid file, it returns None. The parser then
-reads the file and reports errors.
+build_map, import_map and the studio have a fixed layout: a regular expression that matches one
+landmark reads them ten times faster. It accepts only a small subset of YAML, for which its result
+equals the parser's. For any other file, such as a handwritten or invalid file, parse_written_map
+returns None. The parser then reads the file and reports errors.
 """
 
 import json

@@ -44,7 +44,7 @@ class LabelEmbeddings:
         return LabelEmbeddings(embeddings, np.arange(len(embeddings)))
 
     def in_parts(self, sizes: Sequence[int]) -> 'LabelEmbeddings':
-        """Return equal embeddings in which each of several maps has separate rows.
+        """Return the embeddings with separate rows for each of several maps.
 
         A label that two maps share is stored twice.
         """

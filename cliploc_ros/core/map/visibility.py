@@ -87,7 +87,7 @@ class InImage(NamedTuple):
 
     boxes: NDArray[np.float64]  #: (n, 4): NaN if not entirely in front of the camera
     shown: NDArray[np.float64]  #: (n, 4): the part within the image
-    is_shown: NDArray[np.bool_]  #: (n,): whether that part has the least share and side
+    is_shown: NDArray[np.bool_]  #: (n,): whether that part is large enough
 
 
 def boxes_in_image(camera: Camera, camera_from_map: NDArray[np.float64],

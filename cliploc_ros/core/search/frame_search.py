@@ -81,7 +81,7 @@ class Candidates(NamedTuple):
         return self._replace(landmarks=self.landmarks + first)
 
     def ordered(self, *keys: NDArray[np.float64] | NDArray[np.int64]) -> 'Candidates':
-        """Sort the candidates by keys, of which the first is primary; ties keep their order."""
+        """Sort the candidates by keys, the primary key first; ties keep their order."""
         return self.select(np.lexsort(keys[::-1]))
 
 

@@ -52,7 +52,7 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
                sorted_landmarks: SortedLandmarks | None = None,
                classes: NDArray[np.int64] | None = None,
                depths: NDArray[np.float64] | None = None) -> Scene:
-    """Return the scene of one frame.
+    """Build the scene of one frame.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ class Sample(NamedTuple):
     landmarks: NDArray[np.float64]  #: (3, 9): centres and shapes
     #: (12, 6): outlines of the landmarks at each of up to four poses, see project
     outlines: NDArray[np.float64]
-    #: (4,): upper bound of the summed IoUs at each pose; -1 where the pose is impossible
+    #: (4,): upper bound of the summed IoUs at each pose; -1 if the pose is impossible
     uppers: NDArray[np.float64]
 
 
@@ -155,8 +155,8 @@ def _load(candidates, samples, number, size, sample):
 def _choose_pose(constraint, sample, size, poses, count, least_iou):
     """Return the index of the pose with the greatest sum of IoUs of the sampled pairs, or -1.
 
-    All sampled ellipsoids must be entirely in front of the camera, and the pose must agree with
-    the constraint and reach the sum least_iou.
+    All sampled ellipsoids must be entirely in front of the camera, the pose must agree with the
+    constraint, and the sum of IoUs must be at least least_iou.
     """
     boxes, outlines, uppers = sample.boxes, sample.outlines, sample.uppers
     visible, last = 0, -1

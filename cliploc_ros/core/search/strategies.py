@@ -256,7 +256,7 @@ def _depths(scene: Scene) -> NDArray[np.float64]:
     determinant = (xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz))
     radius = np.cbrt(np.sqrt(np.maximum(determinant, 0.0)))
     half = scene.box_ellipses[scene.pairs[:, 0], 2:]
-    # boxes lie on the plane z = 1; the distance to a point on it grows away from the axis
+    # the last factor converts depth along the optical axis to distance along the ray
     middle = scene.box_ellipses[scene.pairs[:, 0], :2]
     return np.asarray(radius / np.sqrt(half.prod(axis=1))
                       * np.sqrt(1.0 + (middle * middle).sum(axis=1)))
@@ -401,7 +401,7 @@ class Progress(NamedTuple):
 
 def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
                    constraint: Constraint | None = None) -> Iterator[Progress]:
-    """Try given minimal samples, a block at a time.
+    """Try the given minimal samples, a block at a time.
 
     Parameters
     ----------

@@ -31,16 +31,16 @@ from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import SAME_VIEW
 from cliploc_ros.core.watch.look import Alignment
 
-_FAULTS = {'dark': 'the camera is in the dark, or covered',
-           'bare': 'the camera is covered, or faces a bare wall',
+_FAULTS = {'dark': 'the camera is in the dark or covered',
+           'bare': 'the camera is covered or faces a bare wall',
            'frozen': 'the image is frozen',
-           'smooth': 'the image is blurred, or the lens is dirty'}
+           'smooth': 'the image is blurred or the lens is dirty'}
 # Number of iterations of the weighted mean, a numerical bound.
 _ROUNDS = 10
 
 
 class ImageFaults:
-    """Signs of faults over the images of one camera."""
+    """Detects faults in the images of one camera."""
 
     def __init__(self) -> None:
         self._counts = dict.fromkeys(_FAULTS, 0)
@@ -50,7 +50,7 @@ class ImageFaults:
     def add(self, image: NDArray[np.uint8], pose: NDArray[np.float64]) -> str:
         """Add an image (h, w, 3) and its pose (4, 4); return the fault as text, empty if none.
 
-        The pose is that of odometry if it is known.
+        The pose should come from odometry if available.
         """
         terms = CALIBRATION.images
         width = int(terms.width_px)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The entry point of the watch: Watch.look(observation, map_from_camera) -> WatchReport.
+"""Entry point of the watch: Watch.look(observation, map_from_camera) -> WatchReport.
 
 The probability that a localizer is right is estimated by a Bayes filter over looks. Between looks
 a localizer may get lost or recover, so the probability decays to one half with time and distance.
@@ -173,7 +173,7 @@ class Watch:
         image : ndarray (h, w, 3) of uint8, optional
             Needed to detect faults of the camera.
         recognizer : ImageRecognizer, optional
-            Recognizer of the keyframes, for this image.
+            Keyframe recognizer of the image.
 
         Raises
         ------
