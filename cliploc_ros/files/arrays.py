@@ -59,7 +59,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Offsets:
-    """A check of offsets: the first row of each part of another array, and the end of its rows."""
+    """A check of offsets, which divide the rows of another array into consecutive parts."""
 
     counted: str
     what: str

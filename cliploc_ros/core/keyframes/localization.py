@@ -526,7 +526,7 @@ class ImageRecognizer:
 
     def recognize(self, guesses: Sequence[NDArray[np.float64]],
                   constraint: Constraint = NOTHING_KNOWN) -> Recognition:
-        """Find the places of the image; search again only if guesses propose other keyframes."""
+        """Return the places of the image; search again only if guesses propose other keyframes."""
         near = {row for guess in guesses for row in keyframes_near(
             self._keyframes.layer.map_from_camera, guess)[:PROPOSED].tolist()}
         if self._known is None or not near <= self._known[0]:

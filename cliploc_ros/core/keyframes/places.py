@@ -20,7 +20,7 @@ class RecognizedPlace(NamedTuple):
     inliers: int
     #: Share of the comparable cells of the image that contain inliers, 0 to 1
     confirmed: float
-    #: Share of cells that this number of inliers confirms with the usual spread, 0 to 1
+    #: Expected value of `confirmed` for this number of inliers, 0 to 1
     expected: float
     #: Number of confirming and of comparable cells. A cell is comparable if the keyframes predict
     #: points in it and the image has features there.
