@@ -133,7 +133,7 @@ def _weighted(rows: list[tuple[Any, Any]], where: str) -> tuple[tuple[str, float
         raise MapError(f'{where}: is empty; omit the field')
     pairs = tuple((_text(text, where), _number(weight, where)) for text, weight in rows)
     if any(weight <= 0.0 for _, weight in pairs):
-        raise MapError(f'{where}: weights must be positive')
+        raise MapError(f'{where}: weights must be above 0')
     return pairs
 
 
